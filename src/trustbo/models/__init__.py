@@ -1,0 +1,17 @@
+"""Trust models and their inference."""
+
+from trustbo.models.fit import diagnostics, fit, sample_prior
+from trustbo.models.pooled import ContactRate, PooledTrust, TrustParams, TrustSample, pooled_trust
+from trustbo.models.priors import Priors
+
+__all__ = [
+    "ContactRate",
+    "PooledTrust",
+    "Priors",
+    "TrustParams",
+    "TrustSample",
+    "diagnostics",
+    "fit",
+    "pooled_trust",
+    "sample_prior",
+]

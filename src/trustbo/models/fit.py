@@ -1,0 +1,265 @@
+"""From missions to a posterior: sampling, checking it, and laying it out for ArviZ."""
+
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jax import Array, random
+from numpyro import handlers
+
+from trustbo.data import Mission, MissionBatch, stack_missions
+from trustbo.errors import PosteriorError, require_choice
+from trustbo.models import latent
+from trustbo.models.nuts import NutsDraws, NutsSettings, run_nuts
+from trustbo.models.pooled import PooledTrust, TrustParams, pooled_trust
+from trustbo.models.priors import Priors
+
+SAMPLERS = ("nuts",)
+MAX_RHAT, MIN_ESS = 1.01, 400.0
+_SITES = TrustParams._fields[:5]
+
+
+def fit(
+    missions: Sequence[Mission],
+    model: PooledTrust | None = None,
+    sampler: str = "nuts",
+    *,
+    seed: int = 0,
+    n_warmup: int = 300,
+    n_draws: int = 1000,
+    n_chains: int = 4,
+    n_trajectories: int = 200,
+    check: bool = True,
+) -> xr.DataTree:
+    """Posterior of the trust model's parameters, and of latent trust, given missions.
+
+    Args:
+        missions: All missions to learn from; contact rates that are NaN were not measured.
+        model: The trust model; by default `PooledTrust()`.
+        sampler: `"nuts"`.
+        seed: Same seed, same posterior.
+        n_warmup: Warm-up draws per chain, not kept.
+        n_draws: Draws kept per chain.
+        n_chains: Chains.
+        n_trajectories: Draws, spread evenly over the chains, for which latent trust and predicted
+            contact rates are kept.
+        check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
+            run does not cure; `False` returns it as it is.
+
+    Returns:
+        An ArviZ DataTree with the groups `posterior` (beta0, beta[feature], b, delta_w, delta_v),
+        `latent` (trust[chain, draw, mission, bound, robot] by backward sampling, and trust_mean and
+        trust_sd over all draws), `posterior_predictive`, `prior`, `prior_predictive`,
+        `log_likelihood` (contact_rate[chain, draw, mission]: a whole mission is one observation, so
+        LOO leaves out missions), `sample_stats`, `observed_data` and `constant_data`. Bound k is
+        labelled k = 1, 2, ...; short missions are padded with NaN.
+
+    Raises:
+        ShapeError: No missions, or missions that disagree on robots or features.
+        TrustboError: An awareness value is NaN, or the sampler is unknown.
+        PosteriorError: The diagnostics say that the posterior must not be used.
+    """
+    require_choice("sampler", sampler, SAMPLERS)
+    model = PooledTrust() if model is None else model
+    batch = stack_missions(missions)
+    settings = NutsSettings(n_warmup, n_draws, n_chains)
+    started = time.perf_counter()
+    with jax.enable_x64(True):
+        key_nuts, key_retry, key_describe = random.split(random.key(seed), 3)
+        draws = _sample(model, settings, key_nuts, batch)
+        retries = 0
+        if check and _complaints(draws):
+            longer = NutsSettings(2 * n_warmup, 2 * n_draws, n_chains, target_accept=0.98)
+            draws, retries = _sample(model, longer, key_retry, batch), 1
+        groups = _describe(model, draws, batch, key_describe, n_trajectories)
+    seconds = time.perf_counter() - started
+    posterior = _to_datatree(groups, missions)
+    posterior.attrs |= {
+        "model": type(model).__name__,
+        "sampler": sampler,
+        "seed": seed,
+        "retries": retries,
+        "seconds": seconds,
+        "x0_mean": float(model.priors.x0_mean),
+        "x0_sd": float(model.priors.x0_sd),
+        **{f"prior_{name}": text for name, text in model.priors.describe().items()},
+        **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
+    }
+    complaints = _complaints(draws) if check else []
+    if complaints:
+        raise PosteriorError(
+            f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions "
+            "or firmer priors, or pass check=False to have it as it is.",
+            posterior,
+        )
+    return posterior
+
+
+def sample_prior(model: PooledTrust, n_features: int, n_draws: int, seed: int) -> TrustParams:
+    """Draws of the parameters from the prior, leading axis (draw,)."""
+    with jax.enable_x64(True):
+        empty = jnp.zeros((1, 1, 1, n_features))
+        draws = _prior_draws(model.priors, empty, random.split(random.key(seed), n_draws))
+        return _params({name: np.asarray(draws[name]) for name in _SITES}, model.priors)
+
+
+def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
+    """The worst R-hat and bulk ESS over all parameters, and the number of divergences."""
+    sites = posterior["posterior"].to_dataset()
+    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+    return {
+        "r_hat": max(float(rhat[name].max()) for name in rhat.data_vars),
+        "ess_bulk": min(float(ess[name].min()) for name in ess.data_vars),
+        "divergences": int(posterior["sample_stats"]["diverging"].sum()),
+    }
+
+
+def _sample(
+    model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch
+) -> NutsDraws:
+    draws = run_nuts(
+        pooled_trust, settings, key, model.priors, batch.awareness, batch.contact_rate
+    )
+    return NutsDraws(*({k: np.asarray(v) for k, v in group.items()} for group in draws))
+
+
+def _complaints(draws: NutsDraws) -> list[str]:
+    """What is wrong with the draws, parameter by parameter; empty if nothing is."""
+    sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
+    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+    found = []
+    for name in sites.data_vars:
+        worst, fewest = float(rhat[name].max()), float(ess[name].min())
+        if not worst <= MAX_RHAT:  # NaN is a complaint too
+            found.append(f"R-hat of {name} is {worst:.3f} (limit {MAX_RHAT})")
+        if not fewest >= MIN_ESS:
+            found.append(f"bulk ESS of {name} is {fewest:.0f} (at least {MIN_ESS:.0f})")
+    n_divergences = int(draws.stats["diverging"].sum())
+    if n_divergences:
+        found.append(f"{n_divergences} divergences")
+    return found
+
+
+def _describe(
+    model: PooledTrust, draws: NutsDraws, batch: MissionBatch, key: Array, n_trajectories: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """Every group of the DataTree as arrays with leading axes (chain, draw), padding included."""
+    n_chains, n_draws = draws.params["beta0"].shape
+    data = (jnp.asarray(batch.awareness), jnp.asarray(batch.contact_rate))
+    every = {name: a.reshape(-1, *a.shape[2:]) for name, a in draws.params.items()}
+    kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
+    thinned = {k: a[:, kept].reshape(-1, *a.shape[2:]) for k, a in draws.params.items()}
+    all_params, few_params = _params(every, model.priors), _params(thinned, model.priors)
+    key_trust, key_predict, key_prior = random.split(key, 3)
+
+    def by_chain(array: Array) -> np.ndarray:
+        return np.asarray(array).reshape(n_chains, -1, *array.shape[1:])
+
+    moments = latent.trust_moments(all_params, *data)
+    prior = _prior_draws(model.priors, data[0], random.split(key_prior, 500))
+    prior = {name: np.asarray(prior[name])[None] for name in (*_SITES, "contact_rate")}
+    return {
+        "posterior": {name: draws.params[name] for name in _SITES},
+        "sample_stats": draws.stats
+        | {"tree_depth": np.ceil(np.log2(draws.stats["n_steps"] + 1)).astype(int)},
+        "log_likelihood": {"contact_rate": by_chain(latent.log_likelihood(all_params, *data))},
+        "latent": {
+            "trust": by_chain(latent.trust_draws(few_params, *data, key_trust)),
+            "trust_mean": np.asarray(moments.mean),
+            "trust_sd": np.asarray(moments.sd),
+            "draw": kept,
+        },
+        "posterior_predictive": {
+            "contact_rate": by_chain(latent.predictive(few_params, data[0], key_predict)),
+            "draw": kept,
+        },
+        "prior_predictive": {"contact_rate": prior.pop("contact_rate")},
+        "prior": prior,
+    }
+
+
+@jax.jit
+def _prior_draws(priors: Priors, awareness: Array, keys: Array) -> dict[str, Array]:
+    def one(key: Array) -> dict[str, Array]:
+        trace = handlers.trace(handlers.seed(pooled_trust, key)).get_trace(awareness, priors)
+        return {name: site["value"] for name, site in trace.items() if site["type"] == "sample"}
+
+    return jax.vmap(one)(keys)
+
+
+def _params(draws: dict[str, np.ndarray], priors: Priors) -> TrustParams:
+    n_draws = len(draws["beta0"])
+    x0 = {name: np.full(n_draws, getattr(priors, name)) for name in ("x0_mean", "x0_sd")}
+    return TrustParams(**{name: draws[name] for name in _SITES}, **x0)
+
+
+_DIMS = {
+    "beta": ("feature",),
+    "trust": ("mission", "bound", "robot"),
+    "trust_mean": ("mission", "bound", "robot"),
+    "trust_sd": ("mission", "bound", "robot"),
+    "contact_rate": ("mission", "bound", "robot"),
+}
+
+
+def _to_datatree(
+    groups: dict[str, dict[str, np.ndarray]], missions: Sequence[Mission]
+) -> xr.DataTree:
+    """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN."""
+    observed = stack_missions(missions, pad=False)
+    n_missions, n_bounds = observed.contact_rate.shape[:2]
+    lengths = xr.DataArray([len(m.bounds) for m in missions], dims="mission")
+    coords = {
+        "mission": np.arange(n_missions),
+        "bound": np.arange(1, n_bounds + 1),
+        "robot": list(missions[0].robots),
+        "feature": list(missions[0].features),
+    }
+    tree = {}
+    for group, arrays in groups.items():
+        draw = arrays.pop("draw", None)
+        variables = {}
+        for name, array in arrays.items():
+            dims = ("mission",) if group == "log_likelihood" else _DIMS.get(name, ())
+            if len(dims) < array.ndim:
+                dims = ("chain", "draw", *dims)
+            cut = xr.DataArray(array, dims=dims)
+            cut = cut.isel({d: slice(len(coords[d])) for d in dims if d in coords})
+            cut = cut.assign_coords({d: coords[d] for d in dims if d in coords})
+            if "bound" in dims:
+                cut = cut.where(cut["bound"] <= lengths)
+            variables[name] = cut.transpose(*dims)
+        dataset = xr.Dataset(variables)
+        index = {"chain": np.arange(dataset.sizes["chain"]), "draw": np.arange(dataset.sizes["draw"])}
+        tree[group] = dataset.assign_coords(index if draw is None else index | {"draw": draw})
+    tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
+    return xr.DataTree.from_dict(tree)
+
+
+def _data_groups(
+    observed: MissionBatch, missions: Sequence[Mission], coords: dict[str, object]
+) -> tuple[xr.Dataset, xr.Dataset]:
+    shape = observed.contact_rate.shape
+    duration, cell = np.full(shape, np.nan), np.full((*shape[:2], 2), -1)
+    for j, mission in enumerate(missions):
+        duration[j, : len(mission.bounds)] = mission.duration
+        cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
+    dims = ("mission", "bound", "robot")
+    own = {name: coords[name] for name in dims}
+    rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, own)
+    constant = xr.Dataset(
+        {
+            "awareness": ((*dims, "feature"), observed.awareness),
+            "duration": (dims, duration, {"units": "s"}),
+            "row": (("mission", "bound"), cell[..., 0]),
+            "col": (("mission", "bound"), cell[..., 1]),
+            "status": (("mission",), [mission.status for mission in missions]),
+        },
+        coords,
+    )
+    return rates, constant

@@ -1,0 +1,79 @@
+"""Fractal terrain with patches of vegetation, for demonstrations and studies."""
+
+import numpy as np
+import xarray as xr
+from scipy import ndimage
+
+from trustbo.errors import TerrainError
+from trustbo.terrain.raster import assemble_terrain
+
+
+def synthetic_terrain(
+    size: tuple[float, float] = (500.0, 500.0),
+    resolution: float = 1.0,
+    seed: int = 0,
+    *,
+    relief: float = 30.0,
+    hurst: float = 0.9,
+    canopy_cover: float = 0.4,
+    canopy_height: float = 6.0,
+    crs: str = "EPSG:32616",
+) -> xr.Dataset:
+    """Make a terrain: fractional Brownian relief and clumped vegetation of varying height.
+
+    Args:
+        size: Height (north-south) and width (east-west), m.
+        resolution: Pixel size, m.
+        seed: Same seed, same terrain.
+        relief: Highest minus lowest ground, m.
+        hurst: Hurst exponent of the relief in (0, 1]; higher is smoother.
+        canopy_cover: Share of the area under vegetation.
+        canopy_height: Mean height of the vegetation where there is any, m.
+        crs: Metric CRS written to the result; by default a UTM zone of northern Michigan, on whose
+            Keweenaw peninsula the terrain is put.
+
+    Returns:
+        Dataset as `read_terrain` gives it.
+
+    Raises:
+        TerrainError: A size under 4 pixels, or a parameter out of its range.
+    """
+    shape = (round(size[0] / resolution), round(size[1] / resolution))
+    if min(shape) < 4:
+        raise TerrainError(f"size {size} m at {resolution} m is {shape} pixels; need 4 x 4.")
+    if not (0.0 < hurst <= 1.0 and 0.0 <= canopy_cover <= 1.0 and relief >= 0.0 <= canopy_height):
+        raise TerrainError(
+            "need hurst in (0, 1], canopy_cover in [0, 1], relief and canopy_height >= 0; got "
+            f"{hurst}, {canopy_cover}, {relief}, {canopy_height}."
+        )
+    rng = np.random.default_rng(seed)
+    ground = _fractal(rng, shape, exponent=hurst + 1.0)
+    # Sub-metre ruggedness (ruts, rocks) in clumps, which the relief alone lacks.
+    rough = np.clip(ndimage.gaussian_filter(_fractal(rng, shape, 1.6), 2.0 / resolution), 0.3, 1.0)
+    dem = relief * ground + 0.25 * rough * rng.standard_normal(shape)
+    dem = ndimage.gaussian_filter(dem, 0.7)
+    patches = _fractal(rng, shape, exponent=1.5)
+    wooded = patches > np.quantile(patches, 1.0 - canopy_cover)
+    crowns = ndimage.gaussian_filter(rng.standard_normal(shape), 2.0 / resolution)
+    height = canopy_height * np.exp(0.5 * crowns / crowns.std() - 0.125)
+    dsm = dem + np.where(wooded, height, 0.0)
+    left, top = 380_000.0, 5_225_000.0
+    coords = {
+        "y": top - (np.arange(shape[0]) + 0.5) * resolution,
+        "x": left + (np.arange(shape[1]) + 0.5) * resolution,
+    }
+    arrays = (xr.DataArray(a, coords, dims=("y", "x")).rio.write_crs(crs) for a in (dem, dsm))
+    return assemble_terrain(*arrays)
+
+
+def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
+    """Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
+
+    Synthesised on twice the size and cropped: the Fourier method makes periodic fields.
+    """
+    rows, cols = 2 * shape[0], 2 * shape[1]
+    frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])
+    frequency[0, 0] = np.inf
+    spectrum = np.fft.rfft2(rng.standard_normal((rows, cols))) * frequency**-exponent
+    field = np.fft.irfft2(spectrum, s=(rows, cols))[: shape[0], : shape[1]]
+    return (field - field.min()) / np.ptp(field)
