@@ -75,7 +75,9 @@ class Team:
     def __post_init__(self) -> None:
         robots = tuple(self.robots) or (Robot(),) * self.n_robots
         if not robots:
-            raise TrustboError(f"a team needs at least one overwatching robot; got {self.n_robots}.")
+            raise TrustboError(
+                f"a team needs at least one overwatching robot; got {self.n_robots}."
+            )
         names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
         if len(set(names)) != len(robots):
             raise TrustboError(f"names must be {len(robots)} distinct names; got {names}.")
@@ -236,7 +238,12 @@ class Mission:
         last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(np.nan_to_num(seconds.max(1)))])
         bounds = tuple(
             Bound(
-                cells[k + 1], z[k], y[k], seconds[k], status if k == last else "ok", float(starts[k])
+                cells[k + 1],
+                z[k],
+                y[k],
+                seconds[k],
+                status if k == last else "ok",
+                float(starts[k]),
             )
             for k in range(len(y))
         )

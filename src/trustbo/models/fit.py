@@ -122,9 +122,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 def _sample(
     model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch
 ) -> NutsDraws:
-    draws = run_nuts(
-        pooled_trust, settings, key, model.priors, batch.awareness, batch.contact_rate
-    )
+    draws = run_nuts(pooled_trust, settings, key, model.priors, batch.awareness, batch.contact_rate)
     return NutsDraws(*({k: np.asarray(v) for k, v in group.items()} for group in draws))
 
 
@@ -235,7 +233,10 @@ def _to_datatree(
                 cut = cut.where(cut["bound"] <= lengths)
             variables[name] = cut.transpose(*dims)
         dataset = xr.Dataset(variables)
-        index = {"chain": np.arange(dataset.sizes["chain"]), "draw": np.arange(dataset.sizes["draw"])}
+        index = {
+            "chain": np.arange(dataset.sizes["chain"]),
+            "draw": np.arange(dataset.sizes["draw"]),
+        }
         tree[group] = dataset.assign_coords(index if draw is None else index | {"draw": draw})
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
     return xr.DataTree.from_dict(tree)

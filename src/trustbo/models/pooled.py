@@ -197,7 +197,8 @@ def broadcast_params(params: TrustParams, leading: tuple[int, ...]) -> TrustPara
     return TrustParams(
         *(
             np.broadcast_to(
-                np.asarray(value, dtype=float), leading + np.shape(params.beta)[-1:] * (name == "beta")
+                np.asarray(value, dtype=float),
+                leading + np.shape(params.beta)[-1:] * (name == "beta"),
             ).reshape(n, *np.shape(params.beta)[-1:] * (name == "beta"))
             for name, value in zip(params._fields, params, strict=True)
         )

@@ -167,3 +167,11 @@ def openness(ground, surface, pixel, reach, eye, target, n_rays, extinction, cro
             if count:
                 result[i, j] = total / count
     return result
+
+
+@njit(cache=True)
+def ground_height(ground, r, c):
+    """Bilinear ground height at a position in pixel coordinates; NaN off the raster."""
+    if r < 0.0 or c < 0.0 or r > ground.shape[0] - 1 or c > ground.shape[1] - 1:
+        return math.nan
+    return _heights(ground, ground, r, c)[0]

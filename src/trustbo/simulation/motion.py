@@ -1,0 +1,187 @@
+"""How a robot gets from one position to another: a route over pixels, and a drive along it."""
+
+import heapq
+import math
+
+import numpy as np
+from numba import njit
+
+from trustbo.data import Robot
+from trustbo.simulation.sight import Surface
+
+LOOKAHEAD = 1.5
+"""How far ahead on its route a robot steers, m."""
+ARRIVED = 0.5
+"""How close to its goal a robot stops, m."""
+SLOWEST = 0.1
+"""Share of its speed that a robot keeps on the steepest slope it stands."""
+_STEPS_PER_TICK = 5
+_STATUS = ("ok", "stuck", "tipped", "timeout")
+
+
+def find_route(
+    surface: Surface,
+    robot: Robot,
+    start: np.ndarray,
+    goal: np.ndarray,
+    window: tuple[int, int, int, int],
+) -> np.ndarray | None:
+    """Fastest way over passable pixels, by A*.
+
+    Args:
+        surface: The terrain.
+        robot: Who drives: its speed falls with the slope.
+        start: x and y, CRS metres.
+        goal: x and y, CRS metres.
+        window: Pixels the route may use: first row, end row, first col, end col.
+
+    Returns:
+        Positions from start to goal, shape (point, 2), CRS metres; None if there is no way.
+    """
+    top, bottom, left, right = window
+    cut = (slice(top, bottom), slice(left, right))
+    slope = np.arctan(np.hypot(*surface.gradient[:, *cut]))
+    pace = np.where(surface.passable[cut], 1.0 / _speed_share(slope, robot.max_slope), np.inf)
+    ends = [surface.nearest(*p) for p in (start, goal)]
+    (r0, c0), (r1, c1) = ((int(r) - top, int(c) - left) for r, c in ends)
+    cells = _a_star(pace, surface.pixel, (r0, c0), (r1, c1))
+    if not len(cells):
+        return None
+    x = surface.origin[0] + (cells[:, 1] + left) * surface.pixel[1]
+    y = surface.origin[1] - (cells[:, 0] + top) * surface.pixel[0]
+    route = np.stack([x, y], axis=1)
+    route[0], route[-1] = start, goal
+    # A single-pixel route still needs two ends.
+    return route if len(route) > 1 else np.stack([start, goal])
+
+
+def drive(
+    surface: Surface,
+    robot: Robot,
+    route: np.ndarray,
+    heading: float,
+    tick: float,
+    max_ticks: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, str]:
+    """Drive along a route as a unicycle that steers for a point ahead (pure pursuit).
+
+    Speed falls linearly with the larger of pitch and roll, to a tenth at the limit; a pitch beyond
+    the limit leaves the robot stuck, a roll beyond it tips it over. Wheel slip scales the speed of
+    each tick by a random factor of some 5 %.
+
+    Args:
+        surface: The terrain.
+        robot: Who drives.
+        route: Positions, shape (point, 2), CRS metres.
+        heading: At the start, rad from east, anticlockwise.
+        tick: Length of a tick, s.
+        max_ticks: Give up after so many.
+        rng: Where slip comes from.
+
+    Returns:
+        Poses (x, y, heading) after each tick, shape (tick, 3), and the status.
+    """
+    slip = np.exp(0.05 * rng.standard_normal(max_ticks))
+    poses, code = _drive(
+        surface.gradient,
+        surface.pixel,
+        surface.origin,
+        route,
+        heading,
+        (robot.speed, robot.turn_rate, robot.max_slope),
+        tick,
+        slip,
+    )
+    return poses, _STATUS[code]
+
+
+@njit(cache=True)
+def _speed_share(tilt, max_slope):
+    return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
+
+
+@njit(cache=True)
+def _a_star(pace, pixel, start, goal):
+    """Cells of the cheapest way over a grid of paces (s per m, inf where closed); empty if none."""
+    rows, cols = pace.shape
+    known = np.full((rows, cols), np.inf)
+    came = np.full((rows, cols), -1)
+    least = pace.min()
+    for r, c in (start, goal):
+        if not (0 <= r < rows and 0 <= c < cols):
+            return np.empty((0, 2), np.int64)
+    known[start] = 0.0
+    queue = [(0.0, start[0], start[1])]
+    while queue:
+        estimate, r, c = heapq.heappop(queue)
+        if (r, c) == goal:
+            break
+        ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
+        if estimate > known[r, c] + ahead + 1e-9:
+            continue  # a stale entry: the cell was improved since
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                i, j = r + dr, c + dc
+                if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
+                    continue
+                # No squeezing between two closed pixels, nor round the corner of one.
+                if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
+                    continue
+                length = math.hypot(dr * pixel[0], dc * pixel[1])
+                cost = known[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
+                if cost < known[i, j]:
+                    known[i, j] = cost
+                    came[i, j] = r * cols + c
+                    rest = math.hypot((goal[0] - i) * pixel[0], (goal[1] - j) * pixel[1])
+                    heapq.heappush(queue, (cost + rest * least, i, j))
+    if not np.isfinite(known[goal]):
+        return np.empty((0, 2), np.int64)
+    n, cell = 1, goal[0] * cols + goal[1]
+    while came[cell // cols, cell % cols] >= 0:
+        cell = came[cell // cols, cell % cols]
+        n += 1
+    cells = np.empty((n, 2), np.int64)
+    cell = goal[0] * cols + goal[1]
+    for k in range(n - 1, -1, -1):
+        cells[k, 0], cells[k, 1] = cell // cols, cell % cols
+        cell = came[cell // cols, cell % cols]
+    return cells
+
+
+@njit(cache=True)
+def _drive(gradient, pixel, origin, route, heading, limits, tick, slip):
+    speed, turn_rate, max_slope = limits
+    rows, cols = gradient.shape[1:]
+    x, y, aim = route[0, 0], route[0, 1], 1
+    poses = np.empty((len(slip), 3))
+    dt = tick / _STEPS_PER_TICK
+    for k in range(len(slip)):
+        for _ in range(_STEPS_PER_TICK):
+            while (
+                aim < len(route) - 1
+                and math.hypot(route[aim, 0] - x, route[aim, 1] - y) < LOOKAHEAD
+            ):
+                aim += 1
+            dx, dy = route[aim, 0] - x, route[aim, 1] - y
+            error = (math.atan2(dy, dx) - heading + math.pi) % (2.0 * math.pi) - math.pi
+            turn = min(turn_rate * dt, max(-turn_rate * dt, error))
+            heading += turn
+            i = min(rows - 1, max(0, round((origin[1] - y) / pixel[0])))
+            j = min(cols - 1, max(0, round((x - origin[0]) / pixel[1])))
+            gx, gy = gradient[0, i, j], gradient[1, i, j]
+            pitch = abs(math.atan(gx * math.cos(heading) + gy * math.sin(heading)))
+            roll = abs(math.atan(gy * math.cos(heading) - gx * math.sin(heading)))
+            if roll > max_slope or pitch > max_slope:
+                poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
+                return poses[: k + 1], 2 if roll > max_slope else 1
+            # A skid-steer robot turns on the spot until it faces its way.
+            v = speed * slip[k] * _speed_share(max(pitch, roll), max_slope)
+            v *= max(0.0, math.cos(error - turn))
+            x += v * dt * math.cos(heading)
+            y += v * dt * math.sin(heading)
+            if aim == len(route) - 1 and math.hypot(route[-1, 0] - x, route[-1, 1] - y) < ARRIVED:
+                poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
+                return poses[: k + 1], 0
+        poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
+    return poses, 3

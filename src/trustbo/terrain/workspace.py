@@ -1,0 +1,212 @@
+"""What the planner and the simulator work on: awareness and passability of every cell."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from trustbo.data import Cell, Team, default_features
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.terrain import features as pixel
+from trustbo.terrain.composite import CompositeIndex
+from trustbo.terrain.grid import Grid
+
+MAX_MISSING = 0.5
+"""A cell is impassable if more than this share of its pixels is missing or too steep."""
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """A planning grid with the situational awareness of each robot in each cell.
+
+    Make it with `from_terrain` or `from_awareness`.
+
+    Attributes:
+        awareness: DataArray (robot, row, col, feature), in [0, 1]; NaN in cells without data.
+        passable: DataArray (row, col), bool.
+        grid: Where the cells are.
+        team: Who works there.
+        terrain: The DEM and DSM, if there are any.
+        pixels: Dataset (y, x) of traversability, visibility and passable per pixel, likewise.
+        composites: The fitted composites by feature.
+    """
+
+    awareness: xr.DataArray
+    passable: xr.DataArray
+    grid: Grid
+    team: Team
+    terrain: xr.Dataset | None = None
+    pixels: xr.Dataset | None = None
+    composites: dict[str, CompositeIndex] = field(default_factory=dict)
+
+    @classmethod
+    def from_terrain(
+        cls,
+        terrain: xr.Dataset,
+        shape: tuple[int, int] = (10, 10),
+        team: Team | None = None,
+        *,
+        scaling: str = "percentile",
+    ) -> Self:
+        """Derive traversability and visibility from a DEM and a DSM.
+
+        A cell's awareness is the mean of its pixels' composites, the same for every robot. A cell
+        is impassable if more than half of its pixels are missing or steeper than the team stands.
+        Openness is measured over the lidar's range, but no farther than the diagonal of a cell:
+        sight beyond one bound does not matter to overwatch.
+
+        Args:
+            terrain: As `read_terrain` or `synthetic_terrain` give it.
+            shape: Rows and columns of the planning grid.
+            team: The robots; by default a lead and three.
+            scaling: See `CompositeIndex`.
+
+        Raises:
+            TerrainError: A grid too fine for the raster.
+            TrustboError: No cell is passable, or an unknown scaling.
+        """
+        team = Team() if team is None else team
+        grid = Grid.over(terrain, shape)
+        reach = min(
+            max(robot.lidar_range for robot in team.robots),
+            float(np.hypot(grid.cell_height, grid.cell_width)),
+        )
+        eye, target = team.robots[0].sensor_height, team.lead.target_height
+        openness = partial(pixel.openness, reach=reach, eye=eye, target=target)
+        ingredients = {
+            "traversability": dict(pixel.TRAVERSABILITY),
+            "visibility": dict(pixel.VISIBILITY)
+            | {"openness": pixel.PixelFeature(openness, pixel.VISIBILITY["openness"].sign)},
+        }
+        composites, maps = {}, {}
+        for name, parts in ingredients.items():
+            values = pixel.pixel_features(terrain, parts)
+            signs = {part: parts[part].sign for part in parts}
+            composites[name] = CompositeIndex(signs, scaling=scaling).fit(values)
+            maps[name] = composites[name].transform(values)
+        maps["passable"] = pixel.slope(terrain) <= team.max_slope
+        per_cell = np.stack([grid.cell_means(maps[name]) for name in ingredients], axis=-1)
+        passable = grid.cell_share(maps["passable"]) >= 1.0 - MAX_MISSING
+        workspace = cls.from_awareness(
+            np.repeat(per_cell[None], len(team.robots), axis=0),
+            passable & np.isfinite(per_cell).all(-1),
+            team=team,
+            features=tuple(ingredients),
+        )
+        return dataclasses.replace(
+            workspace,
+            awareness=workspace.awareness.assign_coords(_positions(grid)),
+            passable=workspace.passable.assign_coords(_positions(grid)),
+            grid=grid,
+            terrain=terrain,
+            pixels=xr.Dataset(maps),
+            composites=composites,
+        )
+
+    @classmethod
+    def from_awareness(
+        cls,
+        awareness: ArrayLike,
+        passable: ArrayLike | None = None,
+        cell_size: float = 50.0,
+        *,
+        team: Team | None = None,
+        features: tuple[str, ...] = (),
+    ) -> Self:
+        """Make a workspace of arrays, without a terrain.
+
+        Args:
+            awareness: Shape (robot, row, col, feature), in [0, 1].
+            passable: Shape (row, col); by default the cells whose awareness is all known.
+            cell_size: Side of a cell, m.
+            team: The robots; by default as many as `awareness` has rows.
+            features: Names; by default traversability, visibility, z3, ...
+
+        Raises:
+            ShapeError: Axes that do not fit together.
+            TrustboError: A value outside [0, 1], NaN in a passable cell, or no passable cell.
+        """
+        z = np.asarray(awareness, dtype=float)
+        if z.ndim != 4:
+            raise ShapeError(f"awareness must be (robot, row, col, feature); got shape {z.shape}.")
+        team = Team(n_robots=len(z)) if team is None else team
+        if len(team.robots) != len(z):
+            raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
+        known = np.isfinite(z).all((0, 3))
+        free = known if passable is None else np.asarray(passable, dtype=bool)
+        if free.shape != z.shape[1:3]:
+            raise ShapeError(f"passable must be (row, col) = {z.shape[1:3]}; got {free.shape}.")
+        if (free & ~known).any():
+            cell = tuple(int(i) for i in np.argwhere(free & ~known)[0])
+            raise TrustboError(
+                f"awareness of the passable cell {cell} is NaN; fill it or mark the cell impassable."
+            )
+        if (bad := (z < 0.0) | (z > 1.0)).any():
+            index = tuple(int(i) for i in np.argwhere(bad)[0])
+            raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")
+        if not free.any():
+            raise TrustboError(
+                "no cell is passable: more than half of every cell is missing or too steep. Use "
+                "other cells, or a team with a larger max_slope."
+            )
+        grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * cell_size, cell_size, cell_size)
+        names = tuple(features) or default_features(z.shape[3])
+        coords = {
+            "robot": list(team.names),
+            "row": np.arange(z.shape[1]),
+            "col": np.arange(z.shape[2]),
+            **_positions(grid),
+        }
+        return cls(
+            xr.DataArray(
+                z,
+                coords | {"feature": list(names)},
+                ("robot", "row", "col", "feature"),
+                "awareness",
+            ),
+            xr.DataArray(
+                free, {k: v for k, v in coords.items() if k != "robot"}, ("row", "col"), "passable"
+            ),
+            grid,
+            team,
+        )
+
+    def require_cell(self, what: str, cell: Cell) -> Cell:
+        """The cell as a pair of ints, if a robot can stand there.
+
+        Raises:
+            TrustboError: It is no pair, off the grid, without data, or impassable.
+        """
+        try:
+            row, col = (int(i) for i in cell)
+        except (TypeError, ValueError):
+            raise TrustboError(f"{what} must be a cell (row, col); got {cell!r}.") from None
+        rows, cols = self.grid.shape
+        if not (0 <= row < rows and 0 <= col < cols):
+            raise TrustboError(
+                f"{what} {(row, col)} is outside the grid of {rows} rows and {cols} columns; rows "
+                f"are 0..{rows - 1} from the top, columns 0..{cols - 1}."
+            )
+        if not self.passable.values[row, col]:
+            unknown = np.isnan(self.awareness.values[:, row, col]).any()
+            reason = "has no data" if unknown else "is impassable"
+            near = self._nearest_passable(row, col)
+            raise TrustboError(
+                f"{what} {(row, col)} {reason} (over half of it is missing or too steep); "
+                f"the nearest passable cell is {near}."
+            )
+        return row, col
+
+    def _nearest_passable(self, row: int, col: int) -> Cell:
+        free = np.argwhere(self.passable.values)
+        nearest = free[np.argmin(((free - (row, col)) ** 2).sum(1))]
+        return int(nearest[0]), int(nearest[1])
+
+
+def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:
+    """Cell centres in CRS metres, as coordinates along row and col."""
+    return {"y": ("row", grid.y), "x": ("col", grid.x)}

@@ -1,0 +1,94 @@
+"""Slow, obvious references that share no code with trustbo."""
+
+import itertools
+import math
+
+import numpy as np
+
+
+def dense_log_likelihood(beta0, beta, b, delta_w, delta_v, x0_mean, x0_sd, awareness, contact_rate):
+    """Log density of one robot's measured rates, from their joint normal written out in full.
+
+    With x = A x_prev + c + w stacked over bounds, x = L^-1 (c + beta0 x0 e_1 + w), L bidiagonal.
+    awareness: (bound, feature); contact_rate: (bound,), NaN where not measured.
+    """
+    K = len(contact_rate)
+    L = np.eye(K) - beta0 * np.eye(K, k=-1)
+    inverse = np.linalg.inv(L)
+    drift = awareness @ beta + b
+    first = np.zeros(K)
+    first[0] = beta0
+    mean = inverse @ (drift + first * x0_mean)
+    cov_x = inverse @ (np.diag(np.full(K, delta_w**2)) + np.outer(first, first) * x0_sd**2)
+    cov_x = cov_x @ inverse.T
+    seen = ~np.isnan(contact_rate)
+    cov = (cov_x + delta_v**2 * np.eye(K))[np.ix_(seen, seen)]
+    residual = (contact_rate - mean)[seen]
+    _, log_det = np.linalg.slogdet(cov)
+    quadratic = residual @ np.linalg.solve(cov, residual)
+    return -0.5 * (quadratic + log_det + seen.sum() * math.log(2.0 * math.pi))
+
+
+def dense_posterior_of_trust(
+    beta0, beta, b, delta_w, delta_v, x0_mean, x0_sd, awareness, contact_rate
+):
+    """Mean and covariance of one robot's trust given its measured rates, by conditioning."""
+    K = len(contact_rate)
+    inverse = np.linalg.inv(np.eye(K) - beta0 * np.eye(K, k=-1))
+    first = np.zeros(K)
+    first[0] = beta0
+    mean = inverse @ (awareness @ beta + b + first * x0_mean)
+    prior = inverse @ (delta_w**2 * np.eye(K) + np.outer(first, first) * x0_sd**2) @ inverse.T
+    seen = ~np.isnan(contact_rate)
+    gain = prior[:, seen] @ np.linalg.inv((prior + delta_v**2 * np.eye(K))[np.ix_(seen, seen)])
+    return mean + gain @ (contact_rate - mean)[seen], prior - gain @ prior[seen]
+
+
+def walks(passable, start, goal, max_bounds, connectivity=8, *, u_turns=True, simple=False):
+    """Every walk from start to its first arrival at goal, of at most `max_bounds` bounds."""
+    rows, cols = len(passable), len(passable[0])
+    moves = [
+        move
+        for move in itertools.product((-1, 0, 1), repeat=2)
+        if move != (0, 0) and (connectivity == 8 or 0 in move)
+    ]
+
+    def extend(path):
+        if path[-1] == goal:
+            yield tuple(path)
+            return
+        if len(path) > max_bounds:
+            return
+        for down, right in moves:
+            row, col = path[-1][0] + down, path[-1][1] + right
+            if not (0 <= row < rows and 0 <= col < cols) or not passable[row][col]:
+                continue
+            if not u_turns and len(path) > 1 and path[-2] == (row, col):
+                continue
+            if simple and (row, col) in path:
+                continue
+            yield from extend([*path, (row, col)])
+
+    return extend([start])
+
+
+def path_value(objective, path, u, beta0, x0):
+    """Value of a path with plain Python; u[i][cell] is robot i's drift in a cell."""
+    x = [x0] * len(u)
+    trust, settled = [], []
+    for cell in path[1:]:
+        x = [beta0 * x[i] + u[i][cell] for i in range(len(u))]
+        trust.append(sum(x) / len(u))
+        if objective == "stationary":
+            settled.append(sum(u_i[cell] for u_i in u) / len(u) / (1.0 - beta0))
+
+    def sigma(t):
+        return 1.0 / (1.0 + math.exp(-t))
+
+    return {
+        "terminal": lambda: sigma(trust[-1]),
+        "mean": lambda: sum(trust) / len(trust),
+        "success": lambda: math.prod(map(sigma, trust)),
+        "bottleneck": lambda: min(trust),
+        "stationary": lambda: math.prod(map(sigma, settled)),
+    }[objective]()
