@@ -1,0 +1,17 @@
+"""Bayesian optimisation of trustworthy paths for multi-robot bounding overwatch.
+
+Implements Zheng, Smereka, Mikulski and Wang, "Bayesian Optimization Based Trustworthiness Model for
+Multi-robot Bounding Overwatch" (2021). Names are loaded when first used; `__init__.pyi` lists them.
+"""
+
+import lazy_loader
+
+_getattr, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("trustbo")
+    return _getattr(name)

@@ -149,13 +149,13 @@ def test_dijkstra_with_trust_on_arrival_as_label_is_wrong():
     wrong = 0
     for seed in range(20):
         case = random_case(seed, n=5)
-        awareness, passable, beta, b = case
+        awareness, _, beta, b = case
         u = (awareness @ beta + b).mean(0)
         planner = make_planner("success", 8, case)
         best = planner.plan(make_params(0.7, case)).value
         queue, done = [(0.0, (4, 0), 0.5, ((4, 0),))], set()
         while queue:
-            cost, cell, x, path = heapq.heappop(queue)
+            _, cell, x, path = heapq.heappop(queue)
             if cell in done:
                 continue
             done.add(cell)

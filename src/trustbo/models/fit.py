@@ -1,8 +1,9 @@
 """From missions to a posterior: sampling, checking it, and laying it out for ArviZ."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from typing import Any
 
 import arviz as az
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 from jax import Array, random
+from numpy.typing import ArrayLike
 from numpyro import handlers
 
 from trustbo.data import Mission, MissionBatch, stack_missions
@@ -115,7 +117,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     return {
         "r_hat": max(float(rhat[name].max()) for name in rhat.data_vars),
         "ess_bulk": min(float(ess[name].min()) for name in ess.data_vars),
-        "divergences": int(posterior["sample_stats"]["diverging"].sum()),
+        "divergences": int(posterior["sample_stats"].to_dataset()["diverging"].sum()),
     }
 
 
@@ -123,7 +125,7 @@ def _sample(
     model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch
 ) -> NutsDraws:
     draws = run_nuts(pooled_trust, settings, key, model.priors, batch.awareness, batch.contact_rate)
-    return NutsDraws(*({k: np.asarray(v) for k, v in group.items()} for group in draws))
+    return NutsDraws(*({k: np.asarray(v) for k, v in group.items()} for group in draws))  # pyright: ignore[reportArgumentType]
 
 
 def _complaints(draws: NutsDraws) -> list[str]:
@@ -145,7 +147,7 @@ def _complaints(draws: NutsDraws) -> list[str]:
 
 def _describe(
     model: PooledTrust, draws: NutsDraws, batch: MissionBatch, key: Array, n_trajectories: int
-) -> dict[str, dict[str, np.ndarray]]:
+) -> dict[str, dict[str, Any]]:
     """Every group of the DataTree as arrays with leading axes (chain, draw), padding included."""
     n_chains, n_draws = draws.params["beta0"].shape
     data = (jnp.asarray(batch.awareness), jnp.asarray(batch.contact_rate))
@@ -190,8 +192,8 @@ def _prior_draws(priors: Priors, awareness: Array, keys: Array) -> dict[str, Arr
     return jax.vmap(one)(keys)
 
 
-def _params(draws: dict[str, np.ndarray], priors: Priors) -> TrustParams:
-    n_draws = len(draws["beta0"])
+def _params(draws: Mapping[str, ArrayLike], priors: Priors) -> TrustParams:
+    n_draws = np.shape(draws["beta0"])[0]
     x0 = {name: np.full(n_draws, getattr(priors, name)) for name in ("x0_mean", "x0_sd")}
     return TrustParams(**{name: draws[name] for name in _SITES}, **x0)
 
@@ -205,9 +207,7 @@ _DIMS = {
 }
 
 
-def _to_datatree(
-    groups: dict[str, dict[str, np.ndarray]], missions: Sequence[Mission]
-) -> xr.DataTree:
+def _to_datatree(groups: dict[str, dict[str, Any]], missions: Sequence[Mission]) -> xr.DataTree:
     """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN."""
     observed = stack_missions(missions, pad=False)
     n_missions, n_bounds = observed.contact_rate.shape[:2]

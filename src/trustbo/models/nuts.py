@@ -1,8 +1,8 @@
 """NUTS on a trust model, as one compiled program that takes missions and priors as data.
 
-numpyro's functional sampler is called inside a single `jax.jit`, so that the next mission, or other
-numbers in the priors, meet the compiled code of the last. The chains start around the posterior mode
-with the inverse Hessian there (Laplace) as their dense mass matrix.
+numpyro's functional sampler is called inside a single `jax.jit`, so that the next mission, or
+other numbers in the priors, meet the compiled code of the last. The chains start around the
+posterior mode with the inverse Hessian there (Laplace) as their dense mass matrix.
 """
 
 from collections.abc import Callable
@@ -105,8 +105,27 @@ def _unconstrained(model: Callable[..., None], data: _Data):
     start = {name: inverse[name].inv(_center(site["fn"])) for name, site in sites.items()}
     flat, unravel = ravel_pytree(start)
 
+    measured = ~jnp.isnan(data.contact_rate)
+    n = jnp.maximum(measured.sum(), 1)
+    mean_y = jnp.where(measured, data.contact_rate, 0.0).sum() / n
+    mean_z = jnp.where(measured[..., None], data.awareness, 0.0).sum((0, 1, 2)) / n
+
     def to_sites(z: Array) -> dict[str, Array]:
-        return _split_noise(unravel(z))
+        """Undo the change of variables, of Jacobian 1, that makes the posterior round.
+
+        The data fix delta_w^2 + delta_v^2 well and their ratio badly: the sampler sees the log of
+        their root, t, and r = log(delta_w / delta_v), in the places of delta_w and delta_v. They
+        fix the level that trust has on average, y = beta0 y + beta . z + b, better than its parts:
+        in the place of b the sampler sees b + beta0 mean(y) + beta . mean(z).
+        """
+        site = unravel(z)
+        t, r = site["delta_w"], site["delta_v"]
+        beta0, beta = (inverse[name](site[name]) for name in ("beta0", "beta"))
+        return site | {
+            "delta_w": t + 0.5 * jax.nn.log_sigmoid(2.0 * r),
+            "delta_v": t + 0.5 * jax.nn.log_sigmoid(-2.0 * r),
+            "b": site["b"] - beta0 * mean_y - beta @ mean_z,
+        }
 
     def constrain(z: Array) -> dict[str, Array]:
         return constrain_fn(model, data, {}, to_sites(z))
@@ -119,20 +138,6 @@ def _unconstrained(model: Callable[..., None], data: _Data):
 
 def _center(prior) -> Array:
     return jnp.broadcast_to(jnp.asarray(prior.mean, dtype=float), prior.shape())
-
-
-def _split_noise(z: dict[str, Array]) -> dict[str, Array]:
-    """Sample the two noises as log total and log ratio, along and across their ridge.
-
-    The data fix delta_w^2 + delta_v^2 well and their ratio badly. With t = log hypot(delta_w,
-    delta_v) and r = log(delta_w / delta_v), log delta_w = t + log_sigmoid(2r)/2 and log delta_v =
-    t + log_sigmoid(-2r)/2; the Jacobian of the pair is 1. The vector's entries named delta_w and
-    delta_v hold t and r.
-    """
-    t, r = z["delta_w"], z["delta_v"]
-    log_w = t + 0.5 * jax.nn.log_sigmoid(2.0 * r)
-    log_v = t + 0.5 * jax.nn.log_sigmoid(-2.0 * r)
-    return z | {"delta_w": log_w, "delta_v": log_v}
 
 
 def _laplace(potential: Callable[[Array], Array], start: Array, n_steps: int = 50):

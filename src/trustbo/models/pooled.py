@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -20,23 +20,26 @@ from trustbo.models import statespace
 from trustbo.models.priors import Priors
 from trustbo.models.statespace import ScalarSSM
 
+Numbers = Any
+"""A float, a NumPy array, or a JAX array or tracer."""
+
 
 class TrustParams(NamedTuple):
     """Parameters of the pooled model; leading axes (...,) such as (draw,) are shared by all."""
 
-    beta0: ArrayLike
+    beta0: Numbers
     """Autoregression, shape (...,)."""
-    beta: ArrayLike
+    beta: Numbers
     """Weights, shape (..., feature)."""
-    b: ArrayLike
+    b: Numbers
     """Intercept, shape (...,)."""
-    delta_w: ArrayLike
+    delta_w: Numbers
     """Standard deviation of the process noise, shape (...,)."""
-    delta_v: ArrayLike
+    delta_v: Numbers
     """Standard deviation of the observation noise, shape (...,)."""
-    x0_mean: ArrayLike = 0.5
+    x0_mean: Numbers = 0.5
     """Mean of trust before the first bound, shape () or (...,)."""
-    x0_sd: ArrayLike = 0.5
+    x0_sd: Numbers = 0.5
     """Its standard deviation, shape () or (...,)."""
 
     @classmethod
@@ -69,19 +72,21 @@ class ContactRate(dist.Distribution):
     Batch shape (mission,), event shape (bound, robot). A rate that is NaN counts as not measured.
     """
 
-    support = constraints.independent(constraints.real, 2)  # pyright: ignore[reportAssignmentType]
+    support = constraints.independent(constraints.real, 2)  # pyright: ignore
     pytree_data_fields = ("params", "awareness")
 
     def __init__(self, params: TrustParams, awareness: Array) -> None:
         self.params, self.awareness = params, awareness
         super().__init__(awareness.shape[:1], awareness.shape[1:3])
 
-    def log_prob(self, value: Array) -> Array:
+    def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Log density in nats, shape (mission,)."""
         filtered = statespace.kalman_filter(self.ssm(), jnp.swapaxes(value, 0, 1))
         return filtered.log_likelihood.sum((0, 2))
 
-    def sample(self, key: Array | None, sample_shape: tuple[int, ...] = ()) -> Array:
+    def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, key: Array, sample_shape: tuple[int, ...] = ()
+    ) -> Array:
         """Contact rates, shape (*sample_shape, mission, bound, robot)."""
         keys = jax.random.split(key, sample_shape)
 
@@ -96,7 +101,7 @@ class ContactRate(dist.Distribution):
         """The state space of every robot of every mission; sequence axes (mission, robot)."""
         p = self.params
         drift = jnp.swapaxes(self.awareness @ p.beta + p.b, 0, 1)
-        return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd)  # pyright: ignore[reportArgumentType]
+        return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd)
 
 
 def pooled_trust(awareness: Array, priors: Priors, contact_rate: Array | None = None) -> None:
@@ -136,7 +141,7 @@ class PooledTrust:
         priors: Prior of each parameter.
     """
 
-    priors: Priors = field(default_factory=Priors)
+    priors: Priors = field(default_factory=lambda: Priors())
 
     def log_likelihood(self, params: TrustParams, missions: Sequence[Mission]) -> np.ndarray:
         """Log p(contact rates | parameters), latent trust integrated out.

@@ -77,7 +77,7 @@ def _flatten(priors: Priors) -> tuple[tuple[object, ...], None]:
 
 
 def _unflatten(_: None, children: Iterable[object]) -> Priors:
-    # Not through __init__: inside a compiled program the values are tracers, which no check can read.
+    # Not through __init__: in a compiled program the values are tracers, which no check can read.
     priors = object.__new__(Priors)
     for f, child in zip(fields(Priors), children, strict=True):
         object.__setattr__(priors, f.name, child)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import networkx as nx
 import numpy as np
@@ -168,7 +169,7 @@ class Planner:
         cells = tuple((int(row), int(col)) for row, col in path)
         if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:
             raise TrustboError(f"a path must lead from {self.start} to {self.goal}; got {cells}.")
-        for a, b in zip(cells, cells[1:], strict=False):
+        for a, b in pairwise(cells):
             if not self.graph.has_edge(a, b):
                 raise TrustboError(f"the path is broken: no bound leads from {a} to {b}.")
         return cells

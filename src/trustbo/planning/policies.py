@@ -1,7 +1,7 @@
 """Policies: from posterior draws to the next plan.
 
-A policy is any callable `policy(key, posterior, planner) -> Plan`; your own may be passed wherever a
-name may.
+A policy is any callable `policy(key, posterior, planner) -> Plan`; your own may be passed wherever
+a name may.
 """
 
 from collections.abc import Callable, Mapping

@@ -8,7 +8,7 @@ every history-dependent objective: the cell's best label need not extend to the 
 import heapq
 import itertools
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import networkx as nx
 import numpy as np
@@ -18,6 +18,7 @@ from trustbo.errors import TrustboError
 from trustbo.planning.objectives import softplus
 
 Path = tuple[Cell, ...]
+_dijkstra: Any = nx.dijkstra_path  # networkx's own annotations do not know `backend=None`
 
 
 class Recursion(NamedTuple):
@@ -92,7 +93,7 @@ def best_additive(
         layer = list(entered)
     for node in layer:
         dag.add_edge(node, sink, weight=0.0)
-    nodes = nx.dijkstra_path(dag, source, sink, weight="weight", backend=backend)
+    nodes: list[Any] = _dijkstra(dag, source, sink, weight="weight", backend=backend)
     return tuple(node[2] for node in nodes[:-1])
 
 
@@ -130,7 +131,9 @@ def best_labelled(
     bit = {cell: 1 << i for i, cell in enumerate(graph)} if not revisit else {}
     settled: dict[Cell, list[tuple[float, int, int]]] = {cell: [] for cell in graph}
     order = itertools.count()  # among equal costs, first come first served: deterministic
-    queue = [(-np.inf if objective == "bottleneck" else 0.0, 0, next(order), x0, (start,), 0)]
+    queue: list[Any] = [
+        (-np.inf if objective == "bottleneck" else 0.0, 0, next(order), x0, (start,), 0)
+    ]
     while queue:
         cost, n_bounds, _, x, path, seen = heapq.heappop(queue)
         cell = path[-1]
@@ -165,4 +168,4 @@ def best_stationary(
     cost = {c: float(softplus(-u / (1.0 - recursion.beta0))) for c, u in recursion.u.items()}
     weighted = nx.DiGraph()
     weighted.add_weighted_edges_from((a, b, cost[b]) for a, b in graph.edges)
-    return tuple(nx.dijkstra_path(weighted, start, goal, weight="weight", backend=backend))
+    return tuple(_dijkstra(weighted, start, goal, weight="weight", backend=backend))

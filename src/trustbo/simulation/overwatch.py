@@ -179,7 +179,7 @@ class KinematicSimulator:
         poses = np.concatenate([leading, watching], axis=1)
         moved_from = len(poses)
         if status == "ok":
-            targets = self._positions.formation(cell, next_cell)
+            targets = list(self._positions.formation(cell, next_cell))
             ticks_left -= len(leading)
             closing, status = self._move(
                 state.poses[1:], team.robots, targets, (state.cell, cell), ticks_left, rng

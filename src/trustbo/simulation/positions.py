@@ -1,5 +1,7 @@
 """Where robots stand: the lead's waypoint in each cell, and T2's formation around it."""
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 import xrspatial
@@ -78,7 +80,7 @@ class Positions:
                 team.lead.target_height,
             )
             seen = in_view(self._surface, robot, position, aim, team.lead.target_height)
-            # Among equally good views the closer one; not on top of one another while there is room.
+            # Among equally good views the closer one; nobody on top of another if there is room.
             score = np.where(seen, clear, 0.0) - 1e-3 * distance[near]
             gaps = [np.linalg.norm(position - other, axis=1) for other in chosen]
             crowded = np.min(gaps, axis=0) < SPACING if gaps else np.zeros(len(position), bool)
@@ -122,12 +124,14 @@ def surface_of(terrain: xr.Dataset, pixels: xr.Dataset) -> Surface:
 
 def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:
     size = [max(1, round(width / step)) for step in pixel]
-    return ndimage.uniform_filter(np.nan_to_num(values), size, mode="nearest")
+    window: dict[str, Any] = {"size": size, "mode": "nearest"}
+    return ndimage.uniform_filter(np.nan_to_num(values), **window)
 
 
 def _largest_region(passable: np.ndarray) -> np.ndarray:
     """The largest connected set of passable pixels; a robot outside it could go nowhere."""
-    labels, n_regions = ndimage.label(passable, np.ones((3, 3)))
+    regions: Any = ndimage.label(passable, np.ones((3, 3)))
+    labels, n_regions = regions
     if n_regions == 0:
         return passable
     sizes = np.bincount(labels.ravel())

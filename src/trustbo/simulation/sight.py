@@ -89,15 +89,17 @@ def transmittance(
     Returns:
         Shape (ray,), in [0, 1].
     """
-    ends = []
-    for position, height in ((sensor, sensor_height), (target, target_height)):
+
+    def end(position: np.ndarray, height: float) -> np.ndarray:
         row, col = surface.to_pixel(position[:, 0], position[:, 1])
-        ends.append(np.stack([row, col, np.full(len(row), height)], axis=1))
+        return np.stack([row, col, np.full(len(row), height)], axis=1)
+
     return _transmittances(
         surface.ground,
         surface.canopy,
         surface.pixel,
-        *ends,
+        end(sensor, sensor_height),
+        end(target, target_height),
         SIGHT_MODES[sight.mode],
         sight.extinction,
         sight.crown_base,

@@ -18,8 +18,8 @@ class CompositeIndex:
     """First principal component of winsorised, standardised features, oriented and scaled.
 
     Each feature is cut at its 1st and 99th percentile and turned into z-scores; the first component
-    is oriented so that the loadings agree with the declared signs (sum of loading x sign > 0), never
-    as the solver happens to return it; its score is mapped to [0, 1].
+    is oriented so that the loadings agree with the declared signs (sum of loading x sign > 0),
+    never as the solver happens to return it; its score is mapped to [0, 1].
 
     Attributes:
         loadings_: DataArray (feature), the oriented unit vector; 0 for a constant feature.
@@ -65,9 +65,9 @@ class CompositeIndex:
         if self._varies.any():
             pca = PCA(n_components=1, svd_solver="covariance_eigh").fit(self._standardise(x))
             signs = np.array(list(self.signs.values()), dtype=float)[self._varies]
-            component = pca.components_[0]
+            component = np.asarray(pca.components_)[0]
             weights[self._varies] = component * (np.sign(component @ signs) or 1.0)
-            self.explained_variance_ratio_ = float(pca.explained_variance_ratio_[0])
+            self.explained_variance_ratio_ = float(np.asarray(pca.explained_variance_ratio_)[0])
         self.loadings_ = xr.DataArray(
             weights, {"feature": list(self.signs)}, dims="feature", name="loading"
         )
@@ -116,8 +116,8 @@ class CompositeIndex:
         ]
         if against:
             warnings.warn(
-                f"{', '.join(against)} enters its composite against the declared sign: here it goes "
-                "along with what it should oppose. Look at the loadings, or leave it out.",
+                f"{', '.join(against)} enters its composite against the declared sign: here it "
+                "goes along with what it should oppose. Look at the loadings, or leave it out.",
                 stacklevel=3,
             )
         if self.explained_variance_ratio_ < 0.5:

@@ -24,7 +24,8 @@ class PixelFeature(NamedTuple):
 
 def slope(terrain: xr.Dataset) -> xr.DataArray:
     """Slope of the ground, rad, by Horn's (1981) 3 x 3 stencil."""
-    return _named(np.deg2rad(xrspatial.slope(terrain["dem"], boundary="nearest")), "slope", "rad")
+    degrees = xrspatial.slope(terrain["dem"], boundary="nearest")
+    return _named(degrees * (np.pi / 180.0), "slope", "rad")
 
 
 def roughness(terrain: xr.Dataset) -> xr.DataArray:

@@ -3,6 +3,7 @@
 import warnings
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -90,7 +91,7 @@ def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
     terrain = xr.Dataset(
         {
             "dem": ground.where(valid).assign_attrs(long_name="ground", units="m"),
-            "dsm": np.maximum(surface, ground)
+            "dsm": surface.where(surface > ground, ground)
             .where(valid)
             .assign_attrs(long_name="surface", units="m"),
         }
@@ -105,7 +106,9 @@ def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     return abs(height), abs(width)
 
 
-def _open(path: str | PathLike[str], role: str, crs: object, resolution: float | None):
+def _open(
+    path: str | PathLike[str], role: str, crs: object, resolution: float | None
+) -> xr.DataArray:
     if not Path(path).exists():
         raise TerrainError(f"{role}: there is no file {str(path)!r}.")
     try:
@@ -113,7 +116,8 @@ def _open(path: str | PathLike[str], role: str, crs: object, resolution: float |
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as source:
                 transform, georeferenced = source.transform, not source.transform.is_identity
-            raster = rioxarray.open_rasterio(path, masked=True).isel(band=0, drop=True).load()
+            opened: Any = rioxarray.open_rasterio(path, masked=True)
+            raster = opened.isel(band=0, drop=True).load()
     except RasterioIOError as error:
         raise TerrainError(
             f"{role}: {str(path)!r} is no raster that GDAL can read ({error}); "
@@ -176,9 +180,9 @@ def _require_overlap(
         names = ", ".join(f"{e:.1f}" for e in (left, bottom, right, top))
         other = ", ".join(f"{e:.1f}" for e in box)
         raise TerrainError(
-            f"dem {str(dem)!r} and dsm {str(dsm)!r} do not overlap: in {ground.rio.crs.to_string()} "
-            f"they cover ({names}) and ({other}) as (left, bottom, right, top). Give two rasters of "
-            "one place."
+            f"dem {str(dem)!r} and dsm {str(dsm)!r} do not overlap: in "
+            f"{ground.rio.crs.to_string()} they cover ({names}) and ({other}) as (left, bottom, "
+            "right, top). Give two rasters of one place."
         )
 
 

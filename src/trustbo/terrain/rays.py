@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 BARE, WALL, TRANSMITTANCE = 0, 1, 2
-"""What blocks sight: the ground only; the surface, canopy included; ground, and canopy by degrees."""
+"""What blocks sight: the ground; the surface, canopy included; or the ground, and canopy partly."""
 
 
 @njit(cache=True)

@@ -143,7 +143,7 @@ class Workspace:
         if (free & ~known).any():
             cell = tuple(int(i) for i in np.argwhere(free & ~known)[0])
             raise TrustboError(
-                f"awareness of the passable cell {cell} is NaN; fill it or mark the cell impassable."
+                f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
             )
         if (bad := (z < 0.0) | (z > 1.0)).any():
             index = tuple(int(i) for i in np.argwhere(bad)[0])

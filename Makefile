@@ -1,0 +1,46 @@
+# make demo   install into .venv and run the main job on a made terrain
+# make test   install what the tests need too, and run them
+# make lint   format, style, types and the direction of imports
+# make slow   the long statistical tests;  make bench: the benchmarks
+# make clean  remove everything that make made
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: demo test lint slow bench clean
+
+demo: $(VENV)/.installed
+	$(BIN)/trustbo demo --out out/demo
+
+test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m "not slow"
+
+slow: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.installed-dev
+	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@python=$$(sh scripts/find_python.sh) && echo "creating $(VENV) with $$python" && \
+		"$$python" -m venv --clear $(VENV)
+
+# The stamps make a second call fast; they are renewed when what is to be installed changes.
+$(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(PIP) --editable ".[test,dev]"
+	@touch $@

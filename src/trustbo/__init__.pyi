@@ -1,0 +1,31 @@
+from . import export, models, planning, plots, simulation, terrain
+from .campaign import Campaign
+from .data import Bound, Mission, Robot, Team
+from .errors import PosteriorError, ShapeError, TerrainError, TrustboError
+from .loop import Result, iterate, load_result
+from .planning import NoPathError
+from .terrain import Workspace
+
+__all__ = [
+    "Bound",
+    "Campaign",
+    "Mission",
+    "NoPathError",
+    "PosteriorError",
+    "Result",
+    "Robot",
+    "ShapeError",
+    "Team",
+    "TerrainError",
+    "TrustboError",
+    "Workspace",
+    "export",
+    "iterate",
+    "load_result",
+    "models",
+    "planning",
+    "plots",
+    "simulation",
+    "terrain",
+]
+__version__: str

@@ -1,0 +1,166 @@
+"""A campaign: ask for a path, run it by whatever means, tell what was measured."""
+
+import numpy as np
+import xarray as xr
+from jax import random
+
+from trustbo.data import Cell, Mission, fill_awareness
+from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models import PooledTrust, TrustParams, fit, sample_prior
+from trustbo.models.fit import SAMPLERS
+from trustbo.planning import Plan, Planner, Policy
+from trustbo.planning.policies import greedy, resolve_policy
+from trustbo.terrain import Workspace
+
+INITIAL = ("prior_draw", "prior_mean")
+_STREAMS = ("policy", "fit", "mission", "prior")
+
+
+class Campaign:
+    """Learns from missions and proposes the next path.
+
+    Attributes:
+        workspace: Where.
+        planner: Finds the paths.
+        missions: All missions told so far.
+        posteriors: The posterior after each of them.
+        plans: The plan each of them was asked for with.
+        belief: Parameter draws the next plan is made from: the posterior's, or, before the first
+            mission, one from the prior.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        start: Cell,
+        goal: Cell,
+        *,
+        model: PooledTrust | None = None,
+        policy: str | Policy = "greedy",
+        objective: str = "terminal",
+        sampler: str = "nuts",
+        initial: str = "prior_draw",
+        connectivity: int = 8,
+        max_bounds: int | str | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Set up; nothing is computed yet.
+
+        Args:
+            workspace: Where.
+            start: First cell of every path.
+            goal: Last cell of every path.
+            model: The trust model; by default `PooledTrust()`.
+            policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
+            objective: See `Planner`.
+            sampler: See `trustbo.models.fit`.
+            initial: What the first plan is made from: `"prior_draw"`, one random draw from the
+                prior as in the paper, or `"prior_mean"`.
+            connectivity: 4, or 8 to allow diagonal bounds too.
+            max_bounds: See `Planner`.
+            seed: Same seed and same missions, same campaign.
+
+        Raises:
+            TrustboError: Start, goal or a name that does not exist.
+            NoPathError: The goal cannot be reached.
+        """
+        self.sampler = require_choice("sampler", sampler, SAMPLERS)
+        require_choice("initial", initial, INITIAL)
+        self._policy = resolve_policy(policy)
+        self.planner = Planner(
+            workspace,
+            start,
+            goal,
+            objective,
+            connectivity=connectivity,
+            max_bounds=max_bounds,
+        )
+        self.workspace, self.seed = workspace, int(seed)
+        self.model = PooledTrust() if model is None else model
+        self.missions: list[Mission] = []
+        self.posteriors: list[xr.DataTree] = []
+        self.plans: list[Plan] = []
+        self._plan: Plan | None = None
+        n_features = workspace.awareness.sizes["feature"]
+        n_draws = 1 if initial == "prior_draw" else 4000
+        prior = sample_prior(self.model, n_features, n_draws, self.seed_of("prior"))
+        self.belief: TrustParams = prior if initial == "prior_draw" else _as_one_draw(prior.mean())
+        self.settings = {
+            "model": type(self.model).__name__,
+            "policy": policy if isinstance(policy, str) else getattr(policy, "__name__", "custom"),
+            "objective": self.planner.objective,
+            "sampler": sampler,
+            "initial": initial,
+            "connectivity": connectivity,
+            "max_bounds": max_bounds,
+            "seed": self.seed,
+        }
+
+    @property
+    def posterior(self) -> xr.DataTree | None:
+        """The posterior after the last mission; None before the first."""
+        return self.posteriors[-1] if self.posteriors else None
+
+    def ask(self) -> Plan:
+        """The next path to run; the same one until `tell`.
+
+        Raises:
+            TrustboError: The policy returned a path that is broken, or no plan.
+        """
+        if self._plan is None:
+            key = random.key(self.seed_of("policy"))
+            plan = self._policy(key, self.belief, self.planner)
+            if not isinstance(plan, Plan):
+                raise TrustboError(f"the policy must return a Plan; got {plan!r}.")
+            self.planner.require_path(plan.path)
+            self._plan = plan
+        return self._plan
+
+    def tell(self, mission: Mission) -> xr.DataTree:
+        """Learn from a mission.
+
+        Awareness that the mission did not measure (NaN) is taken from the workspace's map. The
+        mission may have followed another path than the one asked for.
+
+        Args:
+            mission: What was measured, whether or not the goal was reached.
+
+        Returns:
+            The posterior given all missions so far.
+
+        Raises:
+            ShapeError: Robots or features differ from the workspace's.
+            PosteriorError: The posterior's diagnostics are bad; the mission is then not kept.
+        """
+        awareness = self.workspace.awareness
+        for what, names in (("robot", mission.robots), ("feature", mission.features)):
+            expected = tuple(str(name) for name in awareness[what].values)
+            if names != expected:
+                raise ShapeError(f"the mission has {what}s {names}, the workspace {expected}.")
+        mission = fill_awareness(mission, awareness.values)
+        plan = self.ask()
+        missions = [*self.missions, mission]
+        posterior = fit(missions, self.model, self.sampler, seed=self.seed_of("fit"))
+        # Only now, all at once: a failed fit leaves the campaign as it was.
+        self.missions = missions
+        self.posteriors.append(posterior)
+        self.plans.append(plan)
+        self.belief, self._plan = TrustParams.from_posterior(posterior), None
+        return posterior
+
+    def recommend(self) -> Plan:
+        """The best path under the mean of the belief, whatever the policy would try next."""
+        return greedy(random.key(0), self.belief, self.planner)
+
+    def trust_map(self) -> xr.DataArray:
+        """The team's trust map under the mean of the belief, dims (row, col)."""
+        return self.planner.trust_map(self.belief.mean())
+
+    def seed_of(self, stream: str) -> int:
+        """The seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
+        entropy = [self.seed, _STREAMS.index(stream), len(self.missions)]
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+
+def _as_one_draw(params: TrustParams) -> TrustParams:
+    return TrustParams(*(np.asarray(value)[None] for value in params))
