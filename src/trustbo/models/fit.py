@@ -18,7 +18,12 @@ from trustbo.data import Mission, MissionBatch, stack_missions
 from trustbo.errors import PosteriorError, require_choice
 from trustbo.models import latent
 from trustbo.models.nuts import NutsDraws, NutsSettings, run_nuts
-from trustbo.models.pooled import PooledTrust, TrustParams, pooled_trust
+from trustbo.models.pooled import (
+    PooledTrust,
+    TrustParams,
+    mission_log_likelihood,
+    pooled_trust,
+)
 from trustbo.models.priors import Priors
 
 SAMPLERS = ("nuts",)
@@ -167,7 +172,7 @@ def _describe(
         "posterior": {name: draws.params[name] for name in _SITES},
         "sample_stats": draws.stats
         | {"tree_depth": np.ceil(np.log2(draws.stats["n_steps"] + 1)).astype(int)},
-        "log_likelihood": {"contact_rate": by_chain(latent.log_likelihood(all_params, *data))},
+        "log_likelihood": {"contact_rate": by_chain(mission_log_likelihood(all_params, *data))},
         "latent": {
             "trust": by_chain(latent.trust_draws(few_params, *data, key_trust)),
             "trust_mean": np.asarray(moments.mean),

@@ -1,4 +1,4 @@
-"""What follows from posterior draws, exactly: latent trust, predictions, log-likelihoods."""
+"""What follows from posterior draws, exactly: latent trust and predicted contact rates."""
 
 from typing import NamedTuple
 
@@ -15,12 +15,6 @@ class TrustMoments(NamedTuple):
 
     mean: Array
     sd: Array
-
-
-@jax.jit
-def log_likelihood(params: TrustParams, awareness: Array, contact_rate: Array) -> Array:
-    """Log p(contact rates of each mission | draw), latent trust integrated out; (draw, mission)."""
-    return jax.vmap(lambda p: ContactRate(p, awareness).log_prob(contact_rate))(params)
 
 
 @jax.jit

@@ -143,7 +143,6 @@ def _center(prior) -> Array:
 def _laplace(potential: Callable[[Array], Array], start: Array, n_steps: int = 50):
     """Posterior mode and inverse Hessian there, by Newton's method with a trust-region ridge."""
     gradient, hessian = jax.grad(potential), jax.hessian(potential)
-    eye = jnp.eye(start.size)
 
     def step(_, carry):
         z, value, ridge = carry
@@ -162,4 +161,4 @@ def _laplace(potential: Callable[[Array], Array], start: Array, n_steps: int = 5
     z, _, _ = lax.fori_loop(0, n_steps, step, (start, potential(start), jnp.asarray(1.0)))
     eigenvalues, vectors = jnp.linalg.eigh(hessian(z))
     # Floor: flat directions get the scale of the unconstrained priors, not an infinite one.
-    return z, (vectors / jnp.maximum(eigenvalues, 0.1)) @ vectors.T + 1e-12 * eye
+    return z, (vectors / jnp.maximum(eigenvalues, 0.1)[None]) @ vectors.T

@@ -162,7 +162,7 @@ class PooledTrust:
         leading = np.shape(params.beta)[:-1]
         flat = broadcast_params(params, leading)
         with jax.enable_x64(True):
-            values = _log_likelihood(flat, batch.awareness, batch.contact_rate)
+            values = mission_log_likelihood(flat, batch.awareness, batch.contact_rate)
         return np.asarray(values)[:, : len(missions)].reshape(*leading, len(missions))
 
     def simulate(self, key: Array, params: TrustParams, awareness: ArrayLike) -> TrustSample:
@@ -211,5 +211,6 @@ def broadcast_params(params: TrustParams, leading: tuple[int, ...]) -> TrustPara
 
 
 @jax.jit
-def _log_likelihood(params: TrustParams, awareness: Array, contact_rate: Array) -> Array:
+def mission_log_likelihood(params: TrustParams, awareness: Array, contact_rate: Array) -> Array:
+    """Log p(contact rates of each mission | draw), latent trust integrated out; (draw, mission)."""
     return jax.vmap(lambda p: ContactRate(p, awareness).log_prob(contact_rate))(params)

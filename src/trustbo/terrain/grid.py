@@ -41,7 +41,8 @@ class Grid:
         if pixels[0] < 2 * rows or pixels[1] < 2 * cols:
             raise TerrainError(
                 f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell; the "
-                f"terrain has only {pixels[0]} x {pixels[1]}. Take a smaller shape or a finer raster."
+                f"terrain has {pixels[0]} x {pixels[1]} pixels. Take a smaller shape or a finer "
+                "raster."
             )
         left, bottom, right, top = terrain.rio.bounds()
         return cls(shape, left, top, (top - bottom) / rows, (right - left) / cols)

@@ -1,0 +1,179 @@
+"""`fit`: the right posterior, laid out for ArviZ, refused when it is bad."""
+
+import arviz as az
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from numpyro.infer import MCMC, NUTS
+
+from models.conftest import simulate_missions
+from trustbo.data import Mission, stack_missions
+from trustbo.errors import PosteriorError, ShapeError, TrustboError
+from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit, pooled_trust
+from trustbo.models.nuts import run_nuts
+
+SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]
+
+
+def test_groups_and_axes_are_named(posterior):
+    assert list(posterior["posterior"].data_vars) == SITES
+    assert posterior["posterior"]["beta"].dims == ("chain", "draw", "feature")
+    trust = posterior["latent"]["trust"]
+    assert trust.dims == ("chain", "draw", "mission", "bound", "robot")
+    assert trust.sizes == {"chain": 4, "draw": 50, "mission": 6, "bound": 8, "robot": 3}
+    assert list(trust["robot"].values) == ["r1", "r2", "r3"]
+    assert list(trust["bound"].values) == list(range(1, 9))
+    assert posterior["log_likelihood"]["contact_rate"].dims == ("chain", "draw", "mission")
+    assert posterior["observed_data"]["contact_rate"].dims == ("mission", "bound", "robot")
+    awareness = posterior["constant_data"]["awareness"]
+    assert awareness.dims == ("mission", "bound", "robot", "feature")
+    for group in ("posterior_predictive", "prior", "prior_predictive", "sample_stats"):
+        assert group in posterior.children
+    assert posterior.attrs["prior_delta_w"] == "HalfNormal(scale=0.2)"
+
+
+def test_what_lies_beyond_a_mission_s_end_is_nan(posterior):
+    for group, name in (
+        ("latent", "trust_mean"),
+        ("observed_data", "contact_rate"),
+        ("posterior_predictive", "contact_rate"),
+    ):
+        second = posterior[group][name].sel(mission=1)  # 5 of 8 bounds
+        assert second.sel(bound=slice(1, 5)).notnull().all()
+        assert second.sel(bound=slice(6, 8)).isnull().all()
+
+
+def test_arviz_reads_it(posterior, missions):
+    summary = az.summary(posterior)
+    assert "beta[traversability]" in summary.index
+    assert az.loo(posterior).n_data_points == len(missions)
+    vague = fit(missions, PooledTrust(Priors(beta=dist.Normal(0.0, 5.0))), seed=1)
+    assert set(az.compare({"default": posterior, "vague": vague}).index) == {"default", "vague"}
+    az.plot_trace_dist(posterior)
+    az.plot_forest(posterior)
+    plt.close("all")
+
+
+def test_the_posterior_is_the_one_plain_numpyro_samples(posterior, missions):
+    """The change of variables, the mass matrix and the padding leave the target as it is."""
+    batch = stack_missions(missions)
+    with jax.enable_x64(True):
+        mcmc = MCMC(
+            NUTS(pooled_trust, dense_mass=True, target_accept_prob=0.9),
+            num_warmup=1000,
+            num_samples=4000,
+            progress_bar=False,
+        )
+        mcmc.run(jax.random.key(3), batch.awareness, Priors(), batch.contact_rate)
+        plain = {name: np.asarray(draws) for name, draws in mcmc.get_samples().items()}
+    for name in SITES:
+        ours = posterior["posterior"][name].values.reshape(4000, -1)
+        theirs = plain[name].reshape(4000, -1)
+        for a, b in zip(ours.T, theirs.T, strict=True):
+            sd = np.std(b)
+            # Two samples of ESS > 1000 each: the difference of their means has sd < 0.045 sd, and
+            # of their log sds < 0.045 (more for skewed noises); 4 of these.
+            assert abs(a.mean() - b.mean()) < 0.18 * sd, name
+            assert abs(np.log(np.std(a) / sd)) < 0.25, name
+
+
+def test_latent_trust_agrees_with_its_moments(posterior):
+    latent = posterior["latent"]
+    sampled = latent["trust"].mean(("chain", "draw"))
+    # 200 trajectories: 5 standard errors of a mean over some 120 values.
+    bound = 5 * latent["trust_sd"] / np.sqrt(200)
+    assert (np.abs(sampled - latent["trust_mean"]) < bound).where(sampled.notnull(), True).all()
+
+
+def test_the_same_seed_gives_the_same_posterior(posterior, missions):
+    again = fit(missions, seed=1)
+    for name in SITES:
+        np.testing.assert_array_equal(
+            again["posterior"][name].values, posterior["posterior"][name].values
+        )
+    np.testing.assert_array_equal(
+        again["latent"]["trust"].values, posterior["latent"]["trust"].values
+    )
+    other = fit(missions, seed=2)
+    assert (other["posterior"]["b"].values != posterior["posterior"]["b"].values).any()
+
+
+def test_more_missions_and_other_priors_meet_the_same_compiled_program(posterior):
+    compiled = run_nuts._cache_size()
+    for n in (1, 4, 8):
+        fit(simulate_missions(n), PooledTrust(Priors(x0_sd=0.1 * n)))
+    assert run_nuts._cache_size() == compiled
+
+
+def test_missing_rates_are_predicted_through(missions):
+    rates = missions[0].contact_rate.copy()
+    rates[2:4, 1] = np.nan
+    gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
+    posterior = fit([gap, *missions[1:]])
+    sd = posterior["latent"]["trust_sd"].sel(mission=0, robot="r2")
+    assert sd.notnull().sel(bound=slice(1, 7)).all()
+    assert sd.sel(bound=3) > sd.sel(bound=6)
+    assert np.isnan(posterior["observed_data"]["contact_rate"].sel(mission=0, bound=3, robot="r2"))
+
+
+def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions):
+    with pytest.raises(PosteriorError, match=r"bulk ESS of beta0 is \d+ \(at least 400\)") as error:
+        fit(missions, n_draws=40, n_warmup=50)
+    assert error.value.posterior["posterior"].sizes["draw"] == 80  # after one longer retry
+    assert fit(missions, n_draws=40, n_warmup=50, check=False).attrs["retries"] == 0
+
+
+def test_params_come_out_of_the_posterior_and_go_through_its_draws(posterior):
+    params = TrustParams.from_posterior(posterior)
+    assert np.shape(params.beta) == (4000, 2)
+    assert params.x0_mean == 0.5
+    one = params.draw(7)
+    assert np.shape(one.beta0) == ()
+    assert np.shape(one.beta) == (2,)
+    np.testing.assert_allclose(one.beta, np.asarray(params.beta)[7])
+    mean = params.mean()
+    np.testing.assert_allclose(mean.beta, posterior["posterior"]["beta"].mean(("chain", "draw")))
+
+
+def test_diagnostics_are_the_worst_over_parameters(posterior):
+    found = diagnostics(posterior)
+    assert found["r_hat"] == pytest.approx(float(az.summary(posterior)["r_hat"].astype(float).max()), abs=0.006)
+    assert found["ess_bulk"] >= 400
+    assert found["divergences"] == 0
+
+
+def test_the_caller_s_jax_configuration_is_untouched(posterior):
+    assert not jax.config.jax_enable_x64
+    assert jax.numpy.ones(()).dtype == "float32"
+
+
+def test_bad_input_is_refused_before_sampling(missions):
+    with pytest.raises(TrustboError, match="unknown sampler 'gibbs'; choose one of nuts"):
+        fit(missions, sampler="gibbs")
+    with pytest.raises(ShapeError, match="no missions"):
+        fit([])
+    awareness = missions[0].awareness.copy()
+    awareness[3, 1, 0] = np.nan
+    hole = Mission.from_arrays(missions[0].path, awareness, missions[0].contact_rate)
+    expected = "mission 1, bound 4, robot r2, feature traversability is NaN"
+    with pytest.raises(TrustboError, match=expected):
+        fit([missions[0], hole])
+    named = Mission.from_arrays(
+        missions[0].path, missions[0].awareness, missions[0].contact_rate, robots=["a", "b", "c"]
+    )
+    with pytest.raises(ShapeError, match="mission 1 has robots"):
+        fit([missions[0], named])
+
+
+@pytest.mark.parametrize("name", ["beta0", "delta_w"])
+def test_a_prior_must_be_a_scalar_distribution(name):
+    for value in (0.5, dist.Normal(np.zeros(2), 1.0)):
+        with pytest.raises(TrustboError, match=f"Priors.{name} must be a scalar numpyro"):
+            Priors(**{name: value})
+
+
+def test_trust_before_the_first_bound_cannot_have_a_negative_sd():
+    with pytest.raises(TrustboError, match="x0_sd must not be negative; got -1"):
+        Priors(x0_sd=-1.0)
