@@ -26,7 +26,7 @@ class Robot:
         lidar_range: Distance up to which the lidar tracks another robot, m.
         vertical_fov: Half the vertical field of view, rad, measured from the plane of the body.
         sensor_height: Height of the lidar above ground, m.
-        target_height: Height of the point others aim at, m above ground.
+        target_height: Height of the point others aim at, m above ground; by default the lidar.
         max_slope: Steepest pitch or roll the robot stands, rad.
 
     Raises:
@@ -38,7 +38,7 @@ class Robot:
     lidar_range: float = 100.0
     vertical_fov: float = np.pi / 8
     sensor_height: float = 1.0
-    target_height: float = 0.5
+    target_height: float = 1.0
     max_slope: float = np.pi / 4
 
     def __post_init__(self) -> None:

@@ -139,7 +139,9 @@ def test_params_come_out_of_the_posterior_and_go_through_its_draws(posterior):
 
 def test_diagnostics_are_the_worst_over_parameters(posterior):
     found = diagnostics(posterior)
-    assert found["r_hat"] == pytest.approx(float(az.summary(posterior)["r_hat"].astype(float).max()), abs=0.006)
+    assert found["r_hat"] == pytest.approx(
+        float(az.summary(posterior)["r_hat"].astype(float).max()), abs=0.006
+    )
     assert found["ess_bulk"] >= 400
     assert found["divergences"] == 0
 

@@ -30,9 +30,7 @@ def random_missions(rng, n_missions=3, n_robots=3, missing=0.2):
         rates = rng.uniform(size=(n_bounds, n_robots))
         rates[rng.uniform(size=rates.shape) < missing] = np.nan
         path = [(0, k) for k in range(n_bounds + 1)]
-        missions.append(
-            Mission.from_arrays(path, rng.uniform(size=(n_bounds, n_robots, 2)), rates)
-        )
+        missions.append(Mission.from_arrays(path, rng.uniform(size=(n_bounds, n_robots, 2)), rates))
     return missions
 
 

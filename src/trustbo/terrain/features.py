@@ -75,7 +75,7 @@ def openness(
     reach: float = 50.0,
     *,
     eye: float = 1.0,
-    target: float = 0.5,
+    target: float = 1.0,
     n_rays: int = 16,
     extinction: float = 0.1,
     crown_base: float = 0.3,

@@ -9,6 +9,7 @@ import numpy as np
 import rasterio
 import rioxarray
 import xarray as xr
+from rasterio.crs import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioIOError
 from rasterio.transform import from_origin
@@ -148,7 +149,7 @@ def _open(
                 '"EPSG:32633" (--crs on the command line).'
             )
         try:
-            raster = raster.rio.write_crs(crs)
+            raster = raster.rio.write_crs(CRS.from_user_input(crs))
         except CRSError:
             raise TerrainError(
                 f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'."

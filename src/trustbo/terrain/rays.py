@@ -138,6 +138,10 @@ def openness(ground, surface, pixel, reach, eye, target, n_rays, extinction, cro
         NaN where none counts.
     """
     n_rows, n_cols = ground.shape
+    angle = 2.0 * math.pi / n_rays * np.arange(n_rays)
+    # Rounded, so that a ray along the raster's edge does not leave it by a rounding error.
+    down = np.round(reach * np.sin(angle) / pixel[0], 9)
+    right = np.round(reach * np.cos(angle) / pixel[1], 9)
     result = np.full(ground.shape, np.nan)
     for i in range(n_rows):
         for j in range(n_cols):
@@ -145,9 +149,7 @@ def openness(ground, surface, pixel, reach, eye, target, n_rays, extinction, cro
                 continue
             total, count = 0.0, 0
             for k in range(n_rays):
-                angle = 2.0 * math.pi * k / n_rays
-                r = i + reach * math.sin(angle) / pixel[0]
-                c = j + reach * math.cos(angle) / pixel[1]
+                r, c = i + down[k], j + right[k]
                 if r < 0.0 or c < 0.0 or r > n_rows - 1 or c > n_cols - 1:
                     continue
                 g, _ = _heights(ground, surface, r, c)

@@ -1,0 +1,103 @@
+"""The composite index: oriented by declared signs, in [0, 1], honest about what it lost."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from trustbo.errors import TerrainError, TrustboError
+from trustbo.terrain import CompositeIndex
+
+
+def correlated(n=4000, seed=0, third=-1.0):
+    rng = np.random.default_rng(seed)
+    common = rng.normal(size=n)
+    arrays = {
+        "slope": 10 + 3 * common + rng.normal(size=n),
+        "tri": 1 + 0.2 * common + 0.05 * rng.normal(size=n),
+        "open": third * common + 0.3 * rng.normal(size=n),
+    }
+    return xr.Dataset({name: ("pixel", values) for name, values in arrays.items()})
+
+
+SIGNS = {"slope": -1, "tri": -1, "open": +1}
+
+
+def test_the_first_component_is_numpy_s_up_to_the_declared_sign():
+    features = correlated()
+    index = CompositeIndex(SIGNS).fit(features)
+    x = np.stack([features[name].values for name in SIGNS], axis=1)
+    x = np.clip(x, *np.percentile(x, [1, 99], axis=0))
+    values, vectors = np.linalg.eigh(np.corrcoef(x.T))
+    first = vectors[:, -1] * np.sign(vectors[:, -1] @ list(SIGNS.values()))
+    np.testing.assert_allclose(index.loadings_, first, rtol=1e-6)
+    np.testing.assert_allclose(index.explained_variance_ratio_, values[-1] / 3, rtol=1e-6)
+
+
+def test_more_slope_lowers_the_index_whatever_the_solver_s_sign():
+    features = correlated()
+    for flip in (1, -1):
+        signs = {name: flip * sign for name, sign in SIGNS.items()}
+        index = CompositeIndex(signs).fit(features).transform(features)
+        correlation = np.corrcoef(index, features["slope"])[0, 1]
+        assert np.sign(correlation) == -flip
+
+
+@pytest.mark.parametrize("scaling", ["percentile", "minmax", "logistic"])
+def test_the_index_is_in_the_unit_interval_and_monotone_in_the_score(scaling):
+    features = correlated()
+    index = CompositeIndex(SIGNS, scaling=scaling).fit(features).transform(features)
+    assert float(index.min()) >= 0.0
+    assert float(index.max()) <= 1.0
+    other = CompositeIndex(SIGNS).fit(features).transform(features)
+    order = np.argsort(other.values[(other > 0) & (other < 1)])
+    inner = index.values[(other > 0) & (other < 1)][order]
+    assert (np.diff(inner) >= -1e-12).all()
+
+
+def test_two_percent_at_either_end_are_cut():
+    features = correlated()
+    index = CompositeIndex(SIGNS).fit(features).transform(features)
+    assert float((index == 0.0).mean()) == pytest.approx(0.02, abs=0.002)
+    assert float((index == 1.0).mean()) == pytest.approx(0.02, abs=0.002)
+
+
+def test_missing_pixels_stay_missing_and_do_not_count():
+    features = correlated()
+    holes = features.copy(deep=True)
+    holes["tri"][:100] = np.nan
+    index = CompositeIndex(SIGNS).fit(holes)
+    kept = CompositeIndex(SIGNS).fit(features.isel(pixel=slice(100, None)))
+    np.testing.assert_allclose(index.loadings_, kept.loadings_)
+    assert np.isnan(index.transform(holes)[:100]).all()
+
+
+def test_a_constant_feature_has_no_say():
+    features = correlated().assign(tri=("pixel", np.full(4000, 7.0)))
+    index = CompositeIndex(SIGNS).fit(features)
+    assert float(index.loadings_.sel(feature="tri")) == 0.0
+    assert index.transform(features).notnull().all()
+    flat = xr.Dataset({name: ("pixel", np.ones(10)) for name in SIGNS})
+    np.testing.assert_array_equal(CompositeIndex(SIGNS).fit(flat).transform(flat), 0.5)
+
+
+def test_a_feature_against_its_sign_is_named():
+    with pytest.warns(UserWarning, match="open enters its composite against the declared sign"):
+        CompositeIndex(SIGNS).fit(correlated(third=+1.0))
+
+
+def test_a_component_that_explains_little_is_reported():
+    rng = np.random.default_rng(0)
+    noise = xr.Dataset({name: ("pixel", rng.normal(size=2000)) for name in SIGNS})
+    with pytest.warns(UserWarning) as caught:
+        CompositeIndex(SIGNS).fit(noise)
+    assert any("explains only 3" in str(w.message) for w in caught)
+
+
+def test_bad_input():
+    with pytest.raises(TrustboError, match="unknown scaling 'iqr'; choose one of percentile"):
+        CompositeIndex(SIGNS, scaling="iqr")
+    with pytest.raises(TerrainError, match="the composite needs open"):
+        CompositeIndex(SIGNS).fit(correlated().drop_vars("open"))
+    empty = xr.Dataset({name: ("pixel", np.full(5, np.nan)) for name in SIGNS})
+    with pytest.raises(TerrainError, match="no pixel has all of the features"):
+        CompositeIndex(SIGNS).fit(empty)

@@ -1,0 +1,200 @@
+"""Reading rasters: aligned, metric, and refused where they cannot serve."""
+
+import numpy as np
+import pytest
+import rasterio
+import xarray as xr
+from rasterio.transform import from_origin
+
+from trustbo.errors import TerrainError
+from trustbo.terrain import pixel_size, read_terrain, synthetic_terrain
+
+UTM = "EPSG:32633"
+
+
+def write_raster(path, values, *, crs=UTM, transform=None, nodata=None):
+    transform = from_origin(500_000.0, 5_000_000.0, 1.0, 1.0) if transform is None else transform
+    height, width = values.shape
+    with rasterio.open(
+        path,
+        "w",
+        driver="GTiff",
+        height=height,
+        width=width,
+        count=1,
+        dtype=values.dtype,
+        crs=crs,
+        transform=transform,
+        nodata=nodata,
+    ) as sink:
+        sink.write(values, 1)
+    return path
+
+
+def plane(rows=20, cols=30):
+    row, col = np.mgrid[:rows, :cols]
+    return (100.0 + 0.1 * col - 0.2 * row).astype("float32")
+
+
+def test_a_pair_comes_out_aligned_north_up_and_in_metres(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane())
+    dsm = write_raster(tmp_path / "dsm.tif", plane() + 3.0)
+    terrain = read_terrain(dem, dsm)
+    assert terrain["dem"].dims == ("y", "x")
+    assert terrain["y"][0] > terrain["y"][-1]
+    assert terrain.rio.crs.to_epsg() == 32633
+    assert pixel_size(terrain) == (1.0, 1.0)
+    np.testing.assert_allclose(terrain["dem"], plane())
+    np.testing.assert_allclose(terrain["dsm"] - terrain["dem"], 3.0)
+
+
+def test_a_coarser_shifted_dsm_is_brought_onto_the_dem_s_grid(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane(40, 40))
+    transform = from_origin(500_000.0 - 4.0, 5_000_000.0 + 6.0, 2.0, 2.0)
+    row, col = np.mgrid[:30, :30]
+    # The same plane, 5 m higher, sampled at the coarse pixels' centres.
+    x, y = -4.0 + 2.0 * col + 0.5, -6.0 + 2.0 * row + 0.5
+    values = (105.0 + 0.1 * x - 0.2 * y).astype("float32")
+    dsm = write_raster(tmp_path / "dsm.tif", values, transform=transform)
+    terrain = read_terrain(dem, dsm)
+    assert terrain["dem"].shape == (40, 40)
+    inner = (terrain["dsm"] - terrain["dem"]).isel(x=slice(4, -4), y=slice(4, -4))
+    # Bilinear resampling reproduces a plane, up to float32.
+    np.testing.assert_allclose(inner, 5.0, atol=1e-3)
+
+
+def test_degrees_are_reprojected_to_the_local_utm_zone(tmp_path):
+    transform = from_origin(15.0, 45.0, 1e-5, 1e-5)
+    dem = write_raster(tmp_path / "dem.tif", plane(60, 60), crs="EPSG:4326", transform=transform)
+    dsm = write_raster(
+        tmp_path / "dsm.tif", plane(60, 60) + 2.0, crs="EPSG:4326", transform=transform
+    )
+    terrain = read_terrain(dem, dsm)
+    assert terrain.rio.crs.to_epsg() == 32633
+    height, width = pixel_size(terrain)
+    # 1e-5 degree is 1.11 m of latitude and 0.79 m of longitude at 45 degrees north.
+    assert 0.7 < width < 1.2
+    assert height == pytest.approx(width)
+    extent = terrain["x"].max() - terrain["x"].min()
+    assert float(extent) == pytest.approx(60e-5 * 111_320 * np.cos(np.pi / 4), rel=0.05)
+
+
+def test_nodata_of_either_raster_stays_missing(tmp_path):
+    ground = plane()
+    ground[2, 3] = -9999.0
+    surface = plane() + 1.0
+    surface[5, 6] = -1.0
+    dem = write_raster(tmp_path / "dem.tif", ground, nodata=-9999.0)
+    dsm = write_raster(tmp_path / "dsm.tif", surface, nodata=-1.0)
+    terrain = read_terrain(dem, dsm)
+    missing = np.argwhere(np.isnan(terrain["dem"].values))
+    assert missing.tolist() == [[2, 3], [5, 6]]
+    assert (np.isnan(terrain["dsm"]) == np.isnan(terrain["dem"])).all()
+
+
+def test_integer_rasters_are_read(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane().astype("int16"), nodata=-32768)
+    terrain = read_terrain(dem, dem)
+    assert terrain["dem"].dtype == float
+
+
+def test_a_surface_below_the_ground_is_raised_and_counted(tmp_path):
+    surface = plane() + 1.0
+    surface[:, :3] -= 2.0
+    dem = write_raster(tmp_path / "dem.tif", plane())
+    dsm = write_raster(tmp_path / "dsm.tif", surface)
+    with pytest.warns(UserWarning, match=r"below the DEM on 10\.0% of pixels"):
+        terrain = read_terrain(dem, dsm)
+    assert float((terrain["dsm"] - terrain["dem"]).min()) == 0.0
+    assert terrain.attrs["clipped_share"] == pytest.approx(0.1)
+
+
+def test_south_up_rasters_are_turned_round(tmp_path):
+    flipped = rasterio.Affine(1.0, 0.0, 500_000.0, 0.0, 1.0, 5_000_000.0 - 20.0)
+    dem = write_raster(tmp_path / "dem.tif", plane()[::-1].copy(), transform=flipped)
+    terrain = read_terrain(dem, dem)
+    np.testing.assert_allclose(terrain["dem"], plane())
+
+
+def test_rasters_without_georeference_need_crs_and_resolution(tmp_path):
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
+        dem = write_raster(
+            tmp_path / "dem.tif", plane(), crs=None, transform=rasterio.Affine.identity()
+        )
+    with pytest.raises(TerrainError, match="carries no georeference; pass both crs="):
+        read_terrain(dem, dem)
+    terrain = read_terrain(dem, dem, crs=UTM, resolution=2.0)
+    assert pixel_size(terrain) == (2.0, 2.0)
+    np.testing.assert_allclose(terrain["dem"], plane())
+
+
+def test_a_raster_without_crs_is_refused_unless_it_is_given(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane(), crs=None)
+    with pytest.raises(TerrainError, match="has no coordinate reference system; pass crs="):
+        read_terrain(dem, dem)
+    assert read_terrain(dem, dem, crs=UTM).rio.crs.to_epsg() == 32633
+    with pytest.raises(TerrainError, match="crs 'nonsense' is not one PROJ knows"):
+        read_terrain(dem, dem, crs="nonsense")
+
+
+def test_files_that_are_absent_or_no_raster_are_named(tmp_path):
+    text = tmp_path / "notes.txt"
+    text.write_text("no raster")
+    dem = write_raster(tmp_path / "dem.tif", plane())
+    with pytest.raises(TerrainError, match=r"dsm: '.*notes.txt' is no raster that GDAL can read"):
+        read_terrain(dem, text)
+    with pytest.raises(TerrainError, match=r"dem: there is no file '.*absent.tif'"):
+        read_terrain(tmp_path / "absent.tif", dem)
+
+
+def test_rasters_of_two_places_are_refused(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane())
+    far = from_origin(600_000.0, 5_000_000.0, 1.0, 1.0)
+    dsm = write_raster(tmp_path / "dsm.tif", plane(), transform=far)
+    with pytest.raises(TerrainError, match=r"do not overlap: in EPSG:32633 they cover \(500000.0"):
+        read_terrain(dem, dsm)
+
+
+def test_rasters_of_nothing_but_nodata_are_refused(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane())
+    empty = write_raster(tmp_path / "dsm.tif", np.full((20, 30), -9999.0), nodata=-9999.0)
+    with pytest.raises(TerrainError, match=r"dsm: '.*dsm.tif' is all nodata"):
+        read_terrain(dem, empty)
+
+
+def test_rotated_grids_and_feet_are_refused(tmp_path):
+    rotated = from_origin(500_000.0, 5_000_000.0, 1.0, 1.0) * rasterio.Affine.rotation(10)
+    dem = write_raster(tmp_path / "rotated.tif", plane(), transform=rotated)
+    with pytest.raises(TerrainError, match="rotated grid; warp it to north-up first"):
+        read_terrain(dem, dem)
+    feet = write_raster(tmp_path / "feet.tif", plane(), crs="EPSG:2225")
+    with pytest.raises(TerrainError, match="is in US survey foot, but heights and distances must"):
+        read_terrain(feet, feet)
+
+
+@pytest.mark.parametrize("name", ["wellington", "tahoe", "bcts", "topography"])
+def test_real_terrain_is_read_in_metres(name, real_terrain):
+    terrain = read_terrain(*real_terrain(name))
+    assert terrain.rio.crs.is_projected
+    height, width = pixel_size(terrain)
+    assert 0.4 < height < 1.1
+    assert 0.4 < width < 1.1
+    assert (terrain["dsm"] >= terrain["dem"]).where(terrain["dem"].notnull(), True).all()
+
+
+def test_synthetic_terrain_is_seeded_and_as_ordered():
+    terrain = synthetic_terrain((100.0, 80.0), resolution=2.0, seed=3, canopy_cover=0.3)
+    assert terrain["dem"].shape == (50, 40)
+    xr.testing.assert_identical(
+        terrain, synthetic_terrain((100.0, 80.0), resolution=2.0, seed=3, canopy_cover=0.3)
+    )
+    assert (terrain["dem"] != synthetic_terrain((100.0, 80.0), 2.0, seed=4)["dem"]).any()
+    assert float((terrain["dsm"] > terrain["dem"]).mean()) == pytest.approx(0.3, abs=0.01)
+    assert terrain.rio.crs.to_epsg() == 32616
+
+
+def test_synthetic_terrain_refuses_what_it_cannot_make():
+    with pytest.raises(TerrainError, match="need 4 x 4"):
+        synthetic_terrain((3.0, 3.0))
+    with pytest.raises(TerrainError, match="need hurst in"):
+        synthetic_terrain((50.0, 50.0), canopy_cover=1.5)

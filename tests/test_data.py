@@ -1,0 +1,106 @@
+"""Robots, bounds and missions: refused early, with the value and the remedy."""
+
+import numpy as np
+import pytest
+
+from trustbo.data import Bound, Mission, Robot, Team, fill_awareness
+from trustbo.errors import ShapeError, TrustboError
+
+PATH = [(2, 0), (1, 1), (0, 2)]
+
+
+def arrays(n_bounds=2, n_robots=3, n_features=2):
+    return np.full((n_bounds, n_robots, n_features), 0.5), np.full((n_bounds, n_robots), 0.4)
+
+
+def test_a_user_s_log_becomes_a_mission():
+    z, y = arrays()
+    mission = Mission.from_arrays(PATH, z, y, duration=[10.0, 20.0])
+    assert mission.path == ((2, 0), (1, 1), (0, 2))
+    assert mission.features == ("traversability", "visibility")
+    assert mission.robots == ("r1", "r2", "r3")
+    np.testing.assert_array_equal(mission.contact_rate, y)
+    np.testing.assert_array_equal(mission.awareness, z)
+    assert [bound.cell for bound in mission.bounds] == PATH[1:]
+    assert [bound.t0 for bound in mission.bounds] == [0.0, 10.0]
+    np.testing.assert_allclose(mission.bounds[1].contact_time, 8.0)
+    assert mission.bounds[1].t1 == 30.0
+
+
+def test_a_log_without_durations_has_none():
+    mission = Mission.from_arrays(PATH, *arrays())
+    assert np.isnan(mission.duration).all()
+
+
+def test_a_failed_mission_keeps_its_bounds():
+    z, y = arrays(1)
+    mission = Mission.from_arrays(PATH, z, y, status="stuck")
+    assert mission.status == mission.bounds[-1].status == "stuck"
+    with pytest.raises(ShapeError, match="only 1 of 2 bounds were run; give the status"):
+        Mission.from_arrays(PATH, z, y)
+
+
+@pytest.mark.parametrize(("value", "shown"), [(1.5, "1.5"), (-0.1, "-0.1")])
+def test_contact_rates_outside_the_unit_interval_are_named(value, shown):
+    z, y = arrays()
+    y[1, 2] = value
+    with pytest.raises(
+        TrustboError, match=rf"contact_rate of the bound into cell \(0, 2\): \[2\] = {shown}"
+    ):
+        Mission.from_arrays(PATH, z, y)
+
+
+def test_awareness_outside_the_unit_interval_is_named():
+    z, y = arrays()
+    z[0, 1, 1] = 2.0
+    with pytest.raises(TrustboError, match=r"awareness .* cell \(1, 1\): \[1, 1\] = 2 is outside"):
+        Mission.from_arrays(PATH, z, y)
+
+
+def test_axes_that_do_not_fit_are_shown():
+    z, y = arrays()
+    with pytest.raises(ShapeError, match=r"got \(2, 3, 2\) and \(2, 2\)"):
+        Mission.from_arrays(PATH, z, y[:, :2])
+    with pytest.raises(ShapeError, match="2 bounds need 3 cells; the path has 2"):
+        Mission.from_arrays(PATH[:2], z, y)
+    with pytest.raises(ShapeError, match="duration must be"):
+        Mission.from_arrays(PATH, z, y, duration=[1.0, 2.0, 3.0])
+    with pytest.raises(ShapeError, match="features must be 2 names"):
+        Mission.from_arrays(PATH, z, y, features=["one"])
+    with pytest.raises(ShapeError, match="at least one; got 0"):
+        Mission(tuple(PATH), (), "aborted")
+
+
+def test_unknown_statuses_are_refused_with_the_known_ones():
+    z, y = arrays()
+    with pytest.raises(TrustboError, match="unknown status 'lost'; choose one of ok, stuck"):
+        Mission.from_arrays(PATH, z, y, status="lost")
+
+
+def test_a_bound_s_rows_must_be_robots():
+    with pytest.raises(ShapeError, match="one row per robot; got 2, 3, 2"):
+        Bound((0, 0), np.zeros((2, 2)), np.zeros(3), np.ones(2))
+    with pytest.raises(TrustboError, match=r"duration\[1\] = 0 s must be positive"):
+        Bound((0, 0), np.zeros((2, 2)), np.zeros(2), np.array([1.0, 0.0]))
+
+
+def test_missing_awareness_is_filled_from_a_map():
+    z, y = arrays()
+    z[0, 1] = np.nan
+    grid = np.random.default_rng(0).uniform(size=(3, 3, 3, 2))
+    filled = fill_awareness(Mission.from_arrays(PATH, z, y), grid)
+    np.testing.assert_array_equal(filled.awareness[0, 1], grid[1, 1, 1])
+    np.testing.assert_array_equal(filled.awareness[1], z[1])
+
+
+def test_robots_and_teams_are_checked():
+    assert Team(n_robots=4).names == ("r1", "r2", "r3", "r4")
+    assert Team(robots=[Robot(), Robot(speed=1.0)]).n_robots == 2
+    with pytest.raises(TrustboError, match=r"Robot.speed must be positive and finite; got -1"):
+        Robot(speed=-1.0)
+    with pytest.raises(TrustboError, match=r"below pi/2; got 30 \(degrees\?"):
+        Robot(max_slope=30.0)
+    with pytest.raises(TrustboError, match="at least one overwatching robot; got 0"):
+        Team(n_robots=0)
+    with pytest.raises(TrustboError, match="2 distinct names"):
+        Team(n_robots=2, names=("a", "a"))
