@@ -206,6 +206,7 @@ class _one_line_errors:  # noqa: N801  (used as a context manager)
         self._catch = warnings.catch_warnings()
         self._catch.__enter__()
         warnings.showwarning = show
+        warnings.simplefilter("default", UserWarning)
 
     def __exit__(self, kind, error, traceback) -> None:
         from trustbo.errors import TrustboError

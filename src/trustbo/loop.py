@@ -59,7 +59,7 @@ class Result:
         """The posterior after the last mission."""
         return self.posteriors[-1]
 
-    def plot_maps(self) -> "np.ndarray[tuple[int], np.dtype[np.object_]]":
+    def plot_maps(self) -> np.ndarray:
         """The trust map and path of each iteration, and those after the last; returns the Axes."""
         from trustbo import plots  # matplotlib only for those who plot
 
@@ -269,7 +269,7 @@ def _result(
     for i, plan in enumerate(plans):
         steps[i, : len(plan.path)] = plan.path
     scalars = {name: [row[name] for row in rows] for name in rows[0] if name not in _NOT_SCALAR}
-    maps = [row["trust_map"].drop_vars(["x", "y"]) for row in rows]  # pyright: ignore[reportAttributeAccessIssue]
+    maps: list[xr.DataArray] = [row["trust_map"] for row in rows]  # pyright: ignore[reportAssignmentType]
     iteration = xr.DataArray(np.arange(1, len(rows) + 1), dims="iteration", name="iteration")
     history = xr.Dataset(
         {

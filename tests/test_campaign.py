@@ -1,0 +1,127 @@
+"""Ask and tell: whatever runs the missions."""
+
+import numpy as np
+import pytest
+from simulators import ModelSimulator
+
+from trustbo import (
+    Campaign,
+    Mission,
+    NoPathError,
+    PosteriorError,
+    ShapeError,
+    TrustboError,
+    Workspace,
+)
+from trustbo.models import fit
+from trustbo.planning import policies
+
+ENDS = ((3, 0), (0, 3))
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+
+
+def test_ask_is_the_same_until_told(workspace):
+    campaign = Campaign(workspace, *ENDS, policy="thompson")
+    plan = campaign.ask()
+    assert campaign.ask() is plan
+    assert campaign.posterior is None
+    mission = ModelSimulator(workspace).run(plan.path, seed=0)
+    posterior = campaign.tell(mission)
+    assert campaign.posterior is posterior
+    assert campaign.missions[0].path == plan.path
+    assert campaign.plans == [plan]
+    assert campaign.ask() is not plan
+
+
+def test_the_first_plan_is_from_one_draw_of_the_prior_or_from_its_mean(workspace):
+    first = [Campaign(workspace, *ENDS, seed=s).belief for s in range(2)]
+    assert np.shape(first[0].beta) == (1, 2)
+    assert first[0].beta0[0] != first[1].beta0[0]
+    mean = Campaign(workspace, *ENDS, initial="prior_mean").belief
+    # beta0 ~ Beta(2, 2): mean 1/2, sd 0.22; 4 standard errors of 4000 draws.
+    assert mean.beta0[0] == pytest.approx(0.5, abs=4 * 0.224 / np.sqrt(4000))
+
+
+def test_the_posterior_is_that_of_all_missions_so_far(workspace):
+    campaign = Campaign(workspace, *ENDS)
+    simulator = ModelSimulator(workspace)
+    for j in range(2):
+        seed = campaign.seed_of("fit")
+        campaign.tell(simulator.run(campaign.ask().path, seed=j))
+    again = fit(campaign.missions, seed=seed)
+    np.testing.assert_array_equal(
+        again["posterior"]["beta"].values, campaign.posterior["posterior"]["beta"].values
+    )
+
+
+def test_unmeasured_awareness_comes_from_the_map(workspace):
+    campaign = Campaign(workspace, *ENDS)
+    campaign.tell(ModelSimulator(workspace, blind=True).run(campaign.ask().path, seed=0))
+    cell = campaign.missions[0].bounds[0].cell
+    np.testing.assert_array_equal(
+        campaign.missions[0].awareness[0], workspace.awareness.values[:, *cell]
+    )
+
+
+def test_another_team_s_mission_is_refused(workspace):
+    campaign = Campaign(workspace, *ENDS)
+    mission = Mission.from_arrays([(3, 0), (2, 1)], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
+    with pytest.raises(ShapeError, match=r"the mission has robots \('r1', 'r2'\), the workspace"):
+        campaign.tell(mission)
+    assert campaign.missions == []
+
+
+def test_a_refused_posterior_leaves_the_campaign_as_it_was(workspace, monkeypatch):
+    campaign = Campaign(workspace, *ENDS)
+    plan = campaign.ask()
+
+    def refuse(*args, **kwargs):
+        raise PosteriorError("R-hat of beta0 is 1.5")
+
+    monkeypatch.setattr("trustbo.campaign.fit", refuse)
+    with pytest.raises(PosteriorError):
+        campaign.tell(ModelSimulator(workspace).run(plan.path, seed=0))
+    assert (campaign.missions, campaign.posteriors, campaign.plans) == ([], [], [])
+    assert campaign.ask() is plan
+
+
+def test_a_policy_of_one_s_own(workspace):
+    def along_the_diagonal(key, posterior, planner):
+        return planner.evaluate([(3, 0), (2, 1), (1, 2), (0, 3)], posterior.mean())
+
+    campaign = Campaign(workspace, *ENDS, policy=along_the_diagonal)
+    assert campaign.ask().path == ((3, 0), (2, 1), (1, 2), (0, 3))
+    assert campaign.settings["policy"] == "along_the_diagonal"
+
+
+def test_a_policy_that_gives_no_plan_is_refused(workspace):
+    campaign = Campaign(workspace, *ENDS, policy=lambda key, posterior, planner: [(3, 0)])
+    with pytest.raises(TrustboError, match=r"the policy must return a Plan; got \[\(3, 0\)\]"):
+        campaign.ask()
+
+
+def test_recommending_is_greedy_whatever_the_policy(workspace):
+    campaign = Campaign(workspace, *ENDS, policy="random")
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    best = policies.greedy(None, campaign.belief, campaign.planner)
+    assert campaign.recommend().path == best.path
+
+
+def test_bad_names_and_ends_are_refused_at_once(workspace):
+    for options, message in (
+        ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, thompson, random"),
+        ({"objective": "best"}, "unknown objective 'best'"),
+        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of nuts"),
+        ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_draw, prior_mean"),
+    ):
+        with pytest.raises(TrustboError, match=message):
+            Campaign(workspace, *ENDS, **options)
+    walls = np.ones((4, 4), bool)
+    walls[2] = False
+    closed = Workspace.from_awareness(workspace.awareness.values, walls)
+    with pytest.raises(NoPathError, match="no path from"):
+        Campaign(closed, *ENDS)

@@ -1,0 +1,121 @@
+"""Figures and files of a result."""
+
+import json
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import rasterio
+from rasterio.warp import transform
+
+import trustbo as tb
+
+
+@pytest.fixture(scope="module")
+def result():
+    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    return tb.iterate(
+        tb.Workspace.from_terrain(terrain, (3, 4)), (2, 0), (0, 3), n_iterations=2, progress=False
+    )
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+def test_one_panel_per_iteration_and_one_for_the_end(result):
+    axes = result.plot_maps()
+    assert [ax.get_title() for ax in axes] == [
+        "mission 1 (from the prior)",
+        "mission 2",
+        "after 2 missions",
+    ]
+    figure = axes[0].figure
+    bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
+    assert len(bars) == 1
+    assert bars[0].get_ylabel().startswith("expected trust")
+    assert axes[0].get_xlabel() == "east (m)"
+    assert axes[0].get_ylabel() == "north (m)"
+    np.testing.assert_allclose(axes[0].get_xlim(), (0.0, 120.0))
+    np.testing.assert_allclose(axes[0].get_ylim(), (0.0, 90.0))
+    limits = {axes[i].images[0].get_clim() for i in range(3)}
+    assert len(limits) == 1
+
+
+def test_the_path_is_drawn_from_start_to_goal_where_its_cells_are(result):
+    line, start, goal = result.plot_maps()[-1].lines
+    grid = result.workspace.grid
+    corner = (grid.left, grid.top - 90.0)
+    expected = [np.subtract(grid.center(cell), corner) for cell in result.path]
+    np.testing.assert_allclose(np.column_stack(line.get_data()), expected)
+    np.testing.assert_allclose(np.ravel(start.get_data()), expected[0])
+    np.testing.assert_allclose(np.ravel(goal.get_data()), expected[-1])
+    assert (start.get_marker(), goal.get_marker()) == ("o", "*")
+
+
+def test_a_map_s_top_row_is_north(result):
+    image = result.plot_maps()[-1].images[0]
+    np.testing.assert_allclose(image.get_array(), result.trust_map.values)
+    assert image.origin == "upper"
+    assert image.get_extent() == [0.0, 120.0, 0.0, 90.0] or image.get_extent() == (
+        0.0,
+        120.0,
+        0.0,
+        90.0,
+    )
+
+
+def test_terrain_maps_show_surface_traversability_and_visibility(result):
+    axes = tb.plots.terrain_maps(result.workspace)
+    assert [ax.get_title() for ax in axes] == ["surface (DSM)", "traversability", "visibility"]
+    np.testing.assert_allclose(axes[2].images[0].get_array(), result.workspace.pixels["visibility"])
+    bare = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
+    with pytest.raises(tb.TrustboError, match="Workspace.from_terrain"):
+        tb.plots.terrain_maps(bare)
+
+
+def test_impassable_cells_are_grey():
+    passable = np.ones((3, 3), bool)
+    passable[1, 1] = False
+    workspace = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5), passable)
+    _, ax = plt.subplots()
+    trust = workspace.awareness.isel(robot=0, feature=0)
+    image = tb.plots.cell_map(ax, trust, workspace)
+    assert np.ma.getmaskarray(image.get_array()).tolist() == (~passable).tolist()
+    assert ax.get_facecolor() == (0.75, 0.75, 0.75, 1.0)
+
+
+def test_the_trust_map_is_a_geotiff_in_the_terrain_s_crs(result, tmp_path):
+    path = tmp_path / "trust.tif"
+    tb.export.write_cell_map(path, result.trust_map, result.workspace)
+    with rasterio.open(path) as source:
+        assert source.crs.to_epsg() == 32616
+        assert source.bounds == pytest.approx(result.workspace.terrain.rio.bounds())
+        assert source.descriptions == ("trust",)
+        assert np.isnan(source.nodata)
+        np.testing.assert_allclose(source.read(1), result.trust_map.values, rtol=1e-6)
+
+
+def test_the_path_is_geojson_in_degrees_on_the_right_place(result, tmp_path):
+    path = tmp_path / "path.geojson"
+    tb.export.write_path(path, result)
+    features = json.loads(path.read_text())["features"]
+    line, *points = features
+    assert line["geometry"]["type"] == "LineString"
+    assert len(line["geometry"]["coordinates"]) == len(points) == len(result.path)
+    for (lon, lat), cell in zip(line["geometry"]["coordinates"], result.path, strict=True):
+        x, y = transform("EPSG:4326", "EPSG:32616", [lon], [lat])
+        # 1e-8 degree is 1 mm.
+        np.testing.assert_allclose([x[0], y[0]], result.workspace.grid.center(cell), atol=2e-3)
+    assert points[1]["properties"]["trust_r1"] == pytest.approx(result.trust[0, 0])
+    assert "trust_r1" not in points[0]["properties"]
+
+
+def test_without_a_terrain_there_is_no_place_on_earth(tmp_path):
+    workspace = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
+    trust = workspace.awareness.isel(robot=0, feature=0)
+    with pytest.raises(tb.TrustboError, match="has a place on Earth"):
+        tb.export.write_cell_map(tmp_path / "map.tif", trust, workspace)
+    assert list(tmp_path.iterdir()) == []
