@@ -155,6 +155,15 @@ def test_a_result_on_terrain_is_read_back_with_ticks_and_maps(on_terrain, tmp_pa
     assert again.path == on_terrain.path
 
 
+def test_saving_over_another_result_leaves_nothing_of_it(result, workspace, tmp_path):
+    result.save(tmp_path)
+    shorter = run(workspace, n_iterations=2, seed=5)
+    shorter.save(tmp_path)
+    back = tb.load_result(tmp_path)
+    assert len(back.missions) == len(list((tmp_path / "posteriors").iterdir())) == 2
+    xr.testing.assert_equal(back.posteriors[0], shorter.posteriors[0])
+
+
 def test_a_run_that_dies_has_saved_its_missions(workspace, tmp_path):
     class Dies(ModelSimulator):
         def run(self, path, *, seed):

@@ -72,7 +72,7 @@ def test_terrain_maps_show_surface_traversability_and_visibility(result):
     assert [ax.get_title() for ax in axes] == ["surface (DSM)", "traversability", "visibility"]
     np.testing.assert_allclose(axes[2].images[0].get_array(), result.workspace.pixels["visibility"])
     bare = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
-    with pytest.raises(tb.TrustboError, match="Workspace.from_terrain"):
+    with pytest.raises(tb.TrustboError, match=r"Workspace\.from_terrain"):
         tb.plots.terrain_maps(bare)
 
 

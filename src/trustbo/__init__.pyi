@@ -2,8 +2,9 @@ from . import export, models, planning, plots, simulation, terrain
 from .campaign import Campaign
 from .data import Bound, Mission, Robot, Team
 from .errors import PosteriorError, ShapeError, TerrainError, TrustboError
-from .loop import Result, iterate, load_result
+from .loop import iterate
 from .planning import NoPathError
+from .result import Result, load_result
 from .terrain import Workspace
 
 __all__ = [

@@ -2,7 +2,8 @@
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -115,7 +116,7 @@ def demo(
     """
     from trustbo import terrain
     from trustbo.archive import write_file
-    from trustbo.loop import require_folder
+    from trustbo.result import require_folder
 
     with _one_line_errors(debug):
         require_folder(out)
@@ -193,28 +194,24 @@ def _pair(what: str, text: str) -> tuple[int, int]:
     return first, second
 
 
-class _one_line_errors:  # noqa: N801  (used as a context manager)
-    """Print bad input's message without a traceback and exit with 2; warnings likewise."""
+@contextmanager
+def _one_line_errors(debug: bool) -> Iterator[None]:
+    """Print bad input's message without a traceback and exit with 2; warnings in a line each."""
+    from trustbo.errors import TrustboError
 
-    def __init__(self, debug: bool) -> None:
-        self._debug = debug
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        print(f"warning: {message}", file=sys.stderr)
 
-    def __enter__(self) -> None:
-        def show(message, category, filename, lineno, file=None, line=None) -> None:
-            print(f"warning: {message}", file=sys.stderr)
-
-        self._catch = warnings.catch_warnings()
-        self._catch.__enter__()
+    with warnings.catch_warnings():
         warnings.showwarning = show
         warnings.simplefilter("default", UserWarning)
-
-    def __exit__(self, kind, error, traceback) -> None:
-        from trustbo.errors import TrustboError
-
-        self._catch.__exit__(kind, error, traceback)
-        if isinstance(error, TrustboError) and not self._debug:
+        try:
+            yield
+        except (TrustboError, OSError) as error:
+            if debug:
+                raise
             print(f"error: {error}", file=sys.stderr)
-            raise typer.Exit(2)
+            raise typer.Exit(2) from None
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -12,7 +12,7 @@ from rasterio.warp import transform
 
 from trustbo.archive import write_file, write_text
 from trustbo.errors import TrustboError
-from trustbo.loop import Result
+from trustbo.result import Result
 from trustbo.terrain import Workspace
 
 

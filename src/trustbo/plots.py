@@ -17,7 +17,7 @@ from trustbo.errors import TrustboError
 from trustbo.terrain import Grid, Workspace, pixel_size
 
 if TYPE_CHECKING:
-    from trustbo.loop import Result
+    from trustbo.result import Result
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""

@@ -6,9 +6,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from models.conftest import simulate_missions
 from numpyro.infer import MCMC, NUTS
 
-from models.conftest import simulate_missions
 from trustbo.data import Mission, stack_missions
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit, pooled_trust

@@ -1,0 +1,159 @@
+"""What a campaign learned, in memory and on disk."""
+
+import json
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from trustbo import archive
+from trustbo.data import Cell, Mission
+from trustbo.errors import TrustboError
+from trustbo.terrain import Workspace
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a campaign learned.
+
+    Attributes:
+        workspace: Where it was.
+        missions: All missions, in order.
+        posteriors: The posterior after each of them (ArviZ DataTrees).
+        path: The path recommended after the last mission: the best under the posterior mean.
+        trust: Expected trust along it, shape (bound, robot).
+        value: Its objective.
+        trust_map: The team's trust map after the last mission, dims (row, col).
+        history: Dataset over `iteration` (1, 2, ...): the plan each mission followed (`path`, as
+            row and col of each step, -1 after the goal), its `objective` when it was planned,
+            whether it differs from the plan before (`path_changed`), the `trust_map` it was planned
+            on, the mission's mean `contact_rate` and `status`, the posterior's `r_hat`, `ess_bulk`
+            and `divergences`, and the seconds spent planning, running and fitting.
+        settings: What the campaign was run with.
+        stop_reason: Why it ended.
+    """
+
+    workspace: Workspace
+    missions: list[Mission]
+    posteriors: list[xr.DataTree]
+    path: list[Cell]
+    trust: np.ndarray
+    value: float
+    trust_map: xr.DataArray
+    history: xr.Dataset
+    settings: dict[str, object]
+    stop_reason: str
+
+    @property
+    def posterior(self) -> xr.DataTree:
+        """The posterior after the last mission."""
+        return self.posteriors[-1]
+
+    def plot_maps(self) -> np.ndarray:
+        """The trust map and path of each iteration, and those after the last; returns the Axes."""
+        from trustbo import plots  # matplotlib only for those who plot
+
+        return plots.trust_maps(self)
+
+    def save(self, directory: str | PathLike[str]) -> None:
+        """Write everything to a folder that `load_result` reads.
+
+        Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
+        (the last of them), `missions.nc`, `workspace.nc`, `history.nc`, `history.csv` and
+        `result.json`. What another result left there is replaced.
+
+        Raises:
+            TrustboError: The folder's name belongs to a file.
+        """
+        folder = require_folder(directory)
+        for j, posterior in enumerate(self.posteriors):
+            _write_tree(folder / "posteriors" / _posterior_name(j), posterior)
+        self.checkpoint(folder)
+
+    def checkpoint(self, directory: str | PathLike[str]) -> None:
+        """As `save`, into a folder that has all posteriors but the last: these never change."""
+        folder = require_folder(directory)
+        last = _posterior_name(len(self.posteriors) - 1)
+        _write_tree(folder / "posteriors" / last, self.posterior)
+        for file in (folder / "posteriors").glob("*.nc"):
+            if file.name > last:
+                file.unlink()
+        _write_tree(folder / "posterior.nc", self.posterior)
+        trees = {
+            "missions.nc": archive.missions_to_tree(self.missions),
+            "workspace.nc": archive.workspace_to_tree(self.workspace),
+            "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
+        }
+        for name, tree in trees.items():
+            _write_tree(folder / name, tree)
+        scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
+        table = self.history[scalars].to_dataframe()[scalars]
+        table["path"] = [_path_text(path) for path in self.history["path"].values]
+        archive.write_text(folder / "history.csv", table.to_csv())
+        record = {
+            "n_missions": len(self.missions),
+            "path": self.path,
+            "trust": self.trust.tolist(),
+            "value": self.value,
+            "settings": self.settings,
+            "stop_reason": self.stop_reason,
+        }
+        # Last: its presence says that the rest is complete.
+        archive.write_text(folder / "result.json", json.dumps(record, indent=2))
+
+
+def load_result(directory: str | PathLike[str]) -> Result:
+    """Read a result that `Result.save` wrote.
+
+    Raises:
+        TrustboError: The folder holds no result.
+    """
+    folder = Path(directory)
+    if not (folder / "result.json").exists():
+        raise TrustboError(f"{str(folder)!r} holds no result; give a folder written by save().")
+    record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    # A run killed while it saved may have left one mission more than the record knows of.
+    n = record["n_missions"]
+    history = archive.read_tree(folder / "history.nc").to_dataset().isel(iteration=slice(n))
+    missions = archive.missions_from_tree(archive.read_tree(folder / "missions.nc"))[:n]
+    return Result(
+        archive.workspace_from_tree(archive.read_tree(folder / "workspace.nc")),
+        missions,
+        [archive.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n)],
+        [(int(row), int(col)) for row, col in record["path"]],
+        np.array(record["trust"]),
+        record["value"],
+        history["final_trust_map"].rename("trust"),
+        history.drop_vars("final_trust_map"),
+        record["settings"],
+        record["stop_reason"],
+    )
+
+
+def require_folder(directory: str | PathLike[str]) -> Path:
+    """The folder, which need not exist yet.
+
+    Raises:
+        TrustboError: The name, or that of a folder above it, belongs to a file.
+    """
+    folder = Path(directory)
+    for part in (folder, *folder.parents):
+        if part.exists():
+            if not part.is_dir():
+                raise TrustboError(f"cannot write to {str(folder)!r}: {str(part)!r} is a file.")
+            break
+    return folder
+
+
+def _posterior_name(j: int) -> str:
+    return f"{j + 1:04d}.nc"
+
+
+def _write_tree(path: Path, tree: xr.DataTree) -> None:
+    archive.write_file(path, tree.to_netcdf)
+
+
+def _path_text(path: np.ndarray) -> str:
+    return " ".join(f"{row},{col}" for row, col in path if row >= 0)
