@@ -1,23 +1,20 @@
 # make demo   install into .venv and run the main job on a made terrain
 # make test   install what the tests need too, and run them
 # make lint   format, style, types and the direction of imports
-# make slow   the long statistical tests;  make bench: the benchmarks
+# make bench  the benchmarks, which print the figures we claim
 # make clean  remove everything that make made
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint slow bench clean
+.PHONY: demo test lint bench clean
 
 demo: $(VENV)/.installed
 	$(BIN)/trustbo demo --out out/demo
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "not slow"
-
-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m slow
+	TRUSTBO_FAST=1 $(BIN)/python -m pytest --nbmake tests notebooks
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

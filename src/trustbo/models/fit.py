@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from numpyro import handlers
 
 from trustbo.data import Mission, MissionBatch, stack_missions
-from trustbo.errors import PosteriorError, require_choice
+from trustbo.errors import PosteriorError, TrustboError, require_choice
 from trustbo.models import latent
 from trustbo.models.nuts import NutsDraws, NutsSettings, run_nuts
 from trustbo.models.pooled import (
@@ -68,12 +68,14 @@ def fit(
 
     Raises:
         ShapeError: No missions, or missions that disagree on robots or features.
-        TrustboError: An awareness value is NaN, or the sampler is unknown.
+        TrustboError: An awareness value is NaN, the sampler is unknown, or the contact rates do
+            not vary at all: the Gaussian model's noise then has no posterior.
         PosteriorError: The diagnostics say that the posterior must not be used.
     """
     require_choice("sampler", sampler, SAMPLERS)
     model = PooledTrust() if model is None else model
     batch = stack_missions(missions)
+    _require_variation(batch)
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
     with jax.enable_x64(True):
@@ -124,6 +126,21 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
         "ess_bulk": min(float(ess[name].min()) for name in ess.data_vars),
         "divergences": int(posterior["sample_stats"].to_dataset()["diverging"].sum()),
     }
+
+
+def _require_variation(batch: MissionBatch) -> None:
+    """Refuse rates that are all the same: the likelihood is unbounded as both noises go to 0."""
+    rates = batch.contact_rate[~np.isnan(batch.contact_rate)]
+    if not len(rates):
+        raise TrustboError(
+            "every contact rate is NaN: nothing was measured. Give one rate at least."
+        )
+    if len(rates) > 1 and np.ptp(rates) == 0.0:
+        raise TrustboError(
+            f"all {len(rates)} contact rates are {rates[0]:g}: without variation the model cannot "
+            "learn its noise. Add missions over other ground, or simulate with a sight mode that "
+            "terrain and canopy hinder."
+        )
 
 
 def _sample(

@@ -1,0 +1,74 @@
+"""Seconds per iteration of `iterate` on a synthetic 10 x 10 workspace, and what its NUTS gains.
+
+Run: python benchmarks/loop.py
+
+The peer is numpyro's own MCMC object on the same model, data, draws and chains, called for each
+mission as a user would; both in this process, medians over iterations.
+"""
+
+import time
+
+import arviz as az
+import jax
+import numpy as np
+from numpyro.infer import MCMC, NUTS
+
+import trustbo as tb
+from trustbo.models import Priors, diagnostics, fit, pooled_trust
+
+
+def seconds_of(function):
+    started = time.perf_counter()
+    result = function()
+    return time.perf_counter() - started, result
+
+
+def plain_numpyro(missions):
+    """The posterior's draws by numpyro.infer.MCMC with its defaults and a dense mass matrix."""
+    awareness = np.stack([m.awareness for m in missions])
+    rates = np.stack([m.contact_rate for m in missions])
+    with jax.enable_x64(True):
+        mcmc = MCMC(
+            NUTS(pooled_trust, dense_mass=True),
+            num_warmup=300,
+            num_samples=1000,
+            num_chains=4,
+            chain_method="sequential",
+            progress_bar=False,
+        )
+        mcmc.run(jax.random.key(0), awareness, Priors(), rates)
+        draws = {k: np.asarray(v) for k, v in mcmc.get_samples(group_by_chain=True).items()}
+    sites = az.from_dict({"posterior": draws})["posterior"].to_dataset()
+    ess = az.ess(sites, method="bulk")
+    return min(float(ess[name].min()) for name in ess.data_vars)
+
+
+def main():
+    workspace_seconds, workspace = seconds_of(
+        lambda: tb.Workspace.from_terrain(tb.terrain.synthetic_terrain(seed=0))
+    )
+    result = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=8, seed=0, progress=False)
+    table = result.history[["seconds_plan", "seconds_run", "seconds_fit"]].to_dataframe()
+    total = table.sum(axis=1).to_numpy()
+    print(f"workspace of 500 x 500 pixels: {workspace_seconds:.1f} s (numba may compile)")
+    print(f"iteration 1: {total[0]:.2f} s (compiles); 2 to 8: median {np.median(total[1:]):.2f} s")
+    later = table.iloc[1:].median()
+    for name in ("plan", "run", "fit"):
+        print(f"  {name}: median {1000 * later[f'seconds_{name}']:.0f} ms")
+    same = [m for m in result.missions if len(m.bounds) == len(result.missions[-1].bounds)][-4:]
+    ours, theirs = [], []
+    for n in range(1, len(same) + 1):
+        seconds, posterior = seconds_of(lambda n=n: fit(same[:n], check=False))
+        ours.append((seconds, diagnostics(posterior)["ess_bulk"]))
+        theirs.append(seconds_of(lambda n=n: plain_numpyro(same[:n])))
+    print("refit after each of 4 missions (median seconds, smallest bulk ESS of 4000 draws); the")
+    print("peer compiles anew for each number of missions, trustbo did once, in the loop above:")
+    for name, runs in (("trustbo.fit", ours), ("numpyro MCMC", theirs)):
+        seconds, ess = (np.median(column) for column in zip(*runs, strict=True))
+        print(f"  {name:13s} {seconds:6.2f} s  {ess:6.0f}  {ess / seconds:7.0f} effective draws/s")
+    ratio = np.median([e / s for s, e in ours]) / np.median([e / s for s, e in theirs])
+    print(f"  ratio of effective draws per second: {ratio:.1f}")
+
+
+if __name__ == "__main__":
+    main()
