@@ -2,9 +2,9 @@
 
 Run: python benchmarks/recovery.py [number of campaigns, default 20]
 
-Truths are drawn at random, each campaign is 8 missions of 11 bounds with 3 robots. Trust before the
-first bound is N(0.5, 0.1^2), so that contact rates stay in [0, 1] without being cut there, which the
-Gaussian model does not know of; a draw with a rate outside is drawn again.
+Truths are drawn at random, each campaign is 8 missions of 11 bounds with 3 robots. Trust before
+the first bound is N(0.5, 0.1^2), so that contact rates stay in [0, 1] without being cut there,
+which the Gaussian model does not know of; a draw with a rate outside is drawn again.
 """
 
 import sys
