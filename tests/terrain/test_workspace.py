@@ -65,6 +65,9 @@ def test_steep_cells_are_impassable(terrain):
     robot = Robot(max_slope=float(np.deg2rad(6.0)))
     careful = Workspace.from_terrain(terrain, (4, 3), Team(robots=(robot,) * 3, lead=robot))
     assert int(careful.passable.sum()) < int(gentle.passable.sum())
+    steep = tuple(int(i) for i in np.argwhere(~careful.passable.values)[0])
+    with pytest.raises(TrustboError, match="steeper than the 6 degrees the team stands"):
+        careful.require_cell("start", steep)
 
 
 def test_a_terrain_nobody_can_stand_on_is_refused(terrain):
@@ -76,7 +79,9 @@ def test_a_terrain_nobody_can_stand_on_is_refused(terrain):
 def test_a_cell_mostly_without_data_is_impassable_and_named(real_terrain):
     with pytest.warns(UserWarning, match="against the declared sign"):
         workspace = Workspace.from_terrain(read_terrain(*real_terrain("bcts")), (40, 16))
-    with pytest.raises(TrustboError, match=r"start \(39, 15\) has no data .* nearest passable"):
+    with pytest.raises(
+        TrustboError, match=r"start \(39, 15\) is impassable: \d+% of it has no data; the nearest"
+    ):
         workspace.require_cell("start", (39, 15))
 
 
@@ -117,7 +122,9 @@ def test_cells_off_the_grid_or_impassable_are_named():
     assert workspace.require_cell("start", (2, 3)) == (2, 3)
     with pytest.raises(TrustboError, match=r"goal \(3, 0\) is outside the grid of 3 rows"):
         workspace.require_cell("goal", (3, 0))
-    with pytest.raises(TrustboError, match=r"start \(1, 1\) is impassable .* is \(0, 1\)"):
+    with pytest.raises(
+        TrustboError, match=r"start \(1, 1\) is impassable; the nearest passable cell is \(0, 1\)"
+    ):
         workspace.require_cell("start", (1, 1))
     with pytest.raises(TrustboError, match=r"start must be a cell \(row, col\); got 7"):
         workspace.require_cell("start", 7)

@@ -118,7 +118,9 @@ def _open(
             with rasterio.open(path) as source:
                 transform, georeferenced = source.transform, not source.transform.is_identity
             opened: Any = rioxarray.open_rasterio(path, masked=True)
-            raster = opened.isel(band=0, drop=True).load()
+            # Closed at once: what is still open when Python ends is reported as an error.
+            with opened:
+                raster = opened.isel(band=0, drop=True).load()
     except RasterioIOError as error:
         raise TerrainError(
             f"{role}: {str(path)!r} is no raster that GDAL can read ({error}); "

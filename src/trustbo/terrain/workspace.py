@@ -192,14 +192,22 @@ class Workspace:
                 f"are 0..{rows - 1} from the top, columns 0..{cols - 1}."
             )
         if not self.passable.values[row, col]:
-            unknown = np.isnan(self.awareness.values[:, row, col]).any()
-            reason = "has no data" if unknown else "is impassable"
-            near = self._nearest_passable(row, col)
             raise TrustboError(
-                f"{what} {(row, col)} {reason} (over half of it is missing or too steep); "
-                f"the nearest passable cell is {near}."
+                f"{what} {(row, col)} is impassable{self._why_impassable(row, col)}; the nearest "
+                f"passable cell is {self._nearest_passable(row, col)}."
             )
         return row, col
+
+    def _why_impassable(self, row: int, col: int) -> str:
+        if self.terrain is None:
+            return ""
+        missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
+        if missing > MAX_MISSING:
+            return f": {missing:.0%} of it has no data"
+        steep = np.rad2deg(self.team.max_slope)
+        return (
+            f": over half of it is missing or steeper than the {steep:.0f} degrees the team stands"
+        )
 
     def _nearest_passable(self, row: int, col: int) -> Cell:
         free = np.argwhere(self.passable.values)
