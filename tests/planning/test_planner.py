@@ -131,8 +131,9 @@ def test_bad_options_list_the_good_ones(workspace):
 
 def test_planning_is_for_one_draw_and_evaluating_for_whole_paths(workspace, draws):
     planner = Planner(workspace, (4, 0), (0, 5))
-    with pytest.raises(ShapeError, match=r"plan one draw at a time: beta0 has shape \(300,\)"):
-        planner.plan(draws)
+    for refused in (planner.plan, planner.trust_map, planner.cost_map):
+        with pytest.raises(ShapeError, match=r"one draw at a time: beta0 has shape \(300,\)"):
+            refused(draws)
     with pytest.raises(TrustboError, match=r"no bound leads from \(4, 0\) to \(0, 5\)"):
         planner.evaluate([(4, 0), (0, 5)], PARAMS)
     with pytest.raises(TrustboError, match=r"must lead from \(4, 0\) to \(0, 5\)"):

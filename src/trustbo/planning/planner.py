@@ -119,11 +119,7 @@ class Planner:
             ShapeError: Parameters with leading axes, or of other features.
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        if np.ndim(params.beta0) or np.ndim(params.beta) != 1:
-            raise ShapeError(
-                f"plan one draw at a time: beta0 has shape {np.shape(params.beta0)}. "
-                "Use params.draw(i) or params.mean()."
-            )
+        _require_one_draw(params)
         started = time.perf_counter()
         path = self._search(self._recursion(params))
         plan = self.evaluate(path, params)
@@ -148,8 +144,10 @@ class Planner:
             params: Parameters without leading axes.
 
         Raises:
+            ShapeError: Parameters with leading axes, or of other features.
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
+        _require_one_draw(params)
         cells = self.require_path(path)
         awareness = self.workspace.awareness.values[:, *zip(*cells[1:], strict=True)]
         trust = roll_trust(params, np.swapaxes(awareness, 0, 1))
@@ -187,7 +185,11 @@ class Planner:
 
         Returns:
             DataArray (row, col), or (robot, row, col); NaN where no robot can go.
+
+        Raises:
+            ShapeError: Parameters with leading axes, or of other features.
         """
+        _require_one_draw(params)
         u = drift(params, self.workspace.awareness.values)
         u = u if per_robot else u.mean(0)
         reached = dict(nx.single_source_shortest_path_length(self.graph, self.start))
@@ -263,3 +265,11 @@ class Planner:
                 f"{self.goal}, which is {self.shortest}."
             )
         return int(max_bounds)
+
+
+def _require_one_draw(params: TrustParams) -> None:
+    if np.ndim(params.beta0) or np.ndim(params.beta) != 1:
+        raise ShapeError(
+            f"give one draw at a time: beta0 has shape {np.shape(params.beta0)}. "
+            "Use params.draw(i) or params.mean()."
+        )
