@@ -175,6 +175,10 @@ def test_rates_without_variation_are_refused_with_their_value(missions):
     ]
     with pytest.raises(TrustboError, match="all 120 contact rates are 1: without variation"):
         fit(same)
+    firm = PooledTrust(Priors(delta_v=dist.TruncatedNormal(0.0, 0.2, low=0.01)))
+    posterior = fit(same, firm)
+    assert float(posterior["posterior"]["delta_v"].min()) >= 0.01
+    assert float(posterior["latent"]["trust_mean"].mean()) == pytest.approx(1.0, abs=0.02)
     unmeasured = Mission.from_arrays(
         missions[0].path, missions[0].awareness, np.full_like(missions[0].contact_rate, np.nan)
     )

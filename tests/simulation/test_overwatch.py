@@ -178,6 +178,17 @@ def test_a_robot_that_tips_over_ends_the_mission():
     assert len(mission.bounds) <= 2
 
 
+def test_robots_may_brush_the_edge_of_the_data():
+    rng = np.random.default_rng(0)
+    dem = rng.normal(0.0, 0.05, (90, 90))
+    dem[rng.uniform(size=dem.shape) < 0.01] = np.nan
+    workspace = workspace_of(dem, 1.0)
+    for seed in range(3):
+        mission = KinematicSimulator(workspace).run(PATH, seed=seed)
+        assert mission.status == "ok"
+        assert np.isfinite(mission.bounds[-1].poses).all()
+
+
 def test_bad_input():
     bare = Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
     with pytest.raises(TrustboError, match="needs a terrain"):

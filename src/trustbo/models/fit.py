@@ -28,6 +28,10 @@ from trustbo.models.priors import Priors
 
 SAMPLERS = ("nuts",)
 MAX_RHAT, MIN_ESS = 1.01, 400.0
+_FIRM_NOISE = (
+    "keep the noise away from 0, e.g. Priors(delta_v=numpyro.distributions.TruncatedNormal(0.0, "
+    "0.2, low=0.01))"
+)
 _SITES = TrustParams._fields[:5]
 
 
@@ -75,7 +79,7 @@ def fit(
     require_choice("sampler", sampler, SAMPLERS)
     model = PooledTrust() if model is None else model
     batch = stack_missions(missions)
-    _require_variation(batch)
+    _require_variation(batch, model.priors)
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
     with jax.enable_x64(True):
@@ -102,8 +106,9 @@ def fit(
     complaints = _complaints(draws) if check else []
     if complaints:
         raise PosteriorError(
-            f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions "
-            "or firmer priors, or pass check=False to have it as it is.",
+            f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions, "
+            f"or firmer priors (where the rates hardly vary, {_FIRM_NOISE}), or pass check=False "
+            "to have it as it is.",
             posterior,
         )
     return posterior
@@ -128,18 +133,23 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     }
 
 
-def _require_variation(batch: MissionBatch) -> None:
-    """Refuse rates that are all the same: the likelihood is unbounded as both noises go to 0."""
+def _require_variation(batch: MissionBatch, priors: Priors) -> None:
+    """Refuse rates that are all the same, unless a prior keeps the noise away from 0.
+
+    The likelihood would grow without bound as both noises go to 0, and have no posterior.
+    """
     rates = batch.contact_rate[~np.isnan(batch.contact_rate)]
     if not len(rates):
         raise TrustboError(
             "every contact rate is NaN: nothing was measured. Give one rate at least."
         )
-    if len(rates) > 1 and np.ptp(rates) == 0.0:
+    bounded = any(
+        getattr(p.support, "lower_bound", 0.0) > 0.0 for p in (priors.delta_w, priors.delta_v)
+    )
+    if len(rates) > 1 and np.ptp(rates) == 0.0 and not bounded:
         raise TrustboError(
             f"all {len(rates)} contact rates are {rates[0]:g}: without variation the model cannot "
-            "learn its noise. Add missions over other ground, or simulate with a sight mode that "
-            "terrain and canopy hinder."
+            f"learn its noise. Add missions over other ground, or {_FIRM_NOISE}."
         )
 
 

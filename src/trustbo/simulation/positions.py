@@ -107,8 +107,9 @@ class Positions:
 
 def surface_of(terrain: xr.Dataset, pixels: xr.Dataset) -> Surface:
     """A workspace's terrain as the arrays that sight and motion work on."""
-    aspect = xrspatial.aspect(terrain["dem"], boundary="nearest").values
-    rise = np.tan(np.deg2rad(xrspatial.slope(terrain["dem"], boundary="nearest").values))
+    dem = _filled(terrain["dem"])
+    rise = np.tan(np.deg2rad(xrspatial.slope(dem, boundary="nearest").values))
+    aspect = xrspatial.aspect(dem, boundary="nearest").values
     # Aspect is the compass direction of descent, -1 where flat; the gradient points uphill.
     away = np.deg2rad(np.where(aspect < 0, 0.0, aspect))
     gradient = np.stack([-rise * np.sin(away), -rise * np.cos(away)])
@@ -120,6 +121,15 @@ def surface_of(terrain: xr.Dataset, pixels: xr.Dataset) -> Surface:
         pixel=pixel_size(terrain),
         origin=(float(terrain["x"][0]), float(terrain["y"][0])),
     )
+
+
+def _filled(dem: xr.DataArray) -> xr.DataArray:
+    """Missing heights replaced by the nearest known: a robot may brush the edge of the data."""
+    known = np.isfinite(dem.values)
+    nearest: Any = ndimage.distance_transform_edt(
+        ~known, return_distances=False, return_indices=True
+    )
+    return dem.copy(data=dem.values[tuple(nearest)])
 
 
 def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:
