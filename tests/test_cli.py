@@ -110,7 +110,7 @@ def test_demo_runs_on_the_rasters_it_writes(tmp_path):
         (("--iterations", "0"), "n_iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),
         (("--max-slope", "0.1"), "no cell is passable"),
-        (("--robots", "0"), "at least one overwatching robot; got 0"),
+        (("--robots", "0"), "n_robots must be a whole number from 1 on; got 0"),
         (("--max-bounds", "1"), "max_bounds = 1 is below the fewest possible"),
         (("--dsm", "absent.tif"), "dsm: there is no file 'absent.tif'"),
         (("--shape", "100,100"), "needs at least 2 x 2 pixels per cell"),

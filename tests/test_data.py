@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from trustbo.data import Bound, Mission, Robot, Team, fill_awareness
+from trustbo.data import Bound, Mission, Robot, Team
 from trustbo.errors import ShapeError, TrustboError
+from trustbo.stacking import fill_awareness
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 
@@ -100,7 +101,7 @@ def test_robots_and_teams_are_checked():
         Robot(speed=-1.0)
     with pytest.raises(TrustboError, match=r"below pi/2; got 30 \(degrees\?"):
         Robot(max_slope=30.0)
-    with pytest.raises(TrustboError, match="at least one overwatching robot; got 0"):
+    with pytest.raises(TrustboError, match="n_robots must be a whole number from 1 on; got 0"):
         Team(n_robots=0)
     with pytest.raises(TrustboError, match="2 distinct names"):
         Team(n_robots=2, names=("a", "a"))

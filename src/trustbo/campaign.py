@@ -4,12 +4,13 @@ import numpy as np
 import xarray as xr
 from jax import random
 
-from trustbo.data import Cell, Mission, fill_awareness
+from trustbo.data import Cell, Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models import PooledTrust, TrustParams, fit, sample_prior
 from trustbo.models.fit import SAMPLERS
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import greedy, resolve_policy
+from trustbo.stacking import fill_awareness
 from trustbo.terrain import Workspace
 
 INITIAL = ("prior_draw", "prior_mean")

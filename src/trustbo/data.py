@@ -1,13 +1,20 @@
-"""What goes in and out of a mission: robots, teams, bounds, missions, and missions stacked."""
+"""What goes in and out of a mission: robots, teams, bounds, missions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, Self, get_args
+from dataclasses import dataclass, field
+from typing import Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import (
+    ShapeError,
+    TrustboError,
+    require_choice,
+    require_pair,
+    require_positive,
+    require_whole,
+)
 
 Cell = tuple[int, int]
 Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
@@ -43,8 +50,7 @@ class Robot:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0.0 < value < np.inf:
-                raise TrustboError(f"Robot.{name} must be positive and finite; got {value!r}.")
+            require_positive(f"Robot.{name}", value)
         for name in ("vertical_fov", "max_slope"):
             if getattr(self, name) >= np.pi / 2:
                 raise TrustboError(
@@ -73,13 +79,11 @@ class Team:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        robots = tuple(self.robots) or (Robot(),) * self.n_robots
-        if not robots:
-            raise TrustboError(
-                f"a team needs at least one overwatching robot; got {self.n_robots}."
-            )
+        if isinstance(self.robots, Robot):
+            raise TrustboError(f"Team.robots must be a sequence of robots; got {self.robots!r}.")
+        robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
         names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
-        if len(set(names)) != len(robots):
+        if not len(set(names)) == len(names) == len(robots):
             raise TrustboError(f"names must be {len(robots)} distinct names; got {names}.")
         for name, value in (("n_robots", len(robots)), ("robots", robots), ("names", names)):
             object.__setattr__(self, name, value)
@@ -120,6 +124,12 @@ class Bound:
     contact: np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        for name, n_axes in (("awareness", 2), ("contact_rate", 1), ("duration", 1)):
+            array = _as_array(name, getattr(self, name))
+            if array.ndim != n_axes:
+                axes = "(robot, feature)" if n_axes == 2 else "(robot,)"
+                raise ShapeError(f"{name} of a bound must be {axes}; got shape {array.shape}.")
+            object.__setattr__(self, name, array)
         lengths = [len(self.awareness), len(self.contact_rate), len(self.duration)]
         if len(set(lengths)) != 1:
             raise ShapeError(
@@ -179,6 +189,11 @@ class Mission:
                 f'status "ok" says the goal was reached, but only {len(self.bounds)} of '
                 f"{len(self.path) - 1} bounds were run; give the status it ended with."
             )
+        for k, bound in enumerate(self.bounds, start=1):
+            if bound.cell != self.path[k]:
+                raise ShapeError(
+                    f"bound {k} enters {bound.cell}, but the path has {self.path[k]} there."
+                )
         shapes = {bound.awareness.shape for bound in self.bounds}
         if len(shapes) != 1:
             raise ShapeError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
@@ -219,23 +234,24 @@ class Mission:
             ShapeError: Axes that do not fit together.
             TrustboError: A value outside [0, 1], or an unknown status.
         """
-        z, y = np.asarray(awareness, dtype=float), np.asarray(contact_rate, dtype=float)
-        if z.ndim != 3 or y.shape != z.shape[:2]:
+        z, y = _as_array("awareness", awareness), _as_array("contact_rate", contact_rate)
+        if z.ndim != 3 or y.shape != z.shape[:2] or not y.size:
             raise ShapeError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
-        seconds = np.asarray(np.nan if duration is None else duration, dtype=float)
+        seconds = _as_array("duration", np.nan if duration is None else duration)
         if seconds.ndim == 1:
             seconds = seconds[:, None]
         try:
             seconds = np.broadcast_to(seconds, y.shape)
         except ValueError:
             raise ShapeError(f"duration must be {y.shape}; got {seconds.shape}.") from None
-        cells = tuple((int(row), int(col)) for row, col in path)
+        cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
         if len(y) > len(cells) - 1:
             raise ShapeError(f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}.")
-        last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(np.nan_to_num(seconds.max(1)))])
+        longest = np.nanmax(np.where(np.isnan(seconds), 0.0, seconds), axis=1)
+        last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(longest)])
         bounds = tuple(
             Bound(
                 cells[k + 1],
@@ -265,76 +281,16 @@ class Mission:
         return np.stack([bound.duration for bound in self.bounds])
 
 
-class MissionBatch(NamedTuple):
-    """Missions stacked and padded with NaN, ready for compiled code.
-
-    Both leading axes are padded to a bucket, so that compiled code is reused from one mission to
-    the next; a padded bound has NaN contact rates, which the models read as "not measured".
-    """
-
-    awareness: np.ndarray
-    """Shape (mission, bound, robot, feature); 0 in the padding."""
-    contact_rate: np.ndarray
-    """Shape (mission, bound, robot); NaN in the padding."""
-
-
-def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionBatch:
-    """Stack missions of any length into one batch.
-
-    Args:
-        missions: At least one mission; all with the same robots and features.
-        pad: Grow the axes to their buckets: bounds to a multiple of 8, missions to a power of two
-            from 8 on. Without it, bounds are padded to the longest mission only.
-
-    Raises:
-        ShapeError: No missions, or missions that disagree on robots or features.
-        TrustboError: An awareness value is NaN (contact rates may be missing, awareness may not).
-    """
-    if not missions:
-        raise ShapeError("no missions to learn from; give at least one.")
-    first = missions[0]
-    for j, mission in enumerate(missions):
-        if (mission.robots, mission.features) != (first.robots, first.features):
-            raise ShapeError(
-                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
-                f"0 has {first.robots} and {first.features}; all must agree."
-            )
-        if np.isnan(mission.awareness).any():
-            k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
-            raise TrustboError(
-                f"awareness of mission {j}, bound {k + 1}, robot {first.robots[i]}, feature "
-                f"{first.features[m]} is NaN; fill it from the awareness map or drop the bound."
-            )
-    n_missions, n_bounds = len(missions), max(len(mission.bounds) for mission in missions)
-    if pad:
-        n_missions, n_bounds = max(8, 1 << (n_missions - 1).bit_length()), -(-n_bounds // 8) * 8
-    shape = (n_missions, n_bounds, len(first.robots), len(first.features))
-    batch = MissionBatch(np.zeros(shape), np.full(shape[:-1], np.nan))
-    for j, mission in enumerate(missions):
-        batch.awareness[j, : len(mission.bounds)] = mission.awareness
-        batch.contact_rate[j, : len(mission.bounds)] = mission.contact_rate
-    return batch
-
-
-def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace awareness that a mission did not measure (NaN) by that of a map.
-
-    Args:
-        mission: The mission.
-        awareness: Shape (robot, row, col, feature), such as `Workspace.awareness`.
-    """
-    if not np.isnan(mission.awareness).any():
-        return mission
-    bounds = tuple(
-        replace(b, awareness=np.where(np.isnan(b.awareness), awareness[:, *b.cell], b.awareness))
-        for b in mission.bounds
-    )
-    return replace(mission, bounds=bounds)
-
-
 def default_features(n_features: int) -> tuple[str, ...]:
     """Names of the first features: traversability, visibility, z3, z4, ..."""
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
+
+
+def _as_array(what: str, values: ArrayLike) -> np.ndarray:
+    try:
+        return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ShapeError(f"{what} must be an array of numbers; got {values!r}.") from None
 
 
 def _require_unit_interval(what: str, values: np.ndarray) -> None:

@@ -1,5 +1,7 @@
 """The errors trustbo raises for input it refuses; each is also a ValueError."""
 
+import math
+import operator
 from collections.abc import Iterable
 
 
@@ -37,3 +39,46 @@ def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
     if not isinstance(value, str) or value not in choices:
         raise TrustboError(f"unknown {what} {value!r}; choose one of {', '.join(choices)}.")
     return value
+
+
+def require_whole(what: str, value: object, minimum: int) -> int:
+    """Return `value` as an int if it is a whole number of at least `minimum`.
+
+    Raises:
+        TrustboError: It is not.
+    """
+    try:
+        number = operator.index(value)  # pyright: ignore[reportArgumentType]
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or number < minimum:
+        raise TrustboError(f"{what} must be a whole number from {minimum} on; got {value!r}.")
+    return number
+
+
+def require_positive(what: str, value: object) -> float:
+    """Return `value` as a float if it is a positive, finite number.
+
+    Raises:
+        TrustboError: It is not.
+    """
+    try:
+        number = float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, str) or not 0.0 < number < math.inf:
+        raise TrustboError(f"{what} must be positive and finite; got {value!r}.")
+    return number
+
+
+def require_pair(what: str, value: object) -> tuple[int, int]:
+    """Return `value` as two ints if it is a pair of whole numbers, such as a cell (row, col).
+
+    Raises:
+        TrustboError: It is not.
+    """
+    try:
+        first, second = (operator.index(i) for i in value)  # pyright: ignore[reportGeneralTypeIssues]
+    except (TypeError, ValueError):
+        raise TrustboError(f"{what} must be two whole numbers (row, col); got {value!r}.") from None
+    return first, second

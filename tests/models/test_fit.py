@@ -9,10 +9,11 @@ import pytest
 from models.conftest import simulate_missions
 from numpyro.infer import MCMC, NUTS
 
-from trustbo.data import Mission, stack_missions
+from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit, pooled_trust
 from trustbo.models.nuts import run_nuts
+from trustbo.stacking import stack_missions
 
 SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from references import dense_log_likelihood, dense_posterior_of_trust
 
-from trustbo.data import Mission, stack_missions
+from trustbo.data import Mission
 from trustbo.errors import ShapeError
 from trustbo.models import ContactRate, PooledTrust, TrustParams, statespace
+from trustbo.stacking import stack_missions
 
 
 def random_params(rng):

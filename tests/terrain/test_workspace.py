@@ -126,5 +126,5 @@ def test_cells_off_the_grid_or_impassable_are_named():
         TrustboError, match=r"start \(1, 1\) is impassable; the nearest passable cell is \(0, 1\)"
     ):
         workspace.require_cell("start", (1, 1))
-    with pytest.raises(TrustboError, match=r"start must be a cell \(row, col\); got 7"):
+    with pytest.raises(TrustboError, match=r"start must be two whole numbers \(row, col\); got 7"):
         workspace.require_cell("start", 7)

@@ -14,7 +14,7 @@ from jax import Array, random
 from numpy.typing import ArrayLike
 from numpyro import handlers
 
-from trustbo.data import Mission, MissionBatch, stack_missions
+from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_choice
 from trustbo.models import latent
 from trustbo.models.nuts import NutsDraws, NutsSettings, run_nuts
@@ -25,6 +25,7 @@ from trustbo.models.pooled import (
     pooled_trust,
 )
 from trustbo.models.priors import Priors
+from trustbo.stacking import MissionBatch, stack_missions
 
 SAMPLERS = ("nuts",)
 MAX_RHAT, MIN_ESS = 1.01, 400.0

@@ -14,11 +14,12 @@ from jax import Array
 from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from trustbo.data import Mission, stack_missions
+from trustbo.data import Mission
 from trustbo.errors import ShapeError
 from trustbo.models import statespace
 from trustbo.models.priors import Priors
 from trustbo.models.statespace import ScalarSSM
+from trustbo.stacking import stack_missions
 
 Numbers = Any
 """A float, a NumPy array, or a JAX array or tracer."""

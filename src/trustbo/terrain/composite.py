@@ -74,6 +74,8 @@ class CompositeIndex:
         score = self._score(x)
         percentiles = {"percentile": [2, 98], "minmax": [0, 100], "logistic": [0, 100]}
         self._bottom, self._top = np.percentile(score, percentiles[self.scaling])
+        if self._top - self._bottom < 1e-9:  # nearly all pixels are alike: take the extremes
+            self._bottom, self._top = float(score.min()), float(score.max())
         self._spread = float(score.std()) or 1.0
         self._warn()
         return self
@@ -85,7 +87,7 @@ class CompositeIndex:
         """
         x = self._matrix(features)
         score = self._score(np.clip(x, self._low, self._high))
-        if not self._varies.any():
+        if self._top - self._bottom < 1e-9:
             index = np.where(np.isfinite(x).all(1), 0.5, np.nan)
         elif self.scaling == "logistic":
             index = 1.0 / (1.0 + np.exp(-score / self._spread))

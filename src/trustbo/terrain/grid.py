@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TerrainError, TrustboError, require_pair
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Grid:
         Raises:
             TerrainError: Fewer than 2 cells, or cells smaller than 2 pixels.
         """
-        rows, cols = shape
+        rows, cols = require_pair("shape", shape)
         pixels = terrain["dem"].shape
         if min(rows, cols) < 1 or rows * cols < 2:
             raise TerrainError(f"shape must be (rows, cols) with at least two cells; got {shape}.")
@@ -44,8 +44,8 @@ class Grid:
                 f"terrain has {pixels[0]} x {pixels[1]} pixels. Take a smaller shape or a finer "
                 "raster."
             )
-        left, bottom, right, top = terrain.rio.bounds()
-        return cls(shape, left, top, (top - bottom) / rows, (right - left) / cols)
+        left, bottom, right, top = terrain.rio.bounds(recalc=True)
+        return cls((rows, cols), left, top, (top - bottom) / rows, (right - left) / cols)
 
     def center(self, cell: Cell) -> tuple[float, float]:
         """X and y of a cell's centre, CRS metres."""

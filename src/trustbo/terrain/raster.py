@@ -9,12 +9,15 @@ import numpy as np
 import rasterio
 import rioxarray
 import xarray as xr
+from pyproj import Proj
+from pyproj.exceptions import ProjError
 from rasterio.crs import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioIOError
 from rasterio.transform import from_origin
+from rasterio.warp import transform as transform_points
 
-from trustbo.errors import TerrainError
+from trustbo.errors import TerrainError, require_positive
 
 CLIP_WARNING_SHARE = 0.02
 
@@ -28,8 +31,9 @@ def read_terrain(
 ) -> xr.Dataset:
     """Read a digital elevation model (ground) and a digital surface model (canopy, roofs).
 
-    Both come out on the DEM's grid, or, where the DEM is in degrees, on a grid of square metres in
-    its UTM zone. The surface is clipped to be nowhere below the ground.
+    Both come out on the DEM's grid, or, where the DEM is in degrees or its projection distorts
+    distances by over 1 % (as web maps' EPSG:3857 does), on a grid of square metres in its UTM zone.
+    The surface is clipped to be nowhere below the ground.
 
     Args:
         dem: A raster GDAL can read, heights in metres, first band.
@@ -47,9 +51,9 @@ def read_terrain(
     """
     ground = _open(dem, "dem", crs, resolution)
     surface = _open(dsm, "dsm", crs, resolution)
-    if ground.rio.crs.is_geographic:
+    if ground.rio.crs.is_geographic or _distorts(ground):
         ground = ground.rio.reproject(
-            ground.rio.estimate_utm_crs(), resampling=Resampling.bilinear, nodata=np.nan
+            _utm(ground, dem), resampling=Resampling.bilinear, nodata=np.nan
         )
     _require_overlap(ground, surface, dem, dsm)
     if not _same_grid(ground, surface):
@@ -63,19 +67,26 @@ def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
     """One dataset of two aligned rasters: north up, NaN in common, surface not below ground.
 
     Args:
-        dem: Ground heights, dims (y, x), metres, with a CRS.
+        dem: Ground heights, dims (y, x), metres, with a metric CRS.
         dsm: Surface heights on the same grid.
 
     Raises:
-        TerrainError: No pixel has both heights.
+        TerrainError: No CRS, units other than metres, two different or irregular grids, or no
+            pixel that has both heights.
     """
-    crs = dem.rio.crs
+    _require_metric_crs(dem)
     ground, surface = (
-        a.drop_vars("spatial_ref", errors="ignore").transpose("y", "x").sortby("x").sortby(
-            "y", ascending=False
-        ).astype(float)
+        a.drop_vars("spatial_ref", errors="ignore").transpose("y", "x").astype(float)
         for a in (dem, dsm)
-    )  # fmt: skip
+    )
+    _require_regular(ground)
+    if not _same_coordinates(ground, surface):
+        raise TerrainError(
+            f"dem {ground.shape} and dsm {surface.shape} are not on one grid; align them first, "
+            "e.g. with dsm.rio.reproject_match(dem)."
+        )
+    surface = surface.assign_coords(x=ground["x"], y=ground["y"])
+    ground, surface = (a.sortby("x").sortby("y", ascending=False) for a in (ground, surface))
     valid = np.isfinite(ground) & np.isfinite(surface)
     if not valid.any():
         raise TerrainError(
@@ -98,77 +109,154 @@ def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
         }
     )
     terrain.attrs = {"clipped_share": below}
-    return terrain.rio.write_crs(crs).rio.write_transform()
+    terrain = terrain.rio.write_crs(dem.rio.crs)
+    # From the coordinates: a transform stored before the raster was coarsened or cut is stale.
+    return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
+
+
+def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
+    """A user's own dataset in the form that `assemble_terrain` gives.
+
+    Raises:
+        TerrainError: No `dem` or `dsm`, or what `assemble_terrain` refuses.
+    """
+    if not isinstance(terrain, xr.Dataset) or not {"dem", "dsm"} <= set(terrain.data_vars):
+        raise TerrainError(
+            "a terrain is a Dataset with dem and dsm over (y, x), as read_terrain gives it; got "
+            f"{type(terrain).__name__}."
+        )
+    crs = terrain.rio.crs
+    if crs is None:
+        raise TerrainError(
+            "the terrain has no CRS; set it, e.g. terrain.rio.write_crs('EPSG:32633')."
+        )
+    known = terrain.attrs.get("clipped_share", 0.0)
+    result = assemble_terrain(terrain["dem"].rio.write_crs(crs), terrain["dsm"])
+    result.attrs["clipped_share"] = max(known, result.attrs["clipped_share"])
+    return result
 
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Pixel height and width in metres."""
-    width, height = terrain.rio.resolution()
+    width, height = terrain.rio.resolution(recalc=True)
     return abs(height), abs(width)
 
 
 def _open(
     path: str | PathLike[str], role: str, crs: object, resolution: float | None
 ) -> xr.DataArray:
+    """One raster in memory, with a CRS and a north-up grid."""
+    name = f"{role}: {str(path)!r}"
     if not Path(path).exists():
         raise TerrainError(f"{role}: there is no file {str(path)!r}.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(path) as source:
-                transform, georeferenced = source.transform, not source.transform.is_identity
+                transform = source.transform
             opened: Any = rioxarray.open_rasterio(path, masked=True)
             # Closed at once: what is still open when Python ends is reported as an error.
             with opened:
                 raster = opened.isel(band=0, drop=True).load()
     except RasterioIOError as error:
         raise TerrainError(
-            f"{role}: {str(path)!r} is no raster that GDAL can read ({error}); "
+            f"{name} is no raster that GDAL can read ({error}); "
             "give a GeoTIFF or another raster format."
         ) from None
-    if not georeferenced:
-        if resolution is None or crs is None:
-            raise TerrainError(
-                f"{role}: {str(path)!r} carries no georeference; pass both crs= and resolution= "
-                "(metres), on the command line --crs and --resolution."
-            )
-        height = raster.sizes["y"] * resolution
-        transform = from_origin(0.0, height, resolution, resolution)
-        raster = raster.rio.write_transform(transform)
-        raster = raster.assign_coords(
-            x=(np.arange(raster.sizes["x"]) + 0.5) * resolution,
-            y=height - (np.arange(raster.sizes["y"]) + 0.5) * resolution,
-        )
-    if transform.b or transform.d:
+    if transform.is_identity:
+        raster = _georeference(raster, name, crs, resolution)
+    elif transform.b or transform.d:
         raise TerrainError(
-            f"{role}: {str(path)!r} is on a rotated grid; warp it to north-up first, e.g. with "
-            "gdalwarp."
+            f"{name} is on a rotated grid; warp it to north-up first, e.g. with gdalwarp."
         )
     if raster.rio.crs is None:
-        if crs is None:
-            raise TerrainError(
-                f"{role}: {str(path)!r} has no coordinate reference system; pass crs=, e.g. "
-                '"EPSG:32633" (--crs on the command line).'
-            )
-        try:
-            raster = raster.rio.write_crs(CRS.from_user_input(crs))
-        except CRSError:
-            raise TerrainError(
-                f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'."
-            ) from None
-    _require_metres(raster, role, path)
+        raster = raster.rio.write_crs(_given_crs(name, crs))
+    if not raster.rio.crs.is_geographic:
+        _require_metric_crs(raster, name)
     if not np.isfinite(raster).any():
-        raise TerrainError(f"{role}: {str(path)!r} is all nodata.")
+        raise TerrainError(f"{name} is all nodata.")
     return raster
 
 
-def _require_metres(raster: xr.DataArray, role: str, path: str | PathLike[str]) -> None:
-    crs = raster.rio.crs
-    if crs.is_projected and abs(crs.linear_units_factor[1] - 1.0) > 1e-9:
+def _georeference(
+    raster: xr.DataArray, name: str, crs: object, resolution: float | None
+) -> xr.DataArray:
+    """Put a bare image at the origin, with a pixel size its user knows."""
+    if resolution is None or crs is None:
         raise TerrainError(
-            f"{role}: {str(path)!r} is in {crs.linear_units}, but heights and distances must be in "
-            "metres; warp it to a metric CRS and convert its heights."
+            f"{name} carries no georeference; pass both crs= and resolution= (metres), on the "
+            "command line --crs and --resolution."
         )
+    if _given_crs(name, crs).is_geographic:
+        raise TerrainError(
+            f"crs {crs!r} is in degrees, but resolution= is in metres; give a metric one."
+        )
+    step = require_positive("resolution", resolution)
+    height = raster.sizes["y"] * step
+    return raster.rio.write_transform(from_origin(0.0, height, step, step)).assign_coords(
+        x=(np.arange(raster.sizes["x"]) + 0.5) * step,
+        y=height - (np.arange(raster.sizes["y"]) + 0.5) * step,
+    )
+
+
+def _given_crs(name: str, crs: object) -> CRS:
+    if crs is None:
+        raise TerrainError(
+            f"{name} has no coordinate reference system; pass crs=, e.g. "
+            '"EPSG:32633" (--crs on the command line).'
+        )
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError:
+        raise TerrainError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
+
+
+def _require_metric_crs(raster: xr.DataArray, name: str = "the terrain") -> None:
+    crs = raster.rio.crs
+    if crs is None:
+        raise TerrainError(f"{name} has no CRS; set it, e.g. dem.rio.write_crs('EPSG:32633').")
+    if crs.is_geographic:
+        raise TerrainError(
+            f"{name} is in degrees; reproject it, e.g. with "
+            "dem.rio.reproject(dem.rio.estimate_utm_crs())."
+        )
+    if abs(crs.linear_units_factor[1] - 1.0) > 1e-9:
+        raise TerrainError(
+            f"{name} is in {crs.linear_units}, but heights and distances must be in metres; warp "
+            "it to a metric CRS and convert its heights."
+        )
+
+
+def _require_regular(raster: xr.DataArray) -> None:
+    for axis in ("y", "x"):
+        steps = np.diff(raster[axis].values)
+        if not len(steps) or not np.allclose(steps, steps[0], rtol=1e-3) or steps[0] == 0.0:
+            raise TerrainError(
+                f"the raster's {axis} is not a regular axis of two pixels or more; resample it to "
+                "evenly spaced, sorted coordinates."
+            )
+
+
+def _distorts(raster: xr.DataArray) -> bool:
+    """Whether a metre on the map is more than 1 % off a metre on the ground."""
+    crs = raster.rio.crs
+    left, bottom, right, top = raster.rio.bounds()
+    lon, lat = transform_points(
+        crs, CRS.from_epsg(4326), [(left + right) / 2], [(bottom + top) / 2]
+    )[:2]
+    scale = Proj(crs.to_wkt()).get_factors(lon[0], lat[0]).areal_scale
+    return abs(np.sqrt(scale) - 1.0) > 0.01
+
+
+def _utm(raster: xr.DataArray, path: str | PathLike[str]) -> CRS:
+    try:
+        return raster.rio.estimate_utm_crs()
+    except (RuntimeError, ProjError):
+        bounds = ", ".join(f"{edge:.1f}" for edge in raster.rio.bounds())
+        raise TerrainError(
+            f"{str(path)!r} has CRS {raster.rio.crs.to_string()}, but its bounds ({bounds}) are no "
+            "place on Earth in it; give the CRS its coordinates are in."
+        ) from None
 
 
 def _require_overlap(
@@ -190,8 +278,12 @@ def _require_overlap(
 
 
 def _same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
-    return (
-        a.shape == b.shape
-        and a.rio.crs == b.rio.crs
-        and a.rio.transform().almost_equals(b.rio.transform(), precision=1e-6)
+    return a.rio.crs == b.rio.crs and _same_coordinates(a, b)
+
+
+def _same_coordinates(a: xr.DataArray, b: xr.DataArray) -> bool:
+    """Whether two rasters' pixels coincide to a thousandth of a pixel."""
+    return a.shape == b.shape and all(
+        np.allclose(a[axis], b[axis], rtol=0.0, atol=1e-3 * abs(float(a[axis][1] - a[axis][0])))
+        for axis in ("x", "y")
     )

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TerrainError
+from trustbo.errors import TerrainError, require_positive, require_whole
 from trustbo.terrain.raster import assemble_terrain
 
 
@@ -38,7 +38,9 @@ def synthetic_terrain(
     Raises:
         TerrainError: A size under 4 pixels, or a parameter out of its range.
     """
-    shape = (round(size[0] / resolution), round(size[1] / resolution))
+    step = require_positive("resolution", resolution)
+    height, width = (require_positive(f"size[{i}]", side) for i, side in enumerate(size))
+    shape = (round(height / step), round(width / step))
     if min(shape) < 4:
         raise TerrainError(f"size {size} m at {resolution} m is {shape} pixels; need 4 x 4.")
     if not (0.0 < hurst <= 1.0 and 0.0 <= canopy_cover <= 1.0 and relief >= 0.0 <= canopy_height):
@@ -46,7 +48,7 @@ def synthetic_terrain(
             "need hurst in (0, 1], canopy_cover in [0, 1], relief and canopy_height >= 0; got "
             f"{hurst}, {canopy_cover}, {relief}, {canopy_height}."
         )
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(require_whole("seed", seed, 0))
     ground = _fractal(rng, shape, exponent=hurst + 1.0)
     # Sub-metre ruggedness (ruts, rocks) in clumps, which the relief alone lacks.
     rough = np.clip(ndimage.gaussian_filter(_fractal(rng, shape, 1.6), 2.0 / resolution), 0.3, 1.0)

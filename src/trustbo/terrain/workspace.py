@@ -10,10 +10,11 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Team, default_features
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
 from trustbo.terrain import features as pixel
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.grid import Grid
+from trustbo.terrain.raster import require_terrain
 
 MAX_MISSING = 0.5
 """A cell is impassable if more than this share of its pixels is missing or too steep."""
@@ -66,9 +67,11 @@ class Workspace:
             scaling: See `CompositeIndex`.
 
         Raises:
-            TerrainError: A grid too fine for the raster.
+            TerrainError: A grid too fine for the raster, or a dataset that is no terrain: without
+                dem, dsm or a metric CRS, or with irregular coordinates.
             TrustboError: No cell is passable, or an unknown scaling.
         """
+        terrain = require_terrain(terrain)
         team = Team() if team is None else team
         grid = Grid.over(terrain, shape)
         reach = min(
@@ -153,8 +156,11 @@ class Workspace:
                 "no cell is passable: more than half of every cell is missing or too steep. Use "
                 "other cells, or a team with a larger max_slope."
             )
-        grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * cell_size, cell_size, cell_size)
+        side = require_positive("cell_size", cell_size)
+        grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
         names = tuple(features) or default_features(z.shape[3])
+        if len(names) != z.shape[3]:
+            raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
         coords = {
             "robot": list(team.names),
             "row": np.arange(z.shape[1]),
@@ -181,10 +187,7 @@ class Workspace:
         Raises:
             TrustboError: It is no pair, off the grid, without data, or impassable.
         """
-        try:
-            row, col = (int(i) for i in cell)
-        except (TypeError, ValueError):
-            raise TrustboError(f"{what} must be a cell (row, col); got {cell!r}.") from None
+        row, col = require_pair(what, cell)
         rows, cols = self.grid.shape
         if not (0 <= row < rows and 0 <= col < cols):
             raise TrustboError(

@@ -1,0 +1,79 @@
+"""Missions of any length as one batch of arrays."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.data import Mission
+from trustbo.errors import ShapeError, TrustboError
+
+
+class MissionBatch(NamedTuple):
+    """Missions stacked and padded with NaN, ready for compiled code.
+
+    Both leading axes are padded to a bucket, so that compiled code is reused from one mission to
+    the next; a padded bound has NaN contact rates, which the models read as "not measured".
+    """
+
+    awareness: np.ndarray
+    """Shape (mission, bound, robot, feature); 0 in the padding."""
+    contact_rate: np.ndarray
+    """Shape (mission, bound, robot); NaN in the padding."""
+
+
+def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionBatch:
+    """Stack missions of any length into one batch.
+
+    Args:
+        missions: At least one mission; all with the same robots and features.
+        pad: Grow the axes to their buckets: bounds to a multiple of 8, missions to a power of two
+            from 8 on. Without it, bounds are padded to the longest mission only.
+
+    Raises:
+        ShapeError: No missions, or missions that disagree on robots or features.
+        TrustboError: An awareness value is NaN (contact rates may be missing, awareness may not).
+    """
+    if isinstance(missions, Mission):
+        raise ShapeError("missions must be a list of missions; got one. Write [mission].")
+    if not missions:
+        raise ShapeError("no missions to learn from; give at least one.")
+    first = missions[0]
+    for j, mission in enumerate(missions):
+        if (mission.robots, mission.features) != (first.robots, first.features):
+            raise ShapeError(
+                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
+                f"0 has {first.robots} and {first.features}; all must agree."
+            )
+        if np.isnan(mission.awareness).any():
+            k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
+            raise TrustboError(
+                f"awareness of mission {j}, bound {k + 1}, robot {first.robots[i]}, feature "
+                f"{first.features[m]} is NaN; fill it from the awareness map or drop the bound."
+            )
+    n_missions, n_bounds = len(missions), max(len(mission.bounds) for mission in missions)
+    if pad:
+        n_missions, n_bounds = max(8, 1 << (n_missions - 1).bit_length()), -(-n_bounds // 8) * 8
+    shape = (n_missions, n_bounds, len(first.robots), len(first.features))
+    batch = MissionBatch(np.zeros(shape), np.full(shape[:-1], np.nan))
+    for j, mission in enumerate(missions):
+        batch.awareness[j, : len(mission.bounds)] = mission.awareness
+        batch.contact_rate[j, : len(mission.bounds)] = mission.contact_rate
+    return batch
+
+
+def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
+    """Replace awareness that a mission did not measure (NaN) by that of a map.
+
+    Args:
+        mission: The mission.
+        awareness: Shape (robot, row, col, feature), such as `Workspace.awareness`.
+    """
+    if not np.isnan(mission.awareness).any():
+        return mission
+    bounds = tuple(
+        replace(b, awareness=np.where(np.isnan(b.awareness), awareness[:, *b.cell], b.awareness))
+        for b in mission.bounds
+    )
+    return replace(mission, bounds=bounds)
