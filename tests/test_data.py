@@ -85,6 +85,27 @@ def test_a_bound_s_rows_must_be_robots():
         Bound((0, 0), np.zeros((2, 2)), np.zeros(2), np.array([1.0, 0.0]))
 
 
+def test_a_path_must_be_cells_and_arrays_numbers():
+    z, y = arrays()
+    with pytest.raises(
+        TrustboError, match=r"path\[1\] must be two whole numbers .* got \(1, 1, 0\)"
+    ):
+        Mission.from_arrays([(2, 0), (1, 1, 0), (0, 2)], z, y)
+    with pytest.raises(TrustboError, match=r"path\[0\] must be two whole numbers .* \(2.5, 0\)"):
+        Mission.from_arrays([(2.5, 0), (1, 1), (0, 2)], z, y)
+    with pytest.raises(ShapeError, match="awareness must be an array of numbers; got 'abc'"):
+        Mission.from_arrays(PATH, "abc", y)
+    bound = Bound((1, 1), [[0.5, 0.5]], [0.5], [10.0])  # lists will do
+    with pytest.raises(ShapeError, match=r"bound 1 enters \(1, 1\), but the path has \(0, 2\)"):
+        Mission(((0, 1), (0, 2)), (bound,))
+
+
+def test_a_missing_duration_does_not_stop_the_clock():
+    z, y = arrays(n_robots=2)
+    mission = Mission.from_arrays(PATH, z, y, duration=[[10.0, np.nan], [20.0, 5.0]])
+    assert [(b.t0, b.t1) for b in mission.bounds] == [(0.0, 10.0), (10.0, 30.0)]
+
+
 def test_missing_awareness_is_filled_from_a_map():
     z, y = arrays()
     z[0, 1] = np.nan
@@ -103,5 +124,9 @@ def test_robots_and_teams_are_checked():
         Robot(max_slope=30.0)
     with pytest.raises(TrustboError, match="n_robots must be a whole number from 1 on; got 0"):
         Team(n_robots=0)
+    with pytest.raises(TrustboError, match="must be a sequence of robots"):
+        Team(robots=Robot())
+    with pytest.raises(TrustboError, match="3 distinct names"):
+        Team(n_robots=3, names=("a", "b", "c", "a"))
     with pytest.raises(TrustboError, match="2 distinct names"):
         Team(n_robots=2, names=("a", "a"))

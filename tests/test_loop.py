@@ -120,7 +120,7 @@ def test_a_result_is_saved_and_read_back(result, tmp_path):
     back = tb.load_result(tmp_path / "kept")
     assert back.path == result.path
     assert back.value == result.value
-    assert back.settings["start"] == list(result.settings["start"])
+    assert back.settings == result.settings
     np.testing.assert_array_equal(back.trust, result.trust)
     xr.testing.assert_equal(back.trust_map, result.trust_map)
     xr.testing.assert_equal(back.history, result.history)
@@ -178,7 +178,33 @@ def test_a_run_that_dies_has_saved_its_missions(workspace, tmp_path):
     assert kept.stop_reason == "interrupted"
 
 
-@pytest.mark.parametrize("n", [0, -3, 2.5, True])
+def test_a_run_that_dies_over_an_older_result_leaves_none_or_its_own(
+    result, workspace, tmp_path, monkeypatch
+):
+    result.save(tmp_path)
+
+    def fail(missions):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("trustbo.archive.missions_to_tree", fail)
+    with pytest.raises(OSError, match="disk full"):
+        run(workspace, checkpoint=tmp_path)
+    with pytest.raises(tb.TrustboError, match="holds no result"):
+        tb.load_result(tmp_path)
+
+
+def test_settings_of_any_simulator_are_kept(workspace, tmp_path):
+    class Describes(ModelSimulator):
+        def describe(self):
+            return {"gains": np.array([1.0, 2.0]), "n": np.int64(3), "path": tmp_path}
+
+    result = run(workspace, simulator=Describes(workspace), n_iterations=1, max_bounds=np.int64(5))
+    result.save(tmp_path)
+    settings = tb.load_result(tmp_path).settings
+    assert (settings["gains"], settings["n"], settings["max_bounds"]) == ([1.0, 2.0], 3, 5)
+
+
+@pytest.mark.parametrize("n", [0, -3, 2.5, None, True])
 def test_a_number_of_iterations_must_be_whole_and_positive(workspace, n):
     with pytest.raises(tb.TrustboError, match=f"whole number from 1 on; got {n}"):
         run(workspace, n_iterations=n)
@@ -187,6 +213,10 @@ def test_a_number_of_iterations_must_be_whole_and_positive(workspace, n):
 def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path):
     with pytest.raises(tb.TrustboError, match="goal"):
         tb.iterate(workspace, (3, 0), (0, 9), checkpoint=tmp_path / "never")
+    with pytest.raises(tb.TrustboError, match=r"a simulator needs run\(path"):
+        run(workspace, simulator=object(), checkpoint=tmp_path / "never")
+    with pytest.raises(tb.TrustboError, match="seed must be a whole number from 0 on; got -1"):
+        run(workspace, seed=-1, checkpoint=tmp_path / "never")
     with pytest.raises(tb.TrustboError, match="needs a terrain"):
         tb.iterate(workspace, *ENDS, checkpoint=tmp_path / "never")
     assert not (tmp_path / "never").exists()

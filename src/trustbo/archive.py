@@ -38,6 +38,15 @@ def write_text(path: str | PathLike[str], text: str) -> None:
     write_file(path, lambda file: file.write_text(text, encoding="utf-8"))
 
 
+def to_json(record: object) -> str:
+    """JSON of a record that may hold NumPy's numbers and arrays; anything else as its text."""
+
+    def plain(value: Any) -> object:
+        return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+    return json.dumps(record, indent=2, default=plain)
+
+
 def read_tree(path: Path) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
 
@@ -119,8 +128,8 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
         tree |= {"terrain": workspace.terrain, "pixels": workspace.pixels.drop_vars("spatial_ref")}
     result = xr.DataTree.from_dict(tree)
     result.attrs = {
-        "grid": json.dumps(asdict(workspace.grid)),
-        "team": json.dumps(asdict(workspace.team)),
+        "grid": to_json(asdict(workspace.grid)),
+        "team": to_json(asdict(workspace.team)),
     }
     return result
 

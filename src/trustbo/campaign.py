@@ -5,7 +5,7 @@ import xarray as xr
 from jax import random
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
 from trustbo.models import PooledTrust, TrustParams, fit, sample_prior
 from trustbo.models.fit import SAMPLERS
 from trustbo.planning import Plan, Planner, Policy
@@ -76,16 +76,13 @@ class Campaign:
             connectivity=connectivity,
             max_bounds=max_bounds,
         )
-        self.workspace, self.seed = workspace, int(seed)
+        self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self.model = PooledTrust() if model is None else model
         self.missions: list[Mission] = []
         self.posteriors: list[xr.DataTree] = []
         self.plans: list[Plan] = []
         self._plan: Plan | None = None
-        n_features = workspace.awareness.sizes["feature"]
-        n_draws = 1 if initial == "prior_draw" else 4000
-        prior = sample_prior(self.model, n_features, n_draws, self.seed_of("prior"))
-        self.belief: TrustParams = prior if initial == "prior_draw" else _as_one_draw(prior.mean())
+        self.belief: TrustParams = self._prior_belief(initial)
         self.settings = {
             "model": type(self.model).__name__,
             "policy": policy if isinstance(policy, str) else getattr(policy, "__name__", "custom"),
@@ -93,7 +90,7 @@ class Campaign:
             "sampler": sampler,
             "initial": initial,
             "connectivity": connectivity,
-            "max_bounds": max_bounds,
+            "max_bounds": max_bounds if isinstance(max_bounds, str) else self.planner.longest,
             "seed": self.seed,
         }
 
@@ -131,13 +128,23 @@ class Campaign:
 
         Raises:
             ShapeError: Robots or features differ from the workspace's.
+            TrustboError: The path leaves the grid, or what `fit` refuses.
             PosteriorError: The posterior's diagnostics are bad; the mission is then not kept.
         """
         awareness = self.workspace.awareness
+        if not isinstance(mission, Mission):
+            raise TrustboError(f"tell takes a Mission; got {mission!r}.")
         for what, names in (("robot", mission.robots), ("feature", mission.features)):
             expected = tuple(str(name) for name in awareness[what].values)
             if names != expected:
                 raise ShapeError(f"the mission has {what}s {names}, the workspace {expected}.")
+        rows, cols = self.workspace.grid.shape
+        for cell in mission.path:
+            if not (0 <= cell[0] < rows and 0 <= cell[1] < cols):
+                raise TrustboError(
+                    f"the mission's path enters {cell}, outside the grid of {rows} rows and {cols} "
+                    "columns."
+                )
         mission = fill_awareness(mission, awareness.values)
         plan = self.ask()
         missions = [*self.missions, mission]
@@ -157,11 +164,16 @@ class Campaign:
         """The team's trust map under the mean of the belief, dims (row, col)."""
         return self.planner.trust_map(self.belief.mean())
 
+    def _prior_belief(self, initial: str) -> TrustParams:
+        """One draw from the prior, or its mean, as draws with leading axis (draw,) of length 1."""
+        n_features = self.workspace.awareness.sizes["feature"]
+        if initial == "prior_draw":
+            return sample_prior(self.model, n_features, 1, self.seed_of("prior"))
+        priors = self.model.priors
+        mean = TrustParams(**priors.mean(n_features), x0_mean=priors.x0_mean, x0_sd=priors.x0_sd)
+        return TrustParams(*(np.asarray(value, dtype=float)[None] for value in mean))
+
     def seed_of(self, stream: str) -> int:
         """The seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
         entropy = [self.seed, _STREAMS.index(stream), len(self.missions)]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
-
-
-def _as_one_draw(params: TrustParams) -> TrustParams:
-    return TrustParams(*(np.asarray(value)[None] for value in params))

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from trustbo.campaign import Campaign
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_whole
 from trustbo.models import PooledTrust, diagnostics
 from trustbo.planning import Plan, Policy
 from trustbo.result import Result, require_folder
@@ -70,8 +70,7 @@ def iterate(
         NoPathError: The goal cannot be reached.
         PosteriorError: A posterior's diagnostics are bad.
     """
-    if isinstance(n_iterations, bool) or int(n_iterations) != n_iterations or n_iterations < 1:
-        raise TrustboError(f"n_iterations must be a whole number from 1 on; got {n_iterations!r}.")
+    n_iterations = require_whole("n_iterations", n_iterations, 1)
     campaign = Campaign(
         workspace,
         start,
@@ -86,14 +85,16 @@ def iterate(
         seed=seed,
     )
     runner = KinematicSimulator(workspace) if simulator is None else simulator
+    if not callable(getattr(runner, "run", None)):
+        raise TrustboError(f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}.")
     folder = None if checkpoint is None else require_folder(checkpoint)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     settings = {
         **campaign.settings,
         **describe(),
         "trustbo_version": version("trustbo"),
-        "start": campaign.planner.start,
-        "goal": campaign.planner.goal,
+        "start": list(campaign.planner.start),
+        "goal": list(campaign.planner.goal),
     }
     rows: list[dict[str, object]] = []
     with tqdm(total=n_iterations, desc="missions", disable=not progress) as bar:
@@ -106,10 +107,11 @@ def iterate(
             for callback in callbacks:
                 callback(campaign, campaign.missions[-1])
             if folder is not None and len(rows) < n_iterations:
-                _result(campaign, rows, settings, "interrupted").checkpoint(folder)
+                so_far = _result(campaign, rows, settings, "interrupted")
+                so_far.save(folder) if len(rows) == 1 else so_far.checkpoint(folder)
     result = _result(campaign, rows, settings, "n_iterations")
     if folder is not None:
-        result.checkpoint(folder)
+        result.save(folder) if n_iterations == 1 else result.checkpoint(folder)
     return result
 
 

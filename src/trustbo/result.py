@@ -68,6 +68,7 @@ class Result:
             TrustboError: The folder's name belongs to a file.
         """
         folder = require_folder(directory)
+        (folder / "result.json").unlink(missing_ok=True)  # whatever it spoke of is going
         for j, posterior in enumerate(self.posteriors):
             _write_tree(folder / "posteriors" / _posterior_name(j), posterior)
         self.checkpoint(folder)
@@ -101,7 +102,7 @@ class Result:
             "stop_reason": self.stop_reason,
         }
         # Last: its presence says that the rest is complete.
-        archive.write_text(folder / "result.json", json.dumps(record, indent=2))
+        archive.write_text(folder / "result.json", archive.to_json(record))
 
 
 def load_result(directory: str | PathLike[str]) -> Result:

@@ -195,5 +195,5 @@ def test_a_prior_must_be_a_scalar_distribution(name):
 
 
 def test_trust_before_the_first_bound_cannot_have_a_negative_sd():
-    with pytest.raises(TrustboError, match="x0_sd must not be negative; got -1"):
+    with pytest.raises(TrustboError, match="x0_sd must be finite, not negative; got -1"):
         Priors(x0_sd=-1.0)

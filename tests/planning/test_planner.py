@@ -161,6 +161,20 @@ def test_greedy_plans_under_the_mean_and_thompson_under_single_draws(workspace, 
     assert len(drawn) > 1
 
 
+def test_random_keeps_to_paths_without_revisits_where_asked(workspace, draws):
+    planner = Planner(workspace, (4, 0), (0, 5), "success", revisit=False)
+    for i in range(20):
+        plan = policies.random(jax.random.key(i), draws, planner)
+        assert plan.revisits == 0
+        assert len(plan.path) - 1 <= planner.longest
+
+
+def test_random_walks_long_corridors(draws):
+    workspace = Workspace.from_awareness(np.full((1, 1, 600, 2), 0.5))
+    planner = Planner(workspace, (0, 0), (0, 599))
+    assert len(policies.random(jax.random.key(0), draws, planner).path) == 600
+
+
 def test_random_draws_every_admissible_path_equally_often(draws):
     workspace = Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
     planner = Planner(workspace, (2, 0), (0, 2))
@@ -171,6 +185,7 @@ def test_random_draws_every_admissible_path_equally_often(draws):
         counts[policies.random(jax.random.key(i), draws, planner).path] += 1
     expected = n_draws / len(admissible)
     chi2 = sum((count - expected) ** 2 / expected for count in counts.values())
+    assert sum(counts.values()) == n_draws
     # Chi-squared with n - 1 degrees of freedom: mean n - 1, sd sqrt(2 (n - 1)); 4 of these.
     n = len(admissible) - 1
     assert chi2 < n + 4 * np.sqrt(2 * n)

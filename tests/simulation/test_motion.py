@@ -6,6 +6,7 @@ import pytest
 
 from trustbo.data import Robot
 from trustbo.simulation.motion import _a_star, drive, find_route
+from trustbo.simulation.positions import _largest_region
 from trustbo.simulation.sight import Surface
 
 
@@ -93,6 +94,14 @@ def test_a_pitch_beyond_the_limit_sticks_and_a_roll_tips(dz_dx, dz_dy, status):
     assert found == status
 
 
+def test_routes_and_regions_agree_that_corners_do_not_connect():
+    passable = np.zeros((60, 60), bool)
+    passable[:30, :30] = passable[30:, 30:] = True
+    assert not len(_a_star(np.where(passable, 1.0, np.inf), (1.0, 1.0), (5, 5), (50, 50)))
+    region = _largest_region(passable)
+    assert region.sum() == 900
+
+
 def test_steeper_is_slower():
     times = []
     for rise in (0.0, 0.3, 0.6):
@@ -101,6 +110,16 @@ def test_steeper_is_slower():
         poses, _ = drive(surface, Robot(), route, 0.0, 0.5, 1000, np.random.default_rng(0))
         times.append(len(poses))
     assert times[0] < times[1] < times[2]
+
+
+@pytest.mark.parametrize("speed", [0.3, 8.0, 20.0])
+def test_slow_and_fast_robots_stop_at_their_goal(speed):
+    robot = Robot(speed=speed)
+    route = np.array([[10.0, -30.0], [50.0, -30.0]])
+    poses, status = drive(flat_surface(), robot, route, 0.5, 0.5, 1000, np.random.default_rng(0))
+    assert status == "ok"
+    assert np.hypot(*(poses[-1, :2] - route[-1])) < 0.5
+    assert len(poses) * 0.5 < 1.5 * 40.0 / speed + 3.0
 
 
 def test_a_drive_that_takes_too_long_times_out():

@@ -15,9 +15,12 @@ from trustbo.terrain import Workspace, assemble_terrain, synthetic_terrain
 PATH = [(2, 0), (1, 1), (0, 2)]
 
 
-def workspace_of(dem, height, shape=(3, 3), team=None):
+def workspace_of(dem, height, shape=(3, 3), team=None, resolution=1.0):
     rows, cols = dem.shape
-    coords = {"y": 500.0 - np.arange(rows) - 0.5, "x": 100.0 + np.arange(cols) + 0.5}
+    coords = {
+        "y": 500.0 - (np.arange(rows) + 0.5) * resolution,
+        "x": 100.0 + (np.arange(cols) + 0.5) * resolution,
+    }
     dem = xr.DataArray(dem.astype(float), coords, ("y", "x")).rio.write_crs("EPSG:32633")
     return Workspace.from_terrain(assemble_terrain(dem, dem + height), shape, team)
 
@@ -178,6 +181,14 @@ def test_a_robot_that_tips_over_ends_the_mission():
     assert len(mission.bounds) <= 2
 
 
+def test_on_coarse_pixels_nobody_stands_on_the_lead():
+    workspace = workspace_of(np.zeros((12, 12)), 0.0, (2, 2), resolution=10.0)
+    mission = KinematicSimulator(workspace).run([(0, 0), (0, 1)], seed=0)
+    last = mission.bounds[-1].poses[-1, :, :2]
+    gaps = np.linalg.norm(last[:, None] - last[None], axis=-1)[np.triu_indices(4, 1)]
+    assert (gaps > 5.0).all()
+
+
 def test_robots_may_brush_the_edge_of_the_data():
     rng = np.random.default_rng(0)
     dem = rng.normal(0.0, 0.05, (90, 90))
@@ -196,11 +207,20 @@ def test_bad_input():
     workspace = workspace_of(np.zeros((60, 60)), 0.0)
     with pytest.raises(TrustboError, match="unknown sight mode 'fog'; choose one of bare, wall"):
         KinematicSimulator(workspace, sight="fog")
-    with pytest.raises(TrustboError, match="tick must be positive; got 0"):
+    with pytest.raises(TrustboError, match="tick must be positive and finite; got 0"):
         KinematicSimulator(workspace, tick=0.0)
     with pytest.raises(TrustboError, match=r"path\[1\] \(9, 9\) is outside the grid"):
         KinematicSimulator(workspace).run([(0, 0), (9, 9)], seed=0)
     with pytest.raises(TrustboError, match="at least two cells"):
         KinematicSimulator(workspace).run([(0, 0)], seed=0)
+    for options, message in (
+        ({"sight": None}, "sight must be a mode's name or a Sight; got None"),
+        ({"formation_radius": 1.0}, "formation_radius must be at least 2 m"),
+        ({"bound_timeout": np.inf}, "bound_timeout must be positive and finite; got inf"),
+    ):
+        with pytest.raises(TrustboError, match=message):
+            KinematicSimulator(workspace, **options)
+    with pytest.raises(TrustboError, match="seed must be a whole number from 0 on; got -1"):
+        KinematicSimulator(workspace).run(PATH, seed=-1)
     with pytest.raises(TrustboError, match="extinction >= 0"):
         Sight(extinction=-1.0)

@@ -102,7 +102,7 @@ def _unconstrained(model: Callable[..., None], data: _Data):
         if site["type"] == "sample" and not site["is_observed"]
     }
     inverse = {name: biject_to(site["fn"].support) for name, site in sites.items()}
-    start = {name: inverse[name].inv(_center(site["fn"])) for name, site in sites.items()}
+    start = {name: _start(inverse[name], site["fn"]) for name, site in sites.items()}
     flat, unravel = ravel_pytree(start)
 
     measured = ~jnp.isnan(data.contact_rate)
@@ -136,8 +136,10 @@ def _unconstrained(model: Callable[..., None], data: _Data):
     return flat, constrain, potential
 
 
-def _center(prior) -> Array:
-    return jnp.broadcast_to(jnp.asarray(prior.mean, dtype=float), prior.shape())
+def _start(transform, prior) -> Array:
+    """The prior's mean on the real line, or 0 there if it has none, as a Cauchy has not."""
+    z = transform.inv(jnp.broadcast_to(jnp.asarray(prior.mean, dtype=float), prior.shape()))
+    return jnp.where(jnp.isfinite(z), z, 0.0)
 
 
 def _laplace(potential: Callable[[Array], Array], start: Array, n_steps: int = 50):

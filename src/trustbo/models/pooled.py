@@ -175,9 +175,15 @@ class PooledTrust:
             awareness: Shape (mission, bound, robot, feature).
 
         Raises:
-            ShapeError: `params.beta` has not one weight per feature.
+            ShapeError: Awareness of other axes, parameters with leading axes, or `params.beta` has
+                not one weight per feature.
         """
         z = np.asarray(awareness, dtype=float)
+        if z.ndim != 4 or np.ndim(params.beta0):
+            raise ShapeError(
+                "awareness must be (mission, bound, robot, feature) and the parameters one draw; "
+                f"got {z.shape}, and beta0 of shape {np.shape(params.beta0)}."
+            )
         check_features(params, z.shape[-1])
         with jax.enable_x64(True):
             params64 = TrustParams(*(jnp.asarray(p, dtype=float) for p in params))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Self
 
 import jax
+import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
@@ -59,13 +60,24 @@ class Priors:
                     f"Priors.{name} must be a scalar numpyro distribution, e.g. {default!r}; "
                     f"got {prior!r}."
                 )
-        if not self.x0_sd >= 0.0:
-            raise TrustboError(f"Priors.x0_sd must not be negative; got {self.x0_sd!r}.")
+        if not np.isfinite(self.x0_mean):
+            raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
+        if not 0.0 <= self.x0_sd < np.inf:
+            raise TrustboError(f"Priors.x0_sd must be finite, not negative; got {self.x0_sd!r}.")
 
     @classmethod
     def default(cls) -> Self:
         """The default priors."""
         return cls()
+
+    def mean(self, n_features: int) -> dict[str, np.ndarray]:
+        """Prior mean of each parameter; 0 for one that has none, as a Cauchy has not."""
+        means = {}
+        for name in ("beta0", "beta", "b", "delta_w", "delta_v"):
+            value = np.asarray(getattr(self, name).mean, dtype=float)
+            shape = (n_features,) if name == "beta" else ()
+            means[name] = np.broadcast_to(np.where(np.isfinite(value), value, 0.0), shape)
+        return means
 
     def describe(self) -> dict[str, str]:
         """Each prior as text, for the record kept with a result."""

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.special import expit
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_pair, require_whole
 from trustbo.models import TrustParams
 from trustbo.planning import search
 from trustbo.planning.graph import MOVES, cell_graph, fewest_bounds
@@ -164,7 +164,7 @@ class Planner:
         Raises:
             TrustboError: It is broken, or does not lead from start to goal; the cell is named.
         """
-        cells = tuple((int(row), int(col)) for row, col in path)
+        cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
         if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:
             raise TrustboError(f"a path must lead from {self.start} to {self.goal}; got {cells}.")
         for a, b in pairwise(cells):
@@ -176,8 +176,9 @@ class Planner:
         """Largest expected trust with which each cell can be reached.
 
         Over the paths to each cell with the fewest possible bounds, or, unless `max_bounds` is
-        "shortest", up to two more without turning straight back. So the goal's value is the
-        terminal trust of the `terminal` plan.
+        "shortest", up to two more without turning straight back: with the default `max_bounds`,
+        the goal's value is the terminal trust of the `terminal` plan. Longer walks, which an int
+        admits, are left out, for they loiter to gather trust.
 
         Args:
             params: Parameters without leading axes.
@@ -207,18 +208,20 @@ class Planner:
         return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
 
     def path_posterior(
-        self, posterior: TrustParams, *, n_draws: int = 200, seed: int = 0
+        self, posterior: TrustParams | xr.DataTree, *, n_draws: int = 200, seed: int = 0
     ) -> xr.DataArray:
         """P(cell on the best path), from the best path under each of some draws.
 
         Args:
-            posterior: Draws, leading axis (draw,).
+            posterior: What `fit` returned, or draws with leading axis (draw,).
             n_draws: How many of them to plan under, taken at random without replacement.
             seed: Same seed, same draws.
 
         Returns:
             DataArray (row, col), in [0, 1].
         """
+        if isinstance(posterior, xr.DataTree):
+            posterior = TrustParams.from_posterior(posterior)
         n = len(np.asarray(posterior.beta0))
         chosen = np.random.default_rng(seed).choice(n, min(n, n_draws), replace=False)
         like = self.workspace.passable
@@ -259,7 +262,7 @@ class Planner:
         named = {"shortest": self.shortest, "shortest+2": self.shortest + 2}
         if isinstance(max_bounds, str):
             return named[require_choice("max_bounds", max_bounds, named)]
-        if max_bounds < self.shortest:
+        if require_whole("max_bounds", max_bounds, 1) < self.shortest:
             raise TrustboError(
                 f"max_bounds = {max_bounds} is below the fewest possible from {self.start} to "
                 f"{self.goal}, which is {self.shortest}."

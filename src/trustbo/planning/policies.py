@@ -5,10 +5,8 @@ a name may.
 """
 
 from collections.abc import Callable, Mapping
-from functools import cache
 
 import jax
-import networkx as nx
 import numpy as np
 from jax import Array
 
@@ -33,43 +31,72 @@ def thompson(key: Array, posterior: TrustParams, planner: Planner) -> Plan:
 
 
 def random(key: Array, posterior: TrustParams, planner: Planner) -> Plan:
-    """A path drawn uniformly from the admissible ones, whatever was learned."""
-    graph, goal, u_turns = planner.graph, planner.goal, planner.u_turns
-    to_goal = dict(nx.single_target_shortest_path_length(graph, goal))
+    """A path drawn uniformly from the admissible ones, whatever was learned.
 
-    def onward(before: Cell | None, cell: Cell, n_left: int) -> list[Cell]:
-        """Where a walk with `n_left` bounds to go may lead next."""
-        return [
-            other
-            for other in graph.successors(cell)
-            if to_goal.get(other, np.inf) <= n_left - 1
-            and (other == goal) == (n_left == 1)
-            and (u_turns or other != before)
-        ]
+    For `stationary`, which admits simple paths of any length, from those of up to two bounds more
+    than the fewest.
 
-    @cache
-    def n_walks(before: Cell | None, cell: Cell, n_left: int) -> int:
-        if n_left == 0:
-            return 1
-        return sum(n_walks(cell, other, n_left - 1) for other in onward(before, cell, n_left))
-
+    Raises:
+        TrustboError: Walks must not enter a cell twice, and of 10 000 drawn every one did.
+    """
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    ways = _count_ways(planner)
+    for _ in range(10_000):
+        path = _draw_walk(planner, ways, rng)
+        # Kept only if simple where it must be: what is kept is still uniform.
+        if planner.revisit or len(set(path)) == len(path):
+            return planner.evaluate(path, posterior.mean())
+    raise TrustboError(
+        f"no path without revisits among 10 000 walks of up to {planner.longest} bounds; "
+        "lower max_bounds."
+    )
 
-    def choose(counts: list[int]) -> int:
-        # In floating point only here: the counts themselves are exact.
-        shares = np.array([count / sum(counts) for count in counts])
-        return int(rng.choice(len(counts), p=shares / shares.sum()))
 
+_Ways = list[dict[tuple[Cell | None, Cell], int]]
+
+
+def _count_ways(planner: Planner) -> _Ways:
+    """ways[n][before, cell]: walks of n more bounds to the goal, exact in Python's integers.
+
+    `before` is the cell that the last bound left, or None where walks may turn straight back.
+    """
+    graph, goal = planner.graph, planner.goal
+    ways: _Ways = [{(b, goal): 1 for b in _befores(planner, goal)}]
+    for _ in range(planner.longest):
+        fewer, now = ways[-1], {}
+        for cell in graph:
+            if cell == goal:
+                continue  # a path ends when it first gets there
+            for before in _befores(planner, cell):
+                others = (o for o in graph.successors(cell) if before is None or o != before)
+                left = None if planner.u_turns else cell
+                if n_ways := sum(fewer.get((left, other), 0) for other in others):
+                    now[before, cell] = n_ways
+        ways.append(now)
+    return ways
+
+
+def _befores(planner: Planner, cell: Cell) -> list[Cell | None]:
+    return [None] if planner.u_turns else [None, *planner.graph.predecessors(cell)]
+
+
+def _draw_walk(planner: Planner, ways: _Ways, rng: np.random.Generator) -> list[Cell]:
     lengths = range(planner.shortest, planner.longest + 1)
-    n_left = lengths[choose([n_walks(None, planner.start, n) for n in lengths])]
+    n_left = lengths[_choose(rng, [ways[n].get((None, planner.start), 0) for n in lengths])]
     before, path = None, [planner.start]
-    while n_left:
-        others = onward(before, path[-1], n_left)
-        n_left -= 1
-        chosen = others[choose([n_walks(path[-1], other, n_left) for other in others])]
-        before = path[-1]
-        path.append(chosen)
-    return planner.evaluate(path, posterior.mean())
+    for n in range(n_left - 1, -1, -1):
+        here = path[-1]
+        left = None if planner.u_turns else here
+        others = [o for o in planner.graph.successors(here) if before is None or o != before]
+        path.append(others[_choose(rng, [ways[n].get((left, other), 0) for other in others])])
+        before = left
+    return path
+
+
+def _choose(rng: np.random.Generator, counts: list[int]) -> int:
+    # In floating point only here: the counts themselves are exact.
+    shares = np.array([count / sum(counts) for count in counts])
+    return int(rng.choice(len(counts), p=shares / shares.sum()))
 
 
 POLICIES: Mapping[str, Policy] = {"greedy": greedy, "thompson": thompson, "random": random}

@@ -15,7 +15,7 @@ ARRIVED = 0.5
 """How close to its goal a robot stops, m."""
 SLOWEST = 0.1
 """Share of its speed that a robot keeps on the steepest slope it stands."""
-_STEPS_PER_TICK = 5
+_LEAST_STEPS = 5
 _STATUS = ("ok", "stuck", "tipped", "timeout")
 
 
@@ -91,6 +91,8 @@ def drive(
         heading,
         (robot.speed, robot.turn_rate, robot.max_slope),
         tick,
+        # Short enough that no step leaps over the goal.
+        max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED))),
         slip,
     )
     return poses, _STATUS[code]
@@ -150,14 +152,14 @@ def _a_star(pace, pixel, start, goal):
 
 
 @njit(cache=True)
-def _drive(gradient, pixel, origin, route, heading, limits, tick, slip):
+def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip):
     speed, turn_rate, max_slope = limits
     rows, cols = gradient.shape[1:]
     x, y, aim = route[0, 0], route[0, 1], 1
     poses = np.empty((len(slip), 3))
-    dt = tick / _STEPS_PER_TICK
+    dt = tick / n_steps
     for k in range(len(slip)):
-        for _ in range(_STEPS_PER_TICK):
+        for _ in range(n_steps):
             while (
                 aim < len(route) - 1
                 and math.hypot(route[aim, 0] - x, route[aim, 1] - y) < LOOKAHEAD
@@ -172,7 +174,7 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, slip):
             gx, gy = gradient[0, i, j], gradient[1, i, j]
             pitch = abs(math.atan(gx * math.cos(heading) + gy * math.sin(heading)))
             roll = abs(math.atan(gy * math.cos(heading) - gx * math.sin(heading)))
-            if roll > max_slope or pitch > max_slope:
+            if not (roll <= max_slope and pitch <= max_slope):  # unknown ground fails too
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
                 return poses[: k + 1], 2 if roll > max_slope else 1
             # A skid-steer robot turns on the spot until it faces its way.

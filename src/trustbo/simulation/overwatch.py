@@ -7,9 +7,9 @@ from typing import Protocol
 import numpy as np
 
 from trustbo.data import Bound, Cell, Mission, Robot
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.simulation.motion import drive, find_route
-from trustbo.simulation.positions import Positions, surface_of
+from trustbo.simulation.positions import SPACING, Positions, surface_of
 from trustbo.simulation.sight import Sight, in_view, transmittance
 from trustbo.terrain import Workspace
 
@@ -73,18 +73,20 @@ class KinematicSimulator:
                 "the kinematic simulator needs a terrain; make the workspace with "
                 "Workspace.from_terrain, or pass your own simulator."
             )
-        for name, value in (
-            ("tick", tick),
-            ("formation_radius", formation_radius),
-            ("bound_timeout", bound_timeout),
-            ("lost_contact_after", np.inf if lost_contact_after is None else lost_contact_after),
-        ):
-            if not value > 0.0:
-                raise TrustboError(f"{name} must be positive; got {value!r}.")
+        if not isinstance(sight, str | Sight):
+            raise TrustboError(f"sight must be a mode's name or a Sight; got {sight!r}.")
+        if require_positive("formation_radius", formation_radius) < SPACING:
+            raise TrustboError(
+                f"formation_radius must be at least {SPACING:g} m, the least distance between two "
+                f"robots; got {formation_radius:g}."
+            )
         self.workspace = workspace
         self.sight = Sight(sight) if isinstance(sight, str) else sight
-        self.tick, self.bound_timeout = tick, bound_timeout
+        self.tick = require_positive("tick", tick)
+        self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self.lost_contact_after = lost_contact_after
+        if lost_contact_after is not None:
+            require_positive("lost_contact_after", lost_contact_after)
         self._surface = surface_of(workspace.terrain, workspace.pixels)
         awareness = [workspace.pixels[str(f)].values for f in workspace.awareness["feature"].values]
         self._awareness = np.stack(awareness, axis=-1)
@@ -145,7 +147,7 @@ class KinematicSimulator:
         positions = self._positions.formation(cell, next_cell)
         poses = np.zeros((1 + len(positions), 3))
         poses[0, :2], poses[1:, :2] = here, positions
-        self._state = _State(cell, poses, 0.0, seed)
+        self._state = _State(cell, poses, 0.0, require_whole("seed", seed, 0))
 
     def run_bound(self, k: int, cell: Cell, *, next_cell: Cell | None = None) -> Bound:
         """Run one bound.

@@ -65,8 +65,10 @@ class Positions:
         position = self._position(row, col)
         distance = np.linalg.norm(position - here, axis=1)
         near = np.flatnonzero((distance <= self._radius) & (distance >= SPACING))
-        if len(near) < len(team.robots):  # a cell with hardly any standing room
-            near = np.arange(len(position))
+        if len(near) < len(team.robots):  # hardly any standing room, or pixels as large as that
+            order = np.argsort(distance, kind="stable")
+            near = order[distance[order] > 0.0][: len(team.robots)]
+            near = near if len(near) else order
         position = position[near]
         aim = np.broadcast_to(goal, position.shape)
         chosen: list[np.ndarray] = []
@@ -139,8 +141,11 @@ def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0
 
 
 def _largest_region(passable: np.ndarray) -> np.ndarray:
-    """The largest connected set of passable pixels; a robot outside it could go nowhere."""
-    regions: Any = ndimage.label(passable, np.ones((3, 3)))
+    """The largest connected set of passable pixels; a robot outside it could go nowhere.
+
+    Connected by edges: routes do not squeeze through where two pixels touch at a corner only.
+    """
+    regions: Any = ndimage.label(passable)
     labels, n_regions = regions
     if n_regions == 0:
         return passable

@@ -138,10 +138,17 @@ def in_view(
 def _transmittances(ground, canopy, pixel, start, end, mode, extinction, crown_base):
     result = np.empty(len(start))
     for i in range(len(start)):
-        r0, c0, r1, c1 = start[i, 0], start[i, 1], end[i, 0], end[i, 1]
+        # The outer half of the raster's edge pixels has the heights of their centres.
+        r0, c0 = _inward(start[i, 0], ground.shape[0]), _inward(start[i, 1], ground.shape[1])
+        r1, c1 = _inward(end[i, 0], ground.shape[0]), _inward(end[i, 1], ground.shape[1])
         z0 = rays.ground_height(ground, r0, c0) + start[i, 2]
         z1 = rays.ground_height(ground, r1, c1) + end[i, 2]
         result[i] = rays.ray_transmittance(
             ground, canopy, pixel, (r0, c0, z0), (r1, c1, z1), mode, extinction, crown_base
         )
     return result
+
+
+@njit(cache=True)
+def _inward(x, n):
+    return min(max(x, 0.0), n - 1.0) if -0.5 <= x <= n - 0.5 else x
