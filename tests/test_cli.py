@@ -109,6 +109,8 @@ def test_demo_runs_on_the_rasters_it_writes(tmp_path):
         (("--objective", "best"), "unknown objective 'best'; choose one of terminal, mean"),
         (("--iterations", "0"), "n_iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),
+        (("--seed", "-1"), "seed must be a whole number from 0 on; got -1"),
+        (("--max-slope", "95"), "--max-slope must be between 0 and 90 degrees; got 95"),
         (("--max-slope", "0.1"), "no cell is passable"),
         (("--robots", "0"), "n_robots must be a whole number from 1 on; got 0"),
         (("--max-bounds", "1"), "max_bounds = 1 is below the fewest possible"),
@@ -124,6 +126,12 @@ def test_bad_input_is_one_line_exit_2_and_nothing_written(arguments, message, ra
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
     assert not out.exists()
+
+
+def test_demo_writes_nothing_on_bad_input(tmp_path):
+    done = invoke("demo", "--policy", "bold", "--out", tmp_path / "never")
+    assert done.exit_code == 2
+    assert not (tmp_path / "never").exists()
 
 
 def test_debug_shows_the_traceback(rasters, tmp_path):

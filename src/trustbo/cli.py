@@ -75,10 +75,15 @@ def run(
 
     from trustbo import simulation, terrain
     from trustbo.data import Robot, Team
+    from trustbo.errors import TrustboError, require_choice
 
     with _one_line_errors(debug):
+        _check(policy, objective, iterations, seed)
+        if not 0.0 < max_slope < 90.0:
+            raise TrustboError(f"--max-slope must be between 0 and 90 degrees; got {max_slope:g}.")
         robot = Robot(max_slope=float(np.deg2rad(max_slope)), lidar_range=lidar_range)
         team = Team(n_robots=robots, robots=(robot,) * robots, lead=robot)
+        require_choice("sight mode", sight, simulation.SIGHT_MODES)
         cells = _pair("start", start), _pair("goal", goal)
         ground = terrain.read_terrain(dem, dsm, crs=crs, resolution=resolution)
         workspace = terrain.Workspace.from_terrain(ground, _pair("shape", shape), team)
@@ -119,6 +124,7 @@ def demo(
     from trustbo.result import require_folder
 
     with _one_line_errors(debug):
+        _check(policy, objective, iterations, seed)
         require_folder(out)
         ground = terrain.synthetic_terrain(seed=seed)
         for name in ("dem", "dsm"):
@@ -168,6 +174,17 @@ def _campaign(
         _report(result)
     print(f"results are in {out}/: maps.png, terrain.png, trust_map.tif, path.geojson,")
     print("posterior.nc, history.csv; in Python: trustbo.load_result(" + repr(str(out)) + ")")
+
+
+def _check(policy: str, objective: str, iterations: int, seed: int) -> None:
+    """Refuse bad names and numbers before any raster is read or written."""
+    from trustbo.errors import require_choice, require_whole
+    from trustbo.planning import OBJECTIVES, POLICIES
+
+    require_choice("policy", policy, POLICIES)
+    require_choice("objective", objective, OBJECTIVES)
+    require_whole("n_iterations", iterations, 1)
+    require_whole("seed", seed, 0)
 
 
 def _report(result) -> None:

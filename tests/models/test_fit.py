@@ -194,6 +194,13 @@ def test_a_prior_must_be_a_scalar_distribution(name):
             Priors(**{name: value})
 
 
+def test_priors_without_a_mean_can_be_fitted(missions):
+    heavy = Priors(b=dist.Cauchy(0.0, 0.5), delta_v=dist.HalfCauchy(0.2))
+    posterior = fit(missions, PooledTrust(heavy))
+    assert diagnostics(posterior)["r_hat"] <= 1.01
+    assert heavy.mean(2)["b"] == 0.0
+
+
 def test_trust_before_the_first_bound_cannot_have_a_negative_sd():
     with pytest.raises(TrustboError, match="x0_sd must be finite, not negative; got -1"):
         Priors(x0_sd=-1.0)

@@ -135,6 +135,12 @@ def test_simulated_rates_have_the_joint_normal_s_moments():
     assert abs(log_density - expected) < 5 * 0.5 * np.sqrt(8 / n_draws)
 
 
+def test_simulating_is_for_one_draw_and_a_batch_of_missions():
+    params = random_params(np.random.default_rng(6))
+    with pytest.raises(ShapeError, match=r"\(mission, bound, robot, feature\) .* got \(4, 3, 2\)"):
+        PooledTrust().simulate(jax.random.key(0), params, np.zeros((4, 3, 2)))
+
+
 def test_weights_must_match_the_features():
     rng = np.random.default_rng(4)
     params, missions = random_params(rng), random_missions(rng)

@@ -97,6 +97,15 @@ def test_a_component_that_explains_little_is_reported():
     assert any("explains only 3" in str(w.message) for w in caught)
 
 
+def test_a_few_obstacles_on_flat_ground_are_the_low_end():
+    features = xr.Dataset({name: ("pixel", np.zeros(1000)) for name in ("slope", "tri")})
+    for name in features:
+        features[name][:15] = 1.0  # winsorising leaves them, the 2nd percentile does not
+    index = CompositeIndex({"slope": -1, "tri": -1}).fit(features).transform(features)
+    np.testing.assert_array_equal(index[:15], 0.0)
+    np.testing.assert_array_equal(index[15:], 1.0)
+
+
 def test_bad_input():
     with pytest.raises(TrustboError, match="unknown scaling 'iqr'; choose one of percentile"):
         CompositeIndex(SIGNS, scaling="iqr")

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import rasterio
+import rasterio.warp
 import xarray as xr
 from rasterio.transform import from_origin
 
-from trustbo.errors import TerrainError
+from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import pixel_size, read_terrain, synthetic_terrain
 
 UTM = "EPSG:32633"
@@ -170,6 +171,44 @@ def test_rotated_grids_and_feet_are_refused(tmp_path):
     feet = write_raster(tmp_path / "feet.tif", plane(), crs="EPSG:2225")
     with pytest.raises(TerrainError, match="is in US survey foot, but heights and distances must"):
         read_terrain(feet, feet)
+
+
+@pytest.mark.parametrize("shift", [1e-8, 3e-7, 1e-4])
+def test_grids_that_differ_by_rounding_are_one_grid(tmp_path, shift):
+    dem = write_raster(tmp_path / "dem.tif", plane())
+    moved = from_origin(500_000.0 + shift, 5_000_000.0, 1.0, 1.0 + 1e-9)
+    dsm = write_raster(tmp_path / "dsm.tif", plane() + 1.0, transform=moved)
+    terrain = read_terrain(dem, dsm)
+    assert terrain["dem"].notnull().all()
+    np.testing.assert_allclose(terrain["dsm"] - terrain["dem"], 1.0)
+
+
+def test_metres_labelled_as_degrees_are_recognised(tmp_path):
+    dem = write_raster(tmp_path / "dem.tif", plane(), crs="EPSG:4326")
+    with pytest.raises(TerrainError, match="are no place on Earth in it; give the CRS its"):
+        read_terrain(dem, dem)
+
+
+def test_a_bare_image_needs_metres_per_pixel(tmp_path):
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
+        dem = write_raster(
+            tmp_path / "dem.tif", plane(), crs=None, transform=rasterio.Affine.identity()
+        )
+    with pytest.raises(TerrainError, match="is in degrees, but resolution= is in metres"):
+        read_terrain(dem, dem, crs="EPSG:4326", resolution=1.0)
+    for resolution in (-1.0, 0.0, np.nan, "1"):
+        with pytest.raises(TrustboError, match="resolution must be positive and finite"):
+            read_terrain(dem, dem, crs=UTM, resolution=resolution)
+
+
+def test_web_mercator_s_stretched_metres_are_not_taken_for_metres(tmp_path):
+    x, y = rasterio.warp.transform("EPSG:4326", "EPSG:3857", [15.0], [47.0])
+    stretched = from_origin(x[0], y[0], 1.0, 1.0)
+    dem = write_raster(tmp_path / "dem.tif", plane(60, 60), crs="EPSG:3857", transform=stretched)
+    terrain = read_terrain(dem, dem)
+    assert terrain.rio.crs.to_epsg() == 32633
+    extent = float(terrain["x"].max() - terrain["x"].min())
+    assert extent == pytest.approx(60 * np.cos(np.deg2rad(47.0)), rel=0.06)
 
 
 @pytest.mark.parametrize("name", ["wellington", "tahoe", "bcts", "topography"])

@@ -5,7 +5,14 @@ import pytest
 
 from trustbo.data import Robot, Team
 from trustbo.errors import ShapeError, TerrainError, TrustboError
-from trustbo.terrain import Grid, Workspace, read_terrain, synthetic_terrain
+from trustbo.terrain import (
+    Grid,
+    Workspace,
+    assemble_terrain,
+    pixel_size,
+    read_terrain,
+    synthetic_terrain,
+)
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +90,39 @@ def test_a_cell_mostly_without_data_is_impassable_and_named(real_terrain):
         TrustboError, match=r"start \(39, 15\) is impassable: \d+% of it has no data; the nearest"
     ):
         workspace.require_cell("start", (39, 15))
+
+
+@pytest.mark.filterwarnings("ignore:openness enters its composite")  # 40 x 30 coarse pixels
+def test_a_dataset_of_one_s_own_is_put_in_order(terrain):
+    """Coarsened, cut or flipped datasets keep a stale transform: the coordinates count."""
+    coarse = terrain.coarsen(x=3, y=3).mean()
+    workspace = Workspace.from_terrain(coarse, (4, 3))
+    left, _, right, top = terrain.rio.bounds()
+    assert (workspace.grid.left, workspace.grid.top) == (left, top)
+    assert workspace.grid.cell_width == pytest.approx((right - left) / 3)
+    assert pixel_size(coarse) == (3.0, 3.0)
+    south_up = Workspace.from_terrain(terrain.sortby("y"), (4, 3))
+    np.testing.assert_array_equal(
+        south_up.awareness, Workspace.from_terrain(terrain, (4, 3)).awareness
+    )
+
+
+def test_datasets_that_are_no_terrain_are_refused(terrain):
+    for bad, message in (
+        (terrain.drop_vars("dsm"), "a Dataset with dem and dsm over"),
+        (terrain["dem"], "as read_terrain gives it; got DataArray"),
+        (terrain.drop_vars("spatial_ref"), "the terrain has no CRS"),
+        (terrain.rio.write_crs("EPSG:4326"), "the terrain is in degrees"),
+        (terrain.isel(x=[0, 1, 2, 4, 7, 8]), "x is not a regular axis"),
+    ):
+        with pytest.raises(TerrainError, match=message):
+            Workspace.from_terrain(bad, (2, 2))
+    shifted = terrain["dsm"].assign_coords(x=terrain["x"] + 0.5)
+    with pytest.raises(TerrainError, match="are not on one grid; align them first"):
+        assemble_terrain(terrain["dem"], shifted)
+    for shape in (10, (3.0, 3.0), (3, 3, 3)):
+        with pytest.raises(TrustboError, match="shape must be two whole numbers"):
+            Workspace.from_terrain(terrain, shape)
 
 
 def test_a_workspace_of_arrays():
