@@ -125,7 +125,7 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
     for options, message in (
         ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, thompson, random"),
         ({"objective": "best"}, "unknown objective 'best'"),
-        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of nuts"),
+        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of nuts, exact"),
         ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_draw, prior_mean"),
     ):
         with pytest.raises(TrustboError, match=message):

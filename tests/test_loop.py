@@ -86,6 +86,13 @@ def test_the_same_seed_gives_the_same_result(result, workspace):
     assert (other.missions[0].contact_rate[0] != result.missions[0].contact_rate[0]).any()
 
 
+def test_the_exact_sampler_runs_the_loop_too(workspace, capsys):
+    result = run(workspace, sampler="exact", n_iterations=2, progress=True)
+    assert (result.history["k_hat"] < 0.7).all()
+    assert "k-hat" in capsys.readouterr().err
+    assert result.settings["sampler"] == "exact"
+
+
 @pytest.mark.parametrize("policy", ["thompson", "random"])
 def test_other_policies_run(workspace, policy):
     assert run(workspace, policy=policy, n_iterations=2).settings["policy"] == policy

@@ -41,6 +41,9 @@ def run(
     objective: Objective = "terminal",
     iterations: Iterations = 8,
     seed: Seed = 0,
+    sampler: Annotated[
+        str, typer.Option(help="nuts, or exact: importance sampling, which need not compile.")
+    ] = "nuts",
     robots: Annotated[int, typer.Option(help="Robots that overwatch the lead.")] = 3,
     max_slope: Annotated[float, typer.Option(help="Steepest slope they stand, degrees.")] = 45.0,
     lidar_range: Annotated[float, typer.Option(help="How far they track each other, m.")] = 100.0,
@@ -96,6 +99,7 @@ def run(
             n_iterations=iterations,
             policy=policy,
             objective=objective,
+            sampler=sampler,
             simulator=simulation.KinematicSimulator(workspace, sight=sight),
             connectivity=connectivity,
             max_bounds=max_bounds,
@@ -189,13 +193,14 @@ def _check(policy: str, objective: str, iterations: int, seed: int) -> None:
 
 def _report(result) -> None:
     """One line per mission, and what was learned."""
-    print("mission  status  contact  objective  R-hat  path")
+    name, label = ("r_hat", "R-hat") if "r_hat" in result.history else ("k_hat", "k-hat")
+    print(f"mission  status  contact  objective  {label}  path")
     for i in result.history["iteration"].values:
         row = result.history.sel(iteration=i)
         change = "first" if i == 1 else "changed" if row["path_changed"] else "same"
         print(
             f"{i:7d}  {row['status'].item():6s}  {row['contact_rate'].item():7.3f}  "
-            f"{row['objective'].item():9.3f}  {row['r_hat'].item():5.3f}  {change}"
+            f"{row['objective'].item():9.3f}  {row[name].item():5.3f}  {change}"
         )
     print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")
     print(f"objective {result.value:.3f} ({result.settings['objective']})")

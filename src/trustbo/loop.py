@@ -50,7 +50,7 @@ def iterate(
             `policy(key, draws, planner) -> Plan`.
         objective: `"terminal"` (the paper's), `"mean"`, `"success"`, `"bottleneck"` or
             `"stationary"`; see `Planner`.
-        sampler: `"nuts"`.
+        sampler: `"nuts"` or `"exact"`; see `trustbo.models.fit`.
         simulator: Whatever has `run(path, *, seed) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         initial: The first plan comes from one random draw of the prior (`"prior_draw"`, as in the
@@ -100,8 +100,9 @@ def iterate(
     with tqdm(total=n_iterations, desc="missions", disable=not progress) as bar:
         for _ in range(n_iterations):
             rows.append(_iteration(campaign, runner))
+            name, label = ("r_hat", "R-hat") if "r_hat" in rows[-1] else ("k_hat", "k-hat")
             bar.set_postfix_str(
-                f"objective {rows[-1]['objective']:.3f}, R-hat {rows[-1]['r_hat']:.3f}"
+                f"objective {rows[-1]['objective']:.3f}, {label} {rows[-1][name]:.3f}"
             )
             bar.update()
             for callback in callbacks:
@@ -148,7 +149,9 @@ def _result(
     steps = np.full((len(rows), max(len(plan.path) for plan in plans), 2), -1)
     for i, plan in enumerate(plans):
         steps[i, : len(plan.path)] = plan.path
-    scalars = {name: [row[name] for row in rows] for name in rows[0] if name not in _NOT_SCALAR}
+    # The exact sampler may have fallen back on NUTS, whose diagnostics are others: NaN then.
+    names = {name: None for row in rows for name in row if name not in _NOT_SCALAR}
+    scalars = {name: [row.get(name, np.nan) for row in rows] for name in names}
     maps: list[xr.DataArray] = [row["trust_map"] for row in rows]  # pyright: ignore[reportAssignmentType]
     iteration = xr.DataArray(np.arange(1, len(rows) + 1), dims="iteration", name="iteration")
     history = xr.Dataset(

@@ -29,8 +29,8 @@ class Result:
         history: Dataset over `iteration` (1, 2, ...): the plan each mission followed (`path`, as
             row and col of each step, -1 after the goal), its `objective` when it was planned,
             whether it differs from the plan before (`path_changed`), the `trust_map` it was planned
-            on, the mission's mean `contact_rate` and `status`, the posterior's `r_hat`, `ess_bulk`
-            and `divergences`, and the seconds spent planning, running and fitting.
+            on, the mission's mean `contact_rate` and `status`, what `models.diagnostics` says of
+            its posterior, and the seconds spent planning, running and fitting.
         settings: What the campaign was run with.
         stop_reason: Why it ended.
     """

@@ -1,9 +1,10 @@
 """From missions to a posterior: sampling, checking it, and laying it out for ArviZ."""
 
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
 
 import arviz as az
 import jax
@@ -17,7 +18,9 @@ from numpyro import handlers
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_choice
 from trustbo.models import latent
-from trustbo.models.nuts import NutsDraws, NutsSettings, run_nuts
+from trustbo.models.datatree import to_datatree
+from trustbo.models.exact import KHAT_LIMIT, sample_exact
+from trustbo.models.nuts import NutsSettings, run_nuts
 from trustbo.models.pooled import (
     PooledTrust,
     TrustParams,
@@ -27,7 +30,7 @@ from trustbo.models.pooled import (
 from trustbo.models.priors import Priors
 from trustbo.stacking import MissionBatch, stack_missions
 
-SAMPLERS = ("nuts",)
+SAMPLERS = ("nuts", "exact")
 MAX_RHAT, MIN_ESS = 1.01, 400.0
 _FIRM_NOISE = (
     "keep the noise away from 0, e.g. Priors(delta_v=numpyro.distributions.TruncatedNormal(0.0, "
@@ -53,9 +56,10 @@ def fit(
     Args:
         missions: All missions to learn from; contact rates that are NaN were not measured.
         model: The trust model; by default `PooledTrust()`.
-        sampler: `"nuts"`.
+        sampler: `"nuts"`, or `"exact"`: near-independent draws by importance sampling, without
+            compiling; it falls back on NUTS, with a warning, where that does not work.
         seed: Same seed, same posterior.
-        n_warmup: Warm-up draws per chain, not kept.
+        n_warmup: Warm-up draws per chain of NUTS, not kept.
         n_draws: Draws kept per chain.
         n_chains: Chains.
         n_trajectories: Draws, spread evenly over the chains, for which latent trust and predicted
@@ -84,27 +88,27 @@ def fit(
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
     with jax.enable_x64(True):
-        key_nuts, key_retry, key_describe = random.split(random.key(seed), 3)
-        draws = _sample(model, settings, key_nuts, batch)
-        retries = 0
-        if check and _complaints(draws):
-            longer = NutsSettings(2 * n_warmup, 2 * n_draws, n_chains, target_accept=0.98)
-            draws, retries = _sample(model, longer, key_retry, batch), 1
+        key_sample, key_describe = random.split(random.key(seed))
+        draws = complaints = None
+        if sampler == "exact":
+            draws = _sample_exact(model, settings, seed, batch)
+            sampler = "exact" if draws else "nuts"
+        if draws is None:
+            draws, complaints = _sample_nuts(model, settings, key_sample, batch, check=check)
         groups = _describe(model, draws, batch, key_describe, n_trajectories)
     seconds = time.perf_counter() - started
-    posterior = _to_datatree(groups, missions)
+    posterior = to_datatree(groups, missions)
     posterior.attrs |= {
         "model": type(model).__name__,
         "sampler": sampler,
         "seed": seed,
-        "retries": retries,
         "seconds": seconds,
+        **draws.summary,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
     }
-    complaints = _complaints(draws) if check else []
     if complaints:
         raise PosteriorError(
             f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions, "
@@ -124,7 +128,15 @@ def sample_prior(model: PooledTrust, n_features: int, n_draws: int, seed: int) -
 
 
 def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
-    """The worst R-hat and bulk ESS over all parameters, and the number of divergences."""
+    """How far to trust a posterior.
+
+    Returns:
+        For NUTS `r_hat` and `ess_bulk`, the worst over all parameters, and `divergences`. For the
+        exact sampler, whose draws are nearly independent, `k_hat` (good below 0.5) and `kish`, the
+        effective number of its points.
+    """
+    if posterior.attrs["sampler"] == "exact":
+        return {name: posterior.attrs[name] for name in ("k_hat", "kish")}
     sites = posterior["posterior"].to_dataset()
     rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
     return {
@@ -154,14 +166,55 @@ def _require_variation(batch: MissionBatch, priors: Priors) -> None:
         )
 
 
-def _sample(
-    model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch
-) -> NutsDraws:
-    draws = run_nuts(pooled_trust, settings, key, model.priors, batch.awareness, batch.contact_rate)
-    return NutsDraws(*({k: np.asarray(v) for k, v in group.items()} for group in draws))  # pyright: ignore[reportArgumentType]
+class _Draws(NamedTuple):
+    """Draws and statistics with leading axes (chain, draw), and what there is to say of all."""
+
+    params: dict[str, np.ndarray]
+    stats: dict[str, np.ndarray]
+    summary: dict[str, float]
 
 
-def _complaints(draws: NutsDraws) -> list[str]:
+def _sample_nuts(
+    model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch, *, check: bool
+) -> tuple[_Draws, list[str]]:
+    """Draws by NUTS, longer ones if the first are bad, and what is wrong with them in the end."""
+    data = (model.priors, batch.awareness, batch.contact_rate)
+    longer = NutsSettings(2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98)
+
+    def attempt(tried: NutsSettings, retries: int) -> tuple[_Draws, list[str]]:
+        raw = run_nuts(pooled_trust, tried, random.fold_in(key, retries), *data)
+        params, stats = ({k: np.asarray(v) for k, v in group.items()} for group in raw)
+        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
+        draws = _Draws(params, stats, {"retries": retries})
+        return draws, _complaints(draws) if check else []
+
+    draws, complaints = attempt(settings, 0)
+    return attempt(longer, 1) if complaints else (draws, complaints)
+
+
+def _sample_exact(
+    model: PooledTrust, settings: NutsSettings, seed: int, batch: MissionBatch
+) -> _Draws | None:
+    """Draws by importance sampling, or None, with a warning, where its weights are too uneven."""
+    shape = (settings.n_chains, settings.n_draws)
+    exact = sample_exact(batch, model.priors, shape[0] * shape[1], seed)
+    if not exact.khat <= KHAT_LIMIT:
+        warnings.warn(
+            f"the exact sampler's k-hat is {exact.khat:.2f} (limit {KHAT_LIMIT}): its weights are "
+            "too uneven here, so NUTS is used instead.",
+            stacklevel=3,
+        )
+        return None
+    params = {k: v.reshape(*shape, *v.shape[1:]) for k, v in exact.params.items()}
+    stats = {"lp": exact.lp.reshape(shape), "log_weight": exact.log_weight.reshape(shape)}
+    return _Draws(
+        params,
+        stats,
+        {"k_hat": exact.khat, "kish": exact.kish, "log_evidence": exact.log_evidence},
+    )
+
+
+def _complaints(draws: _Draws) -> list[str]:
     """What is wrong with the draws, parameter by parameter; empty if nothing is."""
     sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
     rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
@@ -179,7 +232,7 @@ def _complaints(draws: NutsDraws) -> list[str]:
 
 
 def _describe(
-    model: PooledTrust, draws: NutsDraws, batch: MissionBatch, key: Array, n_trajectories: int
+    model: PooledTrust, draws: _Draws, batch: MissionBatch, key: Array, n_trajectories: int
 ) -> dict[str, dict[str, Any]]:
     """Every group of the DataTree as arrays with leading axes (chain, draw), padding included."""
     n_chains, n_draws = draws.params["beta0"].shape
@@ -198,8 +251,7 @@ def _describe(
     prior = {name: np.asarray(prior[name])[None] for name in (*_SITES, "contact_rate")}
     return {
         "posterior": {name: draws.params[name] for name in _SITES},
-        "sample_stats": draws.stats
-        | {"tree_depth": np.ceil(np.log2(draws.stats["n_steps"] + 1)).astype(int)},
+        "sample_stats": draws.stats,
         "log_likelihood": {"contact_rate": by_chain(mission_log_likelihood(all_params, *data))},
         "latent": {
             "trust": by_chain(latent.trust_draws(few_params, *data, key_trust)),
@@ -229,71 +281,3 @@ def _params(draws: Mapping[str, ArrayLike], priors: Priors) -> TrustParams:
     n_draws = np.shape(draws["beta0"])[0]
     x0 = {name: np.full(n_draws, getattr(priors, name)) for name in ("x0_mean", "x0_sd")}
     return TrustParams(**{name: draws[name] for name in _SITES}, **x0)
-
-
-_DIMS = {
-    "beta": ("feature",),
-    "trust": ("mission", "bound", "robot"),
-    "trust_mean": ("mission", "bound", "robot"),
-    "trust_sd": ("mission", "bound", "robot"),
-    "contact_rate": ("mission", "bound", "robot"),
-}
-
-
-def _to_datatree(groups: dict[str, dict[str, Any]], missions: Sequence[Mission]) -> xr.DataTree:
-    """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN."""
-    observed = stack_missions(missions, pad=False)
-    n_missions, n_bounds = observed.contact_rate.shape[:2]
-    lengths = xr.DataArray([len(m.bounds) for m in missions], dims="mission")
-    coords = {
-        "mission": np.arange(n_missions),
-        "bound": np.arange(1, n_bounds + 1),
-        "robot": list(missions[0].robots),
-        "feature": list(missions[0].features),
-    }
-    tree = {}
-    for group, arrays in groups.items():
-        draw = arrays.pop("draw", None)
-        variables = {}
-        for name, array in arrays.items():
-            dims = ("mission",) if group == "log_likelihood" else _DIMS.get(name, ())
-            if len(dims) < array.ndim:
-                dims = ("chain", "draw", *dims)
-            cut = xr.DataArray(array, dims=dims)
-            cut = cut.isel({d: slice(len(coords[d])) for d in dims if d in coords})
-            cut = cut.assign_coords({d: coords[d] for d in dims if d in coords})
-            if "bound" in dims:
-                cut = cut.where(cut["bound"] <= lengths)
-            variables[name] = cut.transpose(*dims)
-        dataset = xr.Dataset(variables)
-        index = {
-            "chain": np.arange(dataset.sizes["chain"]),
-            "draw": np.arange(dataset.sizes["draw"]),
-        }
-        tree[group] = dataset.assign_coords(index if draw is None else index | {"draw": draw})
-    tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
-    return xr.DataTree.from_dict(tree)
-
-
-def _data_groups(
-    observed: MissionBatch, missions: Sequence[Mission], coords: dict[str, object]
-) -> tuple[xr.Dataset, xr.Dataset]:
-    shape = observed.contact_rate.shape
-    duration, cell = np.full(shape, np.nan), np.full((*shape[:2], 2), -1)
-    for j, mission in enumerate(missions):
-        duration[j, : len(mission.bounds)] = mission.duration
-        cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
-    dims = ("mission", "bound", "robot")
-    own = {name: coords[name] for name in dims}
-    rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, own)
-    constant = xr.Dataset(
-        {
-            "awareness": ((*dims, "feature"), observed.awareness),
-            "duration": (dims, duration, {"units": "s"}),
-            "row": (("mission", "bound"), cell[..., 0]),
-            "col": (("mission", "bound"), cell[..., 1]),
-            "status": (("mission",), [mission.status for mission in missions]),
-        },
-        coords,
-    )
-    return rates, constant

@@ -1,0 +1,77 @@
+"""How a posterior is laid out for ArviZ: named axes, no padding, the data beside it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Mission
+from trustbo.stacking import MissionBatch, stack_missions
+
+_DIMS = {
+    "beta": ("feature",),
+    "trust": ("mission", "bound", "robot"),
+    "trust_mean": ("mission", "bound", "robot"),
+    "trust_sd": ("mission", "bound", "robot"),
+    "contact_rate": ("mission", "bound", "robot"),
+}
+
+
+def to_datatree(groups: dict[str, dict[str, Any]], missions: Sequence[Mission]) -> xr.DataTree:
+    """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN."""
+    observed = stack_missions(missions, pad=False)
+    n_missions, n_bounds = observed.contact_rate.shape[:2]
+    lengths = xr.DataArray([len(m.bounds) for m in missions], dims="mission")
+    coords = {
+        "mission": np.arange(n_missions),
+        "bound": np.arange(1, n_bounds + 1),
+        "robot": list(missions[0].robots),
+        "feature": list(missions[0].features),
+    }
+    tree = {}
+    for group, arrays in groups.items():
+        draw = arrays.pop("draw", None)
+        variables = {}
+        for name, array in arrays.items():
+            dims = ("mission",) if group == "log_likelihood" else _DIMS.get(name, ())
+            if len(dims) < array.ndim:
+                dims = ("chain", "draw", *dims)
+            cut = xr.DataArray(array, dims=dims)
+            cut = cut.isel({d: slice(len(coords[d])) for d in dims if d in coords})
+            cut = cut.assign_coords({d: coords[d] for d in dims if d in coords})
+            if "bound" in dims:
+                cut = cut.where(cut["bound"] <= lengths)
+            variables[name] = cut.transpose(*dims)
+        dataset = xr.Dataset(variables)
+        index = {
+            "chain": np.arange(dataset.sizes["chain"]),
+            "draw": np.arange(dataset.sizes["draw"]),
+        }
+        tree[group] = dataset.assign_coords(index if draw is None else index | {"draw": draw})
+    tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
+    return xr.DataTree.from_dict(tree)
+
+
+def _data_groups(
+    observed: MissionBatch, missions: Sequence[Mission], coords: dict[str, object]
+) -> tuple[xr.Dataset, xr.Dataset]:
+    shape = observed.contact_rate.shape
+    duration, cell = np.full(shape, np.nan), np.full((*shape[:2], 2), -1)
+    for j, mission in enumerate(missions):
+        duration[j, : len(mission.bounds)] = mission.duration
+        cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
+    dims = ("mission", "bound", "robot")
+    own = {name: coords[name] for name in dims}
+    rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, own)
+    constant = xr.Dataset(
+        {
+            "awareness": ((*dims, "feature"), observed.awareness),
+            "duration": (dims, duration, {"units": "s"}),
+            "row": (("mission", "bound"), cell[..., 0]),
+            "col": (("mission", "bound"), cell[..., 1]),
+            "status": (("mission",), [mission.status for mission in missions]),
+        },
+        coords,
+    )
+    return rates, constant
