@@ -1,5 +1,6 @@
 """Trust models and their inference."""
 
+from trustbo.models.filter import TrustFilter, TrustState
 from trustbo.models.fit import diagnostics, fit, sample_prior
 from trustbo.models.pooled import ContactRate, PooledTrust, TrustParams, TrustSample, pooled_trust
 from trustbo.models.priors import Priors
@@ -8,8 +9,10 @@ __all__ = [
     "ContactRate",
     "PooledTrust",
     "Priors",
+    "TrustFilter",
     "TrustParams",
     "TrustSample",
+    "TrustState",
     "diagnostics",
     "fit",
     "pooled_trust",
