@@ -1,5 +1,6 @@
 """Trust models and their inference."""
 
+from trustbo.models.calibration import sbc
 from trustbo.models.filter import TrustFilter, TrustState
 from trustbo.models.fit import diagnostics, fit, sample_prior
 from trustbo.models.pooled import ContactRate, PooledTrust, TrustParams, TrustSample, pooled_trust
@@ -17,4 +18,5 @@ __all__ = [
     "fit",
     "pooled_trust",
     "sample_prior",
+    "sbc",
 ]

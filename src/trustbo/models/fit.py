@@ -88,19 +88,14 @@ def fit(
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
     with jax.enable_x64(True):
-        key_sample, key_describe = random.split(random.key(seed))
-        draws = complaints = None
-        if sampler == "exact":
-            draws = _sample_exact(model, settings, seed, batch)
-            sampler = "exact" if draws else "nuts"
-        if draws is None:
-            draws, complaints = _sample_nuts(model, settings, key_sample, batch, check=check)
-        groups = _describe(model, draws, batch, key_describe, n_trajectories)
+        draws, complaints = draw_posterior(model, sampler, settings, seed, batch, check=check)
+        key = random.fold_in(random.key(seed), 1)
+        groups = _describe(model, draws, batch, key, n_trajectories)
     seconds = time.perf_counter() - started
     posterior = to_datatree(groups, missions)
     posterior.attrs |= {
         "model": type(model).__name__,
-        "sampler": sampler,
+        "sampler": draws.sampler,
         "seed": seed,
         "seconds": seconds,
         **draws.summary,
@@ -123,7 +118,7 @@ def sample_prior(model: PooledTrust, n_features: int, n_draws: int, seed: int) -
     """Draws of the parameters from the prior, leading axis (draw,)."""
     with jax.enable_x64(True):
         empty = jnp.zeros((1, 1, 1, n_features))
-        draws = _prior_draws(model.priors, empty, random.split(random.key(seed), n_draws))
+        draws = prior_draws(model.priors, empty, random.split(random.key(seed), n_draws))
         return _params({name: np.asarray(draws[name]) for name in _SITES}, model.priors)
 
 
@@ -166,26 +161,42 @@ def _require_variation(batch: MissionBatch, priors: Priors) -> None:
         )
 
 
-class _Draws(NamedTuple):
+class Draws(NamedTuple):
     """Draws and statistics with leading axes (chain, draw), and what there is to say of all."""
 
     params: dict[str, np.ndarray]
     stats: dict[str, np.ndarray]
     summary: dict[str, float]
+    sampler: str
+
+
+def draw_posterior(
+    model: PooledTrust,
+    sampler: str,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    *,
+    check: bool,
+) -> tuple[Draws, list[str]]:
+    """Draws given a batch, and what is wrong with them; call it in a float64 scope."""
+    if sampler == "exact" and (exact := _sample_exact(model, settings, seed, batch)):
+        return exact, []
+    return _sample_nuts(model, settings, random.key(seed), batch, check=check)
 
 
 def _sample_nuts(
     model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch, *, check: bool
-) -> tuple[_Draws, list[str]]:
+) -> tuple[Draws, list[str]]:
     """Draws by NUTS, longer ones if the first are bad, and what is wrong with them in the end."""
     data = (model.priors, batch.awareness, batch.contact_rate)
     longer = NutsSettings(2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98)
 
-    def attempt(tried: NutsSettings, retries: int) -> tuple[_Draws, list[str]]:
+    def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
         raw = run_nuts(pooled_trust, tried, random.fold_in(key, retries), *data)
         params, stats = ({k: np.asarray(v) for k, v in group.items()} for group in raw)
         stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
-        draws = _Draws(params, stats, {"retries": retries})
+        draws = Draws(params, stats, {"retries": retries}, "nuts")
         return draws, _complaints(draws) if check else []
 
     draws, complaints = attempt(settings, 0)
@@ -194,7 +205,7 @@ def _sample_nuts(
 
 def _sample_exact(
     model: PooledTrust, settings: NutsSettings, seed: int, batch: MissionBatch
-) -> _Draws | None:
+) -> Draws | None:
     """Draws by importance sampling, or None, with a warning, where its weights are too uneven."""
     shape = (settings.n_chains, settings.n_draws)
     exact = sample_exact(batch, model.priors, shape[0] * shape[1], seed)
@@ -207,14 +218,15 @@ def _sample_exact(
         return None
     params = {k: v.reshape(*shape, *v.shape[1:]) for k, v in exact.params.items()}
     stats = {"lp": exact.lp.reshape(shape), "log_weight": exact.log_weight.reshape(shape)}
-    return _Draws(
+    return Draws(
         params,
         stats,
         {"k_hat": exact.khat, "kish": exact.kish, "log_evidence": exact.log_evidence},
+        "exact",
     )
 
 
-def _complaints(draws: _Draws) -> list[str]:
+def _complaints(draws: Draws) -> list[str]:
     """What is wrong with the draws, parameter by parameter; empty if nothing is."""
     sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
     rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
@@ -232,7 +244,7 @@ def _complaints(draws: _Draws) -> list[str]:
 
 
 def _describe(
-    model: PooledTrust, draws: _Draws, batch: MissionBatch, key: Array, n_trajectories: int
+    model: PooledTrust, draws: Draws, batch: MissionBatch, key: Array, n_trajectories: int
 ) -> dict[str, dict[str, Any]]:
     """Every group of the DataTree as arrays with leading axes (chain, draw), padding included."""
     n_chains, n_draws = draws.params["beta0"].shape
@@ -247,7 +259,7 @@ def _describe(
         return np.asarray(array).reshape(n_chains, -1, *array.shape[1:])
 
     moments = latent.trust_moments(all_params, *data)
-    prior = _prior_draws(model.priors, data[0], random.split(key_prior, 500))
+    prior = prior_draws(model.priors, data[0], random.split(key_prior, 500))
     prior = {name: np.asarray(prior[name])[None] for name in (*_SITES, "contact_rate")}
     return {
         "posterior": {name: draws.params[name] for name in _SITES},
@@ -269,7 +281,9 @@ def _describe(
 
 
 @jax.jit
-def _prior_draws(priors: Priors, awareness: Array, keys: Array) -> dict[str, Array]:
+def prior_draws(priors: Priors, awareness: Array, keys: Array) -> dict[str, Array]:
+    """Parameters and contact rates drawn from the prior, one set per key."""
+
     def one(key: Array) -> dict[str, Array]:
         trace = handlers.trace(handlers.seed(pooled_trust, key)).get_trace(awareness, priors)
         return {name: site["value"] for name, site in trace.items() if site["type"] == "sample"}
