@@ -42,6 +42,10 @@ def test_one_panel_per_iteration_and_one_for_the_end(result):
     np.testing.assert_allclose(axes[0].get_ylim(), (0.0, 90.0))
     limits = {axes[i].images[0].get_clim() for i in range(3)}
     assert len(limits) == 1
+    # The start's trust is assumed: it must not stretch the colours of what was learned.
+    learned = np.stack([result.history["trust_map"].values[1], result.trust_map.values])
+    learned[:, 2, 0] = np.nan
+    assert limits.pop() == (np.nanmin(learned), np.nanmax(learned))
 
 
 def test_the_path_is_drawn_from_start_to_goal_where_its_cells_are(result):

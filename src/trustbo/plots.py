@@ -44,8 +44,11 @@ def trust_maps(result: "Result", *, n_columns: int | None = None) -> np.ndarray:
     titles[0] += " (from the prior)"
     maps, paths = [*maps, result.trust_map], [*paths, result.path]
     titles.append(f"after {len(titles)} mission{'s' if len(titles) > 1 else ''}")
-    # The first map comes from the prior and may be far off: the others set the colours.
-    learned = np.concatenate([m.values.ravel() for m in maps[1:]])
+    # The first map comes from the prior and may be far off, and the start cell's trust is assumed,
+    # not learned: the rest sets the colours.
+    everything = np.stack([trust.values for trust in maps])
+    learned = everything[1:].copy()
+    learned[:, *paths[0][0]] = np.nan
     low, high = np.nanmin(learned), np.nanmax(learned)
     grid = result.workspace.grid
     tall = _tallness(grid)
@@ -69,8 +72,7 @@ def trust_maps(result: "Result", *, n_columns: int | None = None) -> np.ndarray:
     for ax in panels[len(maps) :]:
         ax.set_visible(False)
     _label_outer(axes, grid)
-    first = maps[0].values
-    extend = _extend(np.nanmin(first) < low, np.nanmax(first) > high)
+    extend = _extend(np.nanmin(everything) < low, np.nanmax(everything) > high)
     label = "expected trust"
     if not result.workspace.passable.all():
         label += " (grey: impassable)"
