@@ -97,6 +97,13 @@ def iterate(
         "goal": list(campaign.planner.goal),
     }
     rows: list[dict[str, object]] = []
+
+    def keep(reason: str) -> Result:
+        result = _result(campaign, rows, settings, reason)
+        if folder is not None:
+            result.save(folder) if len(rows) == 1 else result.checkpoint(folder)
+        return result
+
     with tqdm(total=n_iterations, desc="missions", disable=not progress) as bar:
         for _ in range(n_iterations):
             rows.append(_iteration(campaign, runner))
@@ -108,12 +115,8 @@ def iterate(
             for callback in callbacks:
                 callback(campaign, campaign.missions[-1])
             if folder is not None and len(rows) < n_iterations:
-                so_far = _result(campaign, rows, settings, "interrupted")
-                so_far.save(folder) if len(rows) == 1 else so_far.checkpoint(folder)
-    result = _result(campaign, rows, settings, "n_iterations")
-    if folder is not None:
-        result.save(folder) if n_iterations == 1 else result.checkpoint(folder)
-    return result
+                keep("interrupted")
+    return keep("n_iterations")
 
 
 def _iteration(campaign: Campaign, simulator: Simulator) -> dict[str, object]:

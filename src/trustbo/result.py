@@ -71,10 +71,14 @@ class Result:
         (folder / "result.json").unlink(missing_ok=True)  # whatever it spoke of is going
         for j, posterior in enumerate(self.posteriors):
             _write_tree(folder / "posteriors" / _posterior_name(j), posterior)
+        _write_tree(folder / "workspace.nc", archive.workspace_to_tree(self.workspace))
         self.checkpoint(folder)
 
     def checkpoint(self, directory: str | PathLike[str]) -> None:
-        """As `save`, into a folder that has all posteriors but the last: these never change."""
+        """As `save`, into a folder where it was called a mission ago.
+
+        The workspace and the earlier posteriors never change, and are not written again.
+        """
         folder = require_folder(directory)
         last = _posterior_name(len(self.posteriors) - 1)
         _write_tree(folder / "posteriors" / last, self.posterior)
@@ -84,7 +88,6 @@ class Result:
         _write_tree(folder / "posterior.nc", self.posterior)
         trees = {
             "missions.nc": archive.missions_to_tree(self.missions),
-            "workspace.nc": archive.workspace_to_tree(self.workspace),
             "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
         }
         for name, tree in trees.items():

@@ -10,7 +10,7 @@ from tqdm import tqdm
 from trustbo.errors import require_choice, require_whole
 from trustbo.models.fit import SAMPLERS, draw_posterior, prior_draws
 from trustbo.models.nuts import NutsSettings
-from trustbo.models.pooled import PooledTrust, TrustParams
+from trustbo.models.pooled import SITES, PooledTrust
 from trustbo.stacking import MissionBatch
 
 _CHAINS = 4
@@ -58,7 +58,7 @@ def sbc(
         keys = random.split(random.key(seed), n_datasets)
         simulated = prior_draws(model.priors, awareness, keys)
         rates = np.asarray(simulated["contact_rate"])
-        truths = {name: np.asarray(simulated[name]) for name in TrustParams._fields[:5]}
+        truths = {name: np.asarray(simulated[name]) for name in SITES}
         for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
             batch = MissionBatch(awareness, rates[j])
             draws, _ = draw_posterior(model, sampler, settings, seed + j, batch, check=False)

@@ -7,7 +7,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models.pooled import TrustParams
+from trustbo.models.pooled import TrustParams, broadcast_params
 
 
 class TrustState(NamedTuple):
@@ -57,14 +57,7 @@ class TrustFilter:
             raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
         n = len(np.atleast_1d(posterior.beta0))
         kept = np.linspace(0, n - 1, min(n, max_draws)).astype(int)
-        self.params = TrustParams(
-            *(
-                np.asarray(value, dtype=float)[kept]
-                if np.ndim(value) > (name == "beta")
-                else np.broadcast_to(np.asarray(value, dtype=float), (len(kept), *np.shape(value)))
-                for name, value in zip(posterior._fields, posterior, strict=True)
-            )
-        )
+        self.params = TrustParams(*(each[kept] for each in broadcast_params(posterior, (n,))))
         self._n_robots = n_robots
         self._beta0, self._Q, self._R = (
             column[:, None]

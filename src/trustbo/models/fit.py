@@ -22,6 +22,7 @@ from trustbo.models.datatree import to_datatree
 from trustbo.models.exact import KHAT_LIMIT, sample_exact
 from trustbo.models.nuts import NutsSettings, run_nuts
 from trustbo.models.pooled import (
+    SITES,
     PooledTrust,
     TrustParams,
     mission_log_likelihood,
@@ -36,7 +37,6 @@ _FIRM_NOISE = (
     "keep the noise away from 0, e.g. Priors(delta_v=numpyro.distributions.TruncatedNormal(0.0, "
     "0.2, low=0.01))"
 )
-_SITES = TrustParams._fields[:5]
 
 
 def fit(
@@ -119,7 +119,7 @@ def sample_prior(model: PooledTrust, n_features: int, n_draws: int, seed: int) -
     with jax.enable_x64(True):
         empty = jnp.zeros((1, 1, 1, n_features))
         draws = prior_draws(model.priors, empty, random.split(random.key(seed), n_draws))
-        return _params({name: np.asarray(draws[name]) for name in _SITES}, model.priors)
+        return _params({name: np.asarray(draws[name]) for name in SITES}, model.priors)
 
 
 def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
@@ -132,13 +132,18 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     """
     if posterior.attrs["sampler"] == "exact":
         return {name: posterior.attrs[name] for name in ("k_hat", "kish")}
-    sites = posterior["posterior"].to_dataset()
-    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+    by_site = _convergence(posterior["posterior"].to_dataset())
     return {
-        "r_hat": max(float(rhat[name].max()) for name in rhat.data_vars),
-        "ess_bulk": min(float(ess[name].min()) for name in ess.data_vars),
+        "r_hat": max(rhat for rhat, _ in by_site.values()),
+        "ess_bulk": min(ess for _, ess in by_site.values()),
         "divergences": int(posterior["sample_stats"].to_dataset()["diverging"].sum()),
     }
+
+
+def _convergence(sites: xr.Dataset) -> dict[str, tuple[float, float]]:
+    """The worst R-hat and the least bulk ESS of each parameter."""
+    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+    return {str(n): (float(rhat[n].max()), float(ess[n].min())) for n in sites.data_vars}
 
 
 def _require_variation(batch: MissionBatch, priors: Priors) -> None:
@@ -229,10 +234,8 @@ def _sample_exact(
 def _complaints(draws: Draws) -> list[str]:
     """What is wrong with the draws, parameter by parameter; empty if nothing is."""
     sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
-    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
     found = []
-    for name in sites.data_vars:
-        worst, fewest = float(rhat[name].max()), float(ess[name].min())
+    for name, (worst, fewest) in _convergence(sites).items():
         if not worst <= MAX_RHAT:  # NaN is a complaint too
             found.append(f"R-hat of {name} is {worst:.3f} (limit {MAX_RHAT})")
         if not fewest >= MIN_ESS:
@@ -260,9 +263,9 @@ def _describe(
 
     moments = latent.trust_moments(all_params, *data)
     prior = prior_draws(model.priors, data[0], random.split(key_prior, 500))
-    prior = {name: np.asarray(prior[name])[None] for name in (*_SITES, "contact_rate")}
+    prior = {name: np.asarray(prior[name])[None] for name in (*SITES, "contact_rate")}
     return {
-        "posterior": {name: draws.params[name] for name in _SITES},
+        "posterior": {name: draws.params[name] for name in SITES},
         "sample_stats": draws.stats,
         "log_likelihood": {"contact_rate": by_chain(mission_log_likelihood(all_params, *data))},
         "latent": {
@@ -294,4 +297,4 @@ def prior_draws(priors: Priors, awareness: Array, keys: Array) -> dict[str, Arra
 def _params(draws: Mapping[str, ArrayLike], priors: Priors) -> TrustParams:
     n_draws = np.shape(draws["beta0"])[0]
     x0 = {name: np.full(n_draws, getattr(priors, name)) for name in ("x0_mean", "x0_sd")}
-    return TrustParams(**{name: draws[name] for name in _SITES}, **x0)
+    return TrustParams(**{name: draws[name] for name in SITES}, **x0)

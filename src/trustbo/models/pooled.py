@@ -47,7 +47,7 @@ class TrustParams(NamedTuple):
     def from_posterior(cls, posterior: xr.DataTree) -> Self:
         """All draws of a posterior, chains joined: leading axis (draw,)."""
         draws = posterior["posterior"].to_dataset().stack(sample=("chain", "draw"))
-        arrays = {name: draws[name].transpose("sample", ...).values for name in cls._fields[:5]}
+        arrays = {name: draws[name].transpose("sample", ...).values for name in SITES}
         return cls(**arrays, **{n: posterior.attrs[n] for n in cls._fields[5:]})
 
     def draw(self, index: int) -> Self:
@@ -65,6 +65,10 @@ class TrustParams(NamedTuple):
         beta = np.asarray(self.beta)
         means = {name: float(np.mean(v)) for name, v in zip(self._fields, self, strict=True)}
         return self._replace(**means | {"beta": beta.reshape(-1, beta.shape[-1]).mean(0)})
+
+
+SITES = TrustParams._fields[:5]
+"""The parameters that have a posterior, as their sample sites are called."""
 
 
 class ContactRate(dist.Distribution):

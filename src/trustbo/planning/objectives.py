@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from trustbo.errors import ShapeError
 from trustbo.models import TrustParams
+from trustbo.models.pooled import check_features
 
 
 def roll_trust(
@@ -51,10 +51,7 @@ def drift(params: TrustParams, awareness: ArrayLike) -> np.ndarray:
         ShapeError: The number of features differs from that of `params.beta`.
     """
     z, beta = np.asarray(awareness, dtype=float), np.asarray(params.beta, dtype=float)
-    if beta.ndim < 1 or beta.shape[-1] != z.shape[-1]:
-        raise ShapeError(
-            f"params.beta has shape {beta.shape}, but awareness has {z.shape[-1]} features."
-        )
+    check_features(params, z.shape[-1])
     b = np.asarray(params.b, dtype=float)
     return np.tensordot(beta, z, (-1, -1)) + b.reshape(b.shape + (1,) * (z.ndim - 1))
 

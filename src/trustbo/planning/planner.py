@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import networkx as nx
@@ -55,6 +55,7 @@ class Planner:
 
     Attributes:
         graph: The `networkx.DiGraph` of passable cells (see `cell_graph`).
+        to_goal: Fewest bounds to the goal, by cell; cells that are missing cannot reach it.
         shortest: Fewest bounds from start to goal.
         longest: Most bounds an admissible path may have.
         u_turns: Whether an admissible path may turn straight back.
@@ -101,7 +102,9 @@ class Planner:
         if self.start == self.goal:
             raise TrustboError(f"start and goal are the same cell {self.start}; choose two.")
         self.graph = cell_graph(workspace, connectivity)
-        self.shortest = fewest_bounds(self.graph, self.start, self.goal)[self.start]
+        self.to_goal = fewest_bounds(self.graph, self.start, self.goal)
+        self.shortest = self.to_goal[self.start]
+        self._from_start = dict(nx.single_source_shortest_path_length(self.graph, self.start))
         if max_bounds is None:
             labelled = objective in ("success", "bottleneck")
             max_bounds = self.shortest + DEFAULT_SLACK if labelled else "shortest+2"
@@ -124,17 +127,7 @@ class Planner:
         path = self._search(self._recursion(params))
         plan = self.evaluate(path, params)
         seconds = time.perf_counter() - started
-        return Plan(
-            path=plan.path,
-            trust=plan.trust,
-            value=plan.value,
-            objective=self.objective,
-            exact=True,
-            bound=plan.value,
-            revisits=plan.revisits,
-            engine="networkx",
-            seconds=seconds,
-        )
+        return replace(plan, exact=True, bound=plan.value, engine="networkx", seconds=seconds)
 
     def evaluate(self, path: Sequence[Cell], params: TrustParams) -> Plan:
         """What is expected of a given path; `exact` is False and `bound` NaN.
@@ -193,10 +186,9 @@ class Planner:
         _require_one_draw(params)
         u = drift(params, self.workspace.awareness.values)
         u = u if per_robot else u.mean(0)
-        reached = dict(nx.single_source_shortest_path_length(self.graph, self.start))
         beta0, x0 = float(np.asarray(params.beta0)), float(np.asarray(params.x0_mean))
         slack = min(2, self.longest - self.shortest)
-        values = best_trust(u, beta0, x0, reached, MOVES[self.connectivity], slack)
+        values = best_trust(u, beta0, x0, self._from_start, MOVES[self.connectivity], slack)
         like = self.workspace.awareness.isel(feature=0, drop=True)
         like = like if per_robot else like.isel(robot=0, drop=True)
         return like.copy(data=values).rename("trust").assign_attrs(long_name="expected trust")
@@ -244,13 +236,18 @@ class Planner:
             return search.best_stationary(*ends, recursion, self._backend)
         if self.objective in ("success", "bottleneck"):
             return search.best_labelled(
-                *ends, recursion, self.longest, self.objective, revisit=self.revisit
+                *ends, self.to_goal, recursion, self.longest, self.objective, revisit=self.revisit
             )
         candidates = []
         for n_bounds in range(self.shortest, self.longest + 1):
             weights = search.additive_weights(self.objective, recursion.beta0, n_bounds)
             path = search.best_additive(
-                *ends, recursion.u, weights, u_turns=self.u_turns, backend=self._backend
+                *ends,
+                self.to_goal,
+                recursion.u,
+                weights,
+                u_turns=self.u_turns,
+                backend=self._backend,
             )
             if path is not None:
                 us = np.array([recursion.u[cell] for cell in path[1:]])

@@ -42,6 +42,7 @@ def best_additive(
     graph: nx.DiGraph,
     start: Cell,
     goal: Cell,
+    to_goal: Mapping[Cell, int],
     u: Mapping[Cell, float],
     weights: np.ndarray,
     *,
@@ -58,6 +59,7 @@ def best_additive(
         graph: Passable cells.
         start: First cell.
         goal: Last cell, entered by the last bound only.
+        to_goal: Fewest bounds from each cell to the goal.
         u: Drift of each cell.
         weights: Weight of each bound.
         u_turns: Whether a bound may lead back to the cell that the last one left.
@@ -70,7 +72,6 @@ def best_additive(
     dag = nx.DiGraph()
     source, sink = (0, None, start), "goal"
     dag.add_node(source)
-    to_goal = dict(nx.single_target_shortest_path_length(graph, goal))
     layer = [source]
     for k, weight in enumerate(weights, start=1):
         entered = {}
@@ -101,6 +102,7 @@ def best_labelled(
     graph: nx.DiGraph,
     start: Cell,
     goal: Cell,
+    to_goal: Mapping[Cell, int],
     recursion: Recursion,
     max_bounds: int,
     objective: str,
@@ -127,7 +129,6 @@ def best_labelled(
         if objective == "success"
         else (lambda cost, x: max(cost, -x))
     )
-    to_goal = dict(nx.single_target_shortest_path_length(graph, goal))
     bit = {cell: 1 << i for i, cell in enumerate(graph)} if not revisit else {}
     settled: dict[Cell, list[tuple[float, int, int]]] = {cell: [] for cell in graph}
     order = itertools.count()  # among equal costs, first come first served: deterministic

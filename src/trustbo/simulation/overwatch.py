@@ -94,7 +94,7 @@ class KinematicSimulator:
             workspace,
             self._surface,
             self.sight,
-            workspace.pixels["traversability"].values,
+            workspace.pixels["traversability"],
             formation_radius,
         )
         self._state: _State | None = None

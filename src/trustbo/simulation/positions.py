@@ -19,7 +19,12 @@ class Positions:
     """Waypoints and formations of a workspace's cells; positions are x, y in CRS metres."""
 
     def __init__(
-        self, workspace: Workspace, surface: Surface, sight: Sight, ease: np.ndarray, radius: float
+        self,
+        workspace: Workspace,
+        surface: Surface,
+        sight: Sight,
+        ease: xr.DataArray,
+        radius: float,
     ) -> None:
         """Prepare.
 
@@ -27,13 +32,15 @@ class Positions:
             workspace: The cells and the team.
             surface: The terrain.
             sight: What hinders sight.
-            ease: How easy each pixel is to cross, shape (row, col).
+            ease: How easy each pixel is to cross, dims (y, x).
             radius: How far from the lead's waypoint T2 may stand, m.
         """
         self._workspace, self._surface, self._sight = workspace, surface, sight
-        self._ease = _smoothed(ease, surface.pixel)
+        self._ease = _smoothed(ease.values, surface.pixel)
         self._standable = _largest_region(surface.passable)
         self._radius = radius
+        # Row and column of the cell that each row and column of pixels belongs to, ascending.
+        self._cells = workspace.grid.cells_along(ease["y"].values, ease["x"].values)
 
     def window(self, a: Cell, b: Cell) -> tuple[int, int, int, int]:
         """Pixels of two cells and half a cell around them."""
@@ -91,10 +98,9 @@ class Positions:
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels of a cell where a robot can stand."""
-        rows, cols = self._surface.ground.shape
-        n_rows, n_cols = self._workspace.grid.shape
-        top, bottom = (round(r * rows / n_rows) for r in (cell[0], cell[0] + 1))
-        left, right = (round(c * cols / n_cols) for c in (cell[1], cell[1] + 1))
+        rows, cols = self._cells
+        top, bottom = np.searchsorted(rows, (cell[0], cell[0] + 1))
+        left, right = np.searchsorted(cols, (cell[1], cell[1] + 1))
         for allowed in (self._standable, self._surface.passable):
             row, col = np.nonzero(allowed[top:bottom, left:right])
             if len(row):

@@ -95,9 +95,14 @@ class Grid:
         array = condition.transpose("y", "x").values.astype(float)
         return self._sums(condition, array) / self._sums(condition, np.ones_like(array))
 
+    def cells_along(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row of the cells that pixels at `y` are in, and column of those at `x`."""
+        rows, cols = self.shape
+        row = np.clip(((self.top - y) / self.cell_height).astype(int), 0, rows - 1)
+        return row, np.clip(((x - self.left) / self.cell_width).astype(int), 0, cols - 1)
+
     def _sums(self, like: xr.DataArray, array: np.ndarray) -> np.ndarray:
         rows, cols = self.shape
-        row = np.clip(((self.top - like["y"].values) / self.cell_height).astype(int), 0, rows - 1)
-        col = np.clip(((like["x"].values - self.left) / self.cell_width).astype(int), 0, cols - 1)
+        row, col = self.cells_along(like["y"].values, like["x"].values)
         label = row[:, None] * cols + col[None, :]
         return np.bincount(label.ravel(), array.ravel(), rows * cols).reshape(rows, cols)
