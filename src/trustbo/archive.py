@@ -66,13 +66,13 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
     robots, features = missions[0].robots, missions[0].features
     path = np.full((len(missions), n_steps, 2), -1)
     awareness = np.full((*shape, len(robots), len(features)), np.nan)
-    rates, duration = (np.full((*shape, len(robots)), np.nan) for _ in range(2))
+    rates, duration, exposure = (np.full((*shape, len(robots)), np.nan) for _ in range(3))
     start, status = np.full(shape, np.nan), np.full(shape, "", dtype=object)
     for j, mission in enumerate(missions):
         n = len(mission.bounds)
         path[j, : len(mission.path)] = mission.path
         awareness[j, :n], rates[j, :n] = mission.awareness, mission.contact_rate
-        duration[j, :n] = mission.duration
+        duration[j, :n], exposure[j, :n] = mission.duration, mission.exposure
         start[j, :n] = [bound.t0 for bound in mission.bounds]
         status[j, :n] = [bound.status for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
@@ -82,6 +82,7 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
             "awareness": ((*dims, "feature"), awareness),
             "contact_rate": (dims, rates),
             "duration": (dims, duration, {"units": "s"}),
+            "exposure": (dims, exposure, {"units": "1"}),
             "start": (dims[:2], start, {"units": "s"}),
             "bound_status": (dims[:2], status.astype(str)),
             "status": (dims[:1], [mission.status for mission in missions]),
@@ -114,6 +115,7 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
                     float(row["start"]),
                     ticks["pose"].values[mine] if mine.any() else None,
                     ticks["contact"].values[mine].astype(bool) if mine.any() else None,
+                    row["exposure"].values,
                 )
             )
         missions.append(Mission(path, tuple(bounds), str(one["status"].values), features, robots))

@@ -7,7 +7,7 @@ from jax import random
 from trustbo.data import Cell, Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
 from trustbo.models import PooledTrust, TrustParams, fit, sample_prior
-from trustbo.models.fit import SAMPLERS
+from trustbo.models.sampling import SAMPLERS
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import greedy, resolve_policy
 from trustbo.stacking import fill_awareness

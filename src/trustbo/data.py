@@ -108,10 +108,13 @@ class Bound:
         poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
             from east, anticlockwise. None where not recorded.
         contact: Shape (tick, robot), whether each robot had contact. None where not recorded.
+        exposure: How often each robot looked (ticks), shape (robot,); NaN where not recorded. The
+            rate is the share of these with contact.
 
     Raises:
         ShapeError: The arrays disagree on the number of robots.
-        TrustboError: A value outside [0, 1], a duration that is not positive, an unknown status.
+        TrustboError: A value outside [0, 1], a duration that is not positive, an exposure below
+            one tick, a rate that is no share of the ticks, an unknown status.
     """
 
     cell: Cell
@@ -122,6 +125,7 @@ class Bound:
     t0: float = 0.0
     poses: np.ndarray | None = None
     contact: np.ndarray | None = None
+    exposure: np.ndarray = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
         for name, n_axes in (("awareness", 2), ("contact_rate", 1), ("duration", 1)):
@@ -137,11 +141,26 @@ class Bound:
                 f"got {lengths[0]}, {lengths[1]}, {lengths[2]}."
             )
         require_choice("status", self.status, STATUSES)
+        ticks = np.full(lengths[0], np.nan) if self.exposure is None else self.exposure
+        object.__setattr__(self, "exposure", _as_array("exposure", ticks))
         for name, values in (("awareness", self.awareness), ("contact_rate", self.contact_rate)):
             _require_unit_interval(f"{name} of the bound into cell {self.cell}", values)
         if (self.duration <= 0).any():
             robot = int(np.argmax(self.duration <= 0))
             raise TrustboError(f"duration[{robot}] = {self.duration[robot]:g} s must be positive.")
+        self._require_ticks()
+
+    def _require_ticks(self) -> None:
+        ticks, rate = self.exposure, self.contact_rate
+        if ticks.shape != rate.shape:
+            raise ShapeError(f"exposure of a bound must be {rate.shape}; got shape {ticks.shape}.")
+        for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
+            raise TrustboError(f"exposure[{i}] = {ticks[i]:g} must be a whole number of ticks.")
+        off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
+        for i in np.flatnonzero(off):
+            raise TrustboError(
+                f"contact_rate[{i}] = {rate[i]:g} is no share of exposure[{i}] = {ticks[i]:g} ticks."
+            )
 
     @property
     def contact_time(self) -> np.ndarray:
@@ -216,6 +235,7 @@ class Mission:
         duration: ArrayLike | None = None,
         status: str = "ok",
         *,
+        exposure: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
     ) -> Self:
@@ -227,6 +247,8 @@ class Mission:
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: How the mission ended.
+            exposure: Ticks, shape (bound, robot) or (bound,), of which `contact_rate` is the share
+                with contact; None where not recorded.
             features: Names; by default traversability, visibility, z3, ...
             robots: Names; by default r1, r2, ...
 
@@ -240,13 +262,10 @@ class Mission:
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
                 f"got {z.shape} and {y.shape}."
             )
-        seconds = _as_array("duration", np.nan if duration is None else duration)
-        if seconds.ndim == 1:
-            seconds = seconds[:, None]
-        try:
-            seconds = np.broadcast_to(seconds, y.shape)
-        except ValueError:
-            raise ShapeError(f"duration must be {y.shape}; got {seconds.shape}.") from None
+        seconds, ticks = (
+            _per_robot(name, values, y.shape)
+            for name, values in (("duration", duration), ("exposure", exposure))
+        )
         cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
         if len(y) > len(cells) - 1:
             raise ShapeError(f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}.")
@@ -260,6 +279,7 @@ class Mission:
                 seconds[k],
                 status if k == last else "ok",
                 float(starts[k]),
+                exposure=ticks[k],
             )
             for k in range(len(y))
         )
@@ -280,10 +300,26 @@ class Mission:
         """Running times, shape (bound, robot), s."""
         return np.stack([bound.duration for bound in self.bounds])
 
+    @property
+    def exposure(self) -> np.ndarray:
+        """Ticks, shape (bound, robot); NaN where not recorded."""
+        return np.stack([bound.exposure for bound in self.bounds])
+
 
 def default_features(n_features: int) -> tuple[str, ...]:
     """Names of the first features: traversability, visibility, z3, z4, ..."""
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
+
+
+def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
+    """Values per (bound, robot), given so, per bound, or not at all."""
+    array = _as_array(what, np.nan if values is None else values)
+    if array.ndim == 1:
+        array = array[:, None]
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError:
+        raise ShapeError(f"{what} must be {shape}; got {array.shape}.") from None
 
 
 def _as_array(what: str, values: ArrayLike) -> np.ndarray:

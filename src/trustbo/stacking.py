@@ -21,6 +21,8 @@ class MissionBatch(NamedTuple):
     """Shape (mission, bound, robot, feature); 0 in the padding."""
     contact_rate: np.ndarray
     """Shape (mission, bound, robot); NaN in the padding."""
+    exposure: np.ndarray
+    """Ticks of each bound, of that shape; NaN in the padding and where not recorded."""
 
 
 def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionBatch:
@@ -56,10 +58,11 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
     if pad:
         n_missions, n_bounds = max(8, 1 << (n_missions - 1).bit_length()), -(-n_bounds // 8) * 8
     shape = (n_missions, n_bounds, len(first.robots), len(first.features))
-    batch = MissionBatch(np.zeros(shape), np.full(shape[:-1], np.nan))
+    batch = MissionBatch(np.zeros(shape), *np.full((2, *shape[:-1]), np.nan))
     for j, mission in enumerate(missions):
         batch.awareness[j, : len(mission.bounds)] = mission.awareness
         batch.contact_rate[j, : len(mission.bounds)] = mission.contact_rate
+        batch.exposure[j, : len(mission.bounds)] = mission.exposure
     return batch
 
 

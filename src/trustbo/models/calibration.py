@@ -8,9 +8,10 @@ from scipy import stats
 from tqdm import tqdm
 
 from trustbo.errors import require_choice, require_whole
-from trustbo.models.fit import SAMPLERS, draw_posterior, prior_draws
+from trustbo.models.model import TrustModel, prior_draws
 from trustbo.models.nuts import NutsSettings
-from trustbo.models.pooled import SITES, PooledTrust
+from trustbo.models.pooled import PooledTrust
+from trustbo.models.sampling import SAMPLERS, draw_posterior
 from trustbo.stacking import MissionBatch
 
 _CHAINS = 4

@@ -10,7 +10,6 @@ from trustbo.data import Mission
 from trustbo.stacking import MissionBatch, stack_missions
 
 _DIMS = {
-    "beta": ("feature",),
     "trust": ("mission", "bound", "robot"),
     "trust_mean": ("mission", "bound", "robot"),
     "trust_sd": ("mission", "bound", "robot"),
@@ -18,8 +17,18 @@ _DIMS = {
 }
 
 
-def to_datatree(groups: dict[str, dict[str, Any]], missions: Sequence[Mission]) -> xr.DataTree:
-    """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN."""
+def to_datatree(
+    groups: dict[str, dict[str, Any]],
+    missions: Sequence[Mission],
+    site_dims: dict[str, tuple[str, ...]],
+) -> xr.DataTree:
+    """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN.
+
+    Args:
+        groups: Arrays by group and name, with leading axes (chain, draw) unless they are moments.
+        missions: The missions.
+        site_dims: Axes of the model's parameters.
+    """
     observed = stack_missions(missions, pad=False)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
     lengths = xr.DataArray([len(m.bounds) for m in missions], dims="mission")
@@ -27,6 +36,8 @@ def to_datatree(groups: dict[str, dict[str, Any]], missions: Sequence[Mission]) 
         "mission": np.arange(n_missions),
         "bound": np.arange(1, n_bounds + 1),
         "robot": list(missions[0].robots),
+        "robot_": list(missions[0].robots),
+        "follower": list(missions[0].robots[1:]),
         "feature": list(missions[0].features),
     }
     tree = {}
@@ -34,7 +45,7 @@ def to_datatree(groups: dict[str, dict[str, Any]], missions: Sequence[Mission]) 
         draw = arrays.pop("draw", None)
         variables = {}
         for name, array in arrays.items():
-            dims = ("mission",) if group == "log_likelihood" else _DIMS.get(name, ())
+            dims = ("mission",) if group == "log_likelihood" else (_DIMS | site_dims).get(name, ())
             if len(dims) < array.ndim:
                 dims = ("chain", "draw", *dims)
             cut = xr.DataArray(array, dims=dims)
@@ -68,10 +79,11 @@ def _data_groups(
         {
             "awareness": ((*dims, "feature"), observed.awareness),
             "duration": (dims, duration, {"units": "s"}),
+            "exposure": (dims, observed.exposure, {"units": "1"}),
             "row": (("mission", "bound"), cell[..., 0]),
             "col": (("mission", "bound"), cell[..., 1]),
             "status": (("mission",), [mission.status for mission in missions]),
         },
-        coords,
+        own | {"feature": coords["feature"]},
     )
     return rates, constant

@@ -10,19 +10,18 @@ caller falls back on NUTS.
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import numpyro.distributions as dist
 from arviz_stats.base.array import array_stats
-from numpyro.distributions import Distribution, constraints
+from numpyro.distributions import constraints
 from scipy import special, stats
 from threadpoolctl import threadpool_limits
 
 from trustbo.errors import TrustboError
-from trustbo.models.gram import Quadratic, SufficientStatistics, sufficient_statistics
+from trustbo.models.gram import Quadratic, SufficientStatistics
 from trustbo.models.laplace import laplace
+from trustbo.models.numeric import log_prob, numbers
 from trustbo.models.priors import Priors
-from trustbo.stacking import MissionBatch
 
 KHAT_GOOD, KHAT_LIMIT = 0.5, 0.7
 _LOG2_POINTS = 12
@@ -71,9 +70,9 @@ class _Target(NamedTuple):
         return (
             log_likelihood
             + log_jacobian
-            + _log_prob(self.priors.beta0, beta0)
-            + _log_prob(self.priors.delta_w, delta_w)
-            + _log_prob(self.priors.delta_v, delta_v)
+            + log_prob(self.priors.beta0, beta0)
+            + log_prob(self.priors.delta_w, delta_w)
+            + log_prob(self.priors.delta_v, delta_v)
         )
 
     def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -138,11 +137,13 @@ class _Mixture(NamedTuple):
         return np.logaddexp.reduce(terms, axis=0)
 
 
-def sample_exact(batch: MissionBatch, priors: Priors, n_draws: int, seed: int) -> ExactDraws:
-    """Draw from the pooled model's posterior.
+def sample_exact(
+    statistics: SufficientStatistics, priors: Priors, n_draws: int, seed: int
+) -> ExactDraws:
+    """Draw from the posterior of robots that share their parameters.
 
     Args:
-        batch: The missions.
+        statistics: Of all missions.
         priors: Normal for beta and b, on (0, 1) or the real line for beta0, on (0, inf) for the
             noises.
         n_draws: How many equally weighted draws.
@@ -154,7 +155,7 @@ def sample_exact(batch: MissionBatch, priors: Priors, n_draws: int, seed: int) -
     _require_conjugate(priors)
     # Matrices are small: a second BLAS thread costs more than it brings.
     with threadpool_limits(limits=1):
-        target = _target(batch, priors)
+        target = _target(statistics, priors)
         mode, scale = laplace(target.log_density, _start(target))
         proposal = _Mixture(mode[None], 1.1 * scale[None], np.ones(1))
         z, log_p, log_w, khat, evidence = _weigh(target, proposal, seed)
@@ -179,12 +180,14 @@ def sample_exact(batch: MissionBatch, priors: Priors, n_draws: int, seed: int) -
     return ExactDraws(params, log_w[chosen], log_p[chosen], khat, kish, evidence)
 
 
-def _target(batch: MissionBatch, priors: Priors) -> _Target:
-    statistics = sufficient_statistics(batch, priors.x0_mean)
-    n_features = batch.awareness.shape[-1]
-    each = [priors.beta] * n_features + [priors.b]
-    mean, sd = np.array([[_number(prior, name) for prior in each] for name in ("loc", "scale")])
-    return _Target(statistics, priors, mean, sd**-2.0)
+def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
+    n_features = statistics.n_features
+
+    def each(name: str) -> np.ndarray:
+        return np.append(np.broadcast_to(numbers(priors.beta, name), n_features),
+                         numbers(priors.b, name))  # fmt: skip
+
+    return _Target(statistics, priors, each("loc"), each("scale") ** -2.0)
 
 
 def _weigh(target: _Target, proposal: _Mixture, seed: int):
@@ -238,23 +241,6 @@ def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.nda
 
 def _parts(z: np.ndarray) -> list[np.ndarray]:
     return [z[i : i + _CHUNK] for i in range(0, len(z), _CHUNK)]
-
-
-def _log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
-    """Log density in NumPy for the usual priors: compiling it would take longer than sampling."""
-    if isinstance(prior, dist.HalfNormal):
-        return stats.halfnorm.logpdf(x, scale=_number(prior, "scale"))
-    if isinstance(prior, dist.Beta):
-        a, b = (_number(prior, f"concentration{i}") for i in (1, 0))
-        return special.xlogy(a - 1.0, x) + special.xlog1py(b - 1.0, -x) - special.betaln(a, b)
-    if isinstance(prior, dist.Normal):
-        return stats.norm.logpdf(x, _number(prior, "loc"), _number(prior, "scale"))
-    with jax.enable_x64(True):
-        return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
-
-
-def _number(prior: Distribution, name: str) -> float:
-    return float(getattr(prior, name))
 
 
 def _require_conjugate(priors: Priors) -> None:

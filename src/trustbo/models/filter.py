@@ -7,7 +7,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models.pooled import TrustParams, broadcast_params
+from trustbo.models.params import TrustParams
 
 
 class TrustState(NamedTuple):
@@ -57,7 +57,7 @@ class TrustFilter:
             raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
         n = len(np.atleast_1d(posterior.beta0))
         kept = np.linspace(0, n - 1, min(n, max_draws)).astype(int)
-        self.params = TrustParams(*(each[kept] for each in broadcast_params(posterior, (n,))))
+        self.params = TrustParams(*(each[kept] for each in posterior.flat()))
         self._n_robots = n_robots
         self._beta0, self._Q, self._R = (
             column[:, None]

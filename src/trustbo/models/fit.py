@@ -1,49 +1,43 @@
 """From missions to a posterior: sampling, checking it, and laying it out for ArviZ."""
 
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any
 
-import arviz as az
 import jax
-import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jax import Array, random
+from jax import random
 from numpy.typing import ArrayLike
-from numpyro import handlers
 
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, TrustboError, require_choice
-from trustbo.models import latent
+from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_choice
+from trustbo.models import latent, trajectories
 from trustbo.models.datatree import to_datatree
-from trustbo.models.exact import KHAT_LIMIT, sample_exact
-from trustbo.models.nuts import NutsSettings, run_nuts
-from trustbo.models.pooled import (
-    SITES,
-    PooledTrust,
-    TrustParams,
-    mission_log_likelihood,
-    pooled_trust,
-)
-from trustbo.models.priors import Priors
+from trustbo.models.model import TrustModel, mission_log_likelihood, prior_draws, require_exposure
+from trustbo.models.numeric import draw
+from trustbo.models.geometry import NutsData
+from trustbo.models.nuts import NutsSettings
+from trustbo.models.observation import log_resolution
+from trustbo.models.params import Params, RobotParams, TrustParams, params_from
+from trustbo.models.pooled import PooledTrust
+from trustbo.models.sampling import SAMPLERS, Draws, draw_posterior, require_exact
 from trustbo.stacking import MissionBatch, stack_missions
 
-SAMPLERS = ("nuts", "exact")
-MAX_RHAT, MIN_ESS = 1.01, 400.0
 _FIRM_NOISE = (
     "keep the noise away from 0, e.g. Priors(delta_v=numpyro.distributions.TruncatedNormal(0.0, "
     "0.2, low=0.01))"
 )
+_N_PRIOR = 500
 
 
 def fit(
     missions: Sequence[Mission],
-    model: PooledTrust | None = None,
+    model: TrustModel | None = None,
     sampler: str = "nuts",
     *,
+    weights: ArrayLike | None = None,
     seed: int = 0,
     n_warmup: int = 300,
     n_draws: int = 1000,
@@ -56,8 +50,13 @@ def fit(
     Args:
         missions: All missions to learn from; contact rates that are NaN were not measured.
         model: The trust model; by default `PooledTrust()`.
-        sampler: `"nuts"`, or `"exact"`: near-independent draws by importance sampling, without
-            compiling; it falls back on NUTS, with a warning, where that does not work.
+        sampler: `"nuts"`. Or `"exact"`: near-independent draws by importance sampling, without
+            compiling, for Gaussian observations of robots that share their parameters or have
+            nothing in common; it falls back on NUTS, with a warning, where that does not work. Or
+            `"joint"`: NUTS on parameters and latent trust together, which it is anyway where trust
+            cannot be integrated out.
+        weights: How much each mission counts, shape (mission,), in [0, 1]; 1 by default. For
+            Gaussian observations.
         seed: Same seed, same posterior.
         n_warmup: Warm-up draws per chain of NUTS, not kept.
         n_draws: Draws kept per chain.
@@ -68,42 +67,55 @@ def fit(
             run does not cure; `False` returns it as it is.
 
     Returns:
-        An ArviZ DataTree with the groups `posterior` (beta0, beta[feature], b, delta_w, delta_v),
-        `latent` (trust[chain, draw, mission, bound, robot] by backward sampling, and trust_mean and
-        trust_sd over all draws), `posterior_predictive`, `prior`, `prior_predictive`,
-        `log_likelihood` (contact_rate[chain, draw, mission]: a whole mission is one observation, so
-        LOO leaves out missions), `sample_stats`, `observed_data` and `constant_data`. Bound k is
-        labelled k = 1, 2, ...; short missions are padded with NaN.
+        An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
+        delta_w, delta_v), `latent` (trust[chain, draw, mission, bound, robot] by backward sampling,
+        and trust_mean and trust_sd over all draws), `posterior_predictive`, `prior`,
+        `prior_predictive`, `log_likelihood` (contact_rate[chain, draw, mission]: a whole mission is
+        one observation, so LOO leaves out missions), `sample_stats`, `observed_data` and
+        `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are padded with NaN.
+        Where all rates have an exposure, log-likelihoods are of the counts of ticks, on equal terms
+        for all families of observations; the attribute `log_likelihood_of` says so.
 
     Raises:
         ShapeError: No missions, or missions that disagree on robots or features.
-        TrustboError: An awareness value is NaN, the sampler is unknown, or the contact rates do
-            not vary at all: the Gaussian model's noise then has no posterior.
+        TrustboError: An awareness value is NaN, the sampler is unknown or does not suit the model,
+            or the contact rates do not vary at all: the Gaussian noise then has no posterior.
         PosteriorError: The diagnostics say that the posterior must not be used.
     """
     require_choice("sampler", sampler, SAMPLERS)
     model = PooledTrust() if model is None else model
+    if not isinstance(model, TrustModel):
+        raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")
+    if sampler == "exact":
+        require_exact(model)
     batch = stack_missions(missions)
-    _require_variation(batch, model.priors)
+    require_exposure(model, batch)
+    _require_variation(batch, model)
+    weight = _weights(weights, model, batch, len(missions))
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
-    with jax.enable_x64(True):
-        draws, complaints = draw_posterior(model, sampler, settings, seed, batch, check=check)
-        key = random.fold_in(random.key(seed), 1)
-        groups = _describe(model, draws, batch, key, n_trajectories)
+    draws, complaints = draw_posterior(model, sampler, settings, seed, batch, weight, check=check)
+    groups = _describe(model, draws, batch, seed, n_trajectories)
+    of = _count_ticks(model, batch, groups, len(missions))
     seconds = time.perf_counter() - started
-    posterior = to_datatree(groups, missions)
+    posterior = to_datatree(groups, missions, model.dims)
     posterior.attrs |= {
         "model": type(model).__name__,
+        "observation": model.observation,
+        "response": model.response,
+        "inter_robot": getattr(model, "inter_robot", "none"),
         "sampler": draws.sampler,
         "seed": seed,
         "seconds": seconds,
+        "log_likelihood_of": of,
         **draws.summary,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
     }
+    if weights is not None:
+        posterior["constant_data"]["weight"] = ("mission", weight[: len(missions)])
     if complaints:
         raise PosteriorError(
             f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions, "
@@ -114,187 +126,180 @@ def fit(
     return posterior
 
 
-def sample_prior(model: PooledTrust, n_features: int, n_draws: int, seed: int) -> TrustParams:
+def sample_prior(
+    model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
+) -> Params:
     """Draws of the parameters from the prior, leading axis (draw,)."""
+    return params_from(_prior(model, (n_robots, n_features), n_draws, seed), _x0(model))
+
+
+def _prior(
+    model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
+) -> dict[str, np.ndarray]:
+    """Draws of the parameters from the prior for (robots, features), by name."""
+    if isinstance(model, PooledTrust):
+        rng, priors = np.random.default_rng(seed), model.priors
+        sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
+        return {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
     with jax.enable_x64(True):
-        empty = jnp.zeros((1, 1, 1, n_features))
-        draws = prior_draws(model.priors, empty, random.split(random.key(seed), n_draws))
-        return _params({name: np.asarray(draws[name]) for name in SITES}, model.priors)
+        keys = random.split(random.key(seed), n_draws)
+        drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)
+        return {name: np.asarray(drawn[name]) for name in model.dims}
 
 
-def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
-    """How far to trust a posterior.
-
-    Returns:
-        For NUTS `r_hat` and `ess_bulk`, the worst over all parameters, and `divergences`. For the
-        exact sampler, whose draws are nearly independent, `k_hat` (good below 0.5) and `kish`, the
-        effective number of its points.
-    """
-    if posterior.attrs["sampler"] == "exact":
-        return {name: posterior.attrs[name] for name in ("k_hat", "kish")}
-    by_site = _convergence(posterior["posterior"].to_dataset())
-    return {
-        "r_hat": max(rhat for rhat, _ in by_site.values()),
-        "ess_bulk": min(ess for _, ess in by_site.values()),
-        "divergences": int(posterior["sample_stats"].to_dataset()["diverging"].sum()),
-    }
+def _x0(model: TrustModel) -> dict[str, float]:
+    return {name: float(getattr(model.priors, name)) for name in ("x0_mean", "x0_sd")}
 
 
-def _convergence(sites: xr.Dataset) -> dict[str, tuple[float, float]]:
-    """The worst R-hat and the least bulk ESS of each parameter."""
-    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
-    return {str(n): (float(rhat[n].max()), float(ess[n].min())) for n in sites.data_vars}
-
-
-def _require_variation(batch: MissionBatch, priors: Priors) -> None:
+def _require_variation(batch: MissionBatch, model: TrustModel) -> None:
     """Refuse rates that are all the same, unless a prior keeps the noise away from 0.
 
-    The likelihood would grow without bound as both noises go to 0, and have no posterior.
+    The Gaussian likelihood would grow without bound as both noises go to 0, and have no posterior.
     """
     rates = batch.contact_rate[~np.isnan(batch.contact_rate)]
     if not len(rates):
         raise TrustboError(
             "every contact rate is NaN: nothing was measured. Give one rate at least."
         )
+    priors = model.priors
     bounded = any(
         getattr(p.support, "lower_bound", 0.0) > 0.0 for p in (priors.delta_w, priors.delta_v)
     )
-    if len(rates) > 1 and np.ptp(rates) == 0.0 and not bounded:
+    degenerate = model.observation == "gaussian" or 0.0 < rates[0] < 1.0
+    counted = model.observation == "beta_binomial"
+    if len(rates) > 1 and np.ptp(rates) == 0.0 and degenerate and not bounded and not counted:
         raise TrustboError(
             f"all {len(rates)} contact rates are {rates[0]:g}: without variation the model cannot "
-            f"learn its noise. Add missions over other ground, or {_FIRM_NOISE}."
+            "learn its noise. Add missions over other ground, use observation "
+            f'"censored" or "beta_binomial", or {_FIRM_NOISE}.'
         )
 
 
-class Draws(NamedTuple):
-    """Draws and statistics with leading axes (chain, draw), and what there is to say of all."""
-
-    params: dict[str, np.ndarray]
-    stats: dict[str, np.ndarray]
-    summary: dict[str, float]
-    sampler: str
-
-
-def draw_posterior(
-    model: PooledTrust,
-    sampler: str,
-    settings: NutsSettings,
-    seed: int,
-    batch: MissionBatch,
-    *,
-    check: bool,
-) -> tuple[Draws, list[str]]:
-    """Draws given a batch, and what is wrong with them; call it in a float64 scope."""
-    if sampler == "exact" and (exact := _sample_exact(model, settings, seed, batch)):
-        return exact, []
-    return _sample_nuts(model, settings, random.key(seed), batch, check=check)
-
-
-def _sample_nuts(
-    model: PooledTrust, settings: NutsSettings, key: Array, batch: MissionBatch, *, check: bool
-) -> tuple[Draws, list[str]]:
-    """Draws by NUTS, longer ones if the first are bad, and what is wrong with them in the end."""
-    data = (model.priors, batch.awareness, batch.contact_rate)
-    longer = NutsSettings(2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98)
-
-    def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
-        raw = run_nuts(pooled_trust, tried, random.fold_in(key, retries), *data)
-        params, stats = ({k: np.asarray(v) for k, v in group.items()} for group in raw)
-        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
-        draws = Draws(params, stats, {"retries": retries}, "nuts")
-        return draws, _complaints(draws) if check else []
-
-    draws, complaints = attempt(settings, 0)
-    return attempt(longer, 1) if complaints else (draws, complaints)
-
-
-def _sample_exact(
-    model: PooledTrust, settings: NutsSettings, seed: int, batch: MissionBatch
-) -> Draws | None:
-    """Draws by importance sampling, or None, with a warning, where its weights are too uneven."""
-    shape = (settings.n_chains, settings.n_draws)
-    exact = sample_exact(batch, model.priors, shape[0] * shape[1], seed)
-    if not exact.khat <= KHAT_LIMIT:
-        warnings.warn(
-            f"the exact sampler's k-hat is {exact.khat:.2f} (limit {KHAT_LIMIT}): its weights are "
-            "too uneven here, so NUTS is used instead.",
-            stacklevel=3,
+def _weights(
+    weights: ArrayLike | None, model: TrustModel, batch: MissionBatch, n_missions: int
+) -> np.ndarray:
+    """One weight per mission of the batch, padding included."""
+    padded = np.ones(len(batch.contact_rate))
+    if weights is None:
+        return padded
+    given = np.asarray(weights, dtype=float)
+    if given.shape != (n_missions,):
+        raise ShapeError(f"weights must be ({n_missions},), one per mission; got {given.shape}.")
+    bad = ~((given >= 0.0) & (given <= 1.0))
+    if bad.any() or not given.any():
+        raise TrustboError(f"weights must be in [0, 1], and one of them positive; got {given}.")
+    if model.observation != "gaussian":
+        raise TrustboError(
+            f'weights are for observation "gaussian"; with "{model.observation}" a fractional '
+            "mission would no longer have its trust integrated out. Leave missions out instead."
         )
-        return None
-    params = {k: v.reshape(*shape, *v.shape[1:]) for k, v in exact.params.items()}
-    stats = {"lp": exact.lp.reshape(shape), "log_weight": exact.log_weight.reshape(shape)}
-    return Draws(
-        params,
-        stats,
-        {"k_hat": exact.khat, "kish": exact.kish, "log_evidence": exact.log_evidence},
-        "exact",
-    )
-
-
-def _complaints(draws: Draws) -> list[str]:
-    """What is wrong with the draws, parameter by parameter; empty if nothing is."""
-    sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
-    found = []
-    for name, (worst, fewest) in _convergence(sites).items():
-        if not worst <= MAX_RHAT:  # NaN is a complaint too
-            found.append(f"R-hat of {name} is {worst:.3f} (limit {MAX_RHAT})")
-        if not fewest >= MIN_ESS:
-            found.append(f"bulk ESS of {name} is {fewest:.0f} (at least {MIN_ESS:.0f})")
-    n_divergences = int(draws.stats["diverging"].sum())
-    if n_divergences:
-        found.append(f"{n_divergences} divergences")
-    return found
+    padded[:n_missions] = given
+    return padded
 
 
 def _describe(
-    model: PooledTrust, draws: Draws, batch: MissionBatch, key: Array, n_trajectories: int
+    model: TrustModel, draws: Draws, batch: MissionBatch, seed: int, n_trajectories: int
 ) -> dict[str, dict[str, Any]]:
     """Every group of the DataTree as arrays with leading axes (chain, draw), padding included."""
-    n_chains, n_draws = draws.params["beta0"].shape
-    data = (jnp.asarray(batch.awareness), jnp.asarray(batch.contact_rate))
+    n_chains, n_draws = draws.stats["lp"].shape
     every = {name: a.reshape(-1, *a.shape[2:]) for name, a in draws.params.items()}
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
-    thinned = {k: a[:, kept].reshape(-1, *a.shape[2:]) for k, a in draws.params.items()}
-    all_params, few_params = _params(every, model.priors), _params(thinned, model.priors)
-    key_trust, key_predict, key_prior = random.split(key, 3)
+    few = {k: a[:, kept].reshape(-1, *a.shape[2:]) for k, a in draws.params.items()}
+    all_params, few_params = params_from(every, _x0(model)), params_from(few, _x0(model))
+    scalar = isinstance(all_params, TrustParams | RobotParams)
+    if scalar and model.observation == "gaussian":
+        found = _of_gaussian(model, all_params, few_params, batch, seed)
+    else:
+        found = _of_compiled(model, all_params, few_params, draws.noise, kept, batch, seed)
+    prior = _prior(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
 
-    def by_chain(array: Array) -> np.ndarray:
-        return np.asarray(array).reshape(n_chains, -1, *array.shape[1:])
+    def by_chain(array: np.ndarray) -> np.ndarray:
+        return array.reshape(n_chains, -1, *array.shape[1:])
 
-    moments = latent.trust_moments(all_params, *data)
-    prior = prior_draws(model.priors, data[0], random.split(key_prior, 500))
-    prior = {name: np.asarray(prior[name])[None] for name in (*SITES, "contact_rate")}
     return {
-        "posterior": {name: draws.params[name] for name in SITES},
+        "posterior": {name: draws.params[name] for name in model.dims},
         "sample_stats": draws.stats,
-        "log_likelihood": {"contact_rate": by_chain(mission_log_likelihood(all_params, *data))},
+        "log_likelihood": {"contact_rate": by_chain(found["log_likelihood"])},
         "latent": {
-            "trust": by_chain(latent.trust_draws(few_params, *data, key_trust)),
-            "trust_mean": np.asarray(moments.mean),
-            "trust_sd": np.asarray(moments.sd),
+            "trust": by_chain(found["trust"]),
+            "trust_mean": found["trust_mean"],
+            "trust_sd": found["trust_sd"],
             "draw": kept,
         },
-        "posterior_predictive": {
-            "contact_rate": by_chain(latent.predictive(few_params, data[0], key_predict)),
-            "draw": kept,
-        },
-        "prior_predictive": {"contact_rate": prior.pop("contact_rate")},
-        "prior": prior,
+        "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
+        "prior_predictive": {"contact_rate": _predict(model, prior, batch, seed + 3)[None]},
+        "prior": {name: values[None] for name, values in prior.items()},
     }
 
 
-@jax.jit
-def prior_draws(priors: Priors, awareness: Array, keys: Array) -> dict[str, Array]:
-    """Parameters and contact rates drawn from the prior, one set per key."""
+def _of_gaussian(
+    model: TrustModel,
+    every: TrustParams | RobotParams,
+    few: TrustParams | RobotParams,
+    batch: MissionBatch,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """Latent trust, log-likelihood and predictions of robots apart, without compiling."""
+    rng = np.random.default_rng([seed, 1])
+    summary = trajectories.summarize(every.flat(), model.lag, batch)
+    return {
+        "log_likelihood": summary.log_likelihood,
+        "trust": trajectories.sample(few.flat(), model.lag, batch, rng),
+        "trust_mean": summary.mean,
+        "trust_sd": summary.sd,
+        "predicted": trajectories.simulate(few.flat(), model.lag, batch.awareness, rng),
+    }
 
-    def one(key: Array) -> dict[str, Array]:
-        trace = handlers.trace(handlers.seed(pooled_trust, key)).get_trace(awareness, priors)
-        return {name: site["value"] for name, site in trace.items() if site["type"] == "sample"}
 
-    return jax.vmap(one)(keys)
+def _of_compiled(
+    model: TrustModel,
+    every: Params,
+    few: Params,
+    noise: np.ndarray | None,
+    kept: np.ndarray,
+    batch: MissionBatch,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """The same for coupled robots and other families."""
+    family = (model.observation, model.lag)
+    every, few = every.flat(), few.flat()
+    few_noise = None if noise is None else noise[:, kept].reshape(-1, *noise.shape[2:])
+    noise = None if noise is None else noise.reshape(-1, *noise.shape[2:])
+    with jax.enable_x64(True):
+        data = NutsData(*batch, np.ones(len(batch.contact_rate)))
+        keys = random.split(random.fold_in(random.key(seed), 1), 3)
+        moments = latent.trust_moments(*family, every, noise, data)
+        found = {
+            "log_likelihood": mission_log_likelihood(*family, every, *batch, keys[0]),
+            "trust": latent.trust_draws(*family, few, few_noise, data, keys[1]),
+            "trust_mean": moments.mean,
+            "trust_sd": moments.sd,
+            "predicted": latent.predictive(*family, few, data, keys[2]),
+        }
+        return {name: np.asarray(array) for name, array in found.items()}
 
 
-def _params(draws: Mapping[str, ArrayLike], priors: Priors) -> TrustParams:
-    n_draws = np.shape(draws["beta0"])[0]
-    x0 = {name: np.full(n_draws, getattr(priors, name)) for name in ("x0_mean", "x0_sd")}
-    return TrustParams(**{name: draws[name] for name in SITES}, **x0)
+def _predict(
+    model: TrustModel, draws: Mapping[str, np.ndarray], batch: MissionBatch, seed: int
+) -> np.ndarray:
+    """Contact rates of replicated missions, (draw, mission, bound, robot)."""
+    params = params_from(draws, _x0(model)).flat()
+    if isinstance(params, TrustParams | RobotParams) and model.observation == "gaussian":
+        rng = np.random.default_rng(seed)
+        return trajectories.simulate(params, model.lag, batch.awareness, rng)
+    with jax.enable_x64(True):
+        data = NutsData(*batch, np.ones(len(batch.contact_rate)))
+        key = random.key(seed)
+        return np.asarray(latent.predictive(model.observation, model.lag, params, data, key))
+
+
+def _count_ticks(
+    model: TrustModel, batch: MissionBatch, groups: dict[str, dict[str, Any]], n_missions: int
+) -> str:
+    """Make log-likelihoods those of the counts of ticks, if these are known; say which it is."""
+    shift = log_resolution(model.observation, batch.contact_rate, batch.exposure).sum((1, 2))
+    if np.isnan(shift[:n_missions]).any():
+        return "contact_rate"
+    rates = groups["log_likelihood"]["contact_rate"]
+    groups["log_likelihood"]["contact_rate"] = rates + shift
+    return "ticks"

@@ -1,9 +1,10 @@
 """The marginal likelihood of the pooled model as a quadratic form in its linear coefficients.
 
-With c = (beta, b), one robot's mission is r = y - beta0 y_lag - U c, where y_lag starts with the
-mean of x_0. Its entries are w_k + v_k - beta0 v_{k-1}: an MA(1), so r is normal with covariance
+With c = (beta, b), one robot's mission is r = y - beta0 y_lag - h x0_mean e_1 - (U - lag U_lag) c,
+with h = beta0 - lag, and lag 0 or 1 as in `statespace`. Its entries are an MA(1), for lag 0 w_k +
+v_k - beta0 v_{k-1}, so r is normal with covariance
 
-    Sigma = T + kappa e_1 e_1',   T tridiagonal Toeplitz,   kappa = beta0^2 (x0_sd^2 - delta_v^2),
+    Sigma = T + kappa e_1 e_1',   T tridiagonal Toeplitz,   kappa = h^2 x0_sd^2 - lag Q - beta0^2 R,
 
 and y -> r has Jacobian 1. The type-I sine transform diagonalises T for every parameter value, and
 the corner is a rank-one update (Sherman and Morrison). So the data enter through sums of products
@@ -17,6 +18,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from trustbo.errors import ShapeError, TrustboError
 from trustbo.stacking import MissionBatch
 
 
@@ -33,20 +35,30 @@ class Quadratic(NamedTuple):
 
 
 class LengthGram(NamedTuple):
-    """Sums over the complete sequences of one length, of columns (y, y_lag, features, 1)."""
+    """Weighted sums over the complete sequences of one length.
 
-    n_sequences: float
+    Products of the columns (y, y_lag, x0_mean e_1, features, 1), the last two less `lag` times
+    their values at the bound before.
+    """
+
+    weight: float
+    """How many sequences."""
     spectral: np.ndarray  # (frequency, column, column)
     corner: np.ndarray  # (bound, bound, column, column)
 
-    def evaluate(self, theta: np.ndarray, x0_sd: float) -> Quadratic:
+    def scaled(self, factor: float) -> Self:
+        """The same data with other weight."""
+        return type(self)(*(factor * field for field in self))
+
+    def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3)."""
         n_bounds, p = self.spectral.shape[:2]
         beta0, Q, R = theta.T
         sines = _sine_basis(n_bounds)
         cosine = np.cos(np.pi * np.arange(1, n_bounds + 1) / (n_bounds + 1))
-        eigenvalues = (Q + R * (1.0 + beta0**2))[:, None] - 2.0 * (beta0 * R)[:, None] * cosine
-        kappa = beta0**2 * (x0_sd**2 - R)
+        diagonal, beside = Q * (1.0 + lag) + R * (1.0 + beta0**2), lag * Q + beta0 * R
+        eigenvalues = diagonal[:, None] - 2.0 * beside[:, None] * cosine
+        kappa = (beta0 - lag) ** 2 * x0_sd**2 - lag * Q - beta0**2 * R
         first = sines[0] / eigenvalues
         g = first @ sines  # T^-1 e_1
         tau = first @ sines[0]  # e_1' T^-1 e_1
@@ -55,7 +67,7 @@ class LengthGram(NamedTuple):
         outer = (g[:, :, None] * g[:, None, :]).reshape(len(theta), -1)
         M -= shrink[:, None] * (outer @ self.corner.reshape(n_bounds**2, p * p))
         log_det = np.log(eigenvalues).sum(1) + np.log1p(kappa * tau)
-        return _collapse_lag(M.reshape(-1, p, p), beta0, self.n_sequences * log_det)
+        return _collapse_lag(M.reshape(-1, p, p), beta0, beta0 - lag, self.weight * log_det)
 
 
 class GapSequences(NamedTuple):
@@ -63,9 +75,14 @@ class GapSequences(NamedTuple):
 
     y: np.ndarray  # (sequence, bound), NaN where not measured
     u: np.ndarray  # (sequence, bound, coefficient)
+    weight: np.ndarray  # (sequence,)
     x0_mean: float
 
-    def evaluate(self, theta: np.ndarray, x0_sd: float) -> Quadratic:
+    def scaled(self, factor: float) -> Self:
+        """The same data with other weight."""
+        return self._replace(weight=factor * self.weight)
+
+    def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3), by the Kalman filter.
 
         The state's mean is linear in c: column 0 carries what comes from x_0 and the rates, column
@@ -78,87 +95,156 @@ class GapSequences(NamedTuple):
         variance = np.full((n, n_sequences), x0_sd**2)
         M, log_det = np.zeros((n, 1 + d, 1 + d)), np.zeros(n)
         for k in range(n_bounds):
+            seen = ~np.isnan(self.y[:, k])
+            predicted = (beta0 - lag)[..., None] * m
+            predicted[..., 1:] += self.u[:, k]
+            S = (beta0 - lag) ** 2 * variance + Q + R
+            e = -predicted
+            e[..., 0] += np.where(seen, self.y[:, k], 0.0)
+            precision = np.where(seen, 1.0 / S, 0.0)
+            gain = (beta0 * (beta0 - lag) * variance + Q) * precision
             m = beta0[..., None] * m
             m[..., 1:] += self.u[:, k]
-            variance = beta0**2 * variance + Q
-            seen = ~np.isnan(self.y[:, k])
-            S = variance + R
-            e = -m
-            e[..., 0] += np.where(seen, self.y[:, k], 0.0)
+            m += gain[..., None] * e
             e[..., 1:] *= -1.0
-            weight = np.where(seen, 1.0 / S, 0.0)
-            M += np.einsum("nsi,nsj,ns->nij", e, e, weight, optimize=True)
-            log_det += np.where(seen, np.log(S), 0.0).sum(1)
-            gain = variance * weight
-            m[..., 0] += gain * e[..., 0]
-            m[..., 1:] -= gain[..., None] * m[..., 1:]
-            variance = (1.0 - gain) * variance
+            M += np.einsum("nsi,nsj,ns->nij", e, e, precision * self.weight, optimize=True)
+            log_det += (np.where(seen, np.log(S), 0.0) * self.weight).sum(1)
+            variance = beta0**2 * variance + Q - gain**2 * S
         return Quadratic(M[:, 0, 0], M[:, 0, 1:], M[:, 1:, 1:], log_det)
 
 
 class SufficientStatistics(NamedTuple):
-    """All that the marginal likelihood needs of a batch of missions."""
+    """All that the marginal likelihood needs of some missions; they add up.
+
+    `a + b` are the statistics of the missions of both, `a.scaled(w)` those of missions that count
+    w times as much: forgetting is `old.scaled(0.9) + new`.
+    """
 
     grams: dict[int, LengthGram]
     gaps: tuple[GapSequences, ...]
     n_measured: float
-    level: float
-    """Mean contact rate."""
-    spread: float
-    """Standard deviation of the contact rates."""
+    """Rates measured, weighted."""
+    sums: tuple[float, float]
+    """Of the rates, and of their squares."""
+    x0_mean: float
+    lag: float
+
+    def __add__(self, other: Self) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if (self.x0_mean, self.lag) != (other.x0_mean, other.lag):
+            raise TrustboError(
+                "statistics gathered under different x0_mean or response do not add up: "
+                f"{(self.x0_mean, self.lag)} and {(other.x0_mean, other.lag)}."
+            )
+        if self.n_features != other.n_features:
+            raise ShapeError(
+                f"statistics of {self.n_features} and {other.n_features} features do not add up."
+            )
+        grams = dict(self.grams)
+        for length, gram in other.grams.items():
+            mine = grams.get(length)
+            together = (a + b for a, b in zip(mine, gram, strict=True)) if mine else gram
+            grams[length] = LengthGram(*together)
+        return type(self)(
+            grams,
+            self.gaps + other.gaps,
+            self.n_measured + other.n_measured,
+            (self.sums[0] + other.sums[0], self.sums[1] + other.sums[1]),
+            self.x0_mean,
+            self.lag,
+        )
+
+    def scaled(self, factor: float) -> Self:
+        """The statistics of the same missions with other weight."""
+        return self._replace(
+            grams={length: gram.scaled(factor) for length, gram in self.grams.items()},
+            gaps=tuple(gap.scaled(factor) for gap in self.gaps),
+            n_measured=factor * self.n_measured,
+            sums=(factor * self.sums[0], factor * self.sums[1]),
+        )
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the rates."""
+        mean, square = (total / self.n_measured for total in self.sums)
+        return float(np.sqrt(max(square - mean**2, 0.0)))
+
+    @property
+    def n_features(self) -> int:
+        """How many features the missions have."""
+        if self.gaps:
+            return self.gaps[0].u.shape[-1] - 1
+        return next(iter(self.grams.values())).spectral.shape[-1] - 4
 
     def evaluate(self, theta: np.ndarray, x0_sd: float) -> Quadratic:
         """The quadratic form at theta = (beta0, delta_w^2, delta_v^2), shape (theta, 3)."""
         parts = [*self.grams.values(), *self.gaps]
-        total = parts[0].evaluate(theta, x0_sd)
+        total = parts[0].evaluate(theta, x0_sd, self.lag)
         for part in parts[1:]:
-            total = total + part.evaluate(theta, x0_sd)
+            total = total + part.evaluate(theta, x0_sd, self.lag)
         return total
 
 
-def sufficient_statistics(batch: MissionBatch, x0_mean: float) -> SufficientStatistics:
-    """Gather the statistics of a batch; rates missing at a mission's end only shorten it."""
+def sufficient_statistics(
+    batch: MissionBatch, x0_mean: float, lag: float = 0.0, weight: np.ndarray | None = None
+) -> SufficientStatistics:
+    """Gather the statistics of a batch; rates missing at a mission's end only shorten it.
+
+    Args:
+        batch: The missions.
+        x0_mean: Mean of trust before the first bound.
+        lag: See the module.
+        weight: Of each mission, shape (mission,); 1 by default.
+    """
     z, y = batch.awareness, batch.contact_rate
     u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
+    each = np.repeat(np.ones(len(y)) if weight is None else weight, y.shape[2])
     # One row per robot and mission: (sequence, bound[, coefficient]).
     y = np.swapaxes(y, 1, 2).reshape(-1, y.shape[1])
     u = np.swapaxes(u, 1, 2).reshape(len(y), y.shape[1], -1)
     seen = ~np.isnan(y)
     last = np.where(seen.any(1), y.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)
+    last = np.where(each > 0.0, last, 0)
     complete = (last > 0) & (seen.sum(1) == last)
     grams = {
-        int(n): _length_gram(y[rows, :n], u[rows, :n], x0_mean)
+        int(n): _length_gram(y[rows, :n], u[rows, :n], each[rows], x0_mean, lag)
         for n in np.unique(last[complete])
         for rows in [complete & (last == n)]
     }
-    with_gaps = (last > 0) & ~complete
+    gappy = (last > 0) & ~complete
     gaps = ()
-    if with_gaps.any():
-        n = last[with_gaps].max()
-        gaps = (GapSequences(y[with_gaps, :n], u[with_gaps, :n], x0_mean),)
-    rates = y[seen]
-    return SufficientStatistics(grams, gaps, float(len(rates)), rates.mean(), rates.std())
+    if gappy.any():
+        n = last[gappy].max()
+        gaps = (GapSequences(y[gappy, :n], u[gappy, :n], each[gappy], x0_mean),)
+    weights, rates = (seen * each[:, None])[seen], y[seen]
+    sums = (float(weights @ rates), float(weights @ rates**2))
+    return SufficientStatistics(grams, gaps, float(weights.sum()), sums, x0_mean, lag)
 
 
-def _length_gram(y: np.ndarray, u: np.ndarray, x0_mean: float) -> LengthGram:
+def _length_gram(
+    y: np.ndarray, u: np.ndarray, weight: np.ndarray, x0_mean: float, lag: float
+) -> LengthGram:
     n_sequences, n_bounds, _ = u.shape
-    lag = np.concatenate([np.full((n_sequences, 1), x0_mean), y[:, :-1]], axis=1)
-    columns = np.concatenate([y[..., None], lag[..., None], u], axis=-1)
+    columns = np.concatenate([y[..., None], np.zeros((n_sequences, n_bounds, 2)), u], axis=-1)
+    columns[:, 1:, 1] = y[:, :-1]
+    columns[:, 0, 2] = x0_mean
+    columns[:, 1:, 3:] -= lag * u[:, :-1]
+    columns *= np.sqrt(weight)[:, None, None]
     transformed = np.einsum("kl,skp->slp", _sine_basis(n_bounds), columns, optimize=True)
     return LengthGram(
-        float(n_sequences),
+        float(weight.sum()),
         np.einsum("slp,slq->lpq", transformed, transformed, optimize=True),
         np.einsum("skp,sjq->kjpq", columns, columns, optimize=True),
     )
 
 
-def _collapse_lag(M: np.ndarray, beta0: np.ndarray, log_det: np.ndarray) -> Quadratic:
-    """From columns (y, y_lag, u) to y - beta0 y_lag and u."""
-    ones = np.ones_like(beta0)
-    v = np.stack([ones, -beta0], axis=1)
-    alpha = np.einsum("ni,nij,nj->n", v, M[:, :2, :2], v, optimize=True)
-    h = np.einsum("ni,nij->nj", v, M[:, :2, 2:], optimize=True)
-    return Quadratic(alpha, h, M[:, 2:, 2:], log_det)
+def _collapse_lag(
+    M: np.ndarray, beta0: np.ndarray, h: np.ndarray, log_det: np.ndarray
+) -> Quadratic:
+    """From columns (y, y_lag, x0_mean e_1, u) to y - beta0 y_lag - h x0_mean e_1 and u."""
+    v = np.stack([np.ones_like(beta0), -beta0, -h], axis=1)
+    alpha = np.einsum("ni,nij,nj->n", v, M[:, :3, :3], v, optimize=True)
+    linear = np.einsum("ni,nij->nj", v, M[:, :3, 3:], optimize=True)
+    return Quadratic(alpha, linear, M[:, 3:, 3:], log_det)
 
 
 def _sine_basis(n: int) -> np.ndarray:

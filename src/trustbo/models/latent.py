@@ -1,13 +1,16 @@
-"""What follows from posterior draws, exactly: latent trust and predicted contact rates."""
+"""What follows from posterior draws: latent trust and predicted contact rates."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax, random
 
-from trustbo.models import statespace
-from trustbo.models.pooled import ContactRate, TrustParams
+from trustbo.models import observation as families
+from trustbo.models.model import ContactRate
+from trustbo.models.geometry import NutsData
+from trustbo.models.params import Params
 
 
 class TrustMoments(NamedTuple):
@@ -17,37 +20,56 @@ class TrustMoments(NamedTuple):
     sd: Array
 
 
-@jax.jit
-def trust_draws(params: TrustParams, awareness: Array, contact_rate: Array, key: Array) -> Array:
+@partial(jax.jit, static_argnames=("observation", "lag"))
+def trust_draws(
+    observation: str, lag: float, params: Params, noise: Array | None, data: NutsData, key: Array
+) -> Array:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
 
-    def one(p: TrustParams, key: Array) -> Array:
-        ssm = ContactRate(p, awareness).ssm()
-        filtered = statespace.kalman_filter(ssm, jnp.swapaxes(contact_rate, 0, 1))
-        return jnp.swapaxes(statespace.sample_backward(ssm, filtered, key), 0, 1)
+    def one(inputs):
+        p, e, key = inputs
+        rates = ContactRate(p, data.awareness, exposure=data.exposure, lag=lag)
+        observed = rates.observed(data.contact_rate)
+        # Without sampled noise: fresh noise, which a Gaussian family turns into trust.
+        e = jnp.zeros_like(observed.y) if e is None else e
+        trust = families.draw_trust(observation, rates.ssm(), observed, e, key)
+        return jnp.swapaxes(trust, 0, 1)
 
-    return jax.vmap(one)(params, random.split(key, len(params.beta0)))
+    return lax.map(one, (params, noise, random.split(key, len(params.b))), batch_size=64)
 
 
-@jax.jit
-def trust_moments(params: TrustParams, awareness: Array, contact_rate: Array) -> TrustMoments:
-    """Moments of latent trust over all draws, by the smoother and the law of total variance."""
+@partial(jax.jit, static_argnames=("observation", "lag"))
+def trust_moments(
+    observation: str, lag: float, params: Params, noise: Array | None, data: NutsData
+) -> TrustMoments:
+    """Moments of latent trust over all draws, by the law of total variance."""
 
-    def add(carry, p: TrustParams):
-        ssm = ContactRate(p, awareness).ssm()
-        filtered = statespace.kalman_filter(ssm, jnp.swapaxes(contact_rate, 0, 1))
-        mean, var = statespace.smooth(ssm, filtered)
+    def add(carry, inputs):
+        p, e = inputs
+        rates = ContactRate(p, data.awareness, exposure=data.exposure, lag=lag)
+        observed = rates.observed(data.contact_rate)
+        e = jnp.zeros_like(observed.y) if e is None else e
+        mean, var = families.trust_moments(observation, rates.ssm(), observed, e)
         return (carry[0] + mean, carry[1] + var + mean**2), None
 
-    zero = jnp.zeros_like(jnp.swapaxes(contact_rate, 0, 1))
-    (total, total_squares), _ = lax.scan(add, (zero, zero), params)
-    mean, mean_square = total / len(params.beta0), total_squares / len(params.beta0)
+    zero = jnp.zeros_like(jnp.swapaxes(data.contact_rate, 0, 1))
+    (total, total_squares), _ = lax.scan(add, (zero, zero), (params, noise))
+    mean, mean_square = total / len(params.b), total_squares / len(params.b)
     sd = jnp.sqrt(jnp.maximum(mean_square - mean**2, 0.0))
     return TrustMoments(jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1))
 
 
-@jax.jit
-def predictive(params: TrustParams, awareness: Array, key: Array) -> Array:
+@partial(jax.jit, static_argnames=("observation", "lag"))
+def predictive(
+    observation: str, lag: float, params: Params, data: NutsData, key: Array
+) -> Array:
     """Contact rates of replicated missions, one set per draw: (draw, mission, bound, robot)."""
-    keys = random.split(key, len(params.beta0))
-    return jax.vmap(lambda p, key: ContactRate(p, awareness).sample(key))(params, keys)
+
+    def one(inputs):
+        p, key = inputs
+        rates = ContactRate(
+            p, data.awareness, exposure=data.exposure, observation=observation, lag=lag
+        )
+        return rates.sample(key)
+
+    return lax.map(one, (params, random.split(key, len(params.b))), batch_size=64)

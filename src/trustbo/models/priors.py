@@ -7,9 +7,11 @@ from typing import Self
 import jax
 import numpy as np
 import numpyro.distributions as dist
-from numpyro.distributions import Distribution
+from numpyro.distributions import Distribution, constraints
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_positive
+
+_SCALES = ("delta_w", "delta_v", "tau")
 
 
 @dataclass(frozen=True)
@@ -18,19 +20,25 @@ class Priors:
 
     `Priors()` is the default of DESIGN: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5),
     delta_w and delta_v ~ HalfNormal(0.2), the second argument being a standard deviation, and
-    x_0 ~ N(0.5, 0.5^2), which the paper leaves open.
+    x_0 ~ N(0.5, 0.5^2), which the paper leaves open. What a model does not have, it ignores.
 
     Attributes:
-        beta0: Autoregression.
-        beta: Weight of each feature, independent.
+        beta0: Autoregression; of the coupled model, the diagonal of B0.
+        beta: Weight of each feature, independent; of the coupled model, the diagonals of B_m. A
+            distribution of batch shape (feature,) gives each feature its own.
         b: Intercept.
         delta_w: Standard deviation of the process noise.
-        delta_v: Standard deviation of the observation noise.
+        delta_v: Standard deviation of the observation noise; of the beta-binomial family, the
+            square root of the ratio of excess to binomial variance (concentration delta_v^-2).
+        coupling: What robots do to each other: off-diagonals of B0 and B_m, and gamma.
+        tau: Spread of the robots' coefficients in the hierarchical model.
+        concentration: Of the LKJ prior of the coupled model's noise correlations.
         x0_mean: Mean of trust before the first bound.
         x0_sd: Its standard deviation; 0 fixes it.
 
     Raises:
-        TrustboError: Something that is no scalar distribution, or a negative `x0_sd`.
+        TrustboError: Something that is no such distribution, a noise or tau that can be negative,
+            or a negative `x0_sd`.
     """
 
     # Built on demand: importing trustbo must create no JAX array.
@@ -39,6 +47,9 @@ class Priors:
     b: Distribution = None  # pyright: ignore[reportAssignmentType]
     delta_w: Distribution = None  # pyright: ignore[reportAssignmentType]
     delta_v: Distribution = None  # pyright: ignore[reportAssignmentType]
+    coupling: Distribution = None  # pyright: ignore[reportAssignmentType]
+    tau: Distribution = None  # pyright: ignore[reportAssignmentType]
+    concentration: float = 2.0
     x0_mean: float = 0.5
     x0_sd: float = 0.5
 
@@ -50,25 +61,70 @@ class Priors:
                 "b": dist.Normal(0.0, 0.5),
                 "delta_w": dist.HalfNormal(0.2),
                 "delta_v": dist.HalfNormal(0.2),
+                "coupling": dist.Normal(0.0, 0.1),
+                "tau": dist.HalfNormal(0.3),
             }
         for name, default in defaults.items():
             prior = getattr(self, name)
             if prior is None:
                 object.__setattr__(self, name, default)
-            elif not isinstance(prior, Distribution) or prior.shape():
+                continue
+            scalar = isinstance(prior, Distribution) and not prior.event_shape
+            if not scalar or len(prior.batch_shape) > (name == "beta"):
                 raise TrustboError(
                     f"Priors.{name} must be a scalar numpyro distribution, e.g. {default!r}; "
                     f"got {prior!r}."
                 )
+            if name in _SCALES and not _is_positive(prior):
+                raise TrustboError(
+                    f"Priors.{name} is a standard deviation: its prior must live on (0, inf) or "
+                    f"part of it, e.g. {default!r}; got {prior!r}."
+                )
+        require_positive("Priors.concentration", self.concentration)
         if not np.isfinite(self.x0_mean):
             raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
         if not 0.0 <= self.x0_sd < np.inf:
             raise TrustboError(f"Priors.x0_sd must be finite, not negative; got {self.x0_sd!r}.")
 
     @classmethod
-    def default(cls) -> Self:
-        """The default priors."""
-        return cls()
+    def default(cls, observation: str = "gaussian") -> Self:
+        """The default priors of a family of observations.
+
+        For `"beta_binomial"` trust is a logit, and everything wider: beta_m ~ N(0, 2), b ~ N(0, 1),
+        delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
+        """
+        if observation != "beta_binomial":
+            return cls()
+        with jax.enable_x64(True):
+            return cls(
+                beta=dist.Normal(0.0, 2.0),
+                b=dist.Normal(0.0, 1.0),
+                delta_w=dist.HalfNormal(0.5),
+                x0_mean=0.0,
+                x0_sd=1.5,
+            )
+
+    @classmethod
+    def zheng2023(cls) -> Self:
+        """The vague priors in the manner of the authors' later code, for comparison.
+
+        Everything normal with sd 10, noises half-Cauchy. With few missions the posterior is
+        multimodal in practice (beta0 near 1 with small weights, or near 0 with large ones): look at
+        R-hat before you believe it.
+        """
+        with jax.enable_x64(True):
+            vague = dist.Normal(0.0, 10.0)
+            noise = dist.HalfCauchy(1.0)
+            return cls(
+                beta0=vague,
+                beta=vague,
+                b=vague,
+                delta_w=noise,
+                delta_v=noise,
+                coupling=vague,
+                tau=noise,
+                concentration=1.0,
+            )
 
     def mean(self, n_features: int) -> dict[str, np.ndarray]:
         """Prior mean of each parameter; 0 for one that has none, as a Cauchy has not."""
@@ -103,6 +159,17 @@ jax.tree_util.register_pytree_node(Priors, _flatten, _unflatten)
 def _as_text(prior: Distribution | float) -> str:
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
-    names = type(prior).arg_constraints
-    numbers = ", ".join(f"{name}={float(getattr(prior, name)):g}" for name in names)
+    numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
     return f"{type(prior).__name__}({numbers})"
+
+
+def _numbers(values: object) -> str:
+    array = np.asarray(values, dtype=float)
+    return f"{array:g}" if not array.ndim else f"[{', '.join(f'{v:g}' for v in array)}]"
+
+
+def _is_positive(prior: Distribution) -> bool:
+    support = prior.support
+    if support is constraints.positive or support is constraints.unit_interval:
+        return True
+    return float(np.min(getattr(support, "lower_bound", -np.inf))) >= 0.0

@@ -2,126 +2,199 @@
 
 Every robot of every mission is one independent sequence
 
-    x_k = beta0 x_{k-1} + c_k + N(0, delta_w^2),   y_k = x_k + N(0, delta_v^2),   k = 1..K,
+    x_k = beta0 x_{k-1} + c_k + w_k,   y_k = x_k - lag x_{k-1} + v_k,   k = 1..K,
 
-with x_0 ~ N(x0_mean, x0_sd^2) and the drift c_k = sum_m beta_m z_{m,k} + b. A rate that is NaN was
-not measured: the filter predicts through it. Sequences share the parameters and run side by side,
-so arrays are (bound, sequence) with the bound first, the axis `lax.scan` walks.
+with x_0 ~ N(x0_mean, x0_sd^2), the drift c_k = sum_m beta_m z_{m,k} + b, and lag 0 where the rate
+measures trust, 1 where it measures the change of trust. A rate that is NaN was not measured: the
+filter predicts through it. Sequences run side by side, so arrays are (bound, mission, robot) with
+the bound first, the axis `lax.scan` walks.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax, random
-from jax.scipy.stats import norm
+from jax.scipy.special import log_ndtr, ndtr, ndtri
+
+_LOG_2PI = 1.8378770664093453
 
 
-class ScalarSSM(NamedTuple):
-    """Parameters of the recursion; scalars, except the drift."""
+class Censoring(NamedTuple):
+    """Rates known only to lie beyond a limit, and the noise that completes them."""
 
-    beta0: Array
-    drift: Array  # (bound, sequence)
-    delta_w: Array
-    delta_v: Array
-    x0_mean: Array
-    x0_sd: Array
+    side: Array
+    """-1 where the rate is 0 or below, 1 where it is 1 or above, 0 where it was measured."""
+    noise: Array
+    """Standard normal; one draw of the censored rates is a function of it."""
 
 
 class Filtered(NamedTuple):
-    """Moments of x_k given y_1..y_{k-1} (predicted) and y_1..y_k (filtered); (bound, sequence)."""
+    """Moments of x_k given y_1..y_k, bound first."""
 
-    predicted_mean: Array
-    predicted_var: Array
     mean: Array
     var: Array
-    log_likelihood: Array  # increments, nats; 0 where the rate was not measured
-
-
-def kalman_filter(ssm: ScalarSSM, y: Array) -> Filtered:
-    """Moments of the latent trust given the rates so far.
-
-    Args:
-        ssm: The model.
-        y: Contact rates, shape (bound, sequence); NaN where not measured.
-    """
-    Q, R = ssm.delta_w**2, ssm.delta_v**2
-    measured = ~jnp.isnan(y)
-    # NaN must not reach the arithmetic even where its result is discarded: its gradient would stay.
-    y = jnp.where(measured, y, 0.0)
-
-    def step(carry, inputs):
-        m, P = carry
-        c_k, y_k, seen = inputs
-        m, P = ssm.beta0 * m + c_k, ssm.beta0**2 * P + Q
-        S = P + R
-        gain = jnp.where(seen, P / S, 0.0)
-        increment = jnp.where(seen, norm.logpdf(y_k, m, jnp.sqrt(S)), 0.0)
-        m_k, P_k = m + gain * (y_k - m), (1.0 - gain) * P
-        return (m_k, P_k), Filtered(m, P, m_k, P_k, increment)
-
-    start = (jnp.full_like(y[0], ssm.x0_mean), jnp.full_like(y[0], ssm.x0_sd**2))
-    return lax.scan(step, start, (ssm.drift, y, measured))[1]
+    """Variance, or, of coupled robots, covariance; its axes after the bound broadcast."""
+    log_likelihood: Array
+    """Increments, nats; 0 where the rate was not measured."""
+    y: Array
+    """The rates, censored ones completed; 0 where not measured."""
+    seen: Array
+    """1 where a rate was measured, else 0."""
 
 
 class Smoothed(NamedTuple):
-    """Moments of x_k given all of a sequence's rates; shape (bound, sequence)."""
+    """Moments of x_k given all of a sequence's rates; shape (bound, mission, robot)."""
 
     mean: Array
     var: Array
 
 
-def smooth(ssm: ScalarSSM, filtered: Filtered) -> Smoothed:
-    """Rauch-Tung-Striebel smoother."""
+class ScalarSSM(NamedTuple):
+    """Parameters of the recursion; shapes () or (robot,), unless said otherwise."""
 
-    def step(carry, inputs):
-        m_next, P_next = carry
-        f, predicted_mean, predicted_var = inputs
-        gain = ssm.beta0 * f.var / predicted_var
-        m = f.mean + gain * (m_next - predicted_mean)
-        P = f.var + gain**2 * (P_next - predicted_var)
-        return (m, P), Smoothed(m, P)
+    beta0: Array
+    drift: Array  # (bound, mission, robot)
+    delta_w: Array
+    delta_v: Array  # or (bound, mission, robot)
+    x0_mean: Array
+    x0_sd: Array
+    lag: Array | float = 0.0
 
-    last = (filtered.mean[-1], filtered.var[-1])
-    _, earlier = lax.scan(step, last, _pairs(filtered), reverse=True)
-    return Smoothed(*(jnp.concatenate([e, f[None]]) for e, f in zip(earlier, last, strict=True)))
+    def filter(
+        self, y: Array, *, shared: bool = False, censoring: Censoring | None = None
+    ) -> Filtered:
+        """Moments of the latent trust given the rates so far.
+
+        Args:
+            y: Contact rates, shape (bound, mission, robot); NaN where not measured.
+            shared: No rate is missing before the last of a mission, so that all missions share
+                their variances; what it says of bounds after the last rate is then meaningless.
+            censoring: Which rates are censored, of the shape of `y`.
+        """
+        seen = jnp.where(jnp.isnan(y), 0.0, 1.0)
+        # NaN must not reach the arithmetic even where its result is discarded: its gradient would.
+        y = jnp.where(seen > 0.0, y, 0.0)
+        beta0, Q, x0_mean = (row(p) for p in (self.beta0, self.delta_w**2, self.x0_mean))
+        h, R = beta0 - self.lag, self.delta_v**2
+
+        def advance(P, inputs):
+            R_k, seen_k = inputs
+            S = h**2 * P + Q + R_k
+            gain = (beta0 * h * P + Q) / S * seen_k
+            P_k = beta0**2 * P + Q - gain**2 * S
+            return P_k, (S, gain, P_k)
+
+        mask = jnp.ones_like(y[:, :1]) if shared else seen
+        R = jnp.broadcast_to(row(R), mask.shape) if jnp.ndim(R) < 3 else R
+        P0 = jnp.broadcast_to(row(self.x0_sd**2), mask.shape[1:])
+        _, (S, gain, P) = lax.scan(advance, P0, (R, mask))
+
+        def step(m, inputs):
+            y_k, seen_k, c_k, S_k, gain_k, *rest = inputs
+            predicted = h * m + c_k
+            if rest:
+                y_k, log_mass = complete(y_k, predicted, jnp.sqrt(S_k), Censoring(*rest))
+            e = (y_k - predicted) * seen_k
+            out = (e, y_k, log_mass) if rest else (e,)
+            m = beta0 * m + c_k + gain_k * e
+            return m, (m, *out)
+
+        S, gain = (jnp.broadcast_to(a, y.shape) for a in (S, gain))
+        m0 = jnp.broadcast_to(x0_mean, y.shape[1:])
+        columns = (y, seen, self.drift, S, gain, *(censoring or ()))
+        _, (m, e, *rest) = lax.scan(step, m0, columns)
+        increments = log_normal(e, S)
+        if censoring is not None:
+            y, log_mass = rest
+            increments = jnp.where(censoring.side == 0.0, increments, log_mass)
+        return Filtered(m, P, increments * seen, y * seen, seen)
+
+    def smooth(self, filtered: Filtered) -> Smoothed:
+        """Rauch-Tung-Striebel smoother; `filtered` not `shared`."""
+        A, a, V = self._backward(filtered)
+
+        def step(carry, inputs):
+            m_next, P_next = carry
+            A_k, a_k, V_k = inputs
+            m, P = A_k * m_next + a_k, V_k + A_k**2 * P_next
+            return (m, P), Smoothed(m, P)
+
+        last = (filtered.mean[-1], jnp.broadcast_to(filtered.var[-1], filtered.mean[-1].shape))
+        _, earlier = lax.scan(step, last, (A, a, V), reverse=True)
+        return Smoothed(
+            *(jnp.concatenate([e, f[None]]) for e, f in zip(earlier, last, strict=True))
+        )
+
+    def sample_backward(self, filtered: Filtered, noise: Array) -> Array:
+        """One exact joint draw of the latent trust given all rates, shape (bound, mission, robot).
+
+        Backward sampling (Carter and Kohn 1994; Fruehwirth-Schnatter 1994), as a smooth function of
+        standard normal noise of that shape.
+        """
+        A, a, V = self._backward(filtered)
+
+        def step(x_next, inputs):
+            A_k, a_k, sd, e = inputs
+            x = A_k * x_next + a_k + sd * e
+            return x, x
+
+        last = filtered.mean[-1] + jnp.sqrt(filtered.var[-1]) * noise[-1]
+        _, earlier = lax.scan(step, last, (A, a, jnp.sqrt(V), noise[:-1]), reverse=True)
+        return jnp.concatenate([earlier, last[None]])
+
+    def simulate(self, key: Array) -> tuple[Array, Array]:
+        """Latent trust and contact rates drawn from the model, each (bound, mission, robot)."""
+        key_x0, key_w, key_v = random.split(key, 3)
+        shape, dtype = self.drift.shape, self.drift.dtype
+        beta0, delta_w, delta_v = (row(p) for p in (self.beta0, self.delta_w, self.delta_v))
+
+        def step(x, inputs):
+            c_k, w, v = inputs
+            x_k = beta0 * x + c_k + delta_w * w
+            return x_k, (x_k, x_k - self.lag * x + delta_v * v)
+
+        x0 = row(self.x0_mean) + row(self.x0_sd) * random.normal(key_x0, shape[1:], dtype)
+        noises = (random.normal(key, shape, dtype) for key in (key_w, key_v))
+        return lax.scan(step, x0, (self.drift, *noises))[1]
+
+    def _backward(self, filtered: Filtered) -> tuple[Array, Array, Array]:
+        """A, a, V with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V), for each bound but the last.
+
+        In information form, which cannot turn a variance negative.
+        """
+        beta0, Q, R = (
+            row(p)[None] if jnp.ndim(p) < 3 else p
+            for p in (self.beta0, self.delta_w**2, self.delta_v**2)
+        )
+        R = jnp.broadcast_to(R, filtered.y.shape)
+        of_rate = self.lag * filtered.seen[1:] / R[1:]
+        m, P = filtered.mean[:-1], filtered.var[:-1]
+        V = 1.0 / (1.0 / P + beta0**2 / Q + self.lag * of_rate)
+        A = V * (beta0 / Q + of_rate)
+        a = V * (m / P - beta0 / Q * self.drift[1:] - of_rate * filtered.y[1:])
+        return A, a, V
 
 
-def sample_backward(ssm: ScalarSSM, filtered: Filtered, key: Array) -> Array:
-    """One exact joint draw of the latent trust given all rates, shape (bound, sequence).
+def complete(y: Array, predicted: Array, sd: Array, censoring: Censoring):
+    """Censored rates drawn beyond their limit from the prediction, and the log mass there.
 
-    Backward sampling (Carter and Kohn 1994; Fruehwirth-Schnatter 1994).
+    The step of the GHK simulator (Geweke 1989; Hajivassiliou and McFadden 1998; Keane 1994).
     """
-    noise = random.normal(key, filtered.mean.shape, filtered.mean.dtype)
-
-    def step(x_next, inputs):
-        (f, predicted_mean, predicted_var), e = inputs
-        gain = ssm.beta0 * f.var / predicted_var
-        m = f.mean + gain * (x_next - predicted_mean)
-        # Var(x_k | x_{k+1}, y) = P_k Q / predicted_var: this form cannot turn negative.
-        x = m + jnp.sqrt(f.var * ssm.delta_w**2 / predicted_var) * e
-        return x, x
-
-    last = filtered.mean[-1] + jnp.sqrt(filtered.var[-1]) * noise[-1]
-    _, earlier = lax.scan(step, last, (_pairs(filtered), noise[:-1]), reverse=True)
-    return jnp.concatenate([earlier, last[None]])
+    side, noise = censoring
+    toward = jnp.where(side == 0.0, 1.0, side)
+    limit = jnp.where(side > 0.0, 1.0, 0.0)
+    z = toward * (predicted - limit) / sd
+    # Beyond -35 sd the draw is clipped; its log mass, below -600, is not.
+    inner = ndtri(jnp.clip(ndtr(noise) * ndtr(jnp.clip(z, -35.0, 35.0)), 1e-290, 1.0 - 1e-16))
+    drawn = predicted - toward * sd * inner
+    return jnp.where(side == 0.0, y, drawn), log_ndtr(z)
 
 
-def simulate(ssm: ScalarSSM, key: Array) -> tuple[Array, Array]:
-    """Latent trust and contact rates drawn from the model, each of shape (bound, sequence)."""
-    key_x0, key_w, key_v = random.split(key, 3)
-    shape, dtype = ssm.drift.shape, ssm.drift.dtype
-
-    def step(x, inputs):
-        c_k, w = inputs
-        x = ssm.beta0 * x + c_k + ssm.delta_w * w
-        return x, x
-
-    x0 = ssm.x0_mean + ssm.x0_sd * random.normal(key_x0, shape[1:], dtype)
-    _, trust = lax.scan(step, x0, (ssm.drift, random.normal(key_w, shape, dtype)))
-    return trust, trust + ssm.delta_v * random.normal(key_v, shape, dtype)
+def row(p: Array | float) -> Array:
+    """A parameter of shape () or (robot,) as a row to broadcast over missions."""
+    return jnp.reshape(p, (1, -1))
 
 
-def _pairs(filtered: Filtered) -> tuple[Filtered, Array, Array]:
-    """Each bound but the last, with the prediction of the one after it."""
-    earlier = Filtered(*(field[:-1] for field in filtered))
-    return earlier, filtered.predicted_mean[1:], filtered.predicted_var[1:]
+def log_normal(e: Array, var: Array) -> Array:
+    """Log density of N(0, var) at e."""
+    return -0.5 * (e**2 / var + jnp.log(var) + _LOG_2PI)

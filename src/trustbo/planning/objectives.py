@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from trustbo.models import TrustParams
-from trustbo.models.pooled import check_features
+from trustbo.models.params import check_params
 
 
 def roll_trust(
@@ -51,7 +51,7 @@ def drift(params: TrustParams, awareness: ArrayLike) -> np.ndarray:
         ShapeError: The number of features differs from that of `params.beta`.
     """
     z, beta = np.asarray(awareness, dtype=float), np.asarray(params.beta, dtype=float)
-    check_features(params, z.shape[-1])
+    check_params(params, None, z.shape[-1])
     b = np.asarray(params.b, dtype=float)
     return np.tensordot(beta, z, (-1, -1)) + b.reshape(b.shape + (1,) * (z.ndim - 1))
 

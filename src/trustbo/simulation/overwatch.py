@@ -193,8 +193,17 @@ class KinematicSimulator:
         # On failure in the first phase T2 has not moved: what it measured is where it stands.
         awareness = self._measure(poses[min(moved_from, len(poses) - 1) :, 1:])
         duration = np.full(len(team.robots), len(poses) * self.tick)
+        exposure = np.full(len(team.robots), len(contact))
         bound = Bound(
-            cell, awareness, contact.mean(0), duration, status, state.time, poses, contact
+            cell,
+            awareness,
+            contact.mean(0),
+            duration,
+            status,
+            state.time,
+            poses,
+            contact,
+            exposure,
         )
         self._state = _State(cell, poses[-1], bound.t1, state.seed)
         return bound

@@ -1,0 +1,114 @@
+"""The paper's coupled form (1)-(2): what robots do to each other."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpyro
+from jax import Array
+from numpyro.distributions import Distribution, LKJCholesky
+
+from trustbo.errors import require_choice
+from trustbo.models.model import TrustModel, register
+from trustbo.models.params import CoupledParams, Params, RobotParams, ordered_params
+
+INTER_ROBOT = ("full", "none", "ordered")
+
+
+@register
+@dataclass(frozen=True)
+class CoupledTrust(TrustModel):
+    """Every robot with parameters of its own, equations (1)-(2).
+
+    Attributes:
+        inter_robot: `"full"`, the paper's: matrices B0 and B_m, shrunk towards their diagonals by
+            `Priors.coupling`, and covariances diag(sd) LKJ diag(sd). `"none"`: diagonals only,
+            robots apart. `"ordered"`, the later code's: robots apart, but robot i follows robot i-1
+            at the same bound with weight gamma_i.
+    """
+
+    inter_robot: str = "full"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("inter_robot", self.inter_robot, INTER_ROBOT)
+
+    def sample_params(self, n_robots: int, n_features: int) -> Params:
+        """Sample statements; see the class for what couples the robots."""
+        if self.inter_robot == "full":
+            return self._sample_full(n_robots, n_features)
+        priors, robot = self.priors, (n_robots,)
+        sites = {
+            "beta0": _sample("beta0", priors.beta0, robot),
+            "beta": _sample("beta", priors.beta, (n_robots, n_features)),
+            "b": _sample("b", priors.b, robot),
+            "delta_w": _sample("delta_w", priors.delta_w, robot),
+            "delta_v": _sample("delta_v", priors.delta_v, robot),
+        }
+        x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
+        if self.inter_robot == "none":
+            return RobotParams(**sites, **x0)
+        sites["gamma"] = _sample("gamma", priors.coupling, (n_robots - 1,))
+        return ordered_params(sites, **x0)
+
+    def _sample_full(self, n_robots: int, n_features: int) -> CoupledParams:
+        priors, off = self.priors, n_robots * (n_robots - 1)
+        B0 = _matrix(
+            _sample("B0_diagonal", priors.beta0, (n_robots,)),
+            _sample("B0_coupling", priors.coupling, (off,)),
+        )
+        # (robot, feature): a prior that differs by feature has it last.
+        own = _sample("B_diagonal", priors.beta, (n_robots, n_features)).T
+        B = _matrix(own, _sample("B_coupling", priors.coupling, (n_features, off)))
+        return CoupledParams(
+            B0=numpyro.deterministic("B0", B0),
+            B=numpyro.deterministic("B", B),
+            b=_sample("b", priors.b, (n_robots,)),
+            Delta_w=self._covariance("w", priors.delta_w, n_robots),
+            Delta_v=self._covariance("v", priors.delta_v, n_robots),
+            x0_mean=priors.x0_mean,
+            x0_sd=priors.x0_sd,
+        )
+
+    def _covariance(self, noise: str, sd_prior: Distribution, n_robots: int) -> Array:
+        sd = _sample(f"delta_{noise}", sd_prior, (n_robots,))
+        factor = jnp.eye(n_robots)
+        # Counts of ticks are independent given trust: their noise has no correlations.
+        if n_robots > 1 and not (noise == "v" and self.observation == "beta_binomial"):
+            lkj = LKJCholesky(n_robots, self.priors.concentration)
+            factor = numpyro.sample(f"corr_{noise}", lkj)
+        factor = sd[:, None] * factor
+        return numpyro.deterministic(f"Delta_{noise}", factor @ factor.T)
+
+    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
+        """See `TrustModel.level`."""
+        if self.inter_robot != "full":
+            shift = sites["beta0"] * mean_y + sites["beta"] @ mean_z
+            if self.inter_robot == "ordered":
+                shift = shift + jnp.pad(sites["gamma"] * mean_y, (1, 0))
+            return {"b": shift}
+        rows = _matrix(sites["B0_diagonal"], sites["B0_coupling"]).sum(-1) * mean_y
+        B = _matrix(sites["B_diagonal"].T, sites["B_coupling"])
+        return {"b": rows + mean_z @ B.sum(-1)}
+
+    @property
+    def dims(self) -> dict[str, tuple[str, ...]]:
+        """Axes of the matrices; or, of robots apart, of each robot's coefficients."""
+        if self.inter_robot == "full":
+            return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
+        gamma = {"gamma": ("follower",)} if self.inter_robot == "ordered" else {}
+        return {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]} | gamma
+
+
+def _sample(name: str, prior: Distribution, shape: tuple[int, ...]) -> Array:
+    return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore
+
+
+def _matrix(diagonal: Array, off_diagonal: Array) -> Array:
+    """Square matrices of a diagonal (..., robot) and the other entries, row by row."""
+    n = diagonal.shape[-1]
+    rows, cols = jnp.nonzero(~jnp.eye(n, dtype=bool), size=n * (n - 1))
+    matrix = jnp.zeros((*diagonal.shape, n), diagonal.dtype)
+    index = jnp.arange(n)
+    matrix = matrix.at[..., index, index].set(diagonal)
+    return matrix.at[..., rows, cols].set(off_diagonal)

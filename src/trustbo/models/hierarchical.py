@@ -1,0 +1,118 @@
+"""Robots with coefficients of their own, drawn from a common distribution."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+from jax import Array
+from numpyro.distributions import constraints
+from numpyro.distributions.transforms import biject_to
+
+from trustbo.models.model import TrustModel, register
+from trustbo.models.params import RobotParams
+
+
+@register
+@dataclass(frozen=True)
+class HierarchicalTrust(TrustModel):
+    """Coefficients per robot, partially pooled: between `PooledTrust` and separate robots.
+
+    beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2), b_i ~ N(mean_b, tau_b^2), and the same for beta0 on
+    the real line, where its prior's support is mapped to (by the logit, if that is (0, 1)). The
+    means have the priors of the pooled coefficients, the spreads `Priors.tau`; noises are shared.
+    Sampled non-centred.
+    """
+
+    varies_by_robot: ClassVar[bool] = True
+
+    def sample_params(self, n_robots: int, n_features: int) -> RobotParams:
+        """Sample statements of means, spreads, and each robot's deviation."""
+        priors, unit = self.priors, dist.Normal(0.0, 1.0)
+        params = self.assemble(
+            {
+                "mean_beta0": numpyro.sample("mean_beta0", priors.beta0),
+                "mean_beta": _sample("mean_beta", priors.beta, (n_features,)),
+                "mean_b": numpyro.sample("mean_b", priors.b),
+                "tau_beta0": numpyro.sample("tau_beta0", priors.tau),
+                "tau_beta": _sample("tau_beta", priors.tau, (n_features,)),
+                "tau_b": numpyro.sample("tau_b", priors.tau),
+                "e_beta0": _sample("e_beta0", unit, (n_robots,)),
+                "e_beta": _sample("e_beta", unit, (n_robots, n_features)),
+                "e_b": _sample("e_b", unit, (n_robots,)),
+                "delta_w": numpyro.sample("delta_w", priors.delta_w),
+                "delta_v": numpyro.sample("delta_v", priors.delta_v),
+            }
+        )
+        for name in ("beta0", "beta", "b"):
+            numpyro.deterministic(name, getattr(params, name))
+        return params
+
+    def assemble(self, sites: Mapping[str, Array]) -> RobotParams:
+        """Each robot's parameters."""
+        c, mu, tau = self.robot_coefficients(sites)
+        n_robots = len(c)
+        return RobotParams(
+            beta0=biject_to(self.priors.beta0.support)(c[:, 0]),
+            beta=c[:, 1:-1],
+            b=c[:, -1],
+            delta_w=jnp.broadcast_to(sites["delta_w"], (n_robots,)),
+            delta_v=jnp.broadcast_to(sites["delta_v"], (n_robots,)),
+            x0_mean=self.priors.x0_mean,
+            x0_sd=self.priors.x0_sd,
+        )
+
+    def robot_coefficients(self, sites: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+        """Coefficients on the real line (robot, coefficient), and their means and spreads."""
+        mean_beta0 = biject_to(self.priors.beta0.support).inv(sites["mean_beta0"])
+        mu = jnp.concatenate([mean_beta0[None], sites["mean_beta"], sites["mean_b"][None]])
+        tau = [sites["tau_beta0"][None], sites["tau_beta"], sites["tau_b"][None]]
+        tau = jnp.concatenate(tau)
+        return mu[None] + tau[None] * self.robot_deviations(sites), mu, tau
+
+    def robot_deviations(self, sites: Mapping[str, Array]) -> Array:
+        """Deviations in units of tau, (robot, coefficient)."""
+        columns = [sites["e_beta0"][:, None], sites["e_beta"], sites["e_b"][:, None]]
+        return jnp.concatenate(columns, axis=1)
+
+    def robot_sites(self, deviations: Array) -> dict[str, Array]:
+        """The other way round."""
+        columns = {"e_beta0": 0, "e_beta": slice(1, -1), "e_b": -1}
+        return {name: deviations[:, column] for name, column in columns.items()}
+
+    @property
+    def means_are_real(self) -> bool:
+        """Whether the means of the coefficients can be anywhere on the real line."""
+        supports = (self.priors.beta.support, self.priors.b.support)
+        return all(support is constraints.real for support in supports)
+
+    def mean_sites(self, mu: Array) -> dict[str, Array]:
+        """The means' sites, on their own real lines, of those of the coefficients."""
+        return {"mean_beta0": mu[0], "mean_beta": mu[1:-1], "mean_b": mu[-1]}
+
+    def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
+        """See `TrustModel.level`."""
+        return {"mean_b": sites["mean_beta0"] * mean_y + sites["mean_beta"] @ mean_z}
+
+    @property
+    def dims(self) -> dict[str, tuple[str, ...]]:
+        """Axes of each robot's coefficients, of their means and spreads, and of the noises."""
+        return {
+            "beta0": ("robot",),
+            "beta": ("robot", "feature"),
+            "b": ("robot",),
+            "delta_w": (),
+            "delta_v": (),
+            "mean_beta0": (),
+            "mean_beta": ("feature",),
+            "mean_b": (),
+            "tau_beta0": (),
+            "tau_beta": ("feature",),
+            "tau_b": (),
+        }
+
+
+def _sample(name: str, prior: dist.Distribution, shape: tuple[int, ...]) -> Array:
+    return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore
