@@ -1,26 +1,56 @@
-"""Simulation-based calibration of both samplers: p-values of uniform ranks, per parameter.
+"""Simulation-based calibration of every model, family and sampler; prints the table of the docs.
 
-Run: python benchmarks/calibration.py [data sets for exact, default 1000] [for NUTS, default 100]
+Run: python benchmarks/calibration.py [folder, default out/calibration] [share of data sets, 1]
+
+Ranks are kept in the folder after each data set: a run that was stopped goes on where it was.
 """
 
 import sys
 import time
+from pathlib import Path
 
-from trustbo.models import sbc
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, sbc
+
+SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
 
 
-def main(n_exact=1000, n_nuts=100):
-    for sampler, n in (("exact", n_exact), ("nuts", n_nuts)):
+def cases():
+    """Model, sampler, data sets, shape."""
+    yield PooledTrust(), "exact", 1000, (4, 8, 3, 2)
+    yield CoupledTrust(inter_robot="none"), "exact", 200, SMALL
+    for observation in ("gaussian", "censored", "beta_binomial"):
+        sampler = "nuts" if observation == "gaussian" else "joint"
+        for model in (PooledTrust, HierarchicalTrust):
+            yield model(observation=observation), sampler, 100, SMALL
+        yield CoupledTrust(observation=observation), sampler, 50, SMALL
+    yield PooledTrust(response="change"), "nuts", 100, SMALL
+    yield CoupledTrust(inter_robot="ordered"), "nuts", 50, SMALL
+
+
+def main(folder="out/calibration", share="1"):
+    print("| model | observation | sampler | data sets | parameters | smallest p | limit | "
+          "50 % interval | 90 % interval | uniform |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for model, sampler, n, shape in cases():
+        n = max(2, round(n * float(share)))
+        name = type(model).__name__
+        detail = getattr(model, "inter_robot", model.response)
+        label = name if detail in ("full", "level") else f"{name}, {detail}"
+        file = Path(folder) / f"{name}-{detail}-{model.observation}-{sampler}-{n}.json"
         started = time.perf_counter()
-        p_values = sbc(sampler=sampler, n_datasets=n, progress=False)["p_value"].to_series()
-        seconds = time.perf_counter() - started
-        print(f"{sampler}: {n} data sets of 4 missions, 8 bounds, 3 robots; {seconds:.0f} s")
-        for name, p in p_values.items():
-            print(f"  {name:8s} p = {p:.3f}")
-        limit = 0.01 / len(p_values)
-        verdict = "not rejected" if p_values.min() > limit else "REJECTED"
-        print(f"  uniformity {verdict} at 1 % (Bonferroni: each p > {limit:.4f})")
+        result = sbc(
+            model, sampler, n_datasets=n, shape=shape, checkpoint=file, n_ranked=396, progress=False
+        )
+        p, limit = float(result["p_value"].min()), 0.01 / result.sizes["parameter"]
+        half, most = result["coverage"].mean("parameter").values
+        print(
+            f"| {label} | {model.observation} | `{sampler}` | {n} | {result.sizes['parameter']} | "
+            f"{p:.4f} | {limit:.5f} | {half:.1%} | {most:.1%} | "
+            f"{'not rejected' if p > limit else 'REJECTED'} |",
+            flush=True,
+        )
+        print(f"{label}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
-    main(*(int(a) for a in sys.argv[1:]))
+    main(*sys.argv[1:])

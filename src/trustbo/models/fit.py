@@ -22,7 +22,7 @@ from trustbo.models.nuts import NutsSettings
 from trustbo.models.observation import log_resolution
 from trustbo.models.params import Params, RobotParams, TrustParams, params_from
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.sampling import SAMPLERS, Draws, draw_posterior, require_exact
+from trustbo.models.sampling import SAMPLERS, Draws, draw_posterior, require_sampler
 from trustbo.stacking import MissionBatch, stack_missions
 
 _FIRM_NOISE = (
@@ -82,12 +82,10 @@ def fit(
             or the contact rates do not vary at all: the Gaussian noise then has no posterior.
         PosteriorError: The diagnostics say that the posterior must not be used.
     """
-    require_choice("sampler", sampler, SAMPLERS)
     model = PooledTrust() if model is None else model
     if not isinstance(model, TrustModel):
         raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")
-    if sampler == "exact":
-        require_exact(model)
+    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
     batch = stack_missions(missions)
     require_exposure(model, batch)
     _require_variation(batch, model)
@@ -210,7 +208,7 @@ def _describe(
     if scalar and model.observation == "gaussian":
         found = _of_gaussian(model, all_params, few_params, batch, seed)
     else:
-        found = _of_compiled(model, all_params, few_params, draws.noise, kept, batch, seed)
+        found = _of_compiled(model, all_params, few_params, draws, kept, batch, seed)
     prior = _prior(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
@@ -255,7 +253,7 @@ def _of_compiled(
     model: TrustModel,
     every: Params,
     few: Params,
-    noise: np.ndarray | None,
+    draws: Draws,
     kept: np.ndarray,
     batch: MissionBatch,
     seed: int,
@@ -263,15 +261,17 @@ def _of_compiled(
     """The same for coupled robots and other families."""
     family = (model.observation, model.lag)
     every, few = every.flat(), few.flat()
-    few_noise = None if noise is None else noise[:, kept].reshape(-1, *noise.shape[2:])
-    noise = None if noise is None else noise.reshape(-1, *noise.shape[2:])
+    noise = few_noise = None
+    if draws.noise is not None:
+        shape = (-1, *draws.noise.shape[2:])
+        noise, few_noise = draws.noise.reshape(shape), draws.noise[:, kept].reshape(shape)
     with jax.enable_x64(True):
         data = NutsData(*batch, np.ones(len(batch.contact_rate)))
         keys = random.split(random.fold_in(random.key(seed), 1), 3)
-        moments = latent.trust_moments(*family, every, noise, data)
+        moments = latent.trust_moments(*family, every, noise, draws.pilot, data)
         found = {
             "log_likelihood": mission_log_likelihood(*family, every, *batch, keys[0]),
-            "trust": latent.trust_draws(*family, few, few_noise, data, keys[1]),
+            "trust": latent.trust_draws(*family, few, few_noise, draws.pilot, data, keys[1]),
             "trust_mean": moments.mean,
             "trust_sd": moments.sd,
             "predicted": latent.predictive(*family, few, data, keys[2]),

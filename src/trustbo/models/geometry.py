@@ -57,6 +57,7 @@ class _Space:
             "weight": data.weight,
             "shared": shared,
             "joint": joint,
+            "pilot": None,
         }
         seeded = handlers.seed(model, random.key(0))
         trace = handlers.trace(seeded).get_trace(*self.args, **self.options)
@@ -68,20 +69,19 @@ class _Space:
         self.inverse = {name: biject_to(site["fn"].support) for name, site in sites.items()}
         start = {name: _start(self.inverse[name], site["fn"]) for name, site in sites.items()}
         self.start, self.unravel = ravel_pytree(start)
-        self.means = _levels(model, data)
+        self.means = _average(model, data)
 
     def to_sites(self, theta: Array, robots: _Robots | None) -> tuple[dict[str, Array], Array]:
         """The sites on their own real lines, and the log Jacobian of the way there."""
         site, log_jacobian = self.unravel(theta), jnp.zeros(())
-        if self.model.observation != "beta_binomial":
-            t, r = site["delta_w"], site["delta_v"]
-            site = site | {
-                "delta_w": t + 0.5 * jax.nn.log_sigmoid(2.0 * r),
-                "delta_v": t + 0.5 * jax.nn.log_sigmoid(-2.0 * r),
-            }
+        t, r = site["delta_w"], site["delta_v"]
+        site = site | {
+            "delta_w": t + 0.5 * jax.nn.log_sigmoid(2.0 * r),
+            "delta_v": t + 0.5 * jax.nn.log_sigmoid(-2.0 * r) - self.means.log_unit,
+        }
         if robots is not None:
             return self._whiten(site, robots)
-        shifts = self.model.level(self.values(site), *self.means)
+        shifts = self.model.level(self.values(site), self.means.y, self.means.z)
         site = site | {name: site[name] - shift for name, shift in shifts.items()}
         return site, log_jacobian
 
@@ -104,6 +104,16 @@ class _Space:
         values = constrain_fn(self.model, self.args, self.options, full, return_deterministic=True)
         return {name: values[name] for name in self.model.dims}
 
+    def fit_pilot(self, theta: Array) -> None:
+        """Take the counts for what they are worth at theta, from now on."""
+        values = self.values(self.to_sites(theta, None)[0])
+        values["noise"] = jnp.zeros(noise_shape(self.data))
+        at = handlers.substitute(handlers.seed(self.model, random.key(0)), values)
+        rates = handlers.trace(at).get_trace(*self.args, **self.options)["contact_rate"]["fn"]
+        observed = rates.observed(self.data.contact_rate)
+        observed = families.refine(self.model.observation, rates.ssm(), observed)
+        self.options["pilot"] = observed.pilot
+
     def fit_robots(self, theta: Array) -> _Robots:
         """One Newton step from theta on each robot's log-likelihood of its coefficients."""
         values = self.values(self.to_sites(theta, None)[0])
@@ -118,6 +128,7 @@ class _Space:
                 exposure=self.data.exposure,
                 observation=self.model.observation,
                 lag=self.model.lag,
+                pilot=self.options["pilot"],
             )
             observed = rates.observed(self.data.contact_rate)
             zero = jnp.zeros_like(observed.y)
@@ -158,14 +169,29 @@ class _Space:
         return site | model.robot_sites((c[..., 0] - mu[None]) / tau[None]), log_jacobian
 
 
-def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool):
-    """A start, the way back to parameters, and the potential energy of {"theta", "noise"}."""
+class RoundTarget(NamedTuple):
+    """A posterior, fit to be sampled."""
+
+    start: Array
+    """A flat real vector to look for the mode from."""
+    constrain: Callable[[Array], dict[str, Array]]
+    """From there to parameters."""
+    potential: Callable[[dict[str, Array]], Array]
+    """Minus the log density of {"theta", "noise"}."""
+    pilot: Array | None
+
+
+def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool) -> RoundTarget:
+    """Change variables so that the posterior becomes round."""
     space = _Space(model, data, shared=shared, joint=joint)
+    noise = {"noise": jnp.zeros(noise_shape(data))} if joint else {}
     robots, start = None, space.start
-    if model.varies_by_robot:
-        noise = {"noise": jnp.zeros(noise_shape(data))} if joint else {}
+    if model.varies_by_robot or model.observation == "beta_binomial":
         mode, _ = newton(lambda theta: space.potential({"theta": theta, **noise}), start)
-        robots = space.fit_robots(mode)
+        if model.observation == "beta_binomial":
+            space.fit_pilot(mode)
+        if model.varies_by_robot:
+            robots = space.fit_robots(mode)
 
     def constrain(theta: Array) -> dict[str, Array]:
         return space.constrain(theta, robots)
@@ -173,7 +199,7 @@ def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool
     def potential(z: dict[str, Array]) -> Array:
         return space.potential(z, robots)
 
-    return start, constrain, potential
+    return RoundTarget(start, constrain, potential, space.options["pilot"])
 
 
 def newton(potential: Callable[[Array], Array], start: Array, n_steps: int = 40):
@@ -219,15 +245,25 @@ def noise_shape(data: NutsData) -> tuple[int, ...]:
     return (n_bounds, n_missions, n_robots)
 
 
-def _levels(model: TrustModel, data: NutsData) -> tuple[Array, Array]:
-    """Mean rate, or the logit of the mean, and mean awareness (feature,), where measured."""
+class _Means(NamedTuple):
+    """What the data are like on average."""
+
+    y: Array
+    """Mean rate, or its logit, where measured."""
+    z: Array  # (feature,)
+    log_unit: Array
+    """Log of the noise of trust that an observation noise of 1 is worth."""
+
+
+def _average(model: TrustModel, data: NutsData) -> _Means:
     measured = ~jnp.isnan(data.contact_rate)
     n = jnp.maximum(measured.sum(), 1)
-    mean_y = jnp.where(measured, data.contact_rate, 0.0).sum() / n
-    mean_z = jnp.where(measured[..., None], data.awareness, 0.0).sum((0, 1, 2)) / n
-    if model.observation == "beta_binomial":
-        mean_y = jax.scipy.special.logit(jnp.clip(mean_y, 0.02, 0.98))
-    return mean_y, mean_z
+    y = jnp.where(measured, data.contact_rate, 0.0).sum() / n
+    z = jnp.where(measured[..., None], data.awareness, 0.0).sum((0, 1, 2)) / n
+    if model.observation != "beta_binomial":
+        return _Means(y, z, jnp.zeros(()))
+    p = jnp.clip(y, 0.02, 0.98)
+    return _Means(jax.scipy.special.logit(p), z, -0.5 * jnp.log(p * (1.0 - p)))
 
 
 def _start(transform, prior) -> Array:

@@ -22,13 +22,19 @@ class TrustMoments(NamedTuple):
 
 @partial(jax.jit, static_argnames=("observation", "lag"))
 def trust_draws(
-    observation: str, lag: float, params: Params, noise: Array | None, data: NutsData, key: Array
+    observation: str,
+    lag: float,
+    params: Params,
+    noise: Array | None,
+    pilot: Array | None,
+    data: NutsData,
+    key: Array,
 ) -> Array:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
 
     def one(inputs):
         p, e, key = inputs
-        rates = ContactRate(p, data.awareness, exposure=data.exposure, lag=lag)
+        rates = ContactRate(p, data.awareness, exposure=data.exposure, pilot=pilot, lag=lag)
         observed = rates.observed(data.contact_rate)
         # Without sampled noise: fresh noise, which a Gaussian family turns into trust.
         e = jnp.zeros_like(observed.y) if e is None else e
@@ -40,13 +46,18 @@ def trust_draws(
 
 @partial(jax.jit, static_argnames=("observation", "lag"))
 def trust_moments(
-    observation: str, lag: float, params: Params, noise: Array | None, data: NutsData
+    observation: str,
+    lag: float,
+    params: Params,
+    noise: Array | None,
+    pilot: Array | None,
+    data: NutsData,
 ) -> TrustMoments:
     """Moments of latent trust over all draws, by the law of total variance."""
 
     def add(carry, inputs):
         p, e = inputs
-        rates = ContactRate(p, data.awareness, exposure=data.exposure, lag=lag)
+        rates = ContactRate(p, data.awareness, exposure=data.exposure, pilot=pilot, lag=lag)
         observed = rates.observed(data.contact_rate)
         e = jnp.zeros_like(observed.y) if e is None else e
         mean, var = families.trust_moments(observation, rates.ssm(), observed, e)

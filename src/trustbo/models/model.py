@@ -25,7 +25,7 @@ from trustbo.models.priors import Priors
 from trustbo.stacking import MissionBatch, stack_missions
 
 RESPONSES = ("level", "change")
-N_IMPORTANCE = 64
+N_IMPORTANCE = 32
 
 
 class ContactRate(dist.Distribution):
@@ -37,7 +37,7 @@ class ContactRate(dist.Distribution):
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("params", "awareness", "exposure", "noise", "weight")
+    pytree_data_fields = ("params", "awareness", "exposure", "noise", "weight", "pilot")
     pytree_aux_fields = ("observation", "lag", "shared")
 
     def __init__(
@@ -48,13 +48,14 @@ class ContactRate(dist.Distribution):
         exposure: Array | None = None,
         noise: Array | None = None,
         weight: Array | None = None,
+        pilot: Array | None = None,
         observation: str = "gaussian",
         lag: float = 0.0,
         shared: bool = False,
     ) -> None:
-        """Args as in `TrustModel.__call__`; `noise` has shape (bound, mission, robot)."""
+        """Args as in `TrustModel.__call__`; `noise` and `pilot` are (bound, mission, robot)."""
         self.params, self.awareness, self.exposure = params, awareness, exposure
-        self.noise, self.weight = noise, weight
+        self.noise, self.weight, self.pilot = noise, weight, pilot
         self.observation, self.lag, self.shared = observation, lag, shared
         super().__init__(awareness.shape[:1], awareness.shape[1:3])
 
@@ -92,7 +93,7 @@ class ContactRate(dist.Distribution):
     def observed(self, value: Array) -> Observed:
         """Rates and exposure, bound first."""
         exposure = jnp.full_like(value, jnp.nan) if self.exposure is None else self.exposure
-        return Observed(jnp.swapaxes(value, 0, 1), jnp.swapaxes(exposure, 0, 1))
+        return Observed(jnp.swapaxes(value, 0, 1), jnp.swapaxes(exposure, 0, 1), self.pilot)
 
 
 class TrustSample(NamedTuple):
@@ -176,6 +177,7 @@ class TrustModel:
         weight: Array | None = None,
         shared: bool = False,
         joint: bool | None = None,
+        pilot: Array | None = None,
     ) -> None:
         """The numpyro model.
 
@@ -187,6 +189,7 @@ class TrustModel:
             shared: No rate is missing before the last of a mission.
             joint: Sample the noise that latent trust is made of; by default where it cannot be
                 integrated out.
+            pilot: See `observation.Observed`.
         """
         n_missions, n_bounds, n_robots, n_features = awareness.shape
         params = self.sample_params(n_robots, n_features)
@@ -200,6 +203,7 @@ class TrustModel:
             exposure=exposure,
             noise=noise,
             weight=weight,
+            pilot=pilot,
             observation=self.observation,
             lag=self.lag,
             shared=shared,
@@ -212,7 +216,7 @@ class TrustModel:
     ) -> np.ndarray:
         """Log p(contact rates | parameters), latent trust integrated out.
 
-        Exact for Gaussian observations, else importance sampling over 64 antithetic trajectories.
+        Exact for Gaussian observations, else importance sampling over 32 antithetic trajectories.
         A density of rates; for censored ones with mass at 0 and 1, for counts a probability.
 
         Args:

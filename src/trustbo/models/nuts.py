@@ -33,6 +33,8 @@ class NutsDraws(NamedTuple):
     stats: dict[str, Array]
     noise: Array | None
     """What latent trust is made of, (chain, draw, bound, mission, robot), if it was sampled."""
+    pilot: Array | None
+    """What it is made with, of counts."""
 
 
 @partial(jax.jit, static_argnames=("settings", "shared", "joint"))
@@ -55,9 +57,9 @@ def run_nuts(
         shared: No rate is missing before the last of a mission.
         joint: Sample the noise that latent trust is made of.
     """
-    flat, constrain, potential = round_target(model, data, shared=shared, joint=joint)
+    target = round_target(model, data, shared=shared, joint=joint)
     noise = {"noise": jnp.zeros(noise_shape(data))} if joint else {}
-    mode, hessian = newton(lambda theta: potential({"theta": theta, **noise}), flat)
+    mode, hessian = newton(lambda theta: target.potential({"theta": theta, **noise}), target.start)
     covariance = inverse_hessian(hessian)
     scale = jnp.linalg.cholesky(covariance)
     # Noise is close to standard normal by construction: its mass matrix starts as the identity.
@@ -69,7 +71,7 @@ def run_nuts(
         z = {"theta": mode + 1.5 * scale @ random.normal(key_start, mode.shape, mode.dtype)}
         if joint:
             z["noise"] = random.normal(key_noise, noise["noise"].shape, mode.dtype)
-        init, step = hmc(potential, algo="NUTS")
+        init, step = hmc(target.potential, algo="NUTS")
         state = init(
             z,
             settings.n_warmup,
@@ -95,7 +97,7 @@ def run_nuts(
         # Warm-up and draws in one loop: its body, which takes long to compile, is there once.
         _, kept = lax.scan(advance, state, length=settings.n_warmup + settings.n_draws)
         z, stats = jax.tree.map(lambda a: a[settings.n_warmup :], kept)
-        return jax.vmap(constrain)(z["theta"]), stats, z.get("noise")
+        return jax.vmap(target.constrain)(z["theta"]), stats, z.get("noise")
 
     # One chain after the other: vectorised chains would all wait for the longest trajectory.
-    return NutsDraws(*lax.map(chain, random.split(key, settings.n_chains)))
+    return NutsDraws(*lax.map(chain, random.split(key, settings.n_chains)), target.pilot)

@@ -32,6 +32,7 @@ class Draws(NamedTuple):
     sampler: str
     noise: np.ndarray | None = None
     """What latent trust is made of, if it was sampled."""
+    pilot: Array | None = None
 
 
 def draw_posterior(
@@ -57,25 +58,31 @@ def draw_posterior(
     """
     if sampler == "exact" and (exact := _sample_exact(model, settings, seed, batch, weight)):
         return exact, []
-    joint = sampler == "joint" or model.observation != "gaussian"
+    joint = model.observation != "gaussian"
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
     data = NutsData(*batch, weight)
     with jax.enable_x64(True):
         return _sample_nuts(model, settings, random.key(seed), data, joint=joint, check=check)
 
 
-def require_exact(model: TrustModel) -> None:
-    """Refuse a model that the exact sampler cannot treat.
+def require_sampler(model: TrustModel, sampler: str) -> None:
+    """Refuse a sampler that cannot treat the model.
 
     Raises:
-        TrustboError: Observations that are not Gaussian, or robots that share some parameters only,
-            or influence each other.
+        TrustboError: `"exact"` for observations that are not Gaussian, or robots that share some
+            parameters only or influence each other; `"joint"` where trust integrates out.
     """
     per_robot = isinstance(model, CoupledTrust) and model.inter_robot == "none"
-    if model.observation != "gaussian" or not (per_robot or isinstance(model, PooledTrust)):
+    gaussian = model.observation == "gaussian"
+    if sampler == "exact" and not (gaussian and (per_robot or isinstance(model, PooledTrust))):
         raise TrustboError(
             'sampler "exact" needs Gaussian observations, and PooledTrust or '
             f'CoupledTrust(inter_robot="none"); got {describe(model)}. Use sampler="nuts".'
+        )
+    if sampler == "joint" and gaussian:
+        raise TrustboError(
+            'sampler "joint" is for observations that trust does not integrate out of; with '
+            'Gaussian ones use "nuts" or "exact".'
         )
 
 
@@ -107,7 +114,6 @@ def _sample_exact(
     weight: np.ndarray | None,
 ) -> Draws | None:
     """Draws by importance sampling, or None, with a warning, where its weights are too uneven."""
-    require_exact(model)
     shape = (settings.n_chains, settings.n_draws)
     each = [
         sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
@@ -167,7 +173,7 @@ def _sample_nuts(
         stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
         noise = None if raw.noise is None else np.asarray(raw.noise)
         name = "joint" if joint else "nuts"
-        draws = Draws(params, stats, {"retries": retries}, name, noise)
+        draws = Draws(params, stats, {"retries": retries}, name, noise, raw.pilot)
         return draws, _complaints(draws) if check else []
 
     draws, complaints = attempt(settings, 0)
@@ -201,12 +207,16 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 
 def _convergence(sites: xr.Dataset) -> dict[str, tuple[float, float]]:
     """The worst R-hat and the least bulk ESS of each parameter."""
-    rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
-    return {
-        str(n): (float(rhat[n].max(skipna=False)), float(ess[n].min(skipna=False)))
-        for n in sites.data_vars
-        if sites[n].size
-    }
+    with np.errstate(invalid="ignore"):
+        rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+    found = {}
+    for name, draws in sites.data_vars.items():
+        # What never moves is a constant of the model, such as a correlation it does not have.
+        free = np.ptp(draws.values, axis=(0, 1)) > 0.0
+        if free.any():
+            worst = float(rhat[name].values[free].max())
+            found[str(name)] = (worst, float(ess[name].values[free].min()))
+    return found
 
 
 def _complaints(draws: Draws) -> list[str]:
