@@ -16,8 +16,8 @@ from trustbo.errors import TrustboError
 from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
 from trustbo.models.exact import sample_exact
 from trustbo.models.gram import sufficient_statistics
+from trustbo.models.geometry import NutsData
 from trustbo.models.nuts import NutsSettings, run_nuts
-from trustbo.models.pooled import pooled_trust
 from trustbo.stacking import stack_missions
 
 
@@ -57,17 +57,11 @@ def test_statistics_of_missions_add_up():
 def test_exact_draws_and_a_long_nuts_run_agree(seed):
     missions = simulate_missions(6, seed)
     batch = stack_missions(missions)
-    exact = sample_exact(batch, Priors(), 4000, seed).params
+    exact = sample_exact(sufficient_statistics(batch, 0.5), Priors(), 4000, seed).params
     with jax.enable_x64(True):
         settings = NutsSettings(n_draws=5000)
-        nuts = run_nuts(
-            pooled_trust,
-            settings,
-            jax.random.key(seed),
-            Priors(),
-            batch.awareness,
-            batch.contact_rate,
-        ).params
+        data = NutsData(*batch, np.ones(len(batch.contact_rate)))
+        nuts = run_nuts(settings, jax.random.key(seed), PooledTrust(), data).params
         nuts = {name: np.asarray(a).reshape(20_000, -1) for name, a in nuts.items()}
     for name, reference in nuts.items():
         for ours, theirs in zip(exact[name].reshape(4000, -1).T, reference.T, strict=True):
@@ -81,7 +75,7 @@ def test_exact_draws_and_a_long_nuts_run_agree(seed):
 
 def test_the_evidence_is_the_prior_mean_of_the_likelihood():
     (mission,) = simulate_missions(1, lengths=(3,))
-    exact = sample_exact(stack_missions([mission]), Priors(), 100, 0)
+    exact = sample_exact(sufficient_statistics(stack_missions([mission]), 0.5), Priors(), 100, 0)
     rng = np.random.default_rng(0)
     n = 200_000
     draws = TrustParams(
@@ -119,7 +113,9 @@ def test_gaps_and_single_bounds_are_no_obstacle():
     rates = missions[0].contact_rate.copy()
     rates[2:4, 1] = np.nan
     gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
-    exact = sample_exact(stack_missions([gap, *missions[1:]]), Priors(), 1000, 0)
+    exact = sample_exact(
+        sufficient_statistics(stack_missions([gap, *missions[1:]]), 0.5), Priors(), 1000, 0
+    )
     assert exact.khat < 0.7
     assert np.isfinite(exact.params["beta0"]).all()
 
@@ -131,7 +127,7 @@ def test_other_priors_within_reach_move_the_posterior(missions):
         beta=dist.Normal(0.1, 0.01),
         delta_v=dist.LogNormal(-3.0, 0.2),
     )
-    exact = sample_exact(batch, priors, 2000, 0)
+    exact = sample_exact(sufficient_statistics(batch, 0.5), priors, 2000, 0)
     assert exact.khat < 0.7
     assert abs(exact.params["beta"].mean() - 0.1) < 0.05
     assert exact.params["beta0"].mean() < 0.5  # against a likelihood around 0.6
@@ -153,7 +149,7 @@ def test_priors_out_of_reach_are_named(missions, name, prior, what):
 
 def test_uneven_weights_fall_back_on_nuts_and_say_so(missions, monkeypatch):
     # By its module: the package's `fit` is the function.
-    monkeypatch.setattr(importlib.import_module("trustbo.models.fit"), "KHAT_LIMIT", -10.0)
+    monkeypatch.setattr(importlib.import_module("trustbo.models.sampling"), "KHAT_LIMIT", -10.0)
     with pytest.warns(UserWarning, match=r"k-hat is -?\d.\d\d \(limit -10.0\): .* NUTS is used"):
         posterior = fit(missions, sampler="exact")
     assert posterior.attrs["sampler"] == "nuts"

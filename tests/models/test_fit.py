@@ -11,7 +11,7 @@ from numpyro.infer import MCMC, NUTS
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
-from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit, pooled_trust
+from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
 from trustbo.models.nuts import run_nuts
 from trustbo.stacking import stack_missions
 
@@ -63,12 +63,12 @@ def test_the_posterior_is_the_one_plain_numpyro_samples(posterior, missions):
     batch = stack_missions(missions)
     with jax.enable_x64(True):
         mcmc = MCMC(
-            NUTS(pooled_trust, dense_mass=True, target_accept_prob=0.9),
+            NUTS(PooledTrust(), dense_mass=True, target_accept_prob=0.9),
             num_warmup=1000,
             num_samples=4000,
             progress_bar=False,
         )
-        mcmc.run(jax.random.key(3), batch.awareness, Priors(), batch.contact_rate)
+        mcmc.run(jax.random.key(3), batch.awareness, batch.contact_rate)
         plain = {name: np.asarray(draws) for name, draws in mcmc.get_samples().items()}
     for name in SITES:
         ours = posterior["posterior"][name].values.reshape(4000, -1)

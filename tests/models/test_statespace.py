@@ -8,7 +8,7 @@ from references import dense_log_likelihood, dense_posterior_of_trust
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError
-from trustbo.models import ContactRate, PooledTrust, TrustParams, statespace
+from trustbo.models import PooledTrust, TrustParams
 from trustbo.stacking import stack_missions
 
 
@@ -87,9 +87,9 @@ def test_an_intercept_may_move_into_a_constant_feature():
 
 
 def _filtered(params, mission):
-    ssm = ContactRate(params, jnp.asarray(mission.awareness[None])).ssm()
+    ssm = params.ssm(jnp.asarray(mission.awareness[None]))
     rates = jnp.swapaxes(jnp.asarray(mission.contact_rate[None]), 0, 1)
-    return ssm, statespace.kalman_filter(ssm, rates)
+    return ssm, ssm.filter(rates), rates
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -98,10 +98,10 @@ def test_the_smoother_and_backward_sampling_have_the_exact_moments(seed):
     params, (mission, *_) = random_params(rng), random_missions(rng, missing=0.3)
     n_draws = 20_000
     with jax.enable_x64(True):
-        ssm, filtered = _filtered(params, mission)
-        smoothed = statespace.smooth(ssm, filtered)
-        keys = jax.random.split(jax.random.key(seed), n_draws)
-        draws = jax.vmap(lambda key: statespace.sample_backward(ssm, filtered, key))(keys)
+        ssm, filtered, rates = _filtered(params, mission)
+        smoothed = ssm.smooth(filtered)
+        noise = jax.random.normal(jax.random.key(seed), (n_draws, *rates.shape))
+        draws = jax.vmap(lambda e: ssm.sample_backward(filtered, e))(noise)
         draws = np.asarray(draws)[:, :, 0]
     for i in range(3):
         mean, cov = dense_posterior_of_trust(

@@ -2,10 +2,10 @@
 
 Latent trust and the linear coefficients (beta, b) integrate out in closed form (`gram`). What is
 left is three-dimensional: beta0, and the noises as t = log hypot(delta_w, delta_v) and r =
-log(delta_w / delta_v), on the real line. A Student-t around its mode is drawn from by a scrambled
-Sobol sequence and corrected by Pareto-smoothed importance weights; where these are uneven, a
-mixture along the ridge of r takes its place. k-hat says how far to trust the result; above 0.7 the
-caller falls back on NUTS.
+log(delta_w / delta_v), on the real line. A few points around its mode tell its mean and spread; a
+Student-t that has these is drawn from by a scrambled Sobol sequence and corrected by
+Pareto-smoothed importance weights. Where these are uneven, a mixture along the ridge of r takes its
+place. k-hat says how far to trust the result; above 0.7 the caller falls back on NUTS.
 """
 
 from typing import NamedTuple
@@ -24,8 +24,9 @@ from trustbo.models.numeric import log_prob, numbers
 from trustbo.models.priors import Priors
 
 KHAT_GOOD, KHAT_LIMIT = 0.5, 0.7
-_LOG2_POINTS = 12
+_LOG2_POINTS, _LOG2_PILOT = 12, 10
 _DEGREES = 5.0
+_RIDGE_STEPS, _RIDGE_DROP = 12, 8.0  # at most so many components a side, so far down in nats
 _CHUNK = 1024  # parameter values evaluated at once: bounds the memory of long missions
 
 
@@ -51,7 +52,9 @@ class _Target(NamedTuple):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Unnormalised log posterior density of z = (beta0 on the line, t, r), shape (point,)."""
-        return np.concatenate([self._log_density(part) for part in _parts(z)])
+        # Far out the noise underflows: such a point has no density, and is no reason to warn.
+        with np.errstate(all="ignore"):
+            return np.concatenate([self._log_density(part) for part in _parts(z)])
 
     def _log_density(self, z: np.ndarray) -> np.ndarray:
         beta0, delta_w, delta_v, log_jacobian = self.constrain(z)
@@ -89,9 +92,18 @@ class _Target(NamedTuple):
     def coefficients(self, quadratic: Quadratic) -> tuple[np.ndarray, np.ndarray]:
         """Mean of (beta, b) given theta, and the Cholesky factor of their precision."""
         precision = quadratic.P + np.diag(self.precision)
-        cholesky = np.linalg.cholesky(precision)
         rhs = quadratic.h + self.precision * self.mean
-        return np.linalg.solve(precision, rhs[..., None])[..., 0], cholesky
+        finite = np.isfinite(precision).all((1, 2))
+        precision = np.where(finite[:, None, None], precision, np.eye(rhs.shape[1]))
+        try:
+            cholesky = np.linalg.cholesky(precision)
+        except np.linalg.LinAlgError:  # noise so small that rounding took the sign of an eigenvalue
+            positive = np.linalg.eigvalsh(precision)[:, 0] > 0.0
+            finite &= positive
+            precision = np.where(positive[:, None, None], precision, np.eye(rhs.shape[1]))
+            cholesky = np.linalg.cholesky(precision)
+        mean = np.linalg.solve(precision, rhs[..., None])[..., 0]
+        return np.where(finite[:, None], mean, np.nan), cholesky
 
     def draw_coefficients(self, z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """One exact draw of (beta, b) given each z, shape (point, coefficient)."""
@@ -157,8 +169,7 @@ def sample_exact(
     with threadpool_limits(limits=1):
         target = _target(statistics, priors)
         mode, scale = laplace(target.log_density, _start(target))
-        proposal = _Mixture(mode[None], 1.1 * scale[None], np.ones(1))
-        z, log_p, log_w, khat, evidence = _weigh(target, proposal, seed)
+        z, log_p, log_w, khat, evidence = _weigh(target, _matched(target, mode, scale, seed), seed)
         if not khat < KHAT_GOOD:
             ridge = _weigh(target, _along_the_ridge(target, mode, scale), seed)
             if ridge[3] < khat or not np.isfinite(khat):
@@ -190,9 +201,22 @@ def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
     return _Target(statistics, priors, each("loc"), each("scale") ** -2.0)
 
 
-def _weigh(target: _Target, proposal: _Mixture, seed: int):
+def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) -> _Mixture:
+    """A Student-t with the mean and 1.2 times the spread of a few points around the mode.
+
+    The posterior is skewed: its moments make a far better proposal than its curvature at the mode.
+    """
+    around = _Mixture(mode[None], 1.3 * scale[None], np.ones(1))
+    z, _, log_w, _, _ = _weigh(target, around, seed, _LOG2_PILOT)
+    weights = np.exp(log_w)
+    mean = weights @ z
+    covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
+    return _Mixture(mean[None], 1.2 * np.linalg.cholesky(covariance)[None], np.ones(1))
+
+
+def _weigh(target: _Target, proposal: _Mixture, seed: int, log2_points: int = _LOG2_POINTS):
     """Points, their log densities, smoothed and normalised log weights, k-hat, log evidence."""
-    z = proposal.draw(2**_LOG2_POINTS, seed)
+    z = proposal.draw(2**log2_points, seed)
     log_p = target.log_density(z)
     log_p = np.where(np.isfinite(log_p), log_p, -np.inf)
     raw = log_p - proposal.log_density(z)
@@ -212,14 +236,12 @@ def _start(target: _Target) -> np.ndarray:
 
 
 def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> _Mixture:
-    """Components along r, each at the mode of (beta0, t) given its r."""
-    sd = float(np.sqrt((scale @ scale.T)[2, 2]))
-    spacing = max(sd, 0.5)
+    """Components along r, each at the mode of (beta0, t) given its r, as far as there is mass."""
+    spacing = float(np.clip(np.sqrt((scale @ scale.T)[2, 2]), 0.4, 1.0))
     centers, scales, log_mass = [], [], []
-    start = mode[:2]
-    for r in mode[2] + spacing * np.arange(-5, 6):
 
-        def given_r(xt: np.ndarray, r: float = r) -> np.ndarray:
+    def add(r: float, start: np.ndarray) -> np.ndarray:
+        def given_r(xt: np.ndarray) -> np.ndarray:
             return target.log_density(np.column_stack([xt, np.full(len(xt), r)]))
 
         center, factor = laplace(given_r, start)
@@ -228,6 +250,15 @@ def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> _M
         centers.append([*center, r])
         scales.append(1.2 * full)
         log_mass.append(float(given_r(center[None])[0]) + np.log(np.diag(factor)).sum())
+        return center
+
+    middle = add(mode[2], mode[:2])
+    for direction in (-1.0, 1.0):
+        start = middle
+        for step in range(1, _RIDGE_STEPS + 1):
+            start = add(mode[2] + direction * step * spacing, start)
+            if log_mass[-1] < max(log_mass) - _RIDGE_DROP:
+                break
     weights = np.exp(np.array(log_mass) - np.max(log_mass))
     weights = 0.9 * weights / weights.sum() + 0.1 / len(weights)
     return _Mixture(np.array(centers), np.array(scales), weights)
