@@ -1,19 +1,31 @@
 """A campaign: ask for a path, run it by whatever means, tell what was measured."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import xarray as xr
 from jax import random
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
-from trustbo.models import PooledTrust, TrustParams, fit, sample_prior
-from trustbo.models.sampling import SAMPLERS
+from trustbo.models import (
+    PooledTrust,
+    TrustModel,
+    TrustParams,
+    fit,
+    moment_matched,
+    sample_prior,
+)
+from trustbo.models.gram import require_forgetting
+from trustbo.models.sampling import SAMPLERS, require_sampler
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import greedy, resolve_policy
 from trustbo.stacking import fill_awareness
 from trustbo.terrain import Workspace
 
 INITIAL = ("prior_draw", "prior_mean")
+UPDATES = ("refit", "moment_matched")
 _STREAMS = ("policy", "fit", "mission", "prior")
 
 
@@ -36,11 +48,13 @@ class Campaign:
         start: Cell,
         goal: Cell,
         *,
-        model: PooledTrust | None = None,
+        model: TrustModel | None = None,
         policy: str | Policy = "greedy",
         objective: str = "terminal",
         sampler: str = "nuts",
         initial: str = "prior_draw",
+        update: str = "refit",
+        forgetting: float = 1.0,
         connectivity: int = 8,
         max_bounds: int | str | None = None,
         seed: int = 0,
@@ -57,12 +71,18 @@ class Campaign:
             sampler: See `trustbo.models.fit`.
             initial: What the first plan is made from: `"prior_draw"`, one random draw from the
                 prior as in the paper, or `"prior_mean"`.
+            update: `"refit"`, from all missions so far; or, for comparison with the authors' later
+                code, `"moment_matched"`: from the last mission alone, its prior having the mean and
+                sd of the posterior before, which is not exact.
+            forgetting: How much a mission counts relative to the next, in (0, 1]; below 1, a change
+                of the environment is followed. For `"refit"` with Gaussian observations.
             connectivity: 4, or 8 to allow diagonal bounds too.
             max_bounds: See `Planner`.
             seed: Same seed and same missions, same campaign.
 
         Raises:
-            TrustboError: Start, goal or a name that does not exist.
+            TrustboError: Start, goal or a name that does not exist; a sampler that does not suit
+                the model; or a model that cannot be planned with, or not be updated so.
             NoPathError: The goal cannot be reached.
         """
         self.sampler = require_choice("sampler", sampler, SAMPLERS)
@@ -78,6 +98,11 @@ class Campaign:
         )
         self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self.model = PooledTrust() if model is None else model
+        _require_model(self.model)
+        require_sampler(self.model, sampler)
+        self.update = require_choice("update", update, UPDATES)
+        self.forgetting = require_forgetting(forgetting)
+        _require_update(self.model, self.update, self.forgetting)
         self.missions: list[Mission] = []
         self.posteriors: list[xr.DataTree] = []
         self.plans: list[Plan] = []
@@ -89,6 +114,10 @@ class Campaign:
             "objective": self.planner.objective,
             "sampler": sampler,
             "initial": initial,
+            "observation": self.model.observation,
+            "response": self.model.response,
+            "update": update,
+            "forgetting": self.forgetting,
             "connectivity": connectivity,
             "max_bounds": max_bounds if isinstance(max_bounds, str) else self.planner.longest,
             "seed": self.seed,
@@ -148,7 +177,7 @@ class Campaign:
         mission = fill_awareness(mission, awareness.values)
         plan = self.ask()
         missions = [*self.missions, mission]
-        posterior = fit(missions, self.model, self.sampler, seed=self.seed_of("fit"))
+        posterior = self._learn(missions)
         # Only now, all at once: a failed fit leaves the campaign as it was.
         self.missions = missions
         self.posteriors.append(posterior)
@@ -164,11 +193,24 @@ class Campaign:
         """The team's trust map under the mean of the belief, dims (row, col)."""
         return self.planner.trust_map(self.belief.mean())
 
+    def _learn(self, missions: list[Mission]) -> xr.DataTree:
+        seed = self.seed_of("fit")
+        if self.update == "moment_matched":
+            matched = self.model.priors
+            if self.posteriors:
+                matched = moment_matched(self.belief, self.model.priors)
+            return fit(missions[-1:], replace(self.model, priors=matched), self.sampler, seed=seed)
+        weights = None
+        if self.forgetting < 1.0:
+            weights = self.forgetting ** np.arange(len(missions) - 1, -1, -1)
+        return fit(missions, self.model, self.sampler, weights=weights, seed=seed)
+
     def _prior_belief(self, initial: str) -> TrustParams:
         """One draw from the prior, or its mean, as draws with leading axis (draw,) of length 1."""
         n_features = self.workspace.awareness.sizes["feature"]
         if initial == "prior_draw":
-            return sample_prior(self.model, n_features, 1, self.seed_of("prior"))
+            drawn = sample_prior(self.model, n_features, 1, self.seed_of("prior"))
+            return TrustParams(*drawn)
         priors = self.model.priors
         mean = TrustParams(**priors.mean(n_features), x0_mean=priors.x0_mean, x0_sd=priors.x0_sd)
         return TrustParams(*(np.asarray(value, dtype=float)[None] for value in mean))
@@ -177,3 +219,27 @@ class Campaign:
         """The seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
         entropy = [self.seed, _STREAMS.index(stream), len(self.missions)]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+
+def _require_model(model: TrustModel) -> None:
+    if not isinstance(model, TrustModel):
+        raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")
+    if not isinstance(model, PooledTrust):
+        raise TrustboError(
+            f"paths are planned with PooledTrust for now; got {model.describe()}. Fit it to the "
+            "missions of a campaign with trustbo.models.fit(campaign.missions, model)."
+        )
+
+
+def _require_update(model: TrustModel, update: str, forgetting: float) -> None:
+    if forgetting < 1.0 and (update != "refit" or model.observation != "gaussian"):
+        raise TrustboError(
+            f'forgetting = {forgetting:g} needs update "refit" and Gaussian observations; got '
+            f'"{update}" and "{model.observation}".'
+        )
+    if update == "moment_matched":
+        warnings.warn(
+            'update="moment_matched" is for comparison with the 2023 code: over 20 missions it is '
+            'off by up to 1.15 posterior standard deviations. update="refit" is exact.',
+            stacklevel=3,
+        )

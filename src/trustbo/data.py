@@ -159,7 +159,7 @@ class Bound:
         off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
         for i in np.flatnonzero(off):
             raise TrustboError(
-                f"contact_rate[{i}] = {rate[i]:g} is no share of exposure[{i}] = {ticks[i]:g} ticks."
+                f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (exposure)."
             )
 
     @property

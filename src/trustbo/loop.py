@@ -12,7 +12,7 @@ from tqdm import tqdm
 from trustbo.campaign import Campaign
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.models import PooledTrust, diagnostics
+from trustbo.models import TrustModel, diagnostics
 from trustbo.planning import Plan, Policy
 from trustbo.result import Result, require_folder
 from trustbo.simulation import KinematicSimulator, Simulator
@@ -25,12 +25,14 @@ def iterate(
     goal: Cell,
     *,
     n_iterations: int = 8,
-    model: PooledTrust | None = None,
+    model: TrustModel | None = None,
     policy: str | Policy = "greedy",
     objective: str = "terminal",
     sampler: str = "nuts",
     simulator: Simulator | None = None,
     initial: str = "prior_draw",
+    update: str = "refit",
+    forgetting: float = 1.0,
     connectivity: int = 8,
     max_bounds: int | str | None = None,
     checkpoint: str | PathLike[str] | None = None,
@@ -50,11 +52,13 @@ def iterate(
             `policy(key, draws, planner) -> Plan`.
         objective: `"terminal"` (the paper's), `"mean"`, `"success"`, `"bottleneck"` or
             `"stationary"`; see `Planner`.
-        sampler: `"nuts"` or `"exact"`; see `trustbo.models.fit`.
+        sampler: `"nuts"`, `"exact"` or `"joint"`; see `trustbo.models.fit`.
         simulator: Whatever has `run(path, *, seed) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         initial: The first plan comes from one random draw of the prior (`"prior_draw"`, as in the
             paper) or from `"prior_mean"`.
+        update: `"refit"` from all missions, or `"moment_matched"`; see `Campaign`.
+        forgetting: How much a mission counts relative to the next, in (0, 1]; see `Campaign`.
         connectivity: 4, or 8 to allow diagonal bounds too.
         max_bounds: Which paths are admissible; see `Planner`.
         checkpoint: A folder in which the result so far is saved after each mission.
@@ -80,6 +84,8 @@ def iterate(
         objective=objective,
         sampler=sampler,
         initial=initial,
+        update=update,
+        forgetting=forgetting,
         connectivity=connectivity,
         max_bounds=max_bounds,
         seed=seed,

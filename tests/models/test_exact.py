@@ -15,8 +15,8 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
 from trustbo.models.exact import sample_exact
-from trustbo.models.gram import sufficient_statistics
 from trustbo.models.geometry import NutsData
+from trustbo.models.gram import sufficient_statistics
 from trustbo.models.nuts import NutsSettings, run_nuts
 from trustbo.stacking import stack_missions
 

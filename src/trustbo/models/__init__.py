@@ -1,20 +1,24 @@
 """Trust models and their inference."""
 
 from trustbo.models.calibration import sbc
+from trustbo.models.contact_rate import ContactRate, TrustSample
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.filter import TrustFilter, TrustState
-from trustbo.models.fit import fit, sample_prior
+from trustbo.models.fit import fit
 from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.model import ContactRate, TrustModel, TrustSample
+from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
 from trustbo.models.pooled import PooledTrust
+from trustbo.models.prior import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
 from trustbo.models.sampling import diagnostics
+from trustbo.models.updating import ExactPosterior, moment_matched, sample_statistics
 
 __all__ = [
     "ContactRate",
     "CoupledParams",
     "CoupledTrust",
+    "ExactPosterior",
     "HierarchicalTrust",
     "PooledTrust",
     "Priors",
@@ -26,7 +30,10 @@ __all__ = [
     "TrustState",
     "diagnostics",
     "fit",
+    "moment_matched",
     "params_of",
+    "prior_predictive",
     "sample_prior",
+    "sample_statistics",
     "sbc",
 ]

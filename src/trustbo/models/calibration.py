@@ -13,10 +13,11 @@ from scipy import stats
 from tqdm import tqdm
 
 from trustbo.errors import TrustboError, require_choice, require_whole
-from trustbo.models.model import TrustModel, prior_draws
+from trustbo.models.model import TrustModel
 from trustbo.models.nuts import NutsSettings
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.sampling import SAMPLERS, describe, draw_posterior, require_sampler
+from trustbo.models.prior import prior_draws
+from trustbo.models.sampling import SAMPLERS, draw_posterior, require_sampler
 from trustbo.stacking import MissionBatch
 
 _CHAINS = 4
@@ -71,7 +72,7 @@ def sbc(
     thinned = np.linspace(0, settings.n_draws - 1, kept).astype(int)
     awareness = np.random.default_rng(seed).uniform(size=shape)
     ticks = np.full(shape[:3], float(exposure))
-    asked = f"{describe(model)}, {model.priors.describe()}, {sampler}, {shape}, {exposure}, "
+    asked = f"{model.describe()}, {model.priors.describe()}, {sampler}, {shape}, {exposure}, "
     asked += f"{settings}, {n_ranked}, {seed}"
     ranks = _read(checkpoint, asked)
     for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):

@@ -9,7 +9,7 @@ from jax import Array
 from numpyro.distributions import Distribution, LKJCholesky
 
 from trustbo.errors import require_choice
-from trustbo.models.model import TrustModel, register
+from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import CoupledParams, Params, RobotParams, ordered_params
 
 INTER_ROBOT = ("full", "none", "ordered")
@@ -39,31 +39,31 @@ class CoupledTrust(TrustModel):
             return self._sample_full(n_robots, n_features)
         priors, robot = self.priors, (n_robots,)
         sites = {
-            "beta0": _sample("beta0", priors.beta0, robot),
-            "beta": _sample("beta", priors.beta, (n_robots, n_features)),
-            "b": _sample("b", priors.b, robot),
-            "delta_w": _sample("delta_w", priors.delta_w, robot),
-            "delta_v": _sample("delta_v", priors.delta_v, robot),
+            "beta0": sample("beta0", priors.beta0, robot),
+            "beta": sample("beta", priors.beta, (n_robots, n_features)),
+            "b": sample("b", priors.b, robot),
+            "delta_w": sample("delta_w", priors.delta_w, robot),
+            "delta_v": sample("delta_v", priors.delta_v, robot),
         }
         x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
         if self.inter_robot == "none":
             return RobotParams(**sites, **x0)
-        sites["gamma"] = _sample("gamma", priors.coupling, (n_robots - 1,))
+        sites["gamma"] = sample("gamma", priors.coupling, (n_robots - 1,))
         return ordered_params(sites, **x0)
 
     def _sample_full(self, n_robots: int, n_features: int) -> CoupledParams:
         priors, off = self.priors, n_robots * (n_robots - 1)
         B0 = _matrix(
-            _sample("B0_diagonal", priors.beta0, (n_robots,)),
-            _sample("B0_coupling", priors.coupling, (off,)),
+            sample("B0_diagonal", priors.beta0, (n_robots,)),
+            sample("B0_coupling", priors.coupling, (off,)),
         )
         # (robot, feature): a prior that differs by feature has it last.
-        own = _sample("B_diagonal", priors.beta, (n_robots, n_features)).T
-        B = _matrix(own, _sample("B_coupling", priors.coupling, (n_features, off)))
+        own = sample("B_diagonal", priors.beta, (n_robots, n_features)).T
+        B = _matrix(own, sample("B_coupling", priors.coupling, (n_features, off)))
         return CoupledParams(
             B0=numpyro.deterministic("B0", B0),
             B=numpyro.deterministic("B", B),
-            b=_sample("b", priors.b, (n_robots,)),
+            b=sample("b", priors.b, (n_robots,)),
             Delta_w=self._covariance("w", priors.delta_w, n_robots),
             Delta_v=self._covariance("v", priors.delta_v, n_robots),
             x0_mean=priors.x0_mean,
@@ -71,14 +71,14 @@ class CoupledTrust(TrustModel):
         )
 
     def _covariance(self, noise: str, sd_prior: Distribution, n_robots: int) -> Array:
-        sd = _sample(f"delta_{noise}", sd_prior, (n_robots,))
+        sd = sample(f"delta_{noise}", sd_prior, (n_robots,))
         factor = jnp.eye(n_robots)
         # Counts of ticks are independent given trust: their noise has no correlations.
         if n_robots > 1 and not (noise == "v" and self.observation == "beta_binomial"):
             lkj = LKJCholesky(n_robots, self.priors.concentration)
-            factor = numpyro.sample(f"corr_{noise}", lkj)
+            factor = jnp.asarray(numpyro.sample(f"corr_{noise}", lkj))
         factor = sd[:, None] * factor
-        return numpyro.deterministic(f"Delta_{noise}", factor @ factor.T)
+        return jnp.asarray(numpyro.deterministic(f"Delta_{noise}", factor @ factor.T))
 
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
         """See `TrustModel.level`."""
@@ -99,9 +99,10 @@ class CoupledTrust(TrustModel):
         gamma = {"gamma": ("follower",)} if self.inter_robot == "ordered" else {}
         return {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]} | gamma
 
-
-def _sample(name: str, prior: Distribution, shape: tuple[int, ...]) -> Array:
-    return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore
+    @property
+    def robot_sets(self) -> str | None:
+        """Each robot has its own, if nothing couples them."""
+        return "each" if self.inter_robot == "none" else None
 
 
 def _matrix(diagonal: Array, off_diagonal: Array) -> Array:

@@ -31,7 +31,8 @@ def to_datatree(
     """
     observed = stack_missions(missions, pad=False)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
-    lengths = xr.DataArray([len(m.bounds) for m in missions], dims="mission")
+    lengths = np.array([len(m.bounds) for m in missions])
+    ended = (np.arange(1, n_bounds + 1) > lengths[:, None])[..., None]  # (mission, bound, robot)
     coords = {
         "mission": np.arange(n_missions),
         "bound": np.arange(1, n_bounds + 1),
@@ -43,23 +44,20 @@ def to_datatree(
     tree = {}
     for group, arrays in groups.items():
         draw = arrays.pop("draw", None)
-        variables = {}
+        variables, used, shape = {}, set(), (0, 0)
         for name, array in arrays.items():
             dims = ("mission",) if group == "log_likelihood" else (_DIMS | site_dims).get(name, ())
-            if len(dims) < array.ndim:
-                dims = ("chain", "draw", *dims)
-            cut = xr.DataArray(array, dims=dims)
-            cut = cut.isel({d: slice(len(coords[d])) for d in dims if d in coords})
-            cut = cut.assign_coords({d: coords[d] for d in dims if d in coords})
+            kept = array[(..., *(slice(len(coords[d])) for d in dims))]
             if "bound" in dims:
-                cut = cut.where(cut["bound"] <= lengths)
-            variables[name] = cut.transpose(*dims)
-        dataset = xr.Dataset(variables)
-        index = {
-            "chain": np.arange(dataset.sizes["chain"]),
-            "draw": np.arange(dataset.sizes["draw"]),
-        }
-        tree[group] = dataset.assign_coords(index if draw is None else index | {"draw": draw})
+                kept = np.where(ended, np.nan, kept)
+            if len(dims) < array.ndim:
+                dims, shape = ("chain", "draw", *dims), array.shape[:2]
+            variables[name] = (dims, kept)
+            used |= set(dims)
+        index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+        index = index if draw is None else index | {"draw": draw}
+        own = {name: labels for name, labels in (coords | index).items() if name in used}
+        tree[group] = xr.Dataset(variables, own)
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
     return xr.DataTree.from_dict(tree)
 

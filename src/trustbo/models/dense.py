@@ -1,8 +1,8 @@
 """The likelihood of coupled robots' complete missions, by one Cholesky factor for all of them.
 
-r_k = y_k - B0 y_{k-1} - (c_k - lag c_{k-1}) = w_k - lag w_{k-1} + v_k - B0 v_{k-1} is a block MA(1):
-its covariance is block tridiagonal and does not depend on the data. A mission that ends early needs
-the leading part of the factor only. Without a loop over bounds this is several times as fast as the
+r_k = y_k - B0 y_{k-1} - (c_k - lag c_{k-1}) = w_k - lag w_{k-1} + v_k - B0 v_{k-1} is a block
+MA(1): its covariance is block tridiagonal and does not depend on the data. A mission that ends
+early needs the leading part of the factor only. Without a loop over bounds this is faster than the
 filter, as long as the matrix is small.
 """
 

@@ -6,8 +6,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.errors import ShapeError, TrustboError
-from trustbo.models.params import TrustParams
+from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models.model import RESPONSES
+from trustbo.models.params import (
+    CoupledParams,
+    Params,
+    RobotParams,
+    TrustParams,
+    check_params,
+    params_of,
+)
 
 
 class TrustState(NamedTuple):
@@ -22,7 +30,7 @@ class TrustState(NamedTuple):
 class TrustFilter:
     """Follows the trust of each robot during a mission (a Rao-Blackwellised filter).
 
-    Given a draw of the parameters, trust is Gaussian and the Kalman filter (3)-(4) exact; the draws
+    Given a draw of the parameters, trust is Gaussian and the Kalman filter exact; the draws
     themselves are reweighted by how well they predicted each contact rate. So after bound k the
     filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly but for the number of
     draws.
@@ -35,43 +43,60 @@ class TrustFilter:
 
     def __init__(
         self,
-        posterior: xr.DataTree | TrustParams,
+        posterior: xr.DataTree | Params,
         n_robots: int | None = None,
         *,
+        response: str = "level",
         max_draws: int = 1000,
     ) -> None:
         """Start before the first bound of a mission.
 
         Args:
-            posterior: What `fit` returned, or draws with leading axis (draw,).
-            n_robots: How many robots; needed with draws, a posterior knows its own.
+            posterior: What `fit` returned for any model with Gaussian observations, or draws with
+                leading axis (draw,).
+            n_robots: How many robots; needed with `TrustParams`, others know their own.
+            response: What rates measure; needed with draws, a posterior knows its own.
             max_draws: At most so many draws, evenly spaced, are followed.
 
         Raises:
-            TrustboError: Draws without `n_robots`.
+            ShapeError: Draws of another number of robots.
+            TrustboError: `TrustParams` without `n_robots`, or other observations than Gaussian.
         """
         if isinstance(posterior, xr.DataTree):
             n_robots = posterior["constant_data"].sizes["robot"]
-            posterior = TrustParams.from_posterior(posterior)
+            response = posterior.attrs["response"]
+            if (family := posterior.attrs["observation"]) != "gaussian":
+                raise TrustboError(
+                    f'TrustFilter needs Gaussian observations; this posterior has "{family}".'
+                )
+            posterior = params_of(posterior)
+        elif isinstance(posterior, RobotParams | CoupledParams):
+            n_robots = np.shape(posterior.b)[-1] if n_robots is None else n_robots
         if n_robots is None:
             raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
-        n = len(np.atleast_1d(posterior.beta0))
+        axes = np.shape(posterior.B if isinstance(posterior, CoupledParams) else posterior.beta)
+        self._n_features = axes[-3] if isinstance(posterior, CoupledParams) else axes[-1]
+        check_params(posterior, n_robots, self._n_features)
+        flat = posterior.flat()
+        n = len(flat.b)
         kept = np.linspace(0, n - 1, min(n, max_draws)).astype(int)
-        self.params = TrustParams(*(each[kept] for each in posterior.flat()))
+        self.params = type(flat)(*(each[kept] for each in flat))
         self._n_robots = n_robots
-        self._beta0, self._Q, self._R = (
-            column[:, None]
-            for column in (self.params.beta0, self.params.delta_w**2, self.params.delta_v**2)
+        lag = float(require_choice("response", response, RESPONSES) == "change")
+        params = self.params
+        self._core = (
+            _Coupled(params, lag, n_robots)
+            if isinstance(params, CoupledParams)
+            else _Apart(params, lag, n_robots)
         )
         self.reset()
 
     def reset(self) -> None:
         """Back to before the first bound of a new mission, all draws of equal weight."""
-        shape = (len(self.params.beta0), self._n_robots)
-        self._mean = np.broadcast_to(self.params.x0_mean[:, None], shape).copy()
-        self._var = np.broadcast_to(self.params.x0_sd[:, None] ** 2, shape).copy()
-        self._log_weight = np.zeros(shape[0])
-        self.weights = np.full(shape[0], 1.0 / shape[0])
+        n = len(self.params.b)
+        self._mean, self._var = self._core.start()
+        self._log_weight = np.zeros(n)
+        self.weights = np.full(n, 1.0 / n)
         self.n_bounds = 0
 
     @property
@@ -98,13 +123,8 @@ class TrustFilter:
             raise ShapeError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
         if ((y < 0.0) | (y > 1.0)).any():
             raise TrustboError(f"contact_rate must be in [0, 1]; got {y}.")
-        mean, var = self._step(self._mean, self._var, z)
-        seen = ~np.isnan(y)
-        S = var + self._R
-        residual = np.where(seen, y - mean, 0.0)
-        gain = np.where(seen, var / S, 0.0)
-        self._mean, self._var = mean + gain * residual, (1.0 - gain) * var
-        self._log_weight += np.where(seen, -0.5 * (residual**2 / S + np.log(S)), 0.0).sum(1)
+        self._mean, self._var, increment = self._core.update(self._mean, self._var, z, y)
+        self._log_weight += increment
         weights = np.exp(self._log_weight - self._log_weight.max())
         self.weights = weights / weights.sum()
         self.n_bounds += 1
@@ -125,23 +145,20 @@ class TrustFilter:
         """
         mean, var, ahead = self._mean, self._var, []
         for z in self._checked(awareness, 3):
-            mean, var = self._step(mean, var, z)
+            mean, var = self._core.predict(mean, var, z)
             ahead.append(self._average(mean, var))
         return TrustState(*(np.stack(column) for column in zip(*ahead, strict=True)))
 
-    def _step(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray):
-        drift = self.params.beta @ z.T + self.params.b[:, None]
-        return self._beta0 * mean + drift, self._beta0**2 * var + self._Q
-
     def _average(self, mean: np.ndarray, var: np.ndarray) -> TrustState:
         """Mean and sd of the mixture over draws."""
+        var = var if var.ndim == 2 else np.diagonal(var, axis1=1, axis2=2)
         center = self.weights @ mean
         spread = self.weights @ (var + (mean - center) ** 2)
         return TrustState(center, np.sqrt(spread))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
         z = np.asarray(awareness, dtype=float)
-        expected = (self._n_robots, self.params.beta.shape[-1])
+        expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
             raise ShapeError(
                 f"awareness must be {'(bound, ' if n_axes == 3 else '('}{expected[0]} robots, "
@@ -150,3 +167,74 @@ class TrustFilter:
         if np.isnan(z).any():
             raise TrustboError("awareness must not be NaN; take unmeasured values from the map.")
         return z
+
+
+class _Apart:
+    """One step of robots that do not influence each other; arrays are (draw, robot)."""
+
+    def __init__(self, params: TrustParams | RobotParams, lag: float, n_robots: int) -> None:
+        self._n_robots = n_robots
+        columns = (params.beta0, params.b, params.delta_w**2, params.delta_v**2)
+        self._beta0, self._b, self._Q, self._R = (p.reshape(len(p), -1) for p in columns)
+        self._h = self._beta0 - lag
+        # (draw, robot or 1, feature)
+        self._beta = params.beta.reshape(len(params.b), -1, params.beta.shape[-1])
+        self._x0 = params.x0_mean, params.x0_sd
+
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        shape = (len(self._b), self._n_robots)
+        mean, sd = (np.broadcast_to(p[:, None], shape) for p in self._x0)
+        return mean.copy(), sd**2
+
+    def predict(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray):
+        return self._beta0 * mean + self._drift(z), self._beta0**2 * var + self._Q
+
+    def update(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray):
+        seen = ~np.isnan(y)
+        drift = self._drift(z)
+        S = self._h**2 * var + self._Q + self._R
+        e = np.where(seen, y - self._h * mean - drift, 0.0)
+        gain = np.where(seen, (self._beta0 * self._h * var + self._Q) / S, 0.0)
+        log_density = np.where(seen, -0.5 * (e**2 / S + np.log(S)), 0.0).sum(1)
+        mean = self._beta0 * mean + drift + gain * e
+        return mean, self._beta0**2 * var + self._Q - gain**2 * S, log_density
+
+    def _drift(self, z: np.ndarray) -> np.ndarray:
+        if self._beta.shape[1] == 1:
+            return self._beta[:, 0] @ z.T + self._b
+        return np.einsum("nim,im->ni", self._beta, z) + self._b
+
+
+class _Coupled:
+    """One step of coupled robots; means (draw, robot), covariances (draw, robot, robot)."""
+
+    def __init__(self, params: CoupledParams, lag: float, n_robots: int) -> None:
+        self._p, self._n_robots = params, n_robots
+        self._H = params.B0 - lag * np.eye(n_robots)
+        self._B0_T, self._H_T = (np.swapaxes(a, 1, 2) for a in (params.B0, self._H))
+
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        mean = np.repeat(self._p.x0_mean[:, None], self._n_robots, axis=1)
+        return mean, self._p.x0_sd[:, None, None] ** 2 * np.eye(self._n_robots)
+
+    def predict(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray):
+        moved = (self._p.B0 @ mean[..., None])[..., 0] + self._drift(z)
+        return moved, self._p.B0 @ var @ self._B0_T + self._p.Delta_w
+
+    def update(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray):
+        ahead, P = self.predict(mean, var, z)
+        seen = np.flatnonzero(~np.isnan(y))
+        if not len(seen):
+            return ahead, P, 0.0
+        spread = self._H @ var @ self._H_T + self._p.Delta_w + self._p.Delta_v
+        S = spread[:, seen[:, None], seen]
+        cross = (self._p.B0 @ var @ self._H_T + self._p.Delta_w)[:, :, seen]
+        predicted = (self._H @ mean[..., None])[..., 0] + self._drift(z)
+        e = y[seen] - predicted[:, seen]
+        solved = np.linalg.solve(S, np.concatenate([e[..., None], np.swapaxes(cross, 1, 2)], -1))
+        mean = ahead + (cross @ solved[..., :1])[..., 0]
+        log_density = -0.5 * ((e * solved[..., 0]).sum(1) + np.linalg.slogdet(S)[1])
+        return mean, P - cross @ solved[..., 1:], log_density
+
+    def _drift(self, z: np.ndarray) -> np.ndarray:
+        return np.einsum("nmij,jm->ni", self._p.B, z) + self._p.b

@@ -14,14 +14,15 @@ from numpy.typing import ArrayLike
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_choice
 from trustbo.models import latent, trajectories
+from trustbo.models.contact_rate import mission_log_likelihood
 from trustbo.models.datatree import to_datatree
-from trustbo.models.model import TrustModel, mission_log_likelihood, prior_draws, require_exposure
-from trustbo.models.numeric import draw
 from trustbo.models.geometry import NutsData
+from trustbo.models.model import TrustModel, require_exposure
 from trustbo.models.nuts import NutsSettings
 from trustbo.models.observation import log_resolution
-from trustbo.models.params import Params, RobotParams, TrustParams, params_from
+from trustbo.models.params import Params, params_from
 from trustbo.models.pooled import PooledTrust
+from trustbo.models.prior import draw_sites
 from trustbo.models.sampling import SAMPLERS, Draws, draw_posterior, require_sampler
 from trustbo.stacking import MissionBatch, stack_missions
 
@@ -93,8 +94,10 @@ def fit(
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
     draws, complaints = draw_posterior(model, sampler, settings, seed, batch, weight, check=check)
-    groups = _describe(model, draws, batch, seed, n_trajectories)
-    of = _count_ticks(model, batch, groups, len(missions))
+    # What is not compiled needs no padding.
+    shown = stack_missions(missions, pad=False) if _is_apart(model) else batch
+    groups = _describe(model, draws, shown, seed, n_trajectories)
+    of = _count_ticks(model, shown, groups, len(missions))
     seconds = time.perf_counter() - started
     posterior = to_datatree(groups, missions, model.dims)
     posterior.attrs |= {
@@ -122,31 +125,6 @@ def fit(
             posterior,
         )
     return posterior
-
-
-def sample_prior(
-    model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
-) -> Params:
-    """Draws of the parameters from the prior, leading axis (draw,)."""
-    return params_from(_prior(model, (n_robots, n_features), n_draws, seed), _x0(model))
-
-
-def _prior(
-    model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
-) -> dict[str, np.ndarray]:
-    """Draws of the parameters from the prior for (robots, features), by name."""
-    if isinstance(model, PooledTrust):
-        rng, priors = np.random.default_rng(seed), model.priors
-        sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
-        return {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
-    with jax.enable_x64(True):
-        keys = random.split(random.key(seed), n_draws)
-        drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)
-        return {name: np.asarray(drawn[name]) for name in model.dims}
-
-
-def _x0(model: TrustModel) -> dict[str, float]:
-    return {name: float(getattr(model.priors, name)) for name in ("x0_mean", "x0_sd")}
 
 
 def _require_variation(batch: MissionBatch, model: TrustModel) -> None:
@@ -203,13 +181,12 @@ def _describe(
     every = {name: a.reshape(-1, *a.shape[2:]) for name, a in draws.params.items()}
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
     few = {k: a[:, kept].reshape(-1, *a.shape[2:]) for k, a in draws.params.items()}
-    all_params, few_params = params_from(every, _x0(model)), params_from(few, _x0(model))
-    scalar = isinstance(all_params, TrustParams | RobotParams)
-    if scalar and model.observation == "gaussian":
+    all_params, few_params = params_from(every, model.x0), params_from(few, model.x0)
+    if _is_apart(model):
         found = _of_gaussian(model, all_params, few_params, batch, seed)
     else:
         found = _of_compiled(model, all_params, few_params, draws, kept, batch, seed)
-    prior = _prior(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
+    prior = draw_sites(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -230,10 +207,15 @@ def _describe(
     }
 
 
+def _is_apart(model: TrustModel) -> bool:
+    """Whether robots do not influence each other, and all is Gaussian: NumPy then does."""
+    return model.observation == "gaussian" and getattr(model, "inter_robot", "none") == "none"
+
+
 def _of_gaussian(
     model: TrustModel,
-    every: TrustParams | RobotParams,
-    few: TrustParams | RobotParams,
+    every: Params,
+    few: Params,
     batch: MissionBatch,
     seed: int,
 ) -> dict[str, np.ndarray]:
@@ -283,8 +265,8 @@ def _predict(
     model: TrustModel, draws: Mapping[str, np.ndarray], batch: MissionBatch, seed: int
 ) -> np.ndarray:
     """Contact rates of replicated missions, (draw, mission, bound, robot)."""
-    params = params_from(draws, _x0(model)).flat()
-    if isinstance(params, TrustParams | RobotParams) and model.observation == "gaussian":
+    params = params_from(draws, model.x0).flat()
+    if _is_apart(model):
         rng = np.random.default_rng(seed)
         return trajectories.simulate(params, model.lag, batch.awareness, rng)
     with jax.enable_x64(True):

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax, random
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve, solve_triangular
@@ -25,7 +26,9 @@ from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import constrain_fn, potential_energy
 
 from trustbo.models import observation as families
-from trustbo.models.model import ContactRate, TrustModel
+from trustbo.models.contact_rate import ContactRate
+from trustbo.models.hierarchical import HierarchicalTrust
+from trustbo.models.model import TrustModel
 
 Potential = Callable[[dict[str, Array]], Array]
 
@@ -33,10 +36,10 @@ Potential = Callable[[dict[str, Array]], Array]
 class NutsData(NamedTuple):
     """The data, as compiled code takes them."""
 
-    awareness: Array  # (mission, bound, robot, feature)
-    contact_rate: Array  # (mission, bound, robot)
-    exposure: Array  # (mission, bound, robot)
-    weight: Array  # (mission,)
+    awareness: Array | np.ndarray  # (mission, bound, robot, feature)
+    contact_rate: Array | np.ndarray  # (mission, bound, robot)
+    exposure: Array | np.ndarray  # (mission, bound, robot)
+    weight: Array | np.ndarray  # (mission,)
 
 
 class _Robots(NamedTuple):
@@ -79,8 +82,8 @@ class _Space:
             "delta_w": t + 0.5 * jax.nn.log_sigmoid(2.0 * r),
             "delta_v": t + 0.5 * jax.nn.log_sigmoid(-2.0 * r) - self.means.log_unit,
         }
-        if robots is not None:
-            return self._whiten(site, robots)
+        if robots is not None and isinstance(self.model, HierarchicalTrust):
+            return self._whiten(self.model, site, robots)
         shifts = self.model.level(self.values(site), self.means.y, self.means.z)
         site = site | {name: site[name] - shift for name, shift in shifts.items()}
         return site, log_jacobian
@@ -114,26 +117,26 @@ class _Space:
         observed = families.refine(self.model.observation, rates.ssm(), observed)
         self.options["pilot"] = observed.pilot
 
-    def fit_robots(self, theta: Array) -> _Robots:
+    def fit_robots(self, model: HierarchicalTrust, theta: Array) -> _Robots:
         """One Newton step from theta on each robot's log-likelihood of its coefficients."""
         values = self.values(self.to_sites(theta, None)[0])
-        c, mu, tau = self.model.robot_coefficients(values)  # pyright: ignore
+        c, mu, tau = model.robot_coefficients(values)
 
         def log_likelihood(c: Array) -> Array:
-            deviations = self.model.robot_sites((c - mu[None]) / tau[None])
-            params = self.model.assemble(values | deviations)
+            deviations = model.robot_sites((c - mu[None]) / tau[None])
+            params = model.assemble(values | deviations)
             rates = ContactRate(
                 params,
                 self.data.awareness,
                 exposure=self.data.exposure,
-                observation=self.model.observation,
-                lag=self.model.lag,
+                observation=model.observation,
+                lag=model.lag,
                 pilot=self.options["pilot"],
             )
             observed = rates.observed(self.data.contact_rate)
             zero = jnp.zeros_like(observed.y)
             weight = families.log_weight(
-                self.model.observation, rates.ssm(), observed, zero, shared=False
+                model.observation, rates.ssm(), observed, zero, shared=False
             )
             return (weight * self.data.weight[:, None]).sum(0)
 
@@ -147,9 +150,11 @@ class _Space:
         step = jnp.linalg.solve(precision, gradient[..., None])[..., 0]
         return _Robots(c + step, precision)
 
-    def _whiten(self, site: dict[str, Array], robots: _Robots) -> tuple[dict[str, Array], Array]:
+    def _whiten(
+        self, model: HierarchicalTrust, site: dict[str, Array], robots: _Robots
+    ) -> tuple[dict[str, Array], Array]:
         """Means given spreads, then robots given both, as the Gaussian fits have them."""
-        model, noise = self.model, self.model.robot_deviations(site)
+        noise = model.robot_deviations(site)
         _, mu, tau = model.robot_coefficients(self.values(site))
         log_jacobian = -len(noise) * jnp.log(tau).sum()
         if model.means_are_real:
@@ -186,12 +191,12 @@ def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool
     space = _Space(model, data, shared=shared, joint=joint)
     noise = {"noise": jnp.zeros(noise_shape(data))} if joint else {}
     robots, start = None, space.start
-    if model.varies_by_robot or model.observation == "beta_binomial":
+    if isinstance(model, HierarchicalTrust) or model.observation == "beta_binomial":
         mode, _ = newton(lambda theta: space.potential({"theta": theta, **noise}), start)
         if model.observation == "beta_binomial":
             space.fit_pilot(mode)
-        if model.varies_by_robot:
-            robots = space.fit_robots(mode)
+        if isinstance(model, HierarchicalTrust):
+            robots = space.fit_robots(model, mode)
 
     def constrain(theta: Array) -> dict[str, Array]:
         return space.constrain(theta, robots)
@@ -202,7 +207,9 @@ def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool
     return RoundTarget(start, constrain, potential, space.options["pilot"])
 
 
-def newton(potential: Callable[[Array], Array], start: Array, n_steps: int = 40):
+def newton(
+    potential: Callable[[Array], Array], start: Array, n_steps: int = 40
+) -> tuple[Array, Array]:
     """Mode and Hessian there, by Newton's method with a trust-region ridge."""
 
     def everything(z: Array):

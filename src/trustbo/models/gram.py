@@ -48,7 +48,15 @@ class LengthGram(NamedTuple):
 
     def scaled(self, factor: float) -> Self:
         """The same data with other weight."""
-        return type(self)(*(factor * field for field in self))
+        return type(self)(factor * self.weight, factor * self.spectral, factor * self.corner)
+
+    def plus(self, other: Self) -> Self:
+        """The data of both."""
+        return type(self)(
+            self.weight + other.weight,
+            self.spectral + other.spectral,
+            self.corner + other.corner,
+        )
 
     def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:
         """The quadratic form at parameter values of shape (theta, 3)."""
@@ -142,8 +150,7 @@ class SufficientStatistics(NamedTuple):
         grams = dict(self.grams)
         for length, gram in other.grams.items():
             mine = grams.get(length)
-            together = (a + b for a, b in zip(mine, gram, strict=True)) if mine else gram
-            grams[length] = LengthGram(*together)
+            grams[length] = gram if mine is None else mine.plus(gram)
         return type(self)(
             grams,
             self.gaps + other.gaps,
@@ -182,6 +189,21 @@ class SufficientStatistics(NamedTuple):
         for part in parts[1:]:
             total = total + part.evaluate(theta, x0_sd, self.lag)
         return total
+
+
+Statistics = tuple[SufficientStatistics, ...]
+"""Of all robots together, or of each, if they have nothing in common."""
+
+
+def require_forgetting(forgetting: float) -> float:
+    """Refuse a factor outside (0, 1].
+
+    Raises:
+        TrustboError: It is.
+    """
+    if not (isinstance(forgetting, float | int) and 0.0 < forgetting <= 1.0):
+        raise TrustboError(f"forgetting must be in (0, 1]; got {forgetting!r}.")
+    return float(forgetting)
 
 
 def sufficient_statistics(

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax.numpy as jnp
 import numpyro
@@ -11,7 +10,7 @@ from jax import Array
 from numpyro.distributions import constraints
 from numpyro.distributions.transforms import biject_to
 
-from trustbo.models.model import TrustModel, register
+from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import RobotParams
 
 
@@ -26,24 +25,22 @@ class HierarchicalTrust(TrustModel):
     Sampled non-centred.
     """
 
-    varies_by_robot: ClassVar[bool] = True
-
     def sample_params(self, n_robots: int, n_features: int) -> RobotParams:
         """Sample statements of means, spreads, and each robot's deviation."""
         priors, unit = self.priors, dist.Normal(0.0, 1.0)
         params = self.assemble(
             {
-                "mean_beta0": numpyro.sample("mean_beta0", priors.beta0),
-                "mean_beta": _sample("mean_beta", priors.beta, (n_features,)),
-                "mean_b": numpyro.sample("mean_b", priors.b),
-                "tau_beta0": numpyro.sample("tau_beta0", priors.tau),
-                "tau_beta": _sample("tau_beta", priors.tau, (n_features,)),
-                "tau_b": numpyro.sample("tau_b", priors.tau),
-                "e_beta0": _sample("e_beta0", unit, (n_robots,)),
-                "e_beta": _sample("e_beta", unit, (n_robots, n_features)),
-                "e_b": _sample("e_b", unit, (n_robots,)),
-                "delta_w": numpyro.sample("delta_w", priors.delta_w),
-                "delta_v": numpyro.sample("delta_v", priors.delta_v),
+                "mean_beta0": sample("mean_beta0", priors.beta0),
+                "mean_beta": sample("mean_beta", priors.beta, (n_features,)),
+                "mean_b": sample("mean_b", priors.b),
+                "tau_beta0": sample("tau_beta0", priors.tau),
+                "tau_beta": sample("tau_beta", priors.tau, (n_features,)),
+                "tau_b": sample("tau_b", priors.tau),
+                "e_beta0": sample("e_beta0", unit, (n_robots,)),
+                "e_beta": sample("e_beta", unit, (n_robots, n_features)),
+                "e_b": sample("e_b", unit, (n_robots,)),
+                "delta_w": sample("delta_w", priors.delta_w),
+                "delta_v": sample("delta_v", priors.delta_v),
             }
         )
         for name in ("beta0", "beta", "b"):
@@ -52,7 +49,7 @@ class HierarchicalTrust(TrustModel):
 
     def assemble(self, sites: Mapping[str, Array]) -> RobotParams:
         """Each robot's parameters."""
-        c, mu, tau = self.robot_coefficients(sites)
+        c, _, _ = self.robot_coefficients(sites)
         n_robots = len(c)
         return RobotParams(
             beta0=biject_to(self.priors.beta0.support)(c[:, 0]),
@@ -112,7 +109,3 @@ class HierarchicalTrust(TrustModel):
             "tau_beta": ("feature",),
             "tau_b": (),
         }
-
-
-def _sample(name: str, prior: dist.Distribution, shape: tuple[int, ...]) -> Array:
-    return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore

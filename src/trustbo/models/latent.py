@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax, random
 
 from trustbo.models import observation as families
-from trustbo.models.model import ContactRate
+from trustbo.models.contact_rate import ContactRate
 from trustbo.models.geometry import NutsData
 from trustbo.models.params import Params
 
@@ -71,9 +71,7 @@ def trust_moments(
 
 
 @partial(jax.jit, static_argnames=("observation", "lag"))
-def predictive(
-    observation: str, lag: float, params: Params, data: NutsData, key: Array
-) -> Array:
+def predictive(observation: str, lag: float, params: Params, data: NutsData, key: Array) -> Array:
     """Contact rates of replicated missions, one set per draw: (draw, mission, bound, robot)."""
 
     def one(inputs):

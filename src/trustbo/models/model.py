@@ -1,106 +1,31 @@
 """What all trust models share: the numpyro model, likelihood, simulation, prior prediction."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
-from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-import xarray as xr
-from jax import Array, lax
+from jax import Array
 from numpy.typing import ArrayLike
-from numpyro import handlers
-from numpyro.distributions import constraints
 
-from trustbo.data import Mission, default_features
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
-from trustbo.models import observation as families
-from trustbo.models.observation import OBSERVATIONS, SSM, Observed
+from trustbo.data import Mission
+from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models.contact_rate import (
+    ContactRate,
+    TrustSample,
+    mission_log_likelihood,
+    simulate_missions,
+)
+from trustbo.models.gram import Statistics, require_forgetting, sufficient_statistics
+from trustbo.models.observation import OBSERVATIONS
 from trustbo.models.params import Params, check_params
 from trustbo.models.priors import Priors
 from trustbo.stacking import MissionBatch, stack_missions
 
 RESPONSES = ("level", "change")
-N_IMPORTANCE = 32
-
-
-class ContactRate(dist.Distribution):
-    """Joint distribution of a batch of missions' contact rates.
-
-    Batch shape (mission,), event shape (bound, robot). A rate that is NaN counts as not measured.
-    Latent trust is integrated out; of families other than the Gaussian, `log_prob` is a weight that
-    depends on `noise` and averages to the density (see `observation`).
-    """
-
-    support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("params", "awareness", "exposure", "noise", "weight", "pilot")
-    pytree_aux_fields = ("observation", "lag", "shared")
-
-    def __init__(
-        self,
-        params: Params,
-        awareness: Array,
-        *,
-        exposure: Array | None = None,
-        noise: Array | None = None,
-        weight: Array | None = None,
-        pilot: Array | None = None,
-        observation: str = "gaussian",
-        lag: float = 0.0,
-        shared: bool = False,
-    ) -> None:
-        """Args as in `TrustModel.__call__`; `noise` and `pilot` are (bound, mission, robot)."""
-        self.params, self.awareness, self.exposure = params, awareness, exposure
-        self.noise, self.weight, self.pilot = noise, weight, pilot
-        self.observation, self.lag, self.shared = observation, lag, shared
-        super().__init__(awareness.shape[:1], awareness.shape[1:3])
-
-    def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Log density in nats, times the mission's weight; shape (mission,)."""
-        observed = self.observed(value)
-        noise = jnp.zeros_like(observed.y) if self.noise is None else self.noise
-        each = families.log_weight(
-            self.observation, self.ssm(), observed, noise, shared=self.shared
-        )
-        return each.sum(1) * (1.0 if self.weight is None else self.weight)
-
-    def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, key: Array, sample_shape: tuple[int, ...] = ()
-    ) -> Array:
-        """Contact rates, shape (*sample_shape, mission, bound, robot)."""
-        keys = jax.random.split(key, sample_shape)
-
-        def one(key: Array) -> Array:
-            return jnp.swapaxes(self.simulate(key)[1], 0, 1)
-
-        for _ in sample_shape:
-            one = jax.vmap(one)
-        return one(keys)
-
-    def simulate(self, key: Array) -> tuple[Array, Array]:
-        """Latent trust and contact rates, each (bound, mission, robot)."""
-        like = self.awareness[..., 0] if self.exposure is None else self.exposure
-        return families.simulate(self.observation, self.ssm(), jnp.swapaxes(like, 0, 1), key)
-
-    def ssm(self) -> SSM:
-        """The state space of all missions."""
-        return self.params.ssm(self.awareness, self.lag)
-
-    def observed(self, value: Array) -> Observed:
-        """Rates and exposure, bound first."""
-        exposure = jnp.full_like(value, jnp.nan) if self.exposure is None else self.exposure
-        return Observed(jnp.swapaxes(value, 0, 1), jnp.swapaxes(exposure, 0, 1), self.pilot)
-
-
-class TrustSample(NamedTuple):
-    """Draws of latent trust and contact rate, each of shape (mission, bound, robot)."""
-
-    trust: np.ndarray
-    contact_rate: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -111,7 +36,7 @@ class TrustModel:
         priors: Prior of each parameter; by default those of the family of observations.
         observation: `"gaussian"`, the paper's; `"censored"`, rates of 0 and 1 being limits;
             `"beta_binomial"`, ticks in contact out of `Bound.exposure` ticks, trust being a logit.
-        response: Whether the rate measures trust, `"level"`, or its `"change"` since the last bound.
+        response: Whether the rate measures trust, `"level"`, or its `"change"` over the bound.
 
     Raises:
         TrustboError: An unknown name, or `"change"` with the beta-binomial family.
@@ -136,9 +61,6 @@ class TrustModel:
 
     # --- what a model defines ---
 
-    varies_by_robot: ClassVar[bool] = False
-    """Whether coefficients vary by robot around common means; see `HierarchicalTrust`."""
-
     def sample_params(self, n_robots: int, n_features: int) -> Params:
         """Sample statements of the parameters; what they assemble to."""
         raise NotImplementedError
@@ -161,7 +83,20 @@ class TrustModel:
         """Axes of each parameter that a posterior has."""
         raise NotImplementedError
 
+    @property
+    def robot_sets(self) -> str | None:
+        """Whose parameters sufficient statistics are gathered of: `"all"` robots, or `"each"`.
+
+        None where there are no such statistics: the exact sampler cannot treat the model.
+        """
+        return None
+
     # --- what all models share ---
+
+    @property
+    def x0(self) -> dict[str, float]:
+        """Mean and sd of trust before the first bound, by name."""
+        return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
     @property
     def lag(self) -> float:
@@ -271,69 +206,79 @@ class TrustModel:
             )
         check_params(params, z.shape[2], z.shape[3])
         if exposure is None and self.observation == "beta_binomial":
-            raise TrustboError(_NO_EXPOSURE)
+            raise TrustboError(NO_EXPOSURE)
         ticks = np.broadcast_to(np.asarray(1.0 if exposure is None else exposure), z.shape[:3])
         with jax.enable_x64(True):
             params64 = type(params)(*(jnp.asarray(p, dtype=float) for p in params))
-            drawn = _simulate(self.observation, self.lag, params64, z, ticks * 1.0, key)
+            drawn = simulate_missions(self.observation, self.lag, params64, z, ticks * 1.0, key)
         return TrustSample(*(np.swapaxes(np.asarray(a), 0, 1) for a in drawn))
 
-    def prior_predictive(
+    def update(
         self,
-        awareness: ArrayLike,
+        statistics: Statistics | None,
+        missions: Sequence[Mission],
         *,
-        exposure: ArrayLike | None = None,
-        n_draws: int = 500,
-        seed: int = 0,
-    ) -> xr.DataTree:
-        """What the priors say before any mission.
+        forgetting: float = 1.0,
+    ) -> Statistics:
+        """Sufficient statistics with more missions, for `sample_statistics`.
 
         Args:
-            awareness: Shape (mission, bound, robot, feature).
-            exposure: Ticks, broadcast to (mission, bound, robot); the beta-binomial family needs
-                them.
-            n_draws: How many draws.
-            seed: Same seed, same draws.
-
-        Returns:
-            ArviZ DataTree with the groups `prior` and `prior_predictive` (contact_rate[chain, draw,
-            mission, bound, robot]).
+            statistics: Of earlier missions; None for none.
+            missions: The new ones.
+            forgetting: How much the earlier ones still count, in (0, 1].
 
         Raises:
-            ShapeError: Awareness of other axes.
-            TrustboError: No exposure.
+            ShapeError: Missions of another number of robots or features.
+            TrustboError: A model without such statistics, or a factor outside (0, 1].
         """
-        z = np.asarray(awareness, dtype=float)
-        if z.ndim != 4:
-            raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
-        if exposure is None and self.observation == "beta_binomial":
-            raise TrustboError(_NO_EXPOSURE)
-        ticks = np.broadcast_to(np.asarray(1.0 if exposure is None else exposure), z.shape[:3])
-        require_whole("n_draws", n_draws, 1)
-        with jax.enable_x64(True):
-            keys = jax.random.split(jax.random.key(seed), n_draws)
-            drawn = {k: np.asarray(v)[None] for k, v in prior_draws(self, z, ticks, keys).items()}
-        dims = {**self.dims, "contact_rate": ("mission", "bound", "robot")}
-        robots = [f"r{i + 1}" for i in range(z.shape[2])]
-        coords = {
-            "mission": np.arange(z.shape[0]),
-            "bound": np.arange(1, z.shape[1] + 1),
-            "robot": robots,
-            "robot_": robots,
-            "feature": list(default_features(z.shape[3])),
-        }
+        self.require_exact()
+        require_forgetting(forgetting)
+        new = self.gather(stack_missions(missions))
+        if statistics is None:
+            return new
+        if len(statistics) != len(new):
+            raise ShapeError(
+                f"the statistics are of {len(statistics)} robots, the missions have {len(new)}."
+            )
+        return tuple(
+            old.scaled(forgetting) + more for old, more in zip(statistics, new, strict=True)
+        )
 
-        def group(names: Iterable[str]) -> xr.Dataset:
-            variables = {n: (("chain", "draw", *dims[n]), drawn[n]) for n in names}
-            used = {d for axes, _ in variables.values() for d in axes} & set(coords)
-            index = {"chain": [0], "draw": np.arange(n_draws)}
-            return xr.Dataset(variables, {d: coords[d] for d in coords if d in used} | index)
+    def gather(self, batch: MissionBatch, weight: np.ndarray | None = None) -> Statistics:
+        """Sufficient statistics of a batch, each mission weighted."""
+        args = (self.priors.x0_mean, self.lag, weight)
+        if self.robot_sets == "all":
+            return (sufficient_statistics(batch, *args),)
+        n_robots = batch.contact_rate.shape[2]
+        apart = [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
+        return tuple(sufficient_statistics(one, *args) for one in apart)
 
-        groups = {"prior": group(self.dims), "prior_predictive": group(["contact_rate"])}
-        return xr.DataTree.from_dict(groups)
+    def require_exact(self) -> None:
+        """Refuse a model that has no sufficient statistics.
+
+        Raises:
+            TrustboError: Observations that are not Gaussian, or robots that share some parameters
+                only, or influence each other.
+        """
+        if self.robot_sets is None or self.observation != "gaussian":
+            raise TrustboError(
+                'sampler "exact" needs Gaussian observations, and PooledTrust or '
+                f'CoupledTrust(inter_robot="none"); got {self.describe()}. Use sampler="nuts".'
+            )
+
+    def describe(self) -> str:
+        """The model's name and options."""
+        options = [f.name for f in fields(self) if f.name != "priors"]
+        listed = ", ".join(f'{name}="{getattr(self, name)}"' for name in options)
+        return f"{type(self).__name__}({listed})"
 
 
-def register(cls: type[TrustModel]) -> type[TrustModel]:
+def sample(name: str, prior: dist.Distribution, shape: tuple[int, ...] = ()) -> Array:
+    """A sample statement of independent parameters of that shape."""
+    return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore
+
+
+def register[Model: TrustModel](cls: type[Model]) -> type[Model]:
     """Make a model a pytree, so that compiled samplers take its priors as data."""
     meta = [f.name for f in fields(cls) if f.name != "priors"]
     return jax.tree_util.register_dataclass(cls, data_fields=["priors"], meta_fields=meta)
@@ -351,57 +296,12 @@ def require_exposure(model: TrustModel, batch: MissionBatch) -> None:
     if without.any():
         j, k, i = np.argwhere(without)[0]
         raise TrustboError(
-            f"mission {j}, bound {k + 1}, robot {i} has a contact rate but no exposure. {_NO_EXPOSURE}"
+            f"mission {j}, bound {k + 1}, robot {i} has a contact rate but no exposure. "
+            f"{NO_EXPOSURE}"
         )
 
 
-_NO_EXPOSURE = (
+NO_EXPOSURE = (
     "The beta-binomial family counts ticks: give exposure, the number of ticks of each bound "
-    "(Mission.from_arrays(..., exposure=...)), or use observation \"censored\"."
+    '(Mission.from_arrays(..., exposure=...)), or use observation "censored".'
 )
-
-
-@partial(jax.jit, static_argnames=("observation", "lag"))
-def mission_log_likelihood(
-    observation: str,
-    lag: float,
-    params: Params,
-    awareness: Array,
-    contact_rate: Array,
-    exposure: Array,
-    key: Array,
-) -> Array:
-    """Log p(contact rates of each mission | draw), latent trust integrated out; (draw, mission)."""
-
-    def one(p: Params) -> Array:
-        rates = ContactRate(p, awareness, exposure=exposure, observation=observation, lag=lag)
-        observed = rates.observed(contact_rate)
-        # The same noise for every draw: what is compared does not differ by luck.
-        return families.marginal_log_likelihood(
-            observation, rates.ssm(), observed, key, N_IMPORTANCE
-        )
-
-    return lax.map(one, params, batch_size=256)
-
-
-@partial(jax.jit, static_argnames=("observation", "lag"))
-def _simulate(
-    observation: str, lag: float, params: Params, awareness: Array, exposure: Array, key: Array
-) -> tuple[Array, Array]:
-    rates = ContactRate(params, awareness, exposure=exposure, observation=observation, lag=lag)
-    return rates.simulate(key)
-
-
-@jax.jit
-def prior_draws(
-    model: TrustModel, awareness: Array, exposure: Array, keys: Array
-) -> dict[str, Array]:
-    """Parameters and contact rates drawn from the prior, one set per key."""
-
-    def one(key: Array) -> dict[str, Array]:
-        seeded = handlers.seed(partial(model, joint=False), key)
-        trace = handlers.trace(seeded).get_trace(awareness, exposure=exposure)
-        names = (*model.dims, "contact_rate")
-        return {name: trace[name]["value"] for name in names}
-
-    return jax.vmap(one)(keys)

@@ -16,6 +16,9 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         return special.xlogy(a - 1.0, x) + special.xlog1py(b - 1.0, -x) - special.betaln(a, b)
     if isinstance(prior, dist.Normal):
         return stats.norm.logpdf(x, number(prior, "loc"), number(prior, "scale"))
+    if isinstance(prior, dist.LogNormal):
+        z = (np.log(x) - number(prior, "loc")) / number(prior, "scale")
+        return -0.5 * z**2 - np.log(x * number(prior, "scale")) - 0.5 * np.log(2.0 * np.pi)
     with jax.enable_x64(True):
         return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
 

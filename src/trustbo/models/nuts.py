@@ -63,7 +63,9 @@ def run_nuts(
     covariance = inverse_hessian(hessian)
     scale = jnp.linalg.cholesky(covariance)
     # Noise is close to standard normal by construction: its mass matrix starts as the identity.
-    mass = {("theta",): covariance, **{("noise",): jnp.ones(n.size) for n in noise.values()}}
+    mass = {("theta",): covariance}
+    if joint:
+        mass[("noise",)] = jnp.ones(noise["noise"].size)
 
     def chain(key: Array):
         key_start, key_noise, key_run = random.split(key, 3)
@@ -77,7 +79,7 @@ def run_nuts(
             settings.n_warmup,
             step_size=0.5,
             inverse_mass_matrix=mass,
-            dense_mass=[("theta",)],
+            dense_mass=[("theta",)],  # pyright: ignore[reportArgumentType]
             target_accept_prob=settings.target_accept,
             rng_key=key_run,
         )
@@ -100,4 +102,5 @@ def run_nuts(
         return jax.vmap(target.constrain)(z["theta"]), stats, z.get("noise")
 
     # One chain after the other: vectorised chains would all wait for the longest trajectory.
-    return NutsDraws(*lax.map(chain, random.split(key, settings.n_chains)), target.pilot)
+    params, stats, drawn = lax.map(chain, random.split(key, settings.n_chains))
+    return NutsDraws(params, stats, drawn, target.pilot)

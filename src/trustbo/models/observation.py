@@ -81,7 +81,9 @@ def draw_trust(observation: str, ssm: SSM, observed: Observed, noise: Array, key
     return ssm.sample_backward(filtered, random.normal(key, noise.shape, noise.dtype))
 
 
-def trust_moments(observation: str, ssm: SSM, observed: Observed, noise: Array):
+def trust_moments(
+    observation: str, ssm: SSM, observed: Observed, noise: Array
+) -> tuple[Array, Array]:
     """Mean and variance of latent trust given parameters and noise, (bound, mission, robot)."""
     if observation == "beta_binomial":
         trust = draw_trust(observation, ssm, observed, noise, random.key(0))

@@ -179,9 +179,7 @@ class CoupledParams(_Draws, _Coupled):
 Params = TrustParams | RobotParams | CoupledParams
 
 
-def ordered_params(
-    sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Numbers
-) -> CoupledParams:
+def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Numbers) -> CoupledParams:
     """The coupled form of robots in order, each following the one before it at the same bound.
 
     x_i^k = beta0_i x_i^{k-1} + gamma_i x_{i-1}^k + sum_m beta_{i,m} z_{i,m}^k + b_i + w_i, hence
@@ -256,7 +254,8 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     sizes = dict(zip(axes, shape[len(shape) - len(axes) :], strict=True))
     if sizes["feature"] != n_features:
         raise ShapeError(
-            f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} features."
+            f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} "
+            "features."
         )
     if "robot" not in sizes:
         return

@@ -3,10 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpyro
 from jax import Array
 
-from trustbo.models.model import TrustModel, register
+from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import TrustParams
 
 
@@ -19,11 +18,11 @@ class PooledTrust(TrustModel):
         """Sample statements of beta0, beta, b, delta_w and delta_v."""
         priors = self.priors
         return TrustParams(
-            beta0=numpyro.sample("beta0", priors.beta0),
-            beta=numpyro.sample("beta", priors.beta.expand((n_features,)).to_event(1)),
-            b=numpyro.sample("b", priors.b),
-            delta_w=numpyro.sample("delta_w", priors.delta_w),
-            delta_v=numpyro.sample("delta_v", priors.delta_v),
+            beta0=sample("beta0", priors.beta0),
+            beta=sample("beta", priors.beta, (n_features,)),
+            b=sample("b", priors.b),
+            delta_w=sample("delta_w", priors.delta_w),
+            delta_v=sample("delta_v", priors.delta_v),
             x0_mean=priors.x0_mean,
             x0_sd=priors.x0_sd,
         )
@@ -36,3 +35,8 @@ class PooledTrust(TrustModel):
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of beta0, beta, b, delta_w and delta_v."""
         return {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
+
+    @property
+    def robot_sets(self) -> str:
+        """All robots share their parameters."""
+        return "all"

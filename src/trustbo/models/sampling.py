@@ -10,13 +10,10 @@ import xarray as xr
 from jax import Array, random
 
 from trustbo.errors import TrustboError
-from trustbo.models.coupled import CoupledTrust
 from trustbo.models.exact import KHAT_LIMIT, ExactDraws, sample_exact
-from trustbo.models.gram import SufficientStatistics, sufficient_statistics
-from trustbo.models.model import TrustModel
 from trustbo.models.geometry import NutsData
+from trustbo.models.model import TrustModel
 from trustbo.models.nuts import NutsSettings, run_nuts
-from trustbo.models.pooled import PooledTrust
 from trustbo.stacking import MissionBatch
 
 SAMPLERS = ("nuts", "exact", "joint")
@@ -72,38 +69,13 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
         TrustboError: `"exact"` for observations that are not Gaussian, or robots that share some
             parameters only or influence each other; `"joint"` where trust integrates out.
     """
-    per_robot = isinstance(model, CoupledTrust) and model.inter_robot == "none"
-    gaussian = model.observation == "gaussian"
-    if sampler == "exact" and not (gaussian and (per_robot or isinstance(model, PooledTrust))):
-        raise TrustboError(
-            'sampler "exact" needs Gaussian observations, and PooledTrust or '
-            f'CoupledTrust(inter_robot="none"); got {describe(model)}. Use sampler="nuts".'
-        )
-    if sampler == "joint" and gaussian:
+    if sampler == "exact":
+        model.require_exact()
+    if sampler == "joint" and model.observation == "gaussian":
         raise TrustboError(
             'sampler "joint" is for observations that trust does not integrate out of; with '
             'Gaussian ones use "nuts" or "exact".'
         )
-
-
-def describe(model: TrustModel) -> str:
-    """The model's name and options."""
-    options = f'observation="{model.observation}", response="{model.response}"'
-    if isinstance(model, CoupledTrust):
-        options += f', inter_robot="{model.inter_robot}"'
-    return f"{type(model).__name__}({options})"
-
-
-def gather(
-    model: TrustModel, batch: MissionBatch, weight: np.ndarray | None = None
-) -> list[SufficientStatistics]:
-    """Sufficient statistics of each set of robots that share parameters: all, or one by one."""
-    args = (model.priors.x0_mean, model.lag, weight)
-    if isinstance(model, PooledTrust):
-        return [sufficient_statistics(batch, *args)]
-    n_robots = batch.contact_rate.shape[2]
-    apart = [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
-    return [sufficient_statistics(one, *args) for one in apart]
 
 
 def _sample_exact(
@@ -117,7 +89,7 @@ def _sample_exact(
     shape = (settings.n_chains, settings.n_draws)
     each = [
         sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
-        for i, statistics in enumerate(gather(model, batch, weight))
+        for i, statistics in enumerate(model.gather(batch, weight))
     ]
     khat = max(exact.khat for exact in each)
     if not all(exact.khat <= KHAT_LIMIT for exact in each):
@@ -132,7 +104,7 @@ def _sample_exact(
         "kish": min(exact.kish for exact in each),
         "log_evidence": sum(exact.log_evidence for exact in each),
     }
-    params, stats = _join(each, shape, per_robot=not isinstance(model, PooledTrust))
+    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     return Draws(params, stats, summary, "exact")
 
 
@@ -145,8 +117,8 @@ def _join(each: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
 
     params = {name: join([e.params[name] for e in each]) for name in each[0].params}
     stats = {
-        "lp": sum(e.lp for e in each).reshape(shape),
-        "log_weight": sum(e.log_weight for e in each).reshape(shape),
+        "lp": np.sum([e.lp for e in each], axis=0).reshape(shape),
+        "log_weight": np.sum([e.log_weight for e in each], axis=0).reshape(shape),
     }
     return params, stats
 
@@ -163,7 +135,7 @@ def _sample_nuts(
     """Draws by NUTS, longer ones if the first are bad, and what is wrong with them in the end."""
     longer = NutsSettings(2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98)
     options = {
-        "shared": model.observation != "beta_binomial" and _is_complete(data.contact_rate),
+        "shared": _is_complete(np.asarray(data.contact_rate)),
         "joint": joint,
     }
 

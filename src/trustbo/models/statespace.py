@@ -92,12 +92,13 @@ class ScalarSSM(NamedTuple):
         def step(m, inputs):
             y_k, seen_k, c_k, S_k, gain_k, *rest = inputs
             predicted = h * m + c_k
+            completed = ()
             if rest:
-                y_k, log_mass = complete(y_k, predicted, jnp.sqrt(S_k), Censoring(*rest))
+                completed = complete(y_k, predicted, jnp.sqrt(S_k), Censoring(*rest))
+                y_k = completed[0]
             e = (y_k - predicted) * seen_k
-            out = (e, y_k, log_mass) if rest else (e,)
             m = beta0 * m + c_k + gain_k * e
-            return m, (m, *out)
+            return m, (m, e, *completed)
 
         S, gain = (jnp.broadcast_to(a, y.shape) for a in (S, gain))
         m0 = jnp.broadcast_to(x0_mean, y.shape[1:])
@@ -175,7 +176,7 @@ class ScalarSSM(NamedTuple):
         return A, a, V
 
 
-def complete(y: Array, predicted: Array, sd: Array, censoring: Censoring):
+def complete(y: Array, predicted: Array, sd: Array, censoring: Censoring) -> tuple[Array, Array]:
     """Censored rates drawn beyond their limit from the prediction, and the log mass there.
 
     The step of the GHK simulator (Geweke 1989; Hajivassiliou and McFadden 1998; Keane 1994).

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trustbo.models.params import RobotParams, TrustParams
+from trustbo.models.params import Params, RobotParams, TrustParams
 from trustbo.stacking import MissionBatch
 
 _CELLS = 1 << 18  # numbers per array and chunk of draws: what the cache holds
@@ -24,7 +24,7 @@ class TrustSummary(NamedTuple):
     log_likelihood: np.ndarray  # (draw, mission)
 
 
-def summarize(params: TrustParams | RobotParams, lag: float, batch: MissionBatch) -> TrustSummary:
+def summarize(params: Params, lag: float, batch: MissionBatch) -> TrustSummary:
     """Mean and sd of latent trust over all draws, and each mission's log-likelihood per draw.
 
     Args:
@@ -55,9 +55,7 @@ def summarize(params: TrustParams | RobotParams, lag: float, batch: MissionBatch
     return TrustSummary(mean, np.sqrt(np.maximum(squares / n - mean**2, 0.0)), log_likelihood)
 
 
-def sample(
-    params: TrustParams | RobotParams, lag: float, batch: MissionBatch, rng: np.random.Generator
-) -> np.ndarray:
+def sample(params: Params, lag: float, batch: MissionBatch, rng: np.random.Generator) -> np.ndarray:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
     trust = np.zeros((len(params.b), *batch.contact_rate.shape))
     for group in _groups(params, batch):
@@ -73,7 +71,7 @@ def sample(
 
 
 def simulate(
-    params: TrustParams | RobotParams, lag: float, awareness: np.ndarray, rng: np.random.Generator
+    params: Params, lag: float, awareness: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
     """Gaussian contact rates of new missions, one set per draw: (draw, mission, bound, robot).
 
@@ -128,9 +126,11 @@ class _Filtered(NamedTuple):
     log_likelihood: np.ndarray  # (sequence, draw)
 
 
-def _groups(params: TrustParams | RobotParams, batch: MissionBatch) -> Iterator[_Group]:
+def _groups(params: Params, batch: MissionBatch) -> Iterator[_Group]:
     n_missions, n_bounds, n_robots = batch.contact_rate.shape
-    robots = [range(n_robots)] if isinstance(params, TrustParams) else [[i] for i in range(n_robots)]
+    robots = (
+        [range(n_robots)] if isinstance(params, TrustParams) else [[i] for i in range(n_robots)]
+    )
     for members in robots:
         draws = _of_robots(params, members)
         mission, robot = (a.ravel() for a in np.meshgrid(range(n_missions), members, indexing="ij"))
@@ -154,7 +154,7 @@ def _groups(params: TrustParams | RobotParams, batch: MissionBatch) -> Iterator[
                 )
 
 
-def _of_robots(params: TrustParams | RobotParams, members: range | list[int]) -> _Draws:
+def _of_robots(params: Params, members: range | list[int]) -> _Draws:
     n = len(params.b)
 
     def column(value: np.ndarray) -> np.ndarray:

@@ -137,7 +137,10 @@ class VectorSSM(NamedTuple):
     def _backward(self, filtered: Filtered) -> tuple[Array, Array, Array]:
         """A, a and the Cholesky factor of V^-1, with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V)."""
         n = len(self.B0)
-        eye, both = jnp.eye(n)[None, None], filtered.seen[1:, :, :, None] * filtered.seen[1:, :, None, :]
+        eye, both = (
+            jnp.eye(n)[None, None],
+            filtered.seen[1:, :, :, None] * filtered.seen[1:, :, None, :],
+        )
         # Robots that were not measured get unit noise of their own, then weight 0.
         R = jnp.broadcast_to(self.R, (*filtered.y.shape, n)) if self.R.ndim < 4 else self.R
         of_rate = self.lag * both * jnp.linalg.inv(R[1:] * both + eye * (1.0 - both))
