@@ -44,6 +44,38 @@ def dense_posterior_of_trust(
     return mean + gain @ (contact_rate - mean)[seen], prior - gain @ prior[seen]
 
 
+def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate, lag=0.0):
+    """Log density of a mission's rates, and moments of its trust, from one joint normal.
+
+    drift, contact_rate: (bound, robot), rates NaN where not measured. Trust as one vector of all
+    bounds and robots: A x = d + B0 x_0 e_1 + w; rates y = x - lag x_prev + v.
+    """
+    K, n = contact_rate.shape
+    eye, first = np.eye(K), np.eye(K)[:, :1]
+    inverse = np.linalg.inv(np.eye(K * n) - np.kron(np.eye(K, k=-1), B0))
+    start = np.kron(first, B0)  # how x_0 enters
+    x0 = np.full(n, x0_mean)
+    mean_x = inverse @ (drift.ravel() + start @ x0)
+    cov_x = inverse @ (np.kron(eye, Q) + start @ start.T * x0_sd**2) @ inverse.T
+    cov_x_x0 = inverse @ start * x0_sd**2
+    # Rates are linear in (x, x_0).
+    H = np.eye(K * n) - lag * np.kron(np.eye(K, k=-1), np.eye(n))
+    G = -lag * np.kron(first, np.eye(n))
+    mean_y = H @ mean_x + G @ x0
+    cov_xy = cov_x @ H.T + cov_x_x0 @ G.T
+    cross = H @ cov_x_x0 @ G.T
+    cov_y = H @ cov_x @ H.T + cross + cross.T + G @ G.T * x0_sd**2 + np.kron(eye, R)
+    y = contact_rate.ravel()
+    seen = ~np.isnan(y)
+    cov, residual = cov_y[np.ix_(seen, seen)], (y - mean_y)[seen]
+    log_det = np.linalg.slogdet(cov)[1]
+    quadratic = residual @ np.linalg.solve(cov, residual)
+    log_density = -0.5 * (quadratic + log_det + seen.sum() * math.log(2.0 * math.pi))
+    gain = cov_xy[:, seen] @ np.linalg.inv(cov)
+    mean = mean_x + gain @ residual
+    return log_density, mean.reshape(K, n), cov_x - gain @ cov_xy[:, seen].T
+
+
 def walks(passable, start, goal, max_bounds, connectivity=8, *, u_turns=True, simple=False):
     """Every walk from start to its first arrival at goal, of at most `max_bounds` bounds."""
     rows, cols = len(passable), len(passable[0])

@@ -13,7 +13,7 @@ from trustbo import (
     TrustboError,
     Workspace,
 )
-from trustbo.models import fit
+from trustbo.models import CoupledTrust, PooledTrust, fit
 from trustbo.planning import policies
 
 ENDS = ((3, 0), (0, 3))
@@ -135,3 +135,52 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
     closed = Workspace.from_awareness(workspace.awareness.values, walls)
     with pytest.raises(NoPathError, match="no path from"):
         Campaign(closed, *ENDS)
+
+
+def test_old_missions_can_be_forgotten(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact", forgetting=0.5)
+    for seed in range(2):
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=seed))
+    weight = campaign.posterior["constant_data"]["weight"]
+    np.testing.assert_allclose(weight, [0.5, 1.0])
+    expected = fit(
+        campaign.missions,
+        sampler="exact",
+        weights=[0.5, 1.0],
+        seed=campaign.posterior.attrs["seed"],
+    )
+    np.testing.assert_array_equal(
+        campaign.posterior["posterior"]["b"].values, expected["posterior"]["b"].values
+    )
+
+
+def test_the_later_code_s_updating_is_offered_with_a_warning(workspace):
+    with pytest.warns(UserWarning, match=r"off by up to 1.15 posterior standard deviations"):
+        campaign = Campaign(workspace, *ENDS, sampler="exact", update="moment_matched")
+    for seed in range(2):
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=seed))
+    assert campaign.posterior.sizes.get("mission", 1) == 1  # the last mission alone
+    assert campaign.posterior.attrs["prior_delta_w"].startswith("LogNormal")
+
+
+def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
+    with pytest.raises(TrustboError, match="planned with PooledTrust for now; got Coupled"):
+        Campaign(workspace, *ENDS, model=CoupledTrust())
+    with pytest.raises(TrustboError, match="model must be a trust model"):
+        Campaign(workspace, *ENDS, model="pooled")
+    with pytest.raises(TrustboError, match=r"forgetting must be in \(0, 1\]; got 1.5"):
+        Campaign(workspace, *ENDS, forgetting=1.5)
+    censored = PooledTrust(observation="censored")
+    with pytest.raises(TrustboError, match=r'forgetting = 0.9 needs update "refit" and Gaussian'):
+        Campaign(workspace, *ENDS, model=censored, forgetting=0.9)
+    with pytest.raises(TrustboError, match='sampler "exact" needs Gaussian observations'):
+        Campaign(workspace, *ENDS, model=censored, sampler="exact")
+    with pytest.raises(TrustboError, match="unknown update 'online'"):
+        Campaign(workspace, *ENDS, update="online")
+
+
+def test_a_campaign_with_censored_rates(workspace):
+    campaign = Campaign(workspace, *ENDS, model=PooledTrust(observation="censored"))
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    assert campaign.posterior.attrs["sampler"] == "joint"
+    assert campaign.ask().exact

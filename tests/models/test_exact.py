@@ -59,18 +59,18 @@ def test_exact_draws_and_a_long_nuts_run_agree(seed):
     batch = stack_missions(missions)
     exact = sample_exact(sufficient_statistics(batch, 0.5), Priors(), 4000, seed).params
     with jax.enable_x64(True):
-        settings = NutsSettings(n_draws=5000)
+        settings = NutsSettings(n_draws=20_000)
         data = NutsData(*batch, np.ones(len(batch.contact_rate)))
         nuts = run_nuts(settings, jax.random.key(seed), PooledTrust(), data).params
-        nuts = {name: np.asarray(a).reshape(20_000, -1) for name, a in nuts.items()}
+        nuts = {name: np.asarray(a).reshape(80_000, -1) for name, a in nuts.items()}
     for name, reference in nuts.items():
         for ours, theirs in zip(exact[name].reshape(4000, -1).T, reference.T, strict=True):
             sd = theirs.std()
-            # 4000 draws of Kish size > 2000: the mean's standard error is 0.022 sd, NUTS adds 0.01.
-            assert abs(ours.mean() - theirs.mean()) < 0.1 * sd, name
-            assert abs(np.log(ours.std() / sd)) < 0.1, name
-            # Thinned to near independence: KS assumes it.
-            assert stats.ks_2samp(ours[::4], theirs[::20]).pvalue > 0.001, name
+            # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %;
+            # NUTS of ESS > 40 000 adds 0.005 sd and 0.4 %.
+            assert abs(ours.mean() - theirs.mean()) < 0.05 * sd, name
+            assert abs(np.log(ours.std() / sd)) < 0.03, name
+            assert stats.ks_2samp(ours, theirs[::4]).pvalue > 0.01, name
 
 
 def test_the_evidence_is_the_prior_mean_of_the_likelihood():

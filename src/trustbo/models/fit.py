@@ -116,7 +116,8 @@ def fit(
         **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
     }
     if weights is not None:
-        posterior["constant_data"]["weight"] = ("mission", weight[: len(missions)])
+        counted = xr.DataArray(weight[: len(missions)], dims="mission")
+        posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
     if complaints:
         raise PosteriorError(
             f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions, "
