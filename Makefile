@@ -1,7 +1,7 @@
 # make demo   install into .venv and run the main job on a made terrain
 # make test   install what the tests need too, and run them
 # make lint   format, style, types and the direction of imports
-# make bench  the benchmarks, which print the figures we claim
+# make bench  install the peers, and print the figures we claim beside theirs
 # make clean  remove everything that make made
 
 VENV := .venv
@@ -14,7 +14,7 @@ demo: $(VENV)/.installed
 	$(BIN)/trustbo demo --out out/demo
 
 test: $(VENV)/.installed-dev
-	TRUSTBO_FAST=1 $(BIN)/python -m pytest --nbmake tests notebooks
+	TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --nbmake tests notebooks
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -22,7 +22,7 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.installed-dev
+bench: $(VENV)/.installed-bench
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
 clean:
@@ -40,4 +40,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(PIP) --editable ".[test,dev]"
+	@touch $@
+
+# The samplers we compare ourselves with.
+$(VENV)/.installed-bench: $(VENV)/.installed
+	$(PIP) --editable ".[bench]"
 	@touch $@

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 import trustbo
 
 
@@ -33,3 +35,26 @@ def test_jax_s_configuration_is_untouched_by_importing():
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "False float32"
+
+
+@pytest.mark.parametrize(
+    "before", ["", "import arviz", "import arviz, numpyro.distributions", "import numpyro, arviz"]
+)
+def test_numpyro_works_whatever_was_imported_first(before):
+    """arviz_base leaves it half loaded."""
+    program = (
+        f"{before}\n"
+        "import trustbo as tb\n"
+        "import numpyro.distributions as dist\n"
+        "from numpyro import handlers\n"
+        "import jax, numpy as np\n"
+        "model = tb.models.PooledTrust(tb.models.Priors(beta0=dist.Beta(2.0, 3.0)))\n"
+        "model = handlers.seed(model, jax.random.key(0))\n"
+        "z = np.full((1, 3, 2, 2), 0.5)\n"
+        "print(handlers.trace(model).get_trace(z)['contact_rate']['value'].shape)\n"
+        "import numpyro; numpyro.factor; numpyro.distributions.distribution.Unit\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "(1, 3, 2)"

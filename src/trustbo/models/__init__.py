@@ -1,5 +1,8 @@
 """Trust models and their inference."""
 
+from trustbo.models import backend as backend  # first: it loads numpyro
+
+# isort: split
 from trustbo.models.calibration import sbc
 from trustbo.models.contact_rate import ContactRate, TrustSample
 from trustbo.models.coupled import CoupledTrust
