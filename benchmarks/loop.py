@@ -14,7 +14,7 @@ import numpy as np
 from numpyro.infer import MCMC, NUTS
 
 import trustbo as tb
-from trustbo.models import Priors, diagnostics, fit, pooled_trust
+from trustbo.models import PooledTrust, diagnostics, fit
 
 
 def seconds_of(function):
@@ -29,14 +29,14 @@ def plain_numpyro(missions):
     rates = np.stack([m.contact_rate for m in missions])
     with jax.enable_x64(True):
         mcmc = MCMC(
-            NUTS(pooled_trust, dense_mass=True),
+            NUTS(PooledTrust(), dense_mass=True),
             num_warmup=300,
             num_samples=1000,
             num_chains=4,
             chain_method="sequential",
             progress_bar=False,
         )
-        mcmc.run(jax.random.key(0), awareness, Priors(), rates)
+        mcmc.run(jax.random.key(0), awareness, rates)
         draws = {k: np.asarray(v) for k, v in mcmc.get_samples(group_by_chain=True).items()}
     sites = az.from_dict({"posterior": draws})["posterior"].to_dataset()
     ess = az.ess(sites, method="bulk")
@@ -57,7 +57,7 @@ def main():
         print(f"  {name}: median {1000 * later[f'seconds_{name}']:.0f} ms")
     same = [m for m in result.missions if len(m.bounds) == len(result.missions[-1].bounds)][-4:]
     ours, exact, theirs = [], [], []
-    fit(same, sampler="exact")  # compiles what draws latent trust
+    fit(same, sampler="exact")  # imports and caches
     for n in range(1, len(same) + 1):
         seconds, posterior = seconds_of(lambda n=n: fit(same[:n], check=False))
         ours.append((seconds, diagnostics(posterior)["ess_bulk"]))
