@@ -1,5 +1,7 @@
 """Learning mission by mission: sums, weights, forgetting, and the moments of the later code."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -19,6 +21,7 @@ from trustbo.models import (
     moment_matched,
     sample_statistics,
 )
+from trustbo.models.spectral import log_likelihood, spectrum
 from trustbo.stacking import stack_missions
 
 THETA = np.array([[0.5, 0.01, 0.02], [0.8, 0.03, 0.001], [-0.2, 0.2, 0.1]])
@@ -60,6 +63,19 @@ def test_the_quadratic_form_of_changes_is_the_dense_joint_normal(response):
             for m in missions
         )
         np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("response", ["level", "change"])
+def test_what_nuts_sums_up_is_the_likelihood(response):
+    model, missions = PooledTrust(response=response), simulate_missions(6)
+    sums = spectrum(model.update(None, missions)[0])
+    assert sums.mask.sum() == 7 + 5 + 8  # three lengths, padded to four of eight bounds
+    assert sums.mask.shape == (4, 8)
+    p = TrustParams(0.55, np.array([0.2, 0.3]), 0.07, 0.06, 0.08, 0.5, 0.5)
+    with jax.enable_x64(True):
+        params = TrustParams(*(jnp.asarray(value, dtype=float) for value in p))
+        found = float(log_likelihood(params, jax.tree.map(jnp.asarray, sums), model.lag))
+    np.testing.assert_allclose(found, model.log_likelihood(p, missions).sum(), rtol=1e-10)
 
 
 def test_missions_add_up_in_any_order():

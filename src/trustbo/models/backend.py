@@ -1,7 +1,7 @@
 """numpyro, whole.
 
 arviz_base leaves a lazy numpyro in `sys.modules`. Whoever then imports a submodule of it first, as
-in `import arviz; import numpyro.distributions`, gets packages that do not know their submodules, and
+in `import arviz; import numpyro.distributions`, gets packages that miss their own submodules, and
 numpyro fails ("numpyro.distributions has no attribute 'distribution'"). To ask the package for
 something first avoids it; where it has happened already, the submodules are put in their places.
 """

@@ -29,6 +29,7 @@ from trustbo.models import observation as families
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
+from trustbo.models.spectral import Spectrum
 
 Potential = Callable[[dict[str, Array]], Array]
 
@@ -40,6 +41,10 @@ class NutsData(NamedTuple):
     contact_rate: Array | np.ndarray  # (mission, bound, robot)
     exposure: Array | np.ndarray  # (mission, bound, robot)
     weight: Array | np.ndarray  # (mission,)
+    spectrum: Spectrum | None = None
+    """Of pooled Gaussian missions without gaps: their sums, which take the rates' place."""
+    means: tuple[Array | np.ndarray, Array | np.ndarray] | None = None
+    """Mean rate and mean awareness (feature,), which go with the sums."""
 
 
 class _Robots(NamedTuple):
@@ -61,6 +66,7 @@ class _Space:
             "shared": shared,
             "joint": joint,
             "pilot": None,
+            "spectrum": data.spectrum,
         }
         seeded = handlers.seed(model, random.key(0))
         trace = handlers.trace(seeded).get_trace(*self.args, **self.options)
@@ -223,7 +229,9 @@ def newton(
     def step(_, carry):
         z, at, proposal, ridge = carry
         new = everything(proposal)
-        better = new[0] < at[0]
+        # The Hessian may overflow where the value does not: such a point is not stepped on.
+        finite = jnp.isfinite(new[1]).all() & jnp.isfinite(new[2]).all()
+        better = finite & (new[0] < at[0])
         z = jnp.where(better, proposal, z)
         at = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, at)
         ridge = jnp.where(better, ridge / 4.0, ridge * 8.0 + 1e-6)
@@ -263,6 +271,9 @@ class _Means(NamedTuple):
 
 
 def _average(model: TrustModel, data: NutsData) -> _Means:
+    if data.means is not None:
+        y, z = data.means
+        return _Means(jnp.asarray(y), jnp.asarray(z), jnp.zeros(()))
     measured = ~jnp.isnan(data.contact_rate)
     n = jnp.maximum(measured.sum(), 1)
     y = jnp.where(measured, data.contact_rate, 0.0).sum() / n

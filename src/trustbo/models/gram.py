@@ -62,7 +62,7 @@ class LengthGram(NamedTuple):
         """The quadratic form at parameter values of shape (theta, 3)."""
         n_bounds, p = self.spectral.shape[:2]
         beta0, Q, R = theta.T
-        sines = _sine_basis(n_bounds)
+        sines = sine_basis(n_bounds)
         cosine = np.cos(np.pi * np.arange(1, n_bounds + 1) / (n_bounds + 1))
         diagonal, beside = Q * (1.0 + lag) + R * (1.0 + beta0**2), lag * Q + beta0 * R
         eigenvalues = diagonal[:, None] - 2.0 * beside[:, None] * cosine
@@ -251,7 +251,7 @@ def _length_gram(
     columns[:, 0, 2] = x0_mean
     columns[:, 1:, 3:] -= lag * u[:, :-1]
     columns *= np.sqrt(weight)[:, None, None]
-    transformed = np.einsum("kl,skp->slp", _sine_basis(n_bounds), columns, optimize=True)
+    transformed = np.einsum("kl,skp->slp", sine_basis(n_bounds), columns, optimize=True)
     return LengthGram(
         float(weight.sum()),
         np.einsum("slp,slq->lpq", transformed, transformed, optimize=True),
@@ -269,7 +269,7 @@ def _collapse_lag(
     return Quadratic(alpha, linear, M[:, 3:, 3:], log_det)
 
 
-def _sine_basis(n: int) -> np.ndarray:
+def sine_basis(n: int) -> np.ndarray:
     """The orthonormal, symmetric matrix of the type-I discrete sine transform, (n, n)."""
     k = np.arange(1, n + 1)
     return np.sqrt(2.0 / (n + 1)) * np.sin(np.pi * np.outer(k, k) / (n + 1))

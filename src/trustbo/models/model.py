@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models import spectral
 from trustbo.models.contact_rate import (
     ContactRate,
     TrustSample,
@@ -21,8 +22,9 @@ from trustbo.models.contact_rate import (
 )
 from trustbo.models.gram import Statistics, require_forgetting, sufficient_statistics
 from trustbo.models.observation import OBSERVATIONS
-from trustbo.models.params import Params, check_params
+from trustbo.models.params import Params, TrustParams, check_params
 from trustbo.models.priors import Priors
+from trustbo.models.spectral import Spectrum
 from trustbo.stacking import MissionBatch, stack_missions
 
 RESPONSES = ("level", "change")
@@ -113,6 +115,7 @@ class TrustModel:
         shared: bool = False,
         joint: bool | None = None,
         pilot: Array | None = None,
+        spectrum: Spectrum | None = None,
     ) -> None:
         """The numpyro model.
 
@@ -125,9 +128,14 @@ class TrustModel:
             joint: Sample the noise that latent trust is made of; by default where it cannot be
                 integrated out.
             pilot: See `observation.Observed`.
+            spectrum: Sums over complete missions that the pooled Gaussian likelihood is taken from,
+                in the place of `contact_rate`.
         """
         n_missions, n_bounds, n_robots, n_features = awareness.shape
         params = self.sample_params(n_robots, n_features)
+        if spectrum is not None and isinstance(params, TrustParams):
+            numpyro.factor("contact_rate", spectral.log_likelihood(params, spectrum, self.lag))
+            return
         noise = None
         if self.observation != "gaussian" if joint is None else joint:
             shape = (n_bounds, n_missions, n_robots)

@@ -214,9 +214,12 @@ def _variances(ssm: SSM) -> Array:
 
 
 def _concentration(ssm: SSM) -> Array:
-    """Concentration of the beta distribution, shape (1, 1, robot or 1)."""
+    """Concentration of the beta distribution, shape (1, 1, robot or 1).
+
+    At most 1e6, where counts are binomial for all purposes and log-gamma still has digits to give.
+    """
     variance = ssm.delta_v**2 if isinstance(ssm, ScalarSSM) else jnp.diagonal(ssm.R)
-    return 1.0 / jnp.reshape(variance, (1, 1, -1))
+    return 1.0 / (jnp.reshape(variance, (1, 1, -1)) + 1e-6)
 
 
 def _beta_binomial(counts: tuple[Array, Array], trust: Array, ssm: SSM) -> Array:

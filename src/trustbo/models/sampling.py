@@ -14,6 +14,7 @@ from trustbo.models.exact import KHAT_LIMIT, ExactDraws, sample_exact
 from trustbo.models.geometry import NutsData
 from trustbo.models.model import TrustModel
 from trustbo.models.nuts import NutsSettings, run_nuts
+from trustbo.models.spectral import spectrum
 from trustbo.stacking import MissionBatch
 
 SAMPLERS = ("nuts", "exact", "joint")
@@ -57,9 +58,23 @@ def draw_posterior(
         return exact, []
     joint = model.observation != "gaussian"
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
-    data = NutsData(*batch, weight)
+    data = _summed(model, batch, weight)
     with jax.enable_x64(True):
         return _sample_nuts(model, settings, random.key(seed), data, joint=joint, check=check)
+
+
+def _summed(model: TrustModel, batch: MissionBatch, weight: np.ndarray) -> NutsData:
+    """The data for NUTS: of the pooled Gaussian model without gaps, sums alone."""
+    if model.robot_sets == "all" and model.observation == "gaussian":
+        (statistics,) = model.gather(batch, weight)
+        if not statistics.gaps:
+            seen = ~np.isnan(batch.contact_rate)
+            means = (np.asarray(batch.contact_rate[seen].mean()), batch.awareness[seen].mean(0))
+            # One bound and robot that measured nothing: the shape tells the number of features.
+            nothing = np.full((1, 1, 1), np.nan)
+            awareness = np.zeros((1, 1, 1, batch.awareness.shape[3]))
+            return NutsData(awareness, nothing, nothing, np.ones(1), spectrum(statistics), means)
+    return NutsData(*batch, weight)
 
 
 def require_sampler(model: TrustModel, sampler: str) -> None:

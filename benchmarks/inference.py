@@ -1,0 +1,500 @@
+"""Speed of our inference beside other tools on the same posteriors, and how it grows with data.
+
+Run: python benchmarks/inference.py [pooled] [large] [coupled] [scaling] [latency] [quick]
+
+All sections by default; `quick` cuts the numbers of draws by ten, to see that everything runs.
+Cold is the first call in this process, compilation included (PyTensor's disk cache is empty); warm
+the median of later ones with other seeds, which compile only what a tool compiles each time, as
+numpyro's MCMC does to find its starts. "off" is the largest distance of a parameter's mean from the
+reference's, in posterior standard deviations: about 0.1 is the Monte Carlo error of a few hundred
+effective draws, so rows that show it have the same posterior.
+"""
+
+import importlib.util
+import os
+import platform
+import subprocess
+import sys
+import time
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, NamedTuple
+
+import arviz as az
+import jax
+import numpy as np
+from jax import lax
+from threadpoolctl import threadpool_limits
+
+from trustbo import Mission
+from trustbo.models import (
+    CoupledParams,
+    CoupledTrust,
+    PooledTrust,
+    TrustFilter,
+    TrustParams,
+    fit,
+    sample_prior,
+    sample_statistics,
+)
+from trustbo.models.exact import _matched, _start, _target
+from trustbo.models.geometry import NutsData, round_target
+from trustbo.models.laplace import laplace
+from trustbo.models.nuts import NutsSettings
+from trustbo.models.sampling import draw_posterior
+from trustbo.stacking import stack_missions
+
+N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
+N_WARM = 3
+HEADER = ("", "cold s", "warm s", "min ESS", "ESS/s warm", "R-hat", "off")
+
+
+class Data(NamedTuple):
+    """Missions, and the same as arrays."""
+
+    missions: list[Mission]
+    awareness: np.ndarray  # (mission, bound, robot, feature)
+    rates: np.ndarray  # (mission, bound, robot)
+
+
+class Row(NamedTuple):
+    """What a sampler did."""
+
+    name: str
+    cold: float
+    warm: float
+    ess: float
+    worst: str
+    off: float
+    """Largest |mean - reference mean| / reference sd."""
+
+    @property
+    def speeds(self):
+        """Effective draws per second: warm, cold, and of 1000 from a cold start."""
+        warm = self.ess / self.warm
+        started = max(self.cold - self.warm, 0.0)
+        return warm, self.ess / self.cold, 1000.0 / (started + 1000.0 / warm)
+
+
+class Exact(NamedTuple):
+    """Draws that know their own effective number."""
+
+    sites: dict[str, np.ndarray]
+    kish: float
+    k_hat: float
+
+
+# --- data ---
+
+
+def pooled_truth(n_robots):
+    return TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
+
+
+def coupled_truth(n_robots):
+    eye, share = np.eye(n_robots), 1.0 / max(n_robots - 1, 1)
+    around = share * (1.0 - eye)
+    B = np.stack([0.25 * eye + 0.04 * around, 0.15 * eye + 0.02 * around])
+    noise = 0.05**2 * (0.7 * eye + 0.3)
+    return CoupledParams(0.5 * eye + 0.1 * around, B, np.full(n_robots, 0.05), noise, noise)
+
+
+def simulate(model, truth, n_missions, n_robots=N_ROBOTS):
+    """Missions of 10 bounds, their rates cut at 0 and 1; every tool gets the same."""
+    z = np.random.default_rng(0).uniform(size=(n_missions, N_BOUNDS, n_robots, N_FEATURES))
+    rates = model.simulate(jax.random.key(0), truth(n_robots), z).contact_rate.clip(0.0, 1.0)
+    path = [(0, k) for k in range(N_BOUNDS + 1)]
+    missions = [Mission.from_arrays(path, *pair) for pair in zip(z, rates, strict=True)]
+    return Data(missions, z, rates)
+
+
+def pooled_data(n_missions, n_robots=N_ROBOTS):
+    return simulate(PooledTrust(), pooled_truth, n_missions, n_robots)
+
+
+# --- samplers: a seed in, draws out ---
+
+
+def trustbo_exact(missions):
+    model = PooledTrust()
+
+    def sampler(seed):
+        found = sample_statistics(model, model.update(None, missions), n_draws=4000, seed=seed)
+        names = model.dims
+        sites = {name: np.asarray(getattr(found.params, name))[None] for name in names}
+        return Exact(sites, min(found.kish, 4000.0), found.k_hat)
+
+    return sampler
+
+
+def trustbo_nuts(model, missions, settings):
+    def sampler(seed):
+        batch = stack_missions(missions)
+        return draw_posterior(model, "nuts", settings, seed, batch, check=False)[0].params
+
+    return sampler
+
+
+def peer(module, *needs):
+    """A module of `peers`, or None, said in one line, where its tools are missing or broken."""
+    for need in needs:
+        if importlib.util.find_spec(need) is None:
+            print(f"{need}: not installed (make bench installs the peers)", flush=True)
+            return None
+    try:
+        return importlib.import_module(f"peers.{module}")
+    except (ImportError, AttributeError) as error:
+        print(f"{' and '.join(needs)}: installed, but broken here: {error}", flush=True)
+        return None
+
+
+# --- measuring ---
+
+
+def seconds_of(function):
+    started = time.perf_counter()
+    result = function()
+    return time.perf_counter() - started, result
+
+
+def median_seconds(function, n):
+    return float(np.median([seconds_of(function)[0] for _ in range(n)]))
+
+
+def unknowns(sites):
+    """Every unknown once, as one array (chain, draw, unknown)."""
+    columns = []
+    for name in sorted(sites):
+        values = sites[name]
+        if name.startswith("Delta"):
+            values = values[(..., *np.tril_indices(values.shape[-1]))]
+        columns.append(values.reshape(*sites["b"].shape[:2], -1))
+    return np.concatenate(columns, axis=-1)
+
+
+def measure(name, sampler, reference=None, *, n_warm=N_WARM, compile_seconds=0.0):
+    """Time a sampler, print its row, and return it."""
+    cold, draws = seconds_of(lambda: sampler(1))
+    cold += compile_seconds
+    runs = [seconds_of(partial(sampler, 2 + i)) for i in range(n_warm)]
+    warm = float(np.median([seconds for seconds, _ in runs])) if runs else cold
+    draws = runs[-1][1] if runs else draws
+    if isinstance(draws, Exact):
+        x, ess, worst = unknowns(draws.sites), draws.kish, f"k-hat {draws.k_hat:.2f}"
+    else:
+        x = unknowns(draws)
+        sites = az.from_dict({"posterior": {"x": x}})["posterior"].to_dataset()
+        ess = float(az.ess(sites, method="bulk")["x"].min())
+        worst = f"{float(az.rhat(sites)['x'].max()):.3f}"
+    off = np.nan
+    if reference is not None:
+        off = np.abs((x.mean((0, 1)) - reference.mean((0, 1))) / reference.std((0, 1))).max()
+    row = Row(name, cold, warm, ess, worst, float(off))
+    cells = (f"{cold:.2f}", f"{warm:.3f}", f"{ess:.0f}", f"{ess / warm:.1f}", worst, f"{off:.3f}")
+    print_row((name, *cells))
+    return row
+
+
+def print_row(cells, first=54):
+    print("| " + " | ".join([f"{cells[0]:{first}s}", *(f"{c:>11s}" for c in cells[1:])]) + " |",
+          flush=True)  # fmt: skip
+
+
+def print_header(cells):
+    print_row(cells)
+    print_row(("---", *["---:"] * (len(cells) - 1)))
+
+
+def print_ratios(ratios):
+    """How many times the effective draws per second: (what, ours, theirs, target, warm or cold).
+
+    Runs differ in length, and longer ones spread their compilation over more draws. "cold, 1000"
+    makes up for that: 1000 effective draws at the warm speed, after what the cold call took longer.
+    Cold targets are judged by the less favourable of the two.
+    """
+    print()
+    print_header(("effective draws per second, ratio", "warm", "cold", "cold, 1000", "target",
+                  "reached"))  # fmt: skip
+    for what, ours, theirs, target, when in ratios:
+        speeds = [row.speeds for row in theirs]
+        if not speeds:
+            continue
+        found = np.array(ours.speeds) / np.max(speeds, axis=0)
+        judged = found[0] if when == "warm" else found[1:].min()
+        reached = "yes" if judged >= target else "NO"
+        cells = (f"{ratio:.1f} x" for ratio in found)
+        print_row((what, *cells, f"{target} x", f"{reached} ({when})"))
+    print()
+
+
+def settings_of(warmup, draws, chains, quick):
+    share = 10 if quick else 1
+    return {"warmup": warmup // share, "draws": draws // share, "chains": chains}
+
+
+# --- sections ---
+
+
+def pooled(quick):
+    data = pooled_data(20)
+    arrays = (data.awareness, data.rates)
+    print(f"\n## pooled: {data.rates.size} observations, 6 unknowns\n")
+    reference = unknowns(trustbo_exact(data.missions)(1000).sites)
+    print_header(HEADER)
+    exact = measure("trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
+    settings = NutsSettings(n_draws=100 if quick else 1000)
+    sampler = trustbo_nuts(PooledTrust(), data.missions, settings)
+    nuts = measure("trustbo NUTS, 4 x (300 + 1000)", sampler, reference)
+    mcmc = numpyro_pooled(arrays, reference, quick)
+    if dynamax := peer("dynamax_blackjax", "dynamax", "blackjax"):
+        sampler = dynamax.pooled(*arrays, **settings_of(500, 1000, 4, quick))
+        measure("dynamax + blackjax NUTS, 4 x (500 + 1000)", sampler, reference, n_warm=1)
+    draws = 100 if quick else 1000
+    rows = nutpie_rows("pooled_marginal", data, reference, {"draws": draws, "chains": 4})
+    if rows:
+        nutpie_joint(arrays, reference, draws)
+    gibbs = peer("gibbs")
+    sampler = gibbs.pooled(*arrays, 500 if quick else 5000)
+    measure("Gibbs (NumPy), 4 x (500 + 5000)", sampler, reference, n_warm=1)
+    low_rank = [row for kind, row in rows.items() if kind.startswith("low rank")]
+    print_ratios([
+        ("trustbo exact / best PyMC + nutpie", exact, rows.values(), 20, "warm"),
+        ("trustbo exact / best numpyro MCMC", exact, mcmc, 40, "warm"),
+        ("trustbo NUTS / best numpyro MCMC", nuts, mcmc, 5, "warm"),
+        ("trustbo NUTS / best PyMC + nutpie low rank", nuts, low_rank, 2, "warm"),
+    ])  # fmt: skip
+
+
+def nutpie_joint(arrays, reference, draws):
+    pymc = peer("pymc_nutpie", "pymc", "nutpie")
+    seconds, compiled = seconds_of(lambda: pymc.compile_model(pymc.pooled_joint(*arrays)))
+    sampler = pymc.sampler_of(compiled, PooledTrust().dims, draws=draws, chains=4)
+    name = f"PyMC + nutpie joint, non-centred, 4 x (default + {draws})"
+    measure(name, sampler, reference, n_warm=1, compile_seconds=seconds)
+
+
+def numpyro_pooled(arrays, reference, quick):
+    """Rows of numpyro's MCMC on the marginal likelihood; the joint ones are only printed."""
+    mcmc, rows = peer("numpyro_mcmc"), []
+    for warmup in (1000, 300):
+        options = settings_of(warmup, 1000, 4, quick)
+        name = f"numpyro MCMC, dense, 4 x ({warmup} + 1000)"
+        rows.append(measure(name, mcmc.marginal(PooledTrust(), *arrays, **options), reference))
+    for centred in (True, False):
+        options = settings_of(500, 1000, 4, quick)
+        name = f"numpyro joint, {'' if centred else 'non-'}centred, 4 x (500 + 1000)"
+        sampler = mcmc.joint(*arrays, centred=centred, **options)
+        measure(name, sampler, reference, n_warm=1)
+    return rows
+
+
+def nutpie_rows(build, data, reference, lengths, finish=None, n_warm=N_WARM):
+    """Rows of PyMC + nutpie by kind; none where a tool is missing."""
+    pymc, rows = peer("pymc_nutpie", "pymc", "nutpie"), {}
+    if pymc is None:
+        return rows
+    model = getattr(pymc, build)(data.awareness, data.rates)
+    finish = finish and getattr(pymc, finish)
+    tune = lengths.get("tune", "default")
+    length = f"{lengths['chains']} x ({tune} + {lengths['draws']})"
+    for kind, with_jax in (("low rank", False), ("diagonal", False), ("low rank, JAX", True)):
+        if kind != "diagonal":  # which shares its compiled code with the one before
+            seconds, compiled = seconds_of(partial(pymc.compile_model, model, with_jax=with_jax))
+        low_rank = kind != "diagonal"
+        sampler = pymc.sampler_of(compiled, **lengths, low_rank=low_rank, finish=finish)
+        rows[kind] = measure(f"PyMC + nutpie {kind}, {length}", sampler, reference,
+                             n_warm=n_warm, compile_seconds=seconds)  # fmt: skip
+    return rows
+
+
+def large(quick):
+    data = pooled_data(640)
+    print(f"\n## large: {data.rates.size} observations, 6 unknowns\n")
+    reference = unknowns(trustbo_exact(data.missions)(1000).sites)
+    print_header(HEADER)
+    exact = measure("trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
+    lengths = {"draws": 30 if quick else 300, "tune": 300, "chains": 2}
+    rows = nutpie_rows("pooled_marginal", data, reference, lengths, n_warm=1)
+    print_ratios([("trustbo exact / best PyMC + nutpie", exact, rows.values(), 50, "warm")])
+
+
+def coupled(quick):
+    model = CoupledTrust()
+    data = simulate(model, coupled_truth, 20)
+    arrays = (data.awareness, data.rates)
+    print(f"\n## coupled: {data.rates.size} observations, 42 unknowns\n")
+    settings = NutsSettings(n_draws=100 if quick else 1000)
+    sampler, kept = trustbo_nuts(model, data.missions, settings), {}
+
+    def remembered(seed):
+        kept[seed] = sampler(seed)
+        return kept[seed]
+
+    print_header(HEADER)
+    nuts = measure("trustbo NUTS, 4 x (300 + 1000)", remembered, n_warm=1 if quick else 2)
+    reference = np.concatenate([unknowns(sites) for sites in kept.values()])
+    mcmc = peer("numpyro_mcmc").marginal(model, *arrays, **settings_of(500, 500, 2, quick))
+    rival = measure("numpyro MCMC, dense, 2 x (500 + 500)", mcmc, reference, n_warm=1)
+    lengths = {"draws": 30 if quick else 300, "tune": 300, "chains": 2}
+    rows = nutpie_rows("coupled_marginal", data, reference, lengths, "coupled_matrices", n_warm=1)
+    print_ratios([
+        ("trustbo NUTS / best PyMC + nutpie", nuts, rows.values(), 20, "cold"),
+        ("trustbo NUTS / numpyro MCMC", nuts, [rival], 4, "cold"),
+    ])  # fmt: skip
+
+
+def scaling(quick):
+    print("\n## scaling: one exact log density at 4096 points; gathering its statistics\n")
+    print_header(("observations", "density ms", "gather ms", "with stacking"))
+    costs = []
+    for n_missions in (40, 160, 640, 2560):
+        data = pooled_data(n_missions)
+        costs.append(exact_cost(data))
+        cells = (f"{1000 * seconds:.1f}" for seconds in costs[-1])
+        print_row((f"{data.rates.size}", *cells))
+    growth = costs[-1][0] / costs[0][0]
+    print(f"\ngrowth of the density over 64 x the data: {growth:.2f} x (target <= 2 x)")
+    print("\n## scaling: one potential and gradient of NUTS, padded as `fit` pads\n")
+    print_header(("", "observations", "padded", "us", "ns per rate"))
+    for n_missions in (20, 200, 1000, 3334):
+        gradient_row(PooledTrust(), pooled_data(n_missions), quick)
+    for n_robots in (1, 3, 10, 30):
+        gradient_row(PooledTrust(), pooled_data(20, n_robots), quick)
+    for n_robots in (1, 3, 6, 10):
+        model = CoupledTrust()
+        gradient_row(model, simulate(model, coupled_truth, 20, n_robots), quick)
+
+
+def exact_cost(data):
+    """Seconds of the log density at 4096 points, of gathering, and of that with stacking."""
+    model, batch = PooledTrust(), stack_missions(data.missions)
+    with threadpool_limits(limits=1):  # as the sampler does
+        target = _target(model.gather(batch)[0], model.priors)
+        mode, scale = laplace(target.log_density, _start(target))
+        z = _matched(target, mode, scale, 0).draw(4096, 0)
+        density = median_seconds(lambda: target.log_density(z), 7)
+    gather = median_seconds(lambda: model.gather(batch), 5)
+    return density, gather, median_seconds(lambda: model.update(None, data.missions), 5)
+
+
+def gradient_row(model, data, quick):
+    batch = stack_missions(data.missions)
+    missions = NutsData(*batch, np.ones(len(batch.contact_rate)))
+    n = 20 if quick or batch.contact_rate.size > 20_000 else 200
+
+    @jax.jit
+    def run(missions):
+        target = round_target(model, missions, shared=True, joint=False)
+        potential = jax.value_and_grad(lambda theta: target.potential({"theta": theta}))
+
+        def step(_, carry):
+            theta, total = carry
+            value, gradient = potential(theta)
+            return theta - 1e-9 * gradient, total + value
+
+        return lax.fori_loop(0, n, step, (target.start, 0.0))
+
+    with jax.enable_x64(True):
+        jax.block_until_ready(run(missions))
+        seconds = median_seconds(lambda: jax.block_until_ready(run(missions)), 5) / n
+    name = f"{type(model).__name__}, {len(data.missions)} missions, {data.rates.shape[2]} robots"
+    cells = (data.rates.size, batch.contact_rate.size, f"{1e6 * seconds:.0f}")
+    print_row((name, *map(str, cells), f"{1e9 * seconds / data.rates.size:.0f}"))
+
+
+FRESH = """
+import time
+import arviz, jax, numpy as np, numpyro, trustbo, trustbo.models
+from trustbo import Mission
+from trustbo.models import fit
+rng = np.random.default_rng(0)
+path = [(0, k) for k in range(11)]
+missions = []
+for _ in range(20):
+    z, x, rates = rng.uniform(size=(10, 3, 2)), rng.normal(0.5, 0.5, 3), []
+    for z_k in z:
+        x = 0.6 * x + z_k @ [0.3, 0.2] + 0.05 + rng.normal(0.0, 0.05, 3)
+        rates.append(x + rng.normal(0.0, 0.05, 3))
+    missions.append(Mission.from_arrays(path, z, np.clip(rates, 0.0, 1.0)))
+started = time.perf_counter()
+fit(missions, sampler="exact")
+print(time.perf_counter() - started)
+"""
+
+
+def latency(quick):
+    print("\n## latency\n")
+    print_header(("", "median ms", "target ms", "reached"))
+    n, model, missions = 5 if quick else 20, PooledTrust(), pooled_data(21).missions
+    statistics = model.update(None, missions[:-1])
+
+    def refit():
+        return sample_statistics(model, model.update(statistics, missions[-1:]))
+
+    latency_row("refit after one more mission, 20 before", median_seconds(refit, n), 50)
+    whole = median_seconds(lambda: fit(missions, sampler="exact"), n)
+    latency_row("the whole fit(..., sampler='exact'), all groups", whole)
+    for one in (model, CoupledTrust()):
+        params = sample_prior(one, N_FEATURES, 1000, 0, n_robots=N_ROBOTS)
+        latency_row(f"TrustFilter.update, {type(params).__name__}, 1000 draws",
+                    filter_seconds(params, missions), 1)  # fmt: skip
+    runs = [
+        float(subprocess.run([sys.executable, "-W", "ignore", "-c", FRESH], check=True, text=True,
+                             capture_output=True).stdout)
+        for _ in range(1 if quick else 3)
+    ]  # fmt: skip
+    latency_row("first fit(..., sampler='exact') of a fresh process", float(np.median(runs)), 500)
+
+
+def filter_seconds(params, missions):
+    following = TrustFilter(params, N_ROBOTS)
+    seconds = []
+    for mission in missions:
+        following.reset()
+        for z, y in zip(mission.awareness, mission.contact_rate, strict=True):
+            seconds.append(seconds_of(partial(following.update, z, y))[0])
+    return float(np.median(seconds))
+
+
+def latency_row(name, seconds, target=None):
+    ms = 1000.0 * seconds
+    reached = "" if target is None else "yes" if ms <= target else "NO"
+    print_row((name, f"{ms:.2f}", "" if target is None else str(target), reached))
+
+
+def print_machine():
+    def found(name):
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            return "none"
+
+    tools = ("numpyro", "jax", "pymc", "nutpie", "dynamax", "blackjax", "numpy")
+    cores = len(os.sched_getaffinity(0))
+    print(f"{platform.machine()}, {cores} core(s) for this process, {os.cpu_count()} in all; "
+          f"Python {platform.python_version()}")  # fmt: skip
+    print(", ".join(f"{name} {found(name)}" for name in tools))
+    print(f"nutpie runs {min(2, cores)} chain(s) at once, every other tool one after the other.")
+
+
+SECTIONS: dict[str, Any] = {
+    "pooled": pooled,
+    "large": large,
+    "coupled": coupled,
+    "scaling": scaling,
+    "latency": latency,
+}
+
+
+def main(*words):
+    unknown = set(words) - {*SECTIONS, "quick"}
+    if unknown:
+        sys.exit(f"unknown section {', '.join(sorted(unknown))}; choose from {', '.join(SECTIONS)}")
+    print_machine()
+    chosen = [name for name in SECTIONS if name in words] or list(SECTIONS)
+    for name in chosen:
+        SECTIONS[name](quick="quick" in words)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,80 @@
+"""The pooled Gaussian likelihood from sums over missions, for compiled samplers.
+
+The identity of `gram`, in JAX: a density costs the same for 600 rates as for 100 000. Lengths and
+frequencies are padded, so that compiled code is reused.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from trustbo.models.gram import LengthGram, SufficientStatistics, sine_basis
+from trustbo.models.params import TrustParams
+
+
+class Spectrum(NamedTuple):
+    """Sums over the complete sequences of each length; padding is 0, its mask too."""
+
+    spectral: Array | np.ndarray  # (length, frequency, column, column)
+    corner: Array | np.ndarray  # (length, frequency, frequency, column, column)
+    cosine: Array | np.ndarray  # (length, frequency)
+    first: Array | np.ndarray  # (length, frequency), squares of the first row of the sine basis
+    mask: Array | np.ndarray  # (length, frequency)
+    weight: Array | np.ndarray  # (length,), how many sequences
+    n_measured: Array | np.ndarray  # ()
+
+
+def spectrum(statistics: SufficientStatistics) -> Spectrum:
+    """Pad the statistics of missions without gaps: lengths to a power of two, bounds by fours."""
+    grams = statistics.grams
+    n_bounds = -(-max(grams) // 4) * 4
+    n_lengths = max(2, 1 << (len(grams) - 1).bit_length())
+    p = statistics.n_features + 4
+    padded = Spectrum(
+        np.zeros((n_lengths, n_bounds, p, p)),
+        np.zeros((n_lengths, n_bounds, n_bounds, p, p)),
+        np.zeros((n_lengths, n_bounds)),
+        np.zeros((n_lengths, n_bounds)),
+        np.zeros((n_lengths, n_bounds)),
+        np.zeros(n_lengths),
+        np.asarray(statistics.n_measured),
+    )
+    for i, (n, gram) in enumerate(sorted(grams.items())):
+        sines = sine_basis(n)
+        padded.spectral[i, :n] = gram.spectral
+        padded.corner[i, :n, :n] = _rotated(gram, sines)
+        padded.cosine[i, :n] = np.cos(np.pi * np.arange(1, n + 1) / (n + 1))
+        padded.first[i, :n] = sines[0] ** 2
+        padded.mask[i, :n] = 1.0
+        padded.weight[i] = gram.weight
+    return padded
+
+
+def log_likelihood(params: TrustParams, s: Spectrum, lag: float) -> Array:
+    """Log density of all rates, latent trust integrated out."""
+    p = params
+    Q, R, h = p.delta_w**2, p.delta_v**2, p.beta0 - lag
+    diagonal, beside = Q * (1.0 + lag) + R * (1.0 + p.beta0**2), lag * Q + p.beta0 * R
+    eigenvalues = jnp.where(s.mask > 0.0, diagonal - 2.0 * beside * s.cosine, 1.0)
+    inverse = s.mask / eigenvalues
+    kappa = h**2 * p.x0_sd**2 - lag * Q - p.beta0**2 * R
+    tau = (s.first * inverse).sum(1)
+    shrink = kappa / (1.0 + kappa * tau)
+    known = jnp.stack([jnp.ones_like(p.beta0), -p.beta0, -h])
+    v = jnp.concatenate([known, -p.beta, -jnp.reshape(p.b, (1,))])
+    pairs = jnp.reshape(v[:, None] * v[None, :], -1)
+    # The two products with the data; all else is a handful of numbers.
+    on_diagonal = jnp.reshape(s.spectral, (-1, pairs.size)) @ pairs
+    outer = shrink[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
+    corner = jnp.reshape(outer, -1) @ jnp.reshape(s.corner, (-1, pairs.size))
+    misfit = jnp.reshape(inverse, -1) @ on_diagonal - corner @ pairs
+    log_det = (jnp.log(eigenvalues).sum(1) + jnp.log1p(kappa * tau)) @ s.weight
+    return -0.5 * (misfit + log_det + s.n_measured * jnp.log(2.0 * jnp.pi))
+
+
+def _rotated(gram: LengthGram, sines: np.ndarray) -> np.ndarray:
+    """What e_1' T^-1 meets, frequency by frequency: (frequency, frequency, column, column)."""
+    rotated = np.einsum("ka,lb,abpq->klpq", sines, sines, gram.corner, optimize=True)
+    return rotated * (sines[0][:, None] * sines[0][None])[..., None, None]
