@@ -38,10 +38,10 @@ from trustbo.models import (
     sample_statistics,
 )
 from trustbo.models.exact import _matched, _start, _target
-from trustbo.models.geometry import NutsData, round_target
+from trustbo.models.geometry import round_target
 from trustbo.models.laplace import laplace
 from trustbo.models.nuts import NutsSettings
-from trustbo.models.sampling import draw_posterior
+from trustbo.models.sampling import draw_posterior, nuts_data
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -379,7 +379,7 @@ def exact_cost(data):
 
 def gradient_row(model, data, quick):
     batch = stack_missions(data.missions)
-    missions = NutsData(*batch, np.ones(len(batch.contact_rate)))
+    missions = nuts_data(model, batch, np.ones(len(batch.contact_rate)))
     n = 20 if quick or batch.contact_rate.size > 20_000 else 200
 
     @jax.jit

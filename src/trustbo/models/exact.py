@@ -8,6 +8,7 @@ Pareto-smoothed importance weights. Where these are uneven, a mixture along the 
 place. k-hat says how far to trust the result; above 0.7 the caller falls back on NUTS.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpyro.distributions as dist
 from arviz_stats.base.array import array_stats
 from numpyro.distributions import constraints
 from scipy import special, stats
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from trustbo.errors import TrustboError
 from trustbo.models.gram import Quadratic, SufficientStatistics
@@ -166,7 +167,7 @@ def sample_exact(
     """
     _require_conjugate(priors)
     # Matrices are small: a second BLAS thread costs more than it brings.
-    with threadpool_limits(limits=1):
+    with _blas().limit(limits=1, user_api="blas"):
         target = _target(statistics, priors)
         mode, scale = laplace(target.log_density, _start(target))
         z, log_p, log_w, khat, evidence = _weigh(target, _matched(target, mode, scale, seed), seed)
@@ -189,6 +190,12 @@ def sample_exact(
     }
     kish = float(1.0 / (weights**2).sum())
     return ExactDraws(params, log_w[chosen], log_p[chosen], khat, kish, evidence)
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """The BLAS libraries that are loaded: to look for them takes a fifth as long as to sample."""
+    return ThreadpoolController()
 
 
 def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:

@@ -58,12 +58,12 @@ def draw_posterior(
         return exact, []
     joint = model.observation != "gaussian"
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
-    data = _summed(model, batch, weight)
+    data = nuts_data(model, batch, weight)
     with jax.enable_x64(True):
         return _sample_nuts(model, settings, random.key(seed), data, joint=joint, check=check)
 
 
-def _summed(model: TrustModel, batch: MissionBatch, weight: np.ndarray) -> NutsData:
+def nuts_data(model: TrustModel, batch: MissionBatch, weight: np.ndarray) -> NutsData:
     """The data for NUTS: of the pooled Gaussian model without gaps, sums alone."""
     if model.robot_sets == "all" and model.observation == "gaussian":
         (statistics,) = model.gather(batch, weight)
