@@ -206,35 +206,46 @@ class _Apart:
 
 
 class _Coupled:
-    """One step of coupled robots; means (draw, robot), covariances (draw, robot, robot)."""
+    """One step of coupled robots; means (draw, robot), covariances (draw, robot, robot).
+
+    Rates enter one robot at a time, as in `vectorspace`.
+    """
 
     def __init__(self, params: CoupledParams, lag: float, n_robots: int) -> None:
         self._p, self._n_robots = params, n_robots
-        self._H = params.B0 - lag * np.eye(n_robots)
-        self._B0_T, self._H_T = (np.swapaxes(a, 1, 2) for a in (params.B0, self._H))
+        # Of trust and rate together, (draw, 2 robot, ...).
+        self._F = np.concatenate([params.B0, params.B0 - lag * np.eye(n_robots)], axis=1)
+        self._F_T = np.ascontiguousarray(np.swapaxes(self._F, 1, 2))
+        self._noise = np.tile(params.Delta_w, (1, 2, 2))
+        self._noise[:, n_robots:, n_robots:] += params.Delta_v
+        # (draw, robot, robot' and feature): the drift is one product.
+        self._B = np.moveaxis(params.B, 1, -1).reshape(len(params.b), n_robots, -1)
 
     def start(self) -> tuple[np.ndarray, np.ndarray]:
         mean = np.repeat(self._p.x0_mean[:, None], self._n_robots, axis=1)
         return mean, self._p.x0_sd[:, None, None] ** 2 * np.eye(self._n_robots)
 
     def predict(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray):
-        moved = (self._p.B0 @ mean[..., None])[..., 0] + self._drift(z)
-        return moved, self._p.B0 @ var @ self._B0_T + self._p.Delta_w
+        n = self._n_robots
+        F, F_T = self._F[:, :n], self._F_T[:, :, :n]
+        moved = (F @ mean[..., None])[..., 0] + self._drift(z)
+        return moved, F @ var @ F_T + self._p.Delta_w
 
     def update(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray):
-        ahead, P = self.predict(mean, var, z)
-        seen = np.flatnonzero(~np.isnan(y))
-        if not len(seen):
-            return ahead, P, 0.0
-        spread = self._H @ var @ self._H_T + self._p.Delta_w + self._p.Delta_v
-        S = spread[:, seen[:, None], seen]
-        cross = (self._p.B0 @ var @ self._H_T + self._p.Delta_w)[:, :, seen]
-        predicted = (self._H @ mean[..., None])[..., 0] + self._drift(z)
-        e = y[seen] - predicted[:, seen]
-        solved = np.linalg.solve(S, np.concatenate([e[..., None], np.swapaxes(cross, 1, 2)], -1))
-        mean = ahead + (cross @ solved[..., :1])[..., 0]
-        log_density = -0.5 * ((e * solved[..., 0]).sum(1) + np.linalg.slogdet(S)[1])
-        return mean, P - cross @ solved[..., 1:], log_density
+        n = self._n_robots
+        drift = self._drift(z)
+        joint = (self._F @ mean[..., None])[..., 0]
+        joint[:, :n] += drift
+        joint[:, n:] += drift
+        J = self._F @ var @ self._F_T + self._noise
+        log_density = np.zeros(len(mean))
+        for i in np.flatnonzero(~np.isnan(y)):
+            S, row = J[:, n + i, n + i].copy(), J[:, n + i].copy()
+            gain, e = row / S[:, None], y[i] - joint[:, n + i]
+            log_density -= 0.5 * (e**2 / S + np.log(S))
+            joint += gain * e[:, None]
+            J -= gain[:, :, None] * row[:, None, :]
+        return joint[:, :n], J[:, :n, :n], log_density
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
-        return np.einsum("nmij,jm->ni", self._p.B, z) + self._p.b
+        return self._B @ z.ravel() + self._p.b
