@@ -6,6 +6,8 @@ NUTS works on a flat real vector. In place of the parameters it sees what the da
   log(delta_w / delta_v), stand in the places of delta_w and delta_v;
 - they fix the level that trust has on average, y = beta0 y + beta . z + b, better than its parts:
   b + beta0 mean(y) + beta . mean(z) stands in the place of b. Both have Jacobian 1;
+- weights and intercept of the pooled model are normal given all else: if asked for, standard normal
+  noise stands in their place, and few data round a perfect fit make no funnel;
 - coefficients that vary by robot, e = (c - mu) / tau, non-centred, would make a funnel where the
   data know a robot better than the others tell: in the place of e stands what is left when c is
   drawn from N(mu, tau^2) times a Gaussian fit of the robot's own likelihood; in the place of mu,
@@ -18,6 +20,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from jax import Array, lax, random
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import cho_solve, solve_triangular
@@ -29,7 +32,8 @@ from trustbo.models import observation as families
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
-from trustbo.models.spectral import Spectrum
+from trustbo.models.params import TrustParams
+from trustbo.models.spectral import Spectrum, coefficients
 
 Potential = Callable[[dict[str, Array]], Array]
 
@@ -57,7 +61,15 @@ class _Robots(NamedTuple):
 class _Space:
     """Between a flat vector, the sites' own real lines, and parameters."""
 
-    def __init__(self, model: TrustModel, data: NutsData, *, shared: bool, joint: bool) -> None:
+    def __init__(
+        self,
+        model: TrustModel,
+        data: NutsData,
+        *,
+        shared: bool,
+        joint: bool,
+        collapse: bool = False,
+    ) -> None:
         self.model, self.data, self.joint = model, data, joint
         self.args = (data.awareness, data.contact_rate)
         self.options = {
@@ -79,6 +91,8 @@ class _Space:
         start = {name: _start(self.inverse[name], site["fn"]) for name, site in sites.items()}
         self.start, self.unravel = ravel_pytree(start)
         self.means = _average(model, data)
+        normal = all(isinstance(p, dist.Normal) for p in (model.priors.beta, model.priors.b))
+        self.collapsed = collapse and data.spectrum is not None and normal
 
     def to_sites(self, theta: Array, robots: _Robots | None) -> tuple[dict[str, Array], Array]:
         """The sites on their own real lines, and the log Jacobian of the way there."""
@@ -88,6 +102,8 @@ class _Space:
             "delta_w": t + 0.5 * jax.nn.log_sigmoid(2.0 * r),
             "delta_v": t + 0.5 * jax.nn.log_sigmoid(-2.0 * r) - self.means.log_unit,
         }
+        if self.collapsed:
+            return self._collapse(site)
         if robots is not None and isinstance(self.model, HierarchicalTrust):
             return self._whiten(self.model, site, robots)
         shifts = self.model.level(self.values(site), self.means.y, self.means.z)
@@ -156,6 +172,22 @@ class _Space:
         step = jnp.linalg.solve(precision, gradient[..., None])[..., 0]
         return _Robots(c + step, precision)
 
+    def _collapse(self, site: dict[str, Array]) -> tuple[dict[str, Array], Array]:
+        """Weights and intercept drawn given all else: what is left is standard normal."""
+        priors, e = self.model.priors, jnp.append(site["beta"], site["b"])
+        others = {name: self.inverse[name](site[name]) for name in ("beta0", "delta_w", "delta_v")}
+        x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
+        params = TrustParams(**others, beta=site["beta"], b=site["b"], **x0)
+
+        def each(name: str) -> Array:
+            of_beta = jnp.broadcast_to(getattr(priors.beta, name), site["beta"].shape)
+            return jnp.append(of_beta, getattr(priors.b, name))
+
+        data: Spectrum = self.data.spectrum  # pyright: ignore[reportAssignmentType]
+        mean, L = coefficients(params, data, self.model.lag, each("loc"), each("scale") ** -2.0)
+        c = mean + solve_triangular(L, e, trans=1, lower=True)
+        return site | {"beta": c[:-1], "b": c[-1]}, -jnp.log(jnp.diagonal(L)).sum()
+
     def _whiten(
         self, model: HierarchicalTrust, site: dict[str, Array], robots: _Robots
     ) -> tuple[dict[str, Array], Array]:
@@ -189,12 +221,20 @@ class RoundTarget(NamedTuple):
     """From there to parameters."""
     potential: Callable[[dict[str, Array]], Array]
     """Minus the log density of {"theta", "noise"}."""
+    profile: Callable[[Array], Array]
+    """The same of theta, without noise, for the search of the mode.
+
+    As noise goes to 0 around a perfect fit, a density of few data grows without bound, but holds no
+    mass: each location parameter takes a power of the noise away. That is added, as REML does.
+    """
     pilot: Array | None
 
 
-def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool) -> RoundTarget:
+def round_target(
+    model: TrustModel, data: NutsData, *, shared: bool, joint: bool, collapse: bool = False
+) -> RoundTarget:
     """Change variables so that the posterior becomes round."""
-    space = _Space(model, data, shared=shared, joint=joint)
+    space = _Space(model, data, shared=shared, joint=joint, collapse=collapse)
     noise = {"noise": jnp.zeros(noise_shape(data))} if joint else {}
     robots, start = None, space.start
     if isinstance(model, HierarchicalTrust) or model.observation == "beta_binomial":
@@ -210,7 +250,15 @@ def round_target(model: TrustModel, data: NutsData, *, shared: bool, joint: bool
     def potential(z: dict[str, Array]) -> Array:
         return space.potential(z, robots)
 
-    return RoundTarget(start, constrain, potential, space.options["pilot"])
+    def profile(theta: Array) -> Array:
+        energy = potential({"theta": theta, **noise})
+        if space.collapsed:
+            return energy
+        total = space.unravel(theta)["delta_w"]  # t, the log of all noise
+        n_locations = len(theta) - 2 * total.size
+        return energy - n_locations * total.mean()
+
+    return RoundTarget(start, constrain, potential, profile, space.options["pilot"])
 
 
 def newton(

@@ -24,6 +24,8 @@ class NutsSettings(NamedTuple):
     n_draws: int = 1000
     n_chains: int = 4
     target_accept: float = 0.9
+    collapse: bool = False
+    """Take the pooled model's weights and intercept out: slower, but no funnel for few data."""
 
 
 class NutsDraws(NamedTuple):
@@ -57,30 +59,36 @@ def run_nuts(
         shared: No rate is missing before the last of a mission.
         joint: Sample the noise that latent trust is made of.
     """
-    target = round_target(model, data, shared=shared, joint=joint)
+    target = round_target(model, data, shared=shared, joint=joint, collapse=settings.collapse)
     noise = {"noise": jnp.zeros(noise_shape(data))} if joint else {}
-    mode, hessian = newton(lambda theta: target.potential({"theta": theta, **noise}), target.start)
-    covariance = inverse_hessian(hessian)
-    scale = jnp.linalg.cholesky(covariance)
+    mode, hessian = newton(target.profile, target.start)
+    scale = jnp.linalg.cholesky(inverse_hessian(hessian))
+
+    # NUTS sees standard normal coordinates: numpyro's adaptation adds a thousandth of the identity,
+    # which would drown the covariance of a posterior that many missions have made narrow.
+    def theta_of(x: Array) -> Array:
+        return mode + scale @ x
+
+    def potential(z: dict[str, Array]) -> Array:
+        return target.potential(z | {"theta": theta_of(z["theta"])})
+
     # Noise is close to standard normal by construction: its mass matrix starts as the identity.
-    mass = {("theta",): covariance}
+    mass = {("theta",): jnp.eye(len(mode))}
     if joint:
         mass[("noise",)] = jnp.ones(noise["noise"].size)
 
     def chain(key: Array):
         key_start, key_noise, key_run = random.split(key, 3)
         # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
-        z = {"theta": mode + 1.5 * scale @ random.normal(key_start, mode.shape, mode.dtype)}
+        z = {"theta": 1.5 * random.normal(key_start, mode.shape, mode.dtype)}
         if joint:
             z["noise"] = random.normal(key_noise, noise["noise"].shape, mode.dtype)
-        init, step = hmc(target.potential, algo="NUTS")
+        init, step = hmc(potential, algo="NUTS")
         state = init(
             z,
             settings.n_warmup,
             step_size=0.5,
             inverse_mass_matrix=mass,
-            # The Hessian at the mode beats what 300 draws tell, unless noise is sampled, too.
-            adapt_mass_matrix=joint,
             dense_mass=[("theta",)],  # pyright: ignore[reportArgumentType]
             target_accept_prob=settings.target_accept,
             rng_key=key_run,
@@ -101,7 +109,7 @@ def run_nuts(
         # Warm-up and draws in one loop: its body, which takes long to compile, is there once.
         _, kept = lax.scan(advance, state, length=settings.n_warmup + settings.n_draws)
         z, stats = jax.tree.map(lambda a: a[settings.n_warmup :], kept)
-        return jax.vmap(target.constrain)(z["theta"]), stats, z.get("noise")
+        return jax.vmap(lambda x: target.constrain(theta_of(x)))(z["theta"]), stats, z.get("noise")
 
     # One chain after the other: vectorised chains would all wait for the longest trajectory.
     params, stats, drawn = lax.map(chain, random.split(key, settings.n_chains))

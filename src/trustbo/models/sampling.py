@@ -148,7 +148,9 @@ def _sample_nuts(
     check: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws by NUTS, longer ones if the first are bad, and what is wrong with them in the end."""
-    longer = NutsSettings(2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98)
+    longer = NutsSettings(
+        2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98, collapse=True
+    )
     options = {
         "shared": _is_complete(np.asarray(data.contact_rate)),
         "joint": joint,

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.linalg import cho_solve
 
 from trustbo.models.gram import LengthGram, SufficientStatistics, sine_basis
 from trustbo.models.params import TrustParams
@@ -52,16 +53,52 @@ def spectrum(statistics: SufficientStatistics) -> Spectrum:
     return padded
 
 
-def log_likelihood(params: TrustParams, s: Spectrum, lag: float) -> Array:
-    """Log density of all rates, latent trust integrated out."""
-    p = params
+class Conditional(NamedTuple):
+    """Weights and intercept given all else, under normal priors."""
+
+    mean: Array  # (coefficient,)
+    cholesky: Array  # (coefficient, coefficient), lower factor of their precision
+
+
+def coefficients(
+    params: TrustParams, s: Spectrum, lag: float, mean: Array, precision: Array
+) -> Conditional:
+    """Posterior of (beta, b) given beta0 and the noises, by generalised least squares.
+
+    Args:
+        params: The others; its `beta` and `b` are not read.
+        s: The data.
+        lag: See `statespace`.
+        mean: Prior mean of (beta, b).
+        precision: Prior precisions.
+    """
+    inverse, shrink, _ = _scales(params, s, lag)
+    M = jnp.einsum("gk,gkpq->pq", inverse, s.spectral)
+    outer = shrink[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
+    M = M - jnp.einsum("gkl,gklpq->pq", outer, s.corner)
+    known = jnp.stack([jnp.ones_like(params.beta0), -params.beta0, lag - params.beta0])
+    L = jnp.linalg.cholesky(M[3:, 3:] + jnp.diag(precision))
+    rhs = 0.5 * (M[3:, :3] + M[:3, 3:].T) @ known + precision * mean
+    return Conditional(cho_solve((L, True), rhs), L)
+
+
+def _scales(p: TrustParams, s: Spectrum, lag: float) -> tuple[Array, Array, Array]:
+    """Inverse eigenvalues, the corner's share, and the log determinant."""
     Q, R, h = p.delta_w**2, p.delta_v**2, p.beta0 - lag
     diagonal, beside = Q * (1.0 + lag) + R * (1.0 + p.beta0**2), lag * Q + p.beta0 * R
     eigenvalues = jnp.where(s.mask > 0.0, diagonal - 2.0 * beside * s.cosine, 1.0)
-    inverse = s.mask / eigenvalues
+    inverse = jnp.asarray(s.mask) / eigenvalues
     kappa = h**2 * p.x0_sd**2 - lag * Q - p.beta0**2 * R
     tau = (s.first * inverse).sum(1)
     shrink = kappa / (1.0 + kappa * tau)
+    log_det = (jnp.log(eigenvalues).sum(1) + jnp.log1p(kappa * tau)) @ s.weight
+    return inverse, shrink, log_det
+
+
+def log_likelihood(params: TrustParams, s: Spectrum, lag: float) -> Array:
+    """Log density of all rates, latent trust integrated out."""
+    p, h = params, params.beta0 - lag
+    inverse, shrink, log_det = _scales(params, s, lag)
     known = jnp.stack([jnp.ones_like(p.beta0), -p.beta0, -h])
     v = jnp.concatenate([known, -p.beta, -jnp.reshape(p.b, (1,))])
     pairs = jnp.reshape(v[:, None] * v[None, :], -1)
@@ -70,7 +107,6 @@ def log_likelihood(params: TrustParams, s: Spectrum, lag: float) -> Array:
     outer = shrink[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
     corner = jnp.reshape(outer, -1) @ jnp.reshape(s.corner, (-1, pairs.size))
     misfit = jnp.reshape(inverse, -1) @ on_diagonal - corner @ pairs
-    log_det = (jnp.log(eigenvalues).sum(1) + jnp.log1p(kappa * tau)) @ s.weight
     return -0.5 * (misfit + log_det + s.n_measured * jnp.log(2.0 * jnp.pi))
 
 
