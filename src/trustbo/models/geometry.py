@@ -35,8 +35,6 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import TrustParams
 from trustbo.models.spectral import Spectrum, coefficients
 
-Potential = Callable[[dict[str, Array]], Array]
-
 
 class NutsData(NamedTuple):
     """The data, as compiled code takes them."""

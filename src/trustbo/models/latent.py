@@ -34,11 +34,7 @@ def trust_draws(
 
     def one(inputs):
         p, e, key = inputs
-        rates = ContactRate(p, data.awareness, exposure=data.exposure, pilot=pilot, lag=lag)
-        observed = rates.observed(data.contact_rate)
-        # Without sampled noise: fresh noise, which a Gaussian family turns into trust.
-        e = jnp.zeros_like(observed.y) if e is None else e
-        trust = families.draw_trust(observation, rates.ssm(), observed, e, key)
+        trust = families.draw_trust(observation, *_given(p, e, pilot, data, lag), key)
         return jnp.swapaxes(trust, 0, 1)
 
     return lax.map(one, (params, noise, random.split(key, len(params.b))), batch_size=64)
@@ -57,10 +53,7 @@ def trust_moments(
 
     def add(carry, inputs):
         p, e = inputs
-        rates = ContactRate(p, data.awareness, exposure=data.exposure, pilot=pilot, lag=lag)
-        observed = rates.observed(data.contact_rate)
-        e = jnp.zeros_like(observed.y) if e is None else e
-        mean, var = families.trust_moments(observation, rates.ssm(), observed, e)
+        mean, var = families.trust_moments(observation, *_given(p, e, pilot, data, lag))
         return (carry[0] + mean, carry[1] + var + mean**2), None
 
     zero = jnp.zeros_like(jnp.swapaxes(data.contact_rate, 0, 1))
@@ -82,3 +75,10 @@ def predictive(observation: str, lag: float, params: Params, data: NutsData, key
         return rates.sample(key)
 
     return lax.map(one, (params, random.split(key, len(params.b))), batch_size=64)
+
+
+def _given(p: Params, e: Array | None, pilot: Array | None, data: NutsData, lag: float):
+    """State space, data and noise of one draw; the Gaussian family, without noise, reads zeros."""
+    rates = ContactRate(p, data.awareness, exposure=data.exposure, pilot=pilot, lag=lag)
+    observed = rates.observed(data.contact_rate)
+    return rates.ssm(), observed, jnp.zeros_like(observed.y) if e is None else e

@@ -2,7 +2,7 @@
 
 numpyro's functional sampler is called inside a single `jax.jit`, so that the next mission, or
 other numbers in the priors, meet the compiled code of the last. The chains start around the
-posterior mode with the inverse Hessian there (Laplace) as their dense mass matrix.
+posterior mode, in coordinates that its Hessian makes standard normal (Laplace).
 """
 
 from functools import partial

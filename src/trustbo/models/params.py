@@ -110,17 +110,7 @@ class TrustParams(_Draws, _Trust):
         return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
 
 
-class _Robot(NamedTuple):
-    beta0: Numbers
-    beta: Numbers
-    b: Numbers
-    delta_w: Numbers
-    delta_v: Numbers
-    x0_mean: Numbers = 0.5
-    x0_sd: Numbers = 0.5
-
-
-class RobotParams(_Draws, _Robot):
+class RobotParams(_Draws, _Trust):
     """Parameters of robots with coefficients of their own, that do not influence each other.
 
     Fields: beta0 (..., robot), beta (..., robot, feature), b, delta_w and delta_v (..., robot), and

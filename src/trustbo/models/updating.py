@@ -51,9 +51,8 @@ def sample_statistics(
         name: each[0].params[name] if pooled else np.stack([e.params[name] for e in each], axis=1)
         for name in each[0].params
     }
-    x0 = {"x0_mean": model.priors.x0_mean, "x0_sd": model.priors.x0_sd}
     return ExactPosterior(
-        params_from(sites, x0),
+        params_from(sites, model.x0),
         max(e.khat for e in each),
         min(e.kish for e in each),
         sum(e.log_evidence for e in each),
