@@ -8,16 +8,19 @@ import pytest
 import trustbo
 
 
+def printed(program):
+    """What it prints in a fresh process."""
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
 def test_importing_loads_nothing_heavy():
     program = (
         "import sys, trustbo; "
         "print(sorted({'jax', 'numpyro', 'rasterio', 'matplotlib', 'networkx', 'xarray'} "
         "& set(sys.modules)))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "[]"
+    assert printed(program) == "[]"
 
 
 def test_every_public_name_is_there():
@@ -31,10 +34,7 @@ def test_jax_s_configuration_is_untouched_by_importing():
         "import jax, trustbo, trustbo.models, trustbo.loop; "
         "print(jax.config.jax_enable_x64, jax.numpy.ones(()).dtype)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "False float32"
+    assert printed(program) == "False float32"
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,4 @@ def test_numpyro_works_whatever_was_imported_first(before):
         "print(handlers.trace(model).get_trace(z)['contact_rate']['value'].shape)\n"
         "import numpyro; numpyro.factor; numpyro.distributions.distribution.Unit\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.strip() == "(1, 3, 2)"
+    assert printed(program) == "(1, 3, 2)"

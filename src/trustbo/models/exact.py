@@ -3,7 +3,7 @@
 Latent trust and the linear coefficients (beta, b) integrate out in closed form (`gram`). What is
 left is three-dimensional: beta0, and the noises as t = log hypot(delta_w, delta_v) and r =
 log(delta_w / delta_v), on the real line. A few points around its mode tell its mean and spread; a
-Student-t that has these is drawn from by a scrambled Sobol sequence and corrected by
+heavy-tailed bell that has these is drawn from by a scrambled Sobol sequence and corrected by
 Pareto-smoothed importance weights. Where these are uneven, a mixture along the ridge of r takes its
 place. k-hat says how far to trust the result; above 0.7 the caller falls back on NUTS.
 """
@@ -15,18 +15,18 @@ import numpy as np
 import numpyro.distributions as dist
 from arviz_stats.base.array import array_stats
 from numpyro.distributions import constraints
-from scipy import special, stats
+from scipy import special
 from threadpoolctl import ThreadpoolController
 
 from trustbo.errors import TrustboError
-from trustbo.models.gram import Quadratic, SufficientStatistics
+from trustbo.models.gram import SufficientStatistics
 from trustbo.models.laplace import laplace
 from trustbo.models.numeric import log_prob, numbers
 from trustbo.models.priors import Priors
+from trustbo.models.proposal import Mixture
 
 KHAT_GOOD, KHAT_LIMIT = 0.5, 0.7
 _LOG2_POINTS, _LOG2_PILOT = 12, 10
-_DEGREES = 5.0
 _RIDGE_STEPS, _RIDGE_DROP = 12, 8.0  # at most so many components a side, so far down in nats
 _CHUNK = 1024  # parameter values evaluated at once: bounds the memory of long missions
 
@@ -53,17 +53,28 @@ class _Target(NamedTuple):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Unnormalised log posterior density of z = (beta0 on the line, t, r), shape (point,)."""
+        return self.evaluate(z)[0]
+
+    def evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log density at each z; there the mean of (beta, b) and its precision's Cholesky factor.
+
+        The last two are laid out for `_cholesky`, the point last.
+        """
+        parts = [z[i : i + _CHUNK] for i in range(0, len(z), _CHUNK)]
         # Far out the noise underflows: such a point has no density, and is no reason to warn.
         with np.errstate(all="ignore"):
-            return np.concatenate([self._log_density(part) for part in _parts(z)])
+            done = [self._evaluate(part) for part in parts]
+        log_density, mean, factor = (np.concatenate(of, axis=-1) for of in zip(*done, strict=True))
+        return log_density, mean, factor
 
-    def _log_density(self, z: np.ndarray) -> np.ndarray:
+    def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         beta0, delta_w, delta_v, log_jacobian = self.constrain(z)
-        quadratic = self._quadratic(beta0, delta_w, delta_v)
-        mean, cholesky = self.coefficients(quadratic)
-        rhs = quadratic.h + self.precision * self.mean
-        misfit = quadratic.alpha + self.precision @ self.mean**2 - np.einsum("nc,nc->n", rhs, mean)
-        log_det = 2.0 * np.log(np.diagonal(cholesky, axis1=1, axis2=2)).sum(1)
+        theta = np.stack([beta0, delta_w**2, delta_v**2], axis=1)
+        quadratic = self.statistics.evaluate(theta, self.priors.x0_sd)
+        factor = _cholesky((quadratic.P + np.diag(self.precision)).transpose(1, 2, 0))
+        half = _forward(factor, (quadratic.h + self.precision * self.mean).T)
+        misfit = quadratic.alpha + self.precision @ self.mean**2 - (half**2).sum(0)
+        log_det = 2.0 * np.log(np.einsum("ccn->cn", factor)).sum(0)
         log_likelihood = -0.5 * (
             misfit
             + quadratic.log_det
@@ -71,13 +82,12 @@ class _Target(NamedTuple):
             + log_det
             - np.log(self.precision).sum()
         )
-        return (
-            log_likelihood
-            + log_jacobian
-            + log_prob(self.priors.beta0, beta0)
+        log_prior = (
+            log_prob(self.priors.beta0, beta0)
             + log_prob(self.priors.delta_w, delta_w)
             + log_prob(self.priors.delta_v, delta_v)
         )
+        return log_likelihood + log_jacobian + log_prior, _backward(factor, half), factor
 
     def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """beta0, delta_w, delta_v, and the log Jacobian of the way there."""
@@ -90,64 +100,17 @@ class _Target(NamedTuple):
             x = special.expit(x)
         return x, np.exp(log_w), np.exp(log_v), log_jacobian
 
-    def coefficients(self, quadratic: Quadratic) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of (beta, b) given theta, and the Cholesky factor of their precision."""
-        precision = quadratic.P + np.diag(self.precision)
-        rhs = quadratic.h + self.precision * self.mean
-        finite = np.isfinite(precision).all((1, 2))
-        precision = np.where(finite[:, None, None], precision, np.eye(rhs.shape[1]))
-        try:
-            cholesky = np.linalg.cholesky(precision)
-        except np.linalg.LinAlgError:  # noise so small that rounding took the sign of an eigenvalue
-            positive = np.linalg.eigvalsh(precision)[:, 0] > 0.0
-            finite &= positive
-            precision = np.where(positive[:, None, None], precision, np.eye(rhs.shape[1]))
-            cholesky = np.linalg.cholesky(precision)
-        mean = np.linalg.solve(precision, rhs[..., None])[..., 0]
-        return np.where(finite[:, None], mean, np.nan), cholesky
 
-    def draw_coefficients(self, z: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """One exact draw of (beta, b) given each z, shape (point, coefficient)."""
-        drawn = []
-        for part in _parts(z):
-            mean, cholesky = self.coefficients(self._quadratic(*self.constrain(part)[:3]))
-            noise = rng.standard_normal((*mean.shape, 1))
-            drawn.append(mean + np.linalg.solve(np.swapaxes(cholesky, 1, 2), noise)[..., 0])
-        return np.concatenate(drawn)
+class _Weighted(NamedTuple):
+    """Weighted points."""
 
-    def _quadratic(self, beta0: np.ndarray, delta_w: np.ndarray, delta_v: np.ndarray) -> Quadratic:
-        theta = np.stack([beta0, delta_w**2, delta_v**2], axis=1)
-        return self.statistics.evaluate(theta, self.priors.x0_sd)
-
-
-class _Mixture(NamedTuple):
-    """Multivariate Student-t components, to draw from."""
-
-    centers: np.ndarray  # (component, 3)
-    scales: np.ndarray  # (component, 3, 3), lower triangular
-    weights: np.ndarray  # (component,)
-
-    def draw(self, n: int, seed: int) -> np.ndarray:
-        """Points of a scrambled Sobol sequence, mapped to the mixture; shape (n, 3)."""
-        uniform = stats.qmc.Sobol(5, scramble=True, rng=seed).random(n)
-        uniform = np.clip(uniform, 1e-12, 1.0 - 1e-12)
-        normal = special.ndtri(uniform[:, :3])
-        chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, 3])
-        which = np.searchsorted(np.cumsum(self.weights)[:-1], uniform[:, 4], side="right")
-        steps = np.einsum("nij,nj->ni", self.scales[which], normal)
-        return self.centers[which] + steps * np.sqrt(_DEGREES / chi2)[:, None]
-
-    def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Log density, shape (point,)."""
-        d, nu = z.shape[1], _DEGREES
-        norm = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
-        norm -= 0.5 * d * np.log(nu * np.pi)
-        terms = []
-        for center, scale, weight in zip(*self, strict=True):
-            distance2 = (np.linalg.solve(scale, (z - center).T) ** 2).sum(0)
-            term = norm - np.log(np.diag(scale)).sum() - 0.5 * (nu + d) * np.log1p(distance2 / nu)
-            terms.append(np.log(weight) + term)
-        return np.logaddexp.reduce(terms, axis=0)
+    z: np.ndarray  # (point, 3)
+    log_p: np.ndarray  # (point,)
+    log_w: np.ndarray  # (point,), smoothed and normalised
+    mean: np.ndarray  # (coefficient, point), of (beta, b)
+    factor: np.ndarray  # (coefficient, coefficient, point), Cholesky's, of their precision
+    khat: float
+    log_evidence: float
 
 
 def sample_exact(
@@ -170,26 +133,27 @@ def sample_exact(
     with _blas().limit(limits=1, user_api="blas"):
         target = _target(statistics, priors)
         mode, scale = laplace(target.log_density, _start(target))
-        z, log_p, log_w, khat, evidence = _weigh(target, _matched(target, mode, scale, seed), seed)
-        if not khat < KHAT_GOOD:
+        points = _weigh(target, _matched(target, mode, scale, seed), seed)
+        if not points.khat < KHAT_GOOD:
             ridge = _weigh(target, _along_the_ridge(target, mode, scale), seed)
-            if ridge[3] < khat or not np.isfinite(khat):
-                z, log_p, log_w, khat, evidence = ridge
-        rng = np.random.default_rng(seed)
-        weights = np.exp(log_w)
-        chosen = rng.permutation(_systematic(weights, n_draws, rng))
-        kept = z[chosen]
-        beta0, delta_w, delta_v, _ = target.constrain(kept)
-        coefficients = target.draw_coefficients(kept, rng)
+            if ridge.khat < points.khat or not np.isfinite(points.khat):
+                points = ridge
+    rng = np.random.default_rng(seed)
+    weights = np.exp(points.log_w)
+    chosen = rng.permutation(_systematic(weights, n_draws, rng))
+    beta0, delta_w, delta_v, _ = target.constrain(points.z[chosen])
+    mean, factor = points.mean[:, chosen], points.factor[..., chosen]
+    coefficients = mean + _backward(factor, rng.standard_normal(mean.shape))
     params = {
         "beta0": beta0,
-        "beta": coefficients[:, :-1],
-        "b": coefficients[:, -1],
+        "beta": coefficients[:-1].T,
+        "b": coefficients[-1],
         "delta_w": delta_w,
         "delta_v": delta_v,
     }
     kish = float(1.0 / (weights**2).sum())
-    return ExactDraws(params, log_w[chosen], log_p[chosen], khat, kish, evidence)
+    log_w, log_p = points.log_w[chosen], points.log_p[chosen]
+    return ExactDraws(params, log_w, log_p, points.khat, kish, points.log_evidence)
 
 
 @cache
@@ -208,29 +172,32 @@ def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
     return _Target(statistics, priors, each("loc"), each("scale") ** -2.0)
 
 
-def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) -> _Mixture:
-    """A Student-t with the mean and 1.2 times the spread of a few points around the mode.
+def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) -> Mixture:
+    """A bell with the mean and the spread of a few points around the mode.
 
     The posterior is skewed: its moments make a far better proposal than its curvature at the mode.
     """
-    around = _Mixture(mode[None], 1.3 * scale[None], np.ones(1))
-    z, _, log_w, _, _ = _weigh(target, around, seed, _LOG2_PILOT)
+    around = Mixture(mode[None], 1.3 * scale[None], np.ones(1))
+    z, _, log_w, *_ = _weigh(target, around, seed, _LOG2_PILOT)
     weights = np.exp(log_w)
     mean = weights @ z
     covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
-    return _Mixture(mean[None], 1.2 * np.linalg.cholesky(covariance)[None], np.ones(1))
+    return Mixture(mean[None], np.linalg.cholesky(covariance)[None], np.ones(1))
 
 
-def _weigh(target: _Target, proposal: _Mixture, seed: int, log2_points: int = _LOG2_POINTS):
-    """Points, their log densities, smoothed and normalised log weights, k-hat, log evidence."""
+def _weigh(
+    target: _Target, proposal: Mixture, seed: int, log2_points: int = _LOG2_POINTS
+) -> _Weighted:
+    """Points of the proposal with Pareto-smoothed importance weights."""
     z = proposal.draw(2**log2_points, seed)
-    log_p = target.log_density(z)
+    log_p, mean, factor = target.evaluate(z)
     log_p = np.where(np.isfinite(log_p), log_p, -np.inf)
     raw = log_p - proposal.log_density(z)
     finite = np.where(np.isfinite(raw), raw, raw[np.isfinite(raw)].min() - 100.0)
     smoothed, khat = array_stats.psislw(-finite)  # it takes the log weights' negative
     log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
-    return z, log_p, smoothed - np.logaddexp.reduce(smoothed), float(khat), log_evidence
+    log_w = smoothed - np.logaddexp.reduce(smoothed)
+    return _Weighted(z, log_p, log_w, mean, factor, float(khat), log_evidence)
 
 
 def _start(target: _Target) -> np.ndarray:
@@ -242,7 +209,7 @@ def _start(target: _Target) -> np.ndarray:
     return grid[np.nanargmax(target.log_density(grid))]
 
 
-def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> _Mixture:
+def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> Mixture:
     """Components along r, each at the mode of (beta0, t) given its r, as far as there is mass."""
     spacing = float(np.clip(np.sqrt((scale @ scale.T)[2, 2]), 0.4, 1.0))
     centers, scales, log_mass = [], [], []
@@ -268,7 +235,7 @@ def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> _M
                 break
     weights = np.exp(np.array(log_mass) - np.max(log_mass))
     weights = 0.9 * weights / weights.sum() + 0.1 / len(weights)
-    return _Mixture(np.array(centers), np.array(scales), weights)
+    return Mixture(np.array(centers), np.array(scales), weights)
 
 
 def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -277,8 +244,33 @@ def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.nda
     return np.searchsorted(np.cumsum(weights)[:-1] / weights.sum(), points)
 
 
-def _parts(z: np.ndarray) -> list[np.ndarray]:
-    return [z[i : i + _CHUNK] for i in range(0, len(z), _CHUNK)]
+def _cholesky(A: np.ndarray) -> np.ndarray:
+    """Lower factors of many small matrices, (row, column, point); NaN where one is not positive.
+
+    NumPy's takes the point first, one matrix at a time, and raises for all if one is not positive.
+    """
+    L = np.zeros_like(A)
+    for j in range(len(A)):
+        L[j, j] = np.sqrt(A[j, j] - (L[j, :j] ** 2).sum(0))
+        for i in range(j + 1, len(A)):
+            L[i, j] = (A[i, j] - (L[i, :j] * L[j, :j]).sum(0)) / L[j, j]
+    return L
+
+
+def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """L^-1 b for factors (row, column, point) and vectors (row, point)."""
+    x = np.empty_like(b)
+    for i in range(len(b)):
+        x[i] = (b[i] - (L[i, :i] * x[:i]).sum(0)) / L[i, i]
+    return x
+
+
+def _backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """L'^-1 b for factors (row, column, point) and vectors (row, point)."""
+    x = np.empty_like(b)
+    for i in reversed(range(len(b))):
+        x[i] = (b[i] - (L[i + 1 :, i] * x[i + 1 :]).sum(0)) / L[i, i]
+    return x
 
 
 def _require_conjugate(priors: Priors) -> None:

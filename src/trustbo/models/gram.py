@@ -72,8 +72,11 @@ class LengthGram(NamedTuple):
         tau = first @ sines[0]  # e_1' T^-1 e_1
         shrink = kappa / (1.0 + kappa * tau)
         M = (1.0 / eigenvalues) @ self.spectral.reshape(n_bounds, p * p)
-        outer = (g[:, :, None] * g[:, None, :]).reshape(len(theta), -1)
-        M -= shrink[:, None] * (outer @ self.corner.reshape(n_bounds**2, p * p))
+        # (k, j, column, column) and (j, k, column, column) have one transpose's sum: half will do.
+        k, j = np.triu_indices(n_bounds)
+        both = self.corner[k, j] + self.corner[j, k] * (k != j)[:, None, None]
+        outer = g[:, k] * g[:, j]
+        M -= shrink[:, None] * (outer @ both.reshape(len(k), p * p))
         log_det = np.log(eigenvalues).sum(1) + np.log1p(kappa * tau)
         return _collapse_lag(M.reshape(-1, p, p), beta0, beta0 - lag, self.weight * log_det)
 
@@ -264,9 +267,8 @@ def _collapse_lag(
 ) -> Quadratic:
     """From columns (y, y_lag, x0_mean e_1, u) to y - beta0 y_lag - h x0_mean e_1 and u."""
     v = np.stack([np.ones_like(beta0), -beta0, -h], axis=1)
-    alpha = np.einsum("ni,nij,nj->n", v, M[:, :3, :3], v, optimize=True)
-    linear = np.einsum("ni,nij->nj", v, M[:, :3, 3:], optimize=True)
-    return Quadratic(alpha, linear, M[:, 3:, 3:], log_det)
+    rows = (v[:, None] @ M[:, :3])[:, 0]
+    return Quadratic((rows[:, :3] * v).sum(1), rows[:, 3:], M[:, 3:, 3:], log_det)
 
 
 def sine_basis(n: int) -> np.ndarray:

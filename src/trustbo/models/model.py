@@ -1,5 +1,6 @@
 """What all trust models share: the numpyro model, likelihood, simulation, prior prediction."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
@@ -31,7 +32,7 @@ RESPONSES = ("level", "change")
 
 
 @dataclass(frozen=True)
-class TrustModel:
+class TrustModel(ABC):
     """A trust model; itself a numpyro model, so that `MCMC(NUTS(model))` works.
 
     Attributes:
@@ -63,10 +64,11 @@ class TrustModel:
 
     # --- what a model defines ---
 
+    @abstractmethod
     def sample_params(self, n_robots: int, n_features: int) -> Params:
         """Sample statements of the parameters; what they assemble to."""
-        raise NotImplementedError
 
+    @abstractmethod
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
         """By how much each intercept lies below the level trust has on average.
 
@@ -78,12 +80,11 @@ class TrustModel:
         Returns:
             By name of the intercept's site, the part of the mean level that others bring.
         """
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of each parameter that a posterior has."""
-        raise NotImplementedError
 
     @property
     def robot_sets(self) -> str | None:

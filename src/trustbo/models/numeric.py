@@ -4,23 +4,27 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
-from scipy import special, stats
+from scipy import special
 
 
 def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
     """Log density; of the usual priors in closed form, of others by numpyro."""
     if isinstance(prior, dist.HalfNormal):
-        return stats.halfnorm.logpdf(x, scale=number(prior, "scale"))
+        return np.where(x < 0.0, -np.inf, np.log(2.0) + _normal(x, 0.0, number(prior, "scale")))
     if isinstance(prior, dist.Beta):
         a, b = (number(prior, f"concentration{i}") for i in (1, 0))
         return special.xlogy(a - 1.0, x) + special.xlog1py(b - 1.0, -x) - special.betaln(a, b)
     if isinstance(prior, dist.Normal):
-        return stats.norm.logpdf(x, number(prior, "loc"), number(prior, "scale"))
+        return _normal(x, number(prior, "loc"), number(prior, "scale"))
     if isinstance(prior, dist.LogNormal):
-        z = (np.log(x) - number(prior, "loc")) / number(prior, "scale")
-        return -0.5 * z**2 - np.log(x * number(prior, "scale")) - 0.5 * np.log(2.0 * np.pi)
+        log_x = np.log(x)
+        return _normal(log_x, number(prior, "loc"), number(prior, "scale")) - log_x
     with jax.enable_x64(True):
         return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
+
+
+def _normal(x: np.ndarray, loc: float, scale: float) -> np.ndarray:
+    return -0.5 * ((x - loc) / scale) ** 2 - np.log(scale * np.sqrt(2.0 * np.pi))
 
 
 def draw(prior: Distribution, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

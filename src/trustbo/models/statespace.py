@@ -10,6 +10,7 @@ filter predicts through it. Sequences run side by side, so arrays are (bound, mi
 the bound first, the axis `lax.scan` walks.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -103,12 +104,8 @@ class ScalarSSM(NamedTuple):
         S, gain = (jnp.broadcast_to(a, y.shape) for a in (S, gain))
         m0 = jnp.broadcast_to(x0_mean, y.shape[1:])
         columns = (y, seen, self.drift, S, gain, *(censoring or ()))
-        _, (m, e, *rest) = lax.scan(step, m0, columns)
-        increments = log_normal(e, S)
-        if censoring is not None:
-            y, log_mass = rest
-            increments = jnp.where(censoring.side == 0.0, increments, log_mass)
-        return Filtered(m, P, increments * seen, y * seen, seen)
+        _, (m, e, *completed) = lax.scan(step, m0, columns)
+        return gather_filtered(m, P, e, S, y, seen, censoring, completed)
 
     def smooth(self, filtered: Filtered) -> Smoothed:
         """Rauch-Tung-Striebel smoother; `filtered` not `shared`."""
@@ -174,6 +171,24 @@ class ScalarSSM(NamedTuple):
         A = V * (beta0 / Q + of_rate)
         a = V * (m / P - beta0 / Q * self.drift[1:] - of_rate * filtered.y[1:])
         return A, a, V
+
+
+def gather_filtered(
+    mean: Array,
+    var: Array,
+    error: Array,
+    S: Array,
+    y: Array,
+    seen: Array,
+    censoring: Censoring | None,
+    completed: Sequence[Array],
+) -> Filtered:
+    """What a filter gives, from its pass; `completed` are rates and log masses if censored."""
+    increments = log_normal(error, S)
+    if censoring is not None:
+        y, log_mass = completed
+        increments = jnp.where(censoring.side == 0.0, increments, log_mass)
+    return Filtered(mean, var, increments * seen, y * seen, seen)
 
 
 def complete(y: Array, predicted: Array, sd: Array, censoring: Censoring) -> tuple[Array, Array]:

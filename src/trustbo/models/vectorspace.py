@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array, lax, random
 from jax.scipy.linalg import cho_solve, solve_triangular
 
-from trustbo.models.statespace import Censoring, Filtered, Smoothed, complete, log_normal
+from trustbo.models.statespace import Censoring, Filtered, Smoothed, complete, gather_filtered
 
 
 class VectorSSM(NamedTuple):
@@ -80,11 +80,7 @@ class VectorSSM(NamedTuple):
         m0 = jnp.full(y.shape[1:], self.x0_mean)
         columns = (y, seen, self.drift, S, gain, *(censoring or ()))
         _, (m, e, *rest) = lax.scan(step, m0, columns)
-        increments = log_normal(e, S)
-        if censoring is not None:
-            y, log_mass = rest
-            increments = jnp.where(censoring.side == 0.0, increments, log_mass)
-        return Filtered(m, P, increments * seen, y * seen, seen)
+        return gather_filtered(m, P, e, S, y, seen, censoring, rest)
 
     def smooth(self, filtered: Filtered) -> Smoothed:
         """As `ScalarSSM.smooth`; the variances alone, not the covariances between robots."""
