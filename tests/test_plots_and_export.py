@@ -80,6 +80,25 @@ def test_terrain_maps_show_surface_traversability_and_visibility(result):
         tb.plots.terrain_maps(bare)
 
 
+def test_every_map_has_shadows_and_the_first_a_scale(result):
+    first, *others = tb.plots.trust_maps(result)
+    assert [text.get_text() for text in first.texts] == ["20 m"]
+    for ax in (first, *others):
+        shadow = ax.images[1].get_array()
+        assert shadow.shape[2] == 4
+        assert 0.0 < shadow[..., 3].max() <= 0.55
+
+
+def test_loadings_are_those_of_the_composites(result):
+    composites = result.workspace.composites
+    axes = tb.plots.loadings(composites)
+    for ax, index in zip(axes, composites.values(), strict=True):
+        widths = sorted(bar.get_width() for bar in ax.patches)
+        np.testing.assert_allclose(widths, sorted(index.loadings_.values))
+    with pytest.raises(tb.TrustboError, match="there are no composites"):
+        tb.plots.loadings({})
+
+
 def test_impassable_cells_are_grey():
     passable = np.ones((3, 3), bool)
     passable[1, 1] = False

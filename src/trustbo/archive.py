@@ -1,10 +1,8 @@
 """Files: how missions, workspaces and posteriors are written and read back."""
 
 import json
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -13,38 +11,8 @@ import xarray as xr
 
 from trustbo.data import Bound, Mission, Robot, Team
 from trustbo.errors import TrustboError
-from trustbo.terrain import Grid, Workspace
-
-
-def write_file(path: str | PathLike[str], write: Callable[[Path], object]) -> None:
-    """Write a file whole or not at all: to a temporary name, then renamed.
-
-    Args:
-        path: The file; its folder is made if need be.
-        write: Writes to the path it is given, which has the same suffix.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_text(path: str | PathLike[str], text: str) -> None:
-    """Write a text file whole or not at all."""
-    write_file(path, lambda file: file.write_text(text, encoding="utf-8"))
-
-
-def to_json(record: object) -> str:
-    """JSON of a record that may hold NumPy's numbers and arrays; anything else as its text."""
-
-    def plain(value: Any) -> object:
-        return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-    return json.dumps(record, indent=2, default=plain)
+from trustbo.files import to_json
+from trustbo.terrain import CompositeIndex, Grid, Workspace
 
 
 def read_tree(path: Path) -> xr.DataTree:
@@ -123,9 +91,10 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
 
 
 def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
-    """A workspace as a tree; the fitted composites are not kept, only what they gave."""
+    """A workspace as a tree."""
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
     tree = {"cells": cells}
+    tree |= {f"composites/{n}": index.to_dataset() for n, index in workspace.composites.items()}
     if workspace.terrain is not None and workspace.pixels is not None:
         tree |= {"terrain": workspace.terrain, "pixels": workspace.pixels.drop_vars("spatial_ref")}
     result = xr.DataTree.from_dict(tree)
@@ -152,6 +121,10 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
         ),
         tree["terrain"].to_dataset().set_coords("spatial_ref") if has_terrain else None,
         tree["pixels"].to_dataset() if has_terrain else None,
+        {
+            name: CompositeIndex.from_dataset(node.to_dataset())
+            for name, node in (tree["composites"].children if "composites" in tree else {}).items()
+        },
     )
 
 

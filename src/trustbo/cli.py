@@ -124,7 +124,7 @@ def demo(
     default of `run`, is trust at the goal, which the last few bounds decide.
     """
     from trustbo import terrain
-    from trustbo.archive import write_file
+    from trustbo.files import write_file
     from trustbo.result import require_folder
 
     with _one_line_errors(debug):
@@ -163,7 +163,7 @@ def _campaign(
 
     mpl.use("Agg")
     from trustbo import export, plots
-    from trustbo.archive import write_file
+    from trustbo.files import write_file
     from trustbo.loop import iterate
 
     result = iterate(workspace, start, goal, checkpoint=out, progress=progress, **options)

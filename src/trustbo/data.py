@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, Self, get_args
 
 import numpy as np
@@ -285,25 +286,32 @@ class Mission:
         )
         return cls(cells, bounds, status, tuple(features), tuple(robots))
 
-    @property
+    # Stacked once: every refit asks every mission for these.
+
+    @cached_property
     def awareness(self) -> np.ndarray:
         """Measured awareness, shape (bound, robot, feature)."""
-        return np.stack([bound.awareness for bound in self.bounds])
+        return self._stacked("awareness")
 
-    @property
+    @cached_property
     def contact_rate(self) -> np.ndarray:
         """Contact rates, shape (bound, robot)."""
-        return np.stack([bound.contact_rate for bound in self.bounds])
+        return self._stacked("contact_rate")
 
-    @property
+    @cached_property
     def duration(self) -> np.ndarray:
         """Running times, shape (bound, robot), s."""
-        return np.stack([bound.duration for bound in self.bounds])
+        return self._stacked("duration")
 
-    @property
+    @cached_property
     def exposure(self) -> np.ndarray:
         """Ticks, shape (bound, robot); NaN where not recorded."""
-        return np.stack([bound.exposure for bound in self.bounds])
+        return self._stacked("exposure")
+
+    def _stacked(self, name: str) -> np.ndarray:
+        array = np.stack([getattr(bound, name) for bound in self.bounds])
+        array.flags.writeable = False
+        return array
 
 
 def default_features(n_features: int) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ from rasterio.crs import CRS
 from rasterio.transform import from_origin
 from rasterio.warp import transform
 
-from trustbo.archive import write_file, write_text
 from trustbo.errors import TrustboError
+from trustbo.files import write_file, write_text
 from trustbo.result import Result
 from trustbo.terrain import Workspace
 

@@ -11,6 +11,7 @@ import xarray as xr
 from trustbo import archive
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
+from trustbo.files import to_json, write_file, write_text
 from trustbo.terrain import Workspace
 
 
@@ -95,7 +96,7 @@ class Result:
         scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
         table = self.history[scalars].to_dataframe()[scalars]
         table["path"] = [_path_text(path) for path in self.history["path"].values]
-        archive.write_text(folder / "history.csv", table.to_csv())
+        write_text(folder / "history.csv", table.to_csv())
         record = {
             "n_missions": len(self.missions),
             "path": self.path,
@@ -105,7 +106,7 @@ class Result:
             "stop_reason": self.stop_reason,
         }
         # Last: its presence says that the rest is complete.
-        archive.write_text(folder / "result.json", archive.to_json(record))
+        write_text(folder / "result.json", to_json(record))
 
 
 def load_result(directory: str | PathLike[str]) -> Result:
@@ -156,7 +157,7 @@ def _posterior_name(j: int) -> str:
 
 
 def _write_tree(path: Path, tree: xr.DataTree) -> None:
-    archive.write_file(path, tree.to_netcdf)
+    write_file(path, tree.to_netcdf)
 
 
 def _path_text(path: np.ndarray) -> str:

@@ -48,7 +48,7 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
                 f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
                 f"0 has {first.robots} and {first.features}; all must agree."
             )
-        if np.isnan(mission.awareness).any():
+        if np.isnan(mission.awareness.sum()):
             k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
             raise TrustboError(
                 f"awareness of mission {j}, bound {k + 1}, robot {first.robots[i]}, feature "

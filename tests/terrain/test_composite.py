@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import xarray as xr
+from sklearn.base import clone
 
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import CompositeIndex
@@ -32,7 +33,7 @@ def test_the_first_component_is_numpy_s_up_to_the_declared_sign():
     values, vectors = np.linalg.eigh(np.corrcoef(x.T))
     first = vectors[:, -1] * np.sign(vectors[:, -1] @ list(SIGNS.values()))
     np.testing.assert_allclose(index.loadings_, first, rtol=1e-6)
-    np.testing.assert_allclose(index.explained_variance_ratio_, values[-1] / 3, rtol=1e-6)
+    np.testing.assert_allclose(index.explained_variance_ratio_, values[::-1] / 3, rtol=1e-6)
 
 
 def test_more_slope_lowers_the_index_whatever_the_solver_s_sign():
@@ -114,3 +115,72 @@ def test_bad_input():
     empty = xr.Dataset({name: ("pixel", np.full(5, np.nan)) for name in SIGNS})
     with pytest.raises(TerrainError, match="no pixel has all of the features"):
         CompositeIndex(SIGNS).fit(empty)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("method", ["pca", "zheng2023"])
+def test_a_fitted_index_is_read_back_as_it_was(tmp_path, robust, method):
+    features = correlated()
+    index = CompositeIndex(SIGNS, scaling="logistic", robust=robust, method=method).fit(features)
+    index.save(tmp_path / "index.nc")
+    again = CompositeIndex.load(tmp_path / "index.nc")
+    assert again.get_params() == index.get_params()
+    xr.testing.assert_identical(again.loadings_, index.loadings_)
+    xr.testing.assert_identical(again.transform(features), index.transform(features))
+
+
+def test_it_keeps_scikit_learn_s_conventions():
+    index = CompositeIndex(SIGNS, scaling="minmax")
+    copy = clone(index)
+    assert copy.get_params() == index.get_params()
+    features = correlated()
+    xr.testing.assert_identical(
+        index.fit_transform(features), copy.fit(features).transform(features)
+    )
+    with pytest.raises(TrustboError, match="this CompositeIndex is not fitted; call fit"):
+        CompositeIndex(SIGNS).transform(features)
+
+
+def test_robust_loadings_do_not_see_outliers_or_a_bent_scale():
+    features = correlated()
+    bent = features.assign(tri=np.exp(features["tri"] * 5))
+    straight, curved = (CompositeIndex(SIGNS, robust=True).fit(f) for f in (features, bent))
+    np.testing.assert_allclose(straight.loadings_, curved.loadings_, atol=1e-3)
+    plain = CompositeIndex(SIGNS).fit(bent)
+    assert abs(plain.loadings_ - straight.loadings_).max() > 0.01
+
+
+def test_the_later_code_s_method_squashes_uncut_scores():
+    features = correlated()
+    index = CompositeIndex(SIGNS, method="zheng2023").fit(features)
+    x = np.stack([features[name].values for name in SIGNS], axis=1)
+    low, middle, high = np.percentile(x, [25, 50, 75], axis=0)
+    z = (x - middle) / (high - low)
+    _, vectors = np.linalg.eigh(np.cov(z.T))
+    score = z @ vectors[:, -1]
+    ours = index.transform(features).values
+    theirs = 1 / (1 + np.exp(-score * np.sign(vectors[:, -1] @ index.loadings_.values)))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+def bounds(n, seed=0):
+    """Ease of each bound drives the map's value, speed and attitude."""
+    rng = np.random.default_rng(seed)
+    ease = rng.normal(size=n)
+    names = {"offline": 1, "speed_ratio": 1, "pitch": -1, "roll": -1}
+    return xr.Dataset(
+        {name: ("bound", sign * ease + 0.4 * rng.normal(size=n)) for name, sign in names.items()}
+    )
+
+
+def test_a_real_time_index_is_fitted_once_on_enough_bounds():
+    index = CompositeIndex.realtime("traversability").fit(bounds(400))
+    np.testing.assert_array_equal(np.sign(index.loadings_), [1, 1, -1, -1])
+    window = bounds(10, seed=1)  # later, a short window is only transformed
+    fused = index.transform(window)
+    assert fused.dims == ("bound",)
+    assert np.corrcoef(fused, window["offline"])[0, 1] > 0.7
+    with pytest.raises(TerrainError, match=r"only 199 samples have all of .*; 200 are needed"):
+        CompositeIndex.realtime("traversability").fit(bounds(199))
+    with pytest.raises(TrustboError, match="unknown real-time feature 'trust'"):
+        CompositeIndex.realtime("trust")

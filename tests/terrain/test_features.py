@@ -1,21 +1,36 @@
-"""Pixel features against closed forms, and under turning and mirroring."""
+"""Pixel features against closed forms and GDAL, and under turning, mirroring and scaling."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 import xarray as xr
 
+from trustbo.errors import ShapeError, TerrainError, TrustboError
 from trustbo.terrain import (
+    FEATURES,
+    aspect,
     assemble_terrain,
     canopy_cover,
     canopy_height,
+    curvature,
+    exposure,
     openness,
     pixel_features,
+    rays,
+    register_feature,
     roughness,
     slope,
     step_height,
+    tpi,
     tri,
+    vegetation_density,
 )
-from trustbo.terrain.features import TRAVERSABILITY, VISIBILITY
+
+GDAL = Path(__file__).parent.parent / "data" / "gdal"
+SHORT = {name: f for name, f in FEATURES.items() if name not in ("openness", "aspect")}
+INSIDE = (slice(1, -1), slice(1, -1))
 
 
 def make_terrain(dem, height=0.0, resolution=1.0):
@@ -33,21 +48,85 @@ def tilted(a=0.3, b=-0.2, resolution=1.0, n=12):
     return a * col * resolution + b * row * resolution
 
 
+def rough_terrain(seed=0, n=24):
+    rng = np.random.default_rng(seed)
+    return make_terrain(rng.normal(size=(n, n)), rng.uniform(0.0, 6.0, (n, n)))
+
+
 @pytest.mark.parametrize("resolution", [0.5, 1.0, 3.0])
 def test_a_plane_has_its_own_slope_everywhere_inside(resolution):
     terrain = make_terrain(tilted(resolution=resolution), resolution=resolution)
-    inside = slope(terrain).values[1:-1, 1:-1]
-    # xarray-spatial computes in float32.
-    np.testing.assert_allclose(inside, np.arctan(np.hypot(0.3, 0.2)), rtol=1e-5)
+    # The polynomial arctangent is 1e-8 rad off at most.
+    np.testing.assert_allclose(
+        slope(terrain).values[INSIDE], np.arctan(np.hypot(0.3, 0.2)), atol=2e-8
+    )
 
 
-def test_a_plane_s_roughness_tri_and_step_have_closed_forms():
+@pytest.mark.parametrize("rise", [0.0, 0.1, 0.414, 0.415, 1.0, 2.41, 2.42, 10.0, 1e6])
+def test_slope_is_the_arctangent_of_the_rise(rise):
+    inside = slope(make_terrain(tilted(rise, 0.0))).values[INSIDE]
+    np.testing.assert_allclose(inside, np.arctan(rise), atol=2e-8)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "north"),
+    [(0.0, 1.0, 180.0), (0.0, -1.0, 0.0), (-1.0, 0.0, 90.0), (1.0, 0.0, 270.0), (1.0, -1.0, 315.0)],
+)
+def test_aspect_is_the_compass_direction_of_descent(a, b, north):
+    """Ground rises by a per column to the east and b per row to the south."""
+    down = aspect(make_terrain(tilted(a, -b))).values[INSIDE]
+    np.testing.assert_allclose(np.rad2deg(down), north, atol=1e-9)
+    assert np.isnan(aspect(make_terrain(np.zeros((8, 8))))).all()
+
+
+def test_a_plane_s_roughness_tri_tpi_and_step_have_closed_forms():
     terrain = make_terrain(tilted())
-    inside = (slice(1, -1), slice(1, -1))
-    np.testing.assert_allclose(roughness(terrain).values[inside], 2 * 0.5, rtol=1e-5)
-    np.testing.assert_allclose(step_height(terrain).values[inside], 0.5, rtol=1e-9)
+    np.testing.assert_allclose(roughness(terrain).values[INSIDE], 2 * 0.5, rtol=1e-12)
+    np.testing.assert_allclose(step_height(terrain).values[INSIDE], 0.5, rtol=1e-12)
     squares = 6 * 0.3**2 + 6 * 0.2**2  # each of the 8 steps is +-0.3 i +- 0.2 j
-    np.testing.assert_allclose(tri(terrain).values[inside], np.sqrt(squares), rtol=1e-5)
+    np.testing.assert_allclose(tri(terrain).values[INSIDE], np.sqrt(squares), rtol=1e-12)
+    np.testing.assert_allclose(tpi(terrain).values[INSIDE], 0.0, atol=1e-12)
+    np.testing.assert_allclose(curvature(terrain).values[INSIDE], 0.0, atol=1e-12)
+
+
+def test_a_paraboloid_has_its_own_curvature():
+    row, col = np.mgrid[:12, :12] * 2.0
+    terrain = make_terrain(-0.05 * col**2 - 0.02 * row**2, resolution=2.0)
+    np.testing.assert_allclose(curvature(terrain).values[INSIDE], 2 * 0.05 + 2 * 0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "feature", "atol"),
+    [
+        ("slope", slope, 2e-3),
+        ("roughness", roughness, 1e-4),
+        ("tri", tri, 1e-4),
+        ("tpi", tpi, 1e-4),
+    ],
+)
+def test_gdaldem_says_the_same(name, feature, atol):
+    """Its own numbers, stored with the commands that made them (tests/data/gdal/README.md).
+
+    gdaldem computes in float32 and is itself 1.3e-3 degrees off float64 Horn.
+    """
+    with rasterio.open(GDAL / "dem.tif") as source:
+        dem, resolution = source.read(1).astype(float), source.res[0]
+    with rasterio.open(GDAL / f"{name}.tif") as source:
+        gdal = source.read(1, masked=True).filled(np.nan)
+    ours = feature(make_terrain(dem, resolution=resolution)).values
+    if name == "slope":
+        ours = np.rad2deg(ours)
+    assert np.isfinite(gdal[INSIDE]).all()
+    np.testing.assert_allclose(ours[INSIDE], gdal[INSIDE], rtol=0.0, atol=atol)
+
+
+def test_float32_heights_give_what_float64_gives():
+    terrain = make_terrain(500.0 + np.random.default_rng(0).normal(size=(20, 20)))
+    single = terrain.astype(np.float32)
+    double = single.astype(float)  # the same heights
+    for feature in (slope, roughness, tri, tpi, step_height, curvature):
+        assert feature(single).dtype == np.float32
+        np.testing.assert_allclose(feature(single), feature(double), rtol=3e-6, atol=3e-6)
 
 
 def test_canopy_height_and_cover():
@@ -61,43 +140,137 @@ def test_canopy_height_and_cover():
     np.testing.assert_allclose(cover[20, 20], 6 / 11)  # 6 of 11 columns are wooded
 
 
+@pytest.mark.parametrize(
+    ("height", "share"), [(0.0, 0.0), (2.0, 1.4 / 3), (6.0, 1.2 / 3), (12.0, 0.0)]
+)
+def test_vegetation_density_is_the_share_of_the_lowest_metres(height, share):
+    """Crowns fill the upper 70 %: 6 m ones from 1.8 m on, 12 m ones from 3.6 m on."""
+    density = vegetation_density(make_terrain(np.zeros((20, 20)), height))
+    np.testing.assert_allclose(density, share, atol=1e-12)
+
+
 def test_openness_of_flat_ground_and_of_uniform_shrubs():
     flat = make_terrain(np.zeros((60, 60)))
     np.testing.assert_allclose(openness(flat, reach=20.0), 1.0)
     shrubs = make_terrain(np.zeros((60, 60)), 2.0)
-    # Rays at 1 m, inside the layer from 0.6 m to 2 m all the way.
+    # Rays at 1 m, inside the layer from 0.6 m to 2 m all the way; float32 inside.
     through = openness(shrubs, reach=20.0, eye=1.0, target=1.0).values
-    np.testing.assert_allclose(through, np.exp(-0.1 * 20.0), rtol=1e-9)
+    np.testing.assert_allclose(through, np.exp(-0.1 * 20.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("pixel", "reach", "n_rays"), [((1.0, 1.0), 9.0, 16), ((1.5, 0.7), 6.3, 7)]
+)
+def test_openness_is_the_mean_of_single_rays(pixel, reach, n_rays):
+    """Row-wise vector code against the scalar ray of `rays`, which has tests of its own."""
+    rng = np.random.default_rng(3)
+    dem = rng.normal(size=(30, 34)).cumsum(0) * 0.3
+    height = np.maximum(rng.normal(1.0, 2.0, dem.shape), 0.0)
+    dem[4:6, 7] = np.nan
+    y, x = -np.arange(30) * pixel[0], np.arange(34) * pixel[1]
+    ground = xr.DataArray(dem, {"y": y, "x": x}, ("y", "x")).rio.write_crs("EPSG:32633")
+    ours = openness(assemble_terrain(ground, ground + height), reach, n_rays=n_rays).values
+    for i, j in rng.integers(0, 30, (60, 2)):
+        passed = []
+        for k in range(n_rays):
+            angle = 2.0 * np.pi * k / n_rays
+            r, c = i + reach * np.sin(angle) / pixel[0], j + reach * np.cos(angle) / pixel[1]
+            end = rays.ground_height(dem, round(r, 9), round(c, 9))
+            if not np.isnan(end) and not np.isnan(dem[i, j]):
+                start, stop = (
+                    (float(i), float(j), dem[i, j] + 1.0),
+                    (round(r, 9), round(c, 9), end + 1.0),
+                )
+                passed.append(
+                    rays.ray_transmittance(
+                        dem,
+                        dem + height,
+                        pixel,
+                        start,
+                        stop,
+                        rays.TRANSMITTANCE,
+                        0.1,
+                        0.3,
+                        rays.work_space(),
+                    )
+                )
+        expected = np.mean(passed) if passed else np.nan
+        # float32 heights: a ray that grazes the ground to 1e-6 m may fall on either side.
+        np.testing.assert_allclose(ours[i, j], expected, atol=2e-5)
+
+
+def test_exposure_is_the_share_of_observers_that_see_a_pixel():
+    dem = np.zeros((30, 30))
+    dem[:, 15] = 10.0  # a wall
+    terrain = make_terrain(dem)
+    west, east = (2002.5, 985.5), (2027.5, 985.5)
+    seen = exposure(terrain, [west, east], eye=2.0, target=1.0).values
+    np.testing.assert_allclose(seen[:, :14], 0.5)
+    np.testing.assert_allclose(seen[:, 17:], 0.5)
+    np.testing.assert_allclose(exposure(terrain, [west], reach=5.0).values[:, 8:], 0.0)
+    near = exposure(terrain, [west], reach=5.0).values
+    assert near[14, 2] == 1.0
+    with pytest.raises(
+        TerrainError, match=r"observer \(0, 0\) is off the terrain, which covers x 2000"
+    ):
+        exposure(terrain, [(0.0, 0.0)])
+    with pytest.raises(ShapeError, match=r"must be \(observer, 2\)"):
+        exposure(terrain, [1.0, 2.0])
 
 
 def test_features_keep_missing_pixels_missing():
-    dem = tilted()
+    dem = tilted(n=30)
     dem[5, 6] = np.nan
     terrain = make_terrain(dem, 1.0)
-    for features in (TRAVERSABILITY, VISIBILITY):
-        for name, values in pixel_features(terrain, features).items():
-            assert np.isnan(values.values[5, 6]), name
+    for name, values in pixel_features(terrain, SHORT).items():
+        assert np.isnan(values.values[5, 6]), name
+        assert np.isfinite(values.values[15, 15]), name
+    assert np.isnan(openness(terrain, 5.0).values[5, 6])
 
 
 @pytest.mark.parametrize("turn", [np.rot90, np.fliplr, np.flipud])
 def test_turning_the_terrain_turns_every_feature(turn):
-    rng = np.random.default_rng(0)
-    dem, height = rng.normal(size=(16, 16)), rng.uniform(0.0, 6.0, (16, 16))
-    before, after = make_terrain(dem, height), make_terrain(turn(dem), turn(height))
-    for features in (TRAVERSABILITY, VISIBILITY):
-        a, b = pixel_features(before, features), pixel_features(after, features)
-        for name in features:
-            np.testing.assert_allclose(
-                b[name], turn(a[name].values), rtol=1e-5, atol=1e-6, err_msg=name
-            )
+    before = rough_terrain()
+    after = make_terrain(turn(before["dem"].values), turn((before["dsm"] - before["dem"]).values))
+    a, b = pixel_features(before, SHORT), pixel_features(after, SHORT)
+    for name in SHORT:
+        np.testing.assert_allclose(
+            b[name], turn(a[name].values), rtol=1e-9, atol=1e-12, err_msg=name
+        )
+    a, b = openness(before, 6.0).values, openness(after, 6.0).values
+    np.testing.assert_allclose(b, turn(a), atol=1e-5)
 
 
 def test_a_constant_height_changes_nothing():
-    rng = np.random.default_rng(1)
-    dem, height = rng.normal(size=(16, 16)), rng.uniform(0.0, 6.0, (16, 16))
-    before, after = make_terrain(dem, height), make_terrain(dem + 64.0, height)
-    for features in (TRAVERSABILITY, VISIBILITY):
-        a, b = pixel_features(before, features), pixel_features(after, features)
-        for name in features:
-            # float32 inside xarray-spatial: 64 m costs 6 of its 24 bits.
-            np.testing.assert_allclose(b[name], a[name], rtol=1e-4, atol=1e-4, err_msg=name)
+    before = rough_terrain(1)
+    after = make_terrain(before["dem"].values + 64.0, (before["dsm"] - before["dem"]).values)
+    a, b = pixel_features(before, SHORT), pixel_features(after, SHORT)
+    for name in SHORT:
+        np.testing.assert_allclose(b[name], a[name], rtol=1e-9, atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(openness(before, 6.0), openness(after, 6.0), atol=1e-6)
+
+
+def test_heights_and_pixels_scaled_together_keep_slope_and_aspect():
+    before = rough_terrain(2)
+    after = make_terrain(3.0 * before["dem"].values, resolution=3.0)
+    np.testing.assert_allclose(slope(after), slope(before), rtol=1e-12)
+    np.testing.assert_allclose(aspect(after), aspect(before), rtol=1e-12)
+    np.testing.assert_allclose(tri(after), 3.0 * tri(before).values, rtol=1e-12)
+
+
+def test_a_feature_of_one_s_own():
+    @register_feature("northness", sign=1)
+    def northness(terrain):
+        return np.cos(aspect(terrain))
+
+    try:
+        values = pixel_features(rough_terrain(), ["northness", "slope"])
+        assert list(values) == ["northness", "slope"]
+        with pytest.raises(TerrainError, match="there is a feature 'northness' already"):
+            register_feature("northness", sign=1)
+    finally:
+        del FEATURES["northness"]
+    with pytest.raises(TerrainError, match="need sign 1 or -1 and halo >= 0; got 0"):
+        register_feature("other", sign=0)
+    with pytest.raises(TrustboError, match="unknown feature 'stepheight'; choose one of slope"):
+        pixel_features(rough_terrain(), ["stepheight"])

@@ -9,7 +9,9 @@ from trustbo.terrain import rays
 
 
 def cast(ground, surface, start, end, mode=rays.TRANSMITTANCE, k=0.1, base=0.3, pixel=(1.0, 1.0)):
-    return rays.ray_transmittance(ground, surface, pixel, start, end, mode, k, base)
+    return rays.ray_transmittance(
+        ground, surface, pixel, start, end, mode, k, base, rays.work_space()
+    )
 
 
 def bilinear(values, r, c):
@@ -84,7 +86,7 @@ def test_a_ridge_blocks_and_canopy_blocks_only_as_a_wall():
 
 
 def test_rays_agree_with_fine_sampling():
-    n_far = 0
+    off = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         ground, surface = rough(seed)
@@ -92,10 +94,11 @@ def test_rays_agree_with_fine_sampling():
         points = [(*end, bilinear(ground, *end) + 1.5) for end in ends]
         ours = cast(ground, surface, *points)
         reference = finely_sampled(ground, surface, *points, 0.1, 0.3)
-        # Between crossings we take the bilinear patch as linear: grazing rays may go either way,
-        # and the length inside a canopy of random pixels is off by a little.
-        n_far += abs(ours - reference) > 0.03
-    assert n_far <= 3
+        off.append(abs(ours - reference))
+    # Between two lines we take everything as linear. Grazing rays may go either way, and the length
+    # inside a canopy of independent random pixels, the worst there is, is off by a little.
+    assert np.mean(np.array(off) > 0.1) < 0.05
+    assert np.median(off) < 0.01
 
 
 def test_rays_are_symmetric_and_turn_with_the_terrain():

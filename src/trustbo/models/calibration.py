@@ -1,7 +1,6 @@
 """Are posteriors calibrated? Simulation-based calibration (Talts et al. 2018)."""
 
 import json
-import os
 from os import PathLike
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.files import write_text
 from trustbo.models.model import TrustModel
 from trustbo.models.nuts import NutsSettings
 from trustbo.models.pooled import PooledTrust
@@ -140,9 +140,4 @@ def _read(checkpoint: str | PathLike[str] | None, asked: str) -> list[dict[str, 
 def _write(checkpoint: str | PathLike[str] | None, asked: str, ranks: list[dict[str, int]]) -> None:
     if checkpoint is None:
         return
-    path = Path(checkpoint)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Written beside, then renamed: a killed run leaves the last whole state.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps({"asked": asked, "ranks": ranks}), encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(checkpoint, json.dumps({"asked": asked, "ranks": ranks}))

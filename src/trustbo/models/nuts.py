@@ -16,6 +16,8 @@ from numpyro.infer.hmc import hmc
 from trustbo.models.geometry import NutsData, inverse_hessian, newton, noise_shape, round_target
 from trustbo.models.model import TrustModel
 
+_DRAWS_PER_UNKNOWN = 10  # of the warm-up, to learn a covariance from
+
 
 class NutsSettings(NamedTuple):
     """Length and care of a NUTS run."""
@@ -64,8 +66,8 @@ def run_nuts(
     mode, hessian = newton(target.profile, target.start)
     scale = jnp.linalg.cholesky(inverse_hessian(hessian))
 
-    # NUTS sees standard normal coordinates: numpyro's adaptation adds a thousandth of the identity,
-    # which would drown the covariance of a posterior that many missions have made narrow.
+    # NUTS sees standard normal coordinates. With many unknowns it leaves them so: a covariance
+    # learnt from the few hundred draws of a warm-up is then worse than Laplace's.
     def theta_of(x: Array) -> Array:
         return mode + scale @ x
 
@@ -91,6 +93,7 @@ def run_nuts(
             inverse_mass_matrix=mass,
             dense_mass=[("theta",)],  # pyright: ignore[reportArgumentType]
             target_accept_prob=settings.target_accept,
+            adapt_mass_matrix=joint or _DRAWS_PER_UNKNOWN * len(mode) <= settings.n_warmup,
             rng_key=key_run,
         )
 

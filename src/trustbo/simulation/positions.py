@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-import xrspatial
 from scipy import ndimage
 
 from trustbo.data import Cell
 from trustbo.simulation.sight import Sight, Surface, in_view, transmittance
 from trustbo.terrain import Workspace, pixel_size
+from trustbo.terrain.features import gradient
 
 SPACING = 2.0
 """Least distance between two robots of a formation, m."""
@@ -115,29 +115,22 @@ class Positions:
 
 def surface_of(terrain: xr.Dataset, pixels: xr.Dataset) -> Surface:
     """A workspace's terrain as the arrays that sight and motion work on."""
-    dem = _filled(terrain["dem"])
-    rise = np.tan(np.deg2rad(xrspatial.slope(dem, boundary="nearest").values))
-    aspect = xrspatial.aspect(dem, boundary="nearest").values
-    # Aspect is the compass direction of descent, -1 where flat; the gradient points uphill.
-    away = np.deg2rad(np.where(aspect < 0, 0.0, aspect))
-    gradient = np.stack([-rise * np.sin(away), -rise * np.cos(away)])
     return Surface(
-        ground=terrain["dem"].values,
-        canopy=terrain["dsm"].values,
-        gradient=gradient.astype(float),
+        ground=terrain["dem"].values.astype(float),
+        canopy=terrain["dsm"].values.astype(float),
+        gradient=gradient(_filled(terrain["dem"].values.astype(float)), pixel_size(terrain)),
         passable=pixels["passable"].values.astype(bool),
         pixel=pixel_size(terrain),
         origin=(float(terrain["x"][0]), float(terrain["y"][0])),
     )
 
 
-def _filled(dem: xr.DataArray) -> xr.DataArray:
+def _filled(dem: np.ndarray) -> np.ndarray:
     """Missing heights replaced by the nearest known: a robot may brush the edge of the data."""
-    known = np.isfinite(dem.values)
     nearest: Any = ndimage.distance_transform_edt(
-        ~known, return_distances=False, return_indices=True
+        ~np.isfinite(dem), return_distances=False, return_indices=True
     )
-    return dem.copy(data=dem.values[tuple(nearest)])
+    return dem[tuple(nearest)]
 
 
 def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:

@@ -136,7 +136,7 @@ def in_view(
 
 @njit(cache=True)
 def _transmittances(ground, canopy, pixel, start, end, mode, extinction, crown_base):
-    result = np.empty(len(start))
+    result, work = np.empty(len(start)), rays.work_space()
     for i in range(len(start)):
         # The outer half of the raster's edge pixels has the heights of their centres.
         r0, c0 = _inward(start[i, 0], ground.shape[0]), _inward(start[i, 1], ground.shape[1])
@@ -144,7 +144,7 @@ def _transmittances(ground, canopy, pixel, start, end, mode, extinction, crown_b
         z0 = rays.ground_height(ground, r0, c0) + start[i, 2]
         z1 = rays.ground_height(ground, r1, c1) + end[i, 2]
         result[i] = rays.ray_transmittance(
-            ground, canopy, pixel, (r0, c0, z0), (r1, c1, z1), mode, extinction, crown_base
+            ground, canopy, pixel, (r0, c0, z0), (r1, c1, z1), mode, extinction, crown_base, work
         )
     return result
 

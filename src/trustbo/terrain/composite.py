@@ -1,20 +1,34 @@
-"""One index in [0, 1] out of several pixel features, by their first principal component."""
+"""One index in [0, 1] out of several features, by their first principal component."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from typing import Self
 
 import numpy as np
 import xarray as xr
+from numba import njit
+from scipy import stats
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 
-from trustbo.errors import TerrainError, require_choice
+from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
+from trustbo.files import write_file
 
 SCALINGS = ("percentile", "minmax", "logistic")
+METHODS = ("pca", "zheng2023")
 MAX_PIXELS = 1_000_000
+MIN_CALIBRATION = 200
+"""Rows a real-time index is fitted on at least: on fewer, its loadings are chance."""
+
+REALTIME: Mapping[str, Mapping[str, int]] = {
+    "traversability": {"offline": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
+    "visibility": {"offline": +1, "return_range": +1, "visible_share": +1},
+}
+"""What the value of a bound is fused of: the map's, and the motion or the sensing state."""
 
 
-class CompositeIndex:
+class CompositeIndex(TransformerMixin, BaseEstimator):
     """First principal component of winsorised, standardised features, oriented and scaled.
 
     Each feature is cut at its 1st and 99th percentile and turned into z-scores; the first component
@@ -23,10 +37,18 @@ class CompositeIndex:
 
     Attributes:
         loadings_: DataArray (feature), the oriented unit vector; 0 for a constant feature.
-        explained_variance_ratio_: Share of the variance the component explains.
+        explained_variance_ratio_: DataArray (component), shares of the variance, largest first.
     """
 
-    def __init__(self, signs: Mapping[str, int], *, scaling: str = "percentile") -> None:
+    def __init__(
+        self,
+        signs: Mapping[str, int],
+        *,
+        scaling: str = "percentile",
+        robust: bool = False,
+        method: str = "pca",
+        min_samples: int = 1,
+    ) -> None:
         """Declare the features.
 
         Args:
@@ -34,97 +56,228 @@ class CompositeIndex:
             scaling: `"percentile"` maps the 2nd and 98th percentile of the score to 0 and 1,
                 `"minmax"` its extremes, `"logistic"` passes the standardised score through the
                 logistic function.
+            robust: Loadings from rank correlations (Spearman), which no outlier and no bent scale
+                can sway.
+            method: `"zheng2023"` is for comparison with the later code of the paper's authors:
+                features scaled by median and interquartile range, uncut, the component's sign left
+                to the solver, the score squashed by the logistic function.
+            min_samples: Refuse to be fitted on fewer samples.
 
         Raises:
-            TrustboError: An unknown scaling.
+            TrustboError: An unknown scaling or method.
         """
-        self.signs = dict(signs)
+        self.signs = signs
         self.scaling = require_choice("scaling", scaling, SCALINGS)
+        self.robust = robust
+        self.method = require_choice("method", method, METHODS)
+        self.min_samples = require_whole("min_samples", min_samples, 1)
 
-    def fit(self, features: xr.Dataset) -> Self:
-        """Learn cuts, loadings and scale from pixels.
+    @classmethod
+    def realtime(cls, feature: str, **options: object) -> Self:
+        """The index of a bound as it is driven: the map's value fused with the robot's state.
+
+        Fit it once, on the bounds of a set of calibration missions, and keep it: fitted anew on a
+        short window, its signs flip.
 
         Args:
-            features: One variable per declared feature, any dims; pixels with a NaN are left out.
+            feature: `"traversability"`: the map's (`offline`) at the robot's true position, its
+                `speed_ratio` (achieved over commanded), and the size of its `pitch` and `roll`
+                (rad). `"visibility"`: the map's (`offline`), the mean range of the lidar's returns
+                (`return_range`, m), and the `visible_share` of its beams.
+            **options: See `CompositeIndex`.
 
         Raises:
-            TerrainError: A declared feature is missing, or no pixel has all of them.
+            TrustboError: An unknown feature.
         """
-        x = self._matrix(features)
+        signs = REALTIME[require_choice("real-time feature", feature, REALTIME)]
+        return cls(signs, **{"min_samples": MIN_CALIBRATION} | options)  # pyright: ignore[reportArgumentType]
+
+    def fit(self, features: xr.Dataset, y: None = None) -> Self:
+        """Learn cuts, loadings and scale.
+
+        Args:
+            features: One variable per declared feature, any dims; samples with a NaN are left out.
+            y: Not used; scikit-learn's convention.
+
+        Raises:
+            TerrainError: A declared feature is missing, or too few samples have all of them.
+        """
+        x = np.stack(self._columns(features), axis=1).astype(float)
         x = x[np.isfinite(x).all(1)]
-        if not len(x):
-            raise TerrainError(f"no pixel has all of the features {', '.join(self.signs)}.")
+        if len(x) < self.min_samples:
+            found = f"only {len(x)} samples have" if len(x) else "no pixel has"
+            raise TerrainError(
+                f"{found} all of the features {', '.join(self.signs)}; "
+                f"{self.min_samples} are needed."
+            )
         x = x[:: -(-len(x) // MAX_PIXELS)]
-        self._low, self._high = np.percentile(x, [1, 99], axis=0)
+        self._standardise(x)
         x = np.clip(x, self._low, self._high)
-        self._mean, self._sd = x.mean(0), x.std(0)
-        # A feature that (nearly) never changes carries no information, and has no z-score.
-        self._varies = self._sd > 1e-9 * np.maximum(1.0, np.abs(self._mean))
-        weights = np.zeros(len(self.signs))
-        self.explained_variance_ratio_ = 1.0
+        z = ((x - self._mean) / np.where(self._varies, self._sd, 1.0))[:, self._varies]
+        weights, ratios = np.zeros(len(self.signs)), np.array([1.0])
         if self._varies.any():
-            pca = PCA(n_components=1, svd_solver="covariance_eigh").fit(self._standardise(x))
+            vectors, ratios = _components(z, self.robust)
             signs = np.array(list(self.signs.values()), dtype=float)[self._varies]
-            component = np.asarray(pca.components_)[0]
-            weights[self._varies] = component * (np.sign(component @ signs) or 1.0)
-            self.explained_variance_ratio_ = float(np.asarray(pca.explained_variance_ratio_)[0])
+            turn = 1.0 if self.method == "zheng2023" else np.sign(vectors[0] @ signs) or 1.0
+            weights[self._varies] = turn * vectors[0]
         self.loadings_ = xr.DataArray(
             weights, {"feature": list(self.signs)}, dims="feature", name="loading"
         )
-        score = self._score(x)
-        percentiles = {"percentile": [2, 98], "minmax": [0, 100], "logistic": [0, 100]}
-        self._bottom, self._top = np.percentile(score, percentiles[self.scaling])
-        if self._top - self._bottom < 1e-9:  # nearly all pixels are alike: take the extremes
-            self._bottom, self._top = float(score.min()), float(score.max())
-        self._spread = float(score.std()) or 1.0
-        self._warn()
+        self.explained_variance_ratio_ = xr.DataArray(
+            ratios, {"component": np.arange(1, len(ratios) + 1)}, dims="component"
+        )
+        self._scale(z @ weights[self._varies])
+        if self.method == "pca":
+            self._warn()
         return self
 
     def transform(self, features: xr.Dataset) -> xr.DataArray:
-        """The index of every pixel, in [0, 1]; NaN where a feature is.
+        """The index of every sample, in [0, 1]; NaN where a feature is.
 
         Features that are all constant say nothing: the index is then 0.5 everywhere.
-        """
-        x = self._matrix(features)
-        score = self._score(np.clip(x, self._low, self._high))
-        if self._top - self._bottom < 1e-9:
-            index = np.where(np.isfinite(x).all(1), 0.5, np.nan)
-        elif self.scaling == "logistic":
-            index = 1.0 / (1.0 + np.exp(-score / self._spread))
-        else:
-            index = np.clip((score - self._bottom) / (self._top - self._bottom), 0.0, 1.0)
-        like = features[next(iter(self.signs))]
-        return like.copy(data=index.reshape(like.shape)).rename(None).assign_attrs(units="1")
 
-    def _matrix(self, features: xr.Dataset) -> np.ndarray:
+        Raises:
+            TerrainError: A declared feature is missing.
+            TrustboError: It has not been fitted.
+        """
+        columns = dict(zip(self.signs, self._columns(features), strict=True))
+        like = features[next(iter(self.signs))]
+        index = self.of_columns(columns).reshape(like.shape)
+        attrs = {"units": "1", "long_name": "index"}
+        return like.copy(deep=False, data=index).rename(None).assign_attrs(attrs)
+
+    def of_columns(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """As `transform`, of arrays of shape (sample,), which come first in their precision.
+
+        Raises:
+            TrustboError: It has not been fitted.
+        """
+        if not hasattr(self, "loadings_"):
+            raise TrustboError("this CompositeIndex is not fitted; call fit, or load one.")
+        weights = self.loadings_.values / np.where(self._varies, self._sd, 1.0)
+        numbers = zip(self._low, self._high, self._mean, weights, strict=True)
+        first = next(iter(columns.values()))
+        score = np.zeros(first.size, first.dtype if first.dtype.kind == "f" else float)
+        for name, of_feature in zip(self.signs, numbers, strict=True):
+            _add_score(score, columns[name], *np.asarray(of_feature, score.dtype))
+        if self._top - self._bottom < 1e-9:
+            return np.where(np.isfinite(score), 0.5, np.nan)
+        if self.scaling == "logistic" or self.method == "zheng2023":
+            return 1.0 / (1.0 + np.exp(-score / self._spread))
+        score -= self._bottom
+        score /= self._top - self._bottom
+        return np.clip(score, 0.0, 1.0, out=score)
+
+    def to_dataset(self) -> xr.Dataset:
+        """All of it as arrays (feature) and attributes, as `save` writes it."""
+        columns = {name: getattr(self, f"_{name}") for name in _COLUMNS}
+        data = xr.Dataset(
+            {name: ("feature", np.asarray(values, float)) for name, values in columns.items()}
+            | {"sign": ("feature", list(self.signs.values())), "loading": self.loadings_}
+            | {"explained_variance_ratio": self.explained_variance_ratio_}
+        )
+        data.attrs = {
+            "scaling": self.scaling,
+            "robust": int(self.robust),
+            "method": self.method,
+            "min_samples": self.min_samples,
+            **{name: float(getattr(self, f"_{name}")) for name in _NUMBERS},
+        }
+        return data
+
+    @classmethod
+    def from_dataset(cls, data: xr.Dataset) -> Self:
+        """What `to_dataset` took apart."""
+        names = [str(name) for name in data["feature"].values]
+        attrs = data.attrs
+        index = cls(
+            dict(zip(names, data["sign"].values.astype(int).tolist(), strict=True)),
+            scaling=str(attrs["scaling"]),
+            robust=bool(attrs["robust"]),
+            method=str(attrs["method"]),
+            min_samples=int(attrs["min_samples"]),
+        )
+        index.loadings_ = data["loading"].load()
+        index.explained_variance_ratio_ = data["explained_variance_ratio"].load()
+        for name in _COLUMNS:
+            setattr(index, f"_{name}", data[name].values)
+        index._varies = index._varies.astype(bool)
+        for name in _NUMBERS:
+            setattr(index, f"_{name}", float(attrs[name]))
+        return index
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write a fitted index to a netCDF file."""
+        write_file(path, lambda file: self.to_dataset().to_netcdf(file))
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read an index that `save` wrote."""
+        with xr.open_dataset(path) as data:
+            return cls.from_dataset(data.load())
+
+    def _columns(self, features: xr.Dataset) -> Sequence[np.ndarray]:
         missing = [name for name in self.signs if name not in features]
         if missing:
             raise TerrainError(f"the composite needs {', '.join(missing)}; got {list(features)}.")
-        return np.stack([features[name].values.ravel() for name in self.signs], axis=1)
+        return [features[name].values.ravel() for name in self.signs]
 
-    def _standardise(self, x: np.ndarray) -> np.ndarray:
-        return ((x - self._mean) / np.where(self._varies, self._sd, 1.0))[:, self._varies]
+    def _standardise(self, x: np.ndarray) -> None:
+        """Learn where to cut, and centre and scale of each column."""
+        if self.method == "zheng2023":
+            self._low, self._high = (np.full(x.shape[1], end) for end in (-np.inf, np.inf))
+            quartiles = np.percentile(x, [25, 50, 75], axis=0)
+            self._mean, self._sd = quartiles[1], quartiles[2] - quartiles[0]
+        else:
+            self._low, self._high = np.percentile(x, [1, 99], axis=0)
+            x = np.clip(x, self._low, self._high)
+            self._mean, self._sd = x.mean(0), x.std(0)
+        # A feature that (nearly) never changes carries no information, and has no z-score.
+        self._varies = self._sd > 1e-9 * np.maximum(1.0, np.abs(self._mean))
 
-    def _score(self, x: np.ndarray) -> np.ndarray:
-        score = self._standardise(x) @ self.loadings_.values[self._varies]
-        return np.where(np.isfinite(x).all(1), score, np.nan)
+    def _scale(self, score: np.ndarray) -> None:
+        """Learn which scores become 0 and 1."""
+        ends = [2, 98] if self.scaling == "percentile" else [0, 100]
+        self._bottom, self._top = np.percentile(score, ends)
+        if self._top - self._bottom < 1e-9:  # nearly all pixels are alike: take the extremes
+            self._bottom, self._top = float(score.min()), float(score.max())
+        self._spread = 1.0 if self.method == "zheng2023" else float(score.std()) or 1.0
 
     def _warn(self) -> None:
-        signs = np.array(list(self.signs.values()))
-        against = [
-            name
-            for name, w, s in zip(self.signs, self.loadings_.values, signs, strict=True)
-            if w * s < 0
-        ]
+        loadings = zip(self.signs.items(), self.loadings_.values, strict=True)
+        against = [name for (name, sign), loading in loadings if loading * sign < 0]
         if against:
             warnings.warn(
                 f"{', '.join(against)} enters its composite against the declared sign: here it "
                 "goes along with what it should oppose. Look at the loadings, or leave it out.",
                 stacklevel=3,
             )
-        if self.explained_variance_ratio_ < 0.5:
+        if (ratio := float(self.explained_variance_ratio_[0])) < 0.5:
             warnings.warn(
-                f"the first component of {', '.join(self.signs)} explains only "
-                f"{self.explained_variance_ratio_:.0%} of their variance.",
+                f"the first component of {', '.join(self.signs)} explains only {ratio:.0%} of "
+                "their variance.",
                 stacklevel=3,
             )
+
+
+_COLUMNS = ("low", "high", "mean", "sd", "varies")
+_NUMBERS = ("bottom", "top", "spread")
+
+
+def _components(z: np.ndarray, robust: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (component, feature) and shares of the variance, largest first."""
+    if robust and z.shape[1] > 1:
+        ranks = stats.rankdata(z, axis=0)
+        values, vectors = np.linalg.eigh(np.corrcoef(ranks.T))
+        return vectors.T[::-1], values[::-1] / values.sum()
+    pca = PCA(svd_solver="covariance_eigh").fit(z)
+    return np.asarray(pca.components_), np.asarray(pca.explained_variance_ratio_)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz", "arcp", "reassoc"})
+def _add_score(score, x, low, high, mean, weight):
+    """One feature's part of the score; a comparison with NaN is false, so NaN goes through."""
+    for n in range(len(x)):
+        v = low if x[n] < low else x[n]
+        v = high if v > high else v
+        score[n] += (v - mean) * weight

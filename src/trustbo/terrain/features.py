@@ -1,137 +1,350 @@
 """Attributes of every pixel that make ground hard to cross or sight hard to keep."""
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import xarray as xr
-import xrspatial
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from trustbo.terrain import rays
+from trustbo.errors import ShapeError, TerrainError, require_choice, require_whole
+from trustbo.terrain import fan, rays, stencil
+from trustbo.terrain.parallel import over_rows
 from trustbo.terrain.raster import pixel_size
 
 CANOPY_THRESHOLD = 2.0
 """Vegetation at least this high (m) counts as canopy."""
+COVER_RADIUS = 5.0
+"""Half-width of the squares over which canopy is averaged, m."""
+REACH = 50.0
+"""Length of the rays of openness, m."""
+
+Compute = Callable[..., xr.DataArray]
+"""Of a terrain, Dataset of `dem` and `dsm` over (y, x)."""
 
 
 class PixelFeature(NamedTuple):
-    """A named attribute and the sign with which it enters its composite."""
+    """A named attribute of pixels, and how it enters an index."""
 
-    compute: Callable[[xr.Dataset], xr.DataArray]
+    compute: Compute
+    """Of a terrain or a strip of one, dims (y, x)."""
     sign: int
+    """+1 if more of it raises the index it is part of, -1 if it lowers it."""
+    halo: float = 0.0
+    """How far around a pixel it looks, m; the pixels next to it are always there."""
+    by_rows: bool = False
+    """Whether `compute` takes `rows=`, the rows that are wanted; it may leave out the others."""
+
+    def of_rows(self, terrain: xr.Dataset, rows: slice) -> np.ndarray:
+        """Its values on some rows of a terrain, shape (row, col)."""
+        options = {"rows": rows} if self.by_rows else {}
+        return self.compute(terrain, **options).values[rows]
 
 
+FEATURES: dict[str, PixelFeature] = {}
+"""Every feature known by name."""
+
+
+class _Registrar(Protocol):
+    def __call__[F: Compute](self, compute: F, /) -> F: ...
+
+
+def register_feature(name: str, *, sign: int, halo: float = 0.0) -> _Registrar:
+    """Add a feature of one's own, to be used by its name.
+
+    Args:
+        name: A new one.
+        sign: +1 if more of it raises the index it is part of, -1 if it lowers it.
+        halo: How far around a pixel it looks, m, so that large rasters can be done in strips.
+
+    Returns:
+        A decorator for a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), m) that
+        returns a DataArray (y, x), NaN where unknown.
+
+    Raises:
+        TerrainError: The name is taken, or the sign neither 1 nor -1.
+    """
+    if name in FEATURES:
+        raise TerrainError(f"there is a feature {name!r} already; take another name.")
+    if sign not in (1, -1) or not halo >= 0.0:
+        raise TerrainError(f"need sign 1 or -1 and halo >= 0; got {sign!r} and {halo!r}.")
+
+    def register[F: Compute](compute: F, /) -> F:
+        FEATURES[name] = PixelFeature(compute, sign, halo)
+        return compute
+
+    return register
+
+
+def feature_named(name: str) -> PixelFeature:
+    """A registered feature.
+
+    Raises:
+        TrustboError: There is none of that name.
+    """
+    return FEATURES[require_choice("feature", name, FEATURES)]
+
+
+@register_feature("slope", sign=-1)
 def slope(terrain: xr.Dataset) -> xr.DataArray:
     """Slope of the ground, rad, by Horn's (1981) 3 x 3 stencil."""
-    degrees = xrspatial.slope(terrain["dem"], boundary="nearest")
-    return _named(degrees * (np.pi / 180.0), "slope", "rad")
+    return _stencil(terrain, stencil.slope, "slope", "rad")
 
 
+@register_feature("aspect", sign=1)
+def aspect(terrain: xr.Dataset) -> xr.DataArray:
+    """Direction of the steepest descent, rad clockwise from grid north; NaN where flat.
+
+    An angle: take a function of it, such as its cosine, for a composite.
+    """
+    return _stencil(terrain, stencil.aspect, "aspect", "rad")
+
+
+@register_feature("curvature", sign=1)
+def curvature(terrain: xr.Dataset) -> xr.DataArray:
+    """Minus the Laplacian of the ground, 1/m: positive on ridges, negative in hollows."""
+    return _stencil(terrain, stencil.curvature, "curvature", "1/m")
+
+
+@register_feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> xr.DataArray:
     """Highest minus lowest ground in the 3 x 3 window, m (GDAL's roughness)."""
-    return _named(xrspatial.roughness(terrain["dem"], boundary="nearest"), "roughness", "m")
+    return _stencil(terrain, stencil.roughness, "roughness", "m")
 
 
+@register_feature("tri", sign=-1)
 def tri(terrain: xr.Dataset) -> xr.DataArray:
     """Terrain ruggedness index, m: root sum of squared steps to the 8 neighbours (Riley 1999)."""
-    return _named(xrspatial.tri(terrain["dem"], boundary="nearest"), "tri", "m")
+    return _stencil(terrain, stencil.tri, "tri", "m")
 
 
+@register_feature("tpi", sign=1)
+def tpi(terrain: xr.Dataset) -> xr.DataArray:
+    """Topographic position index, m: height above the mean of the 8 neighbours."""
+    return _stencil(terrain, stencil.tpi, "tpi", "m")
+
+
+@register_feature("step_height", sign=-1)
 def step_height(terrain: xr.Dataset) -> xr.DataArray:
     """Largest step up or down to one of the 8 neighbours, m."""
-    dem = terrain["dem"].values
-    rows, cols = dem.shape
-    padded = np.pad(dem, 1, mode="edge")
-    steps = np.zeros_like(dem)
-    for i in range(3):
-        for j in range(3):
-            # fmax: a missing neighbour is no step.
-            steps = np.fmax(steps, np.abs(padded[i : i + rows, j : j + cols] - dem))
-    values = np.where(np.isnan(dem), np.nan, steps)
-    return _named(terrain["dem"].copy(data=values), "step_height", "m")
+    return _stencil(terrain, stencil.step_height, "step_height", "m")
 
 
+@register_feature("canopy_height", sign=-1)
 def canopy_height(terrain: xr.Dataset) -> xr.DataArray:
     """Surface minus ground, m."""
     return _named(terrain["dsm"] - terrain["dem"], "canopy_height", "m")
 
 
-def canopy_cover(terrain: xr.Dataset, radius: float = 5.0) -> xr.DataArray:
+@register_feature("canopy_cover", sign=-1, halo=COVER_RADIUS)
+def canopy_cover(terrain: xr.Dataset, radius: float = COVER_RADIUS) -> xr.DataArray:
     """Share of the square of half-width `radius` (m) that is under canopy over 2 m high."""
     height = canopy_height(terrain)
-    size = [2 * max(1, round(radius / step)) + 1 for step in pixel_size(terrain)]
-    valid = np.isfinite(height.values)
-    tall = np.where(valid, height.values > CANOPY_THRESHOLD, False).astype(float)
-    window = {"size": size, "mode": "nearest"}
-    weight = ndimage.uniform_filter(valid.astype(float), **window)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        cover = np.where(valid, ndimage.uniform_filter(tall, **window) / weight, np.nan)
-    return _named(height.copy(data=np.clip(cover, 0.0, 1.0)), "canopy_cover", "1")
+    tall = (height.values > CANOPY_THRESHOLD).astype(height.dtype)
+    return _named(_local_mean(terrain, tall, radius).clip(0.0, 1.0), "canopy_cover", "1")
+
+
+@register_feature("vegetation_density", sign=-1, halo=COVER_RADIUS)
+def vegetation_density(
+    terrain: xr.Dataset,
+    radius: float = COVER_RADIUS,
+    *,
+    layer: float = 3.0,
+    crown_base: float = 0.3,
+) -> xr.DataArray:
+    """Share of the lowest metres of air that canopy fills, around each pixel.
+
+    Args:
+        terrain: DEM and DSM.
+        radius: Half-width of the square around a pixel that counts, m.
+        layer: Height of the air that counts, m: where robots look through.
+        crown_base: Lower edge of the canopy layer as a share of its height.
+
+    Returns:
+        Dims (y, x), in [0, 1].
+    """
+    height = canopy_height(terrain).values
+    filled = np.minimum(height, layer) - np.minimum(crown_base * height, layer)
+    share = _local_mean(terrain, np.maximum(filled, 0.0) / layer, radius)
+    return _named(share.clip(0.0, 1.0), "vegetation_density", "1")
 
 
 def openness(
     terrain: xr.Dataset,
-    reach: float = 50.0,
+    reach: float = REACH,
     *,
     eye: float = 1.0,
     target: float = 1.0,
     n_rays: int = 16,
     extinction: float = 0.1,
     crown_base: float = 0.3,
+    rows: slice | None = None,
 ) -> xr.DataArray:
     """Expected share of clear rays from a pixel to targets `reach` metres away all around.
 
     Args:
         terrain: DEM and DSM.
-        reach: Length of the rays, m; at most half the terrain's shorter side is used.
+        reach: Length of the rays, m.
         eye: Height of the sensor above ground, m.
         target: Height of the targets above ground, m.
         n_rays: Number of directions.
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Lower edge of the canopy layer as a share of its height.
+        rows: Only these rows of pixels; the others are NaN.
 
     Returns:
-        Dims (y, x), in [0, 1]; rays that end off the raster do not count.
+        Dims (y, x), in [0, 1]; rays that end off the raster do not count, and a pixel all of whose
+        rays do so is NaN: keep `reach` below half the terrain's shorter side.
+
+    Raises:
+        TrustboError: No direction.
     """
-    pixel = pixel_size(terrain)
-    extent = min(n * step for n, step in zip(terrain["dem"].shape, pixel, strict=True))
-    values = rays.openness(
+    values = fan.openness(
         terrain["dem"].values,
         terrain["dsm"].values,
-        pixel,
-        min(reach, 0.5 * extent),
+        pixel_size(terrain),
+        reach,
         eye,
         target,
-        n_rays,
+        require_whole("n_rays", n_rays, 1),
         extinction,
         crown_base,
+        rows or slice(None),
     )
-    return _named(terrain["dem"].copy(data=values), "openness", "1")
+    return _named(terrain["dem"].copy(deep=False, data=values), "openness", "1")
 
 
-TRAVERSABILITY: Mapping[str, PixelFeature] = {
-    "slope": PixelFeature(slope, -1),
-    "roughness": PixelFeature(roughness, -1),
-    "tri": PixelFeature(tri, -1),
-    "step_height": PixelFeature(step_height, -1),
-}
+FEATURES["openness"] = PixelFeature(openness, +1, REACH, by_rows=True)
+
+
+def exposure(
+    terrain: xr.Dataset,
+    observers: ArrayLike,
+    reach: float = np.inf,
+    *,
+    eye: float = 2.0,
+    target: float = 1.0,
+    extinction: float = 0.1,
+    crown_base: float = 0.3,
+    rows: slice | None = None,
+) -> xr.DataArray:
+    """Expected share of a set of observers, such as enemy posts, that see a pixel.
+
+    Args:
+        terrain: DEM and DSM.
+        observers: Their positions, shape (observer, 2), x and y in CRS metres.
+        reach: How far they see, m.
+        eye: Their height above ground, m.
+        target: Height above ground of what they look for, m.
+        extinction: Extinction coefficient of the canopy, 1/m.
+        crown_base: Lower edge of the canopy layer as a share of its height.
+        rows: Only these rows of pixels; the others are NaN.
+
+    Returns:
+        Dims (y, x), in [0, 1].
+
+    Raises:
+        ShapeError: Observers that are no list of positions.
+        TerrainError: An observer off the terrain.
+    """
+    place = require_observers(terrain, observers)
+    height, width = pixel_size(terrain)
+    row = (float(terrain["y"][0]) - place[:, 1]) / height
+    col = (place[:, 0] - float(terrain["x"][0])) / width
+    values = rays.exposure(
+        terrain["dem"].values,
+        terrain["dsm"].values,
+        (height, width),
+        np.stack([row, col], axis=1),
+        reach,
+        (eye, target),
+        (extinction, crown_base),
+        rows or slice(None),
+    )
+    return _named(terrain["dem"].copy(deep=False, data=values), "exposure", "1")
+
+
+def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
+    """Positions as an array (observer, 2), all on the terrain.
+
+    Raises:
+        ShapeError: They are no list of positions.
+        TerrainError: One is off the terrain.
+    """
+    place = np.asarray(observers, dtype=float)
+    if place.ndim != 2 or place.shape[1] != 2 or not len(place):
+        raise ShapeError(
+            f"observers must be (observer, 2), x and y in CRS metres; got shape {place.shape}."
+        )
+    left, bottom, right, top = terrain.rio.bounds(recalc=True)
+    inside = (place >= (left, bottom)).all(1) & (place <= (right, top)).all(1)
+    if not inside.all():
+        x, y = place[~inside][0]
+        raise TerrainError(
+            f"observer ({x:g}, {y:g}) is off the terrain, which covers x {left:g} to {right:g} and "
+            f"y {bottom:g} to {top:g}."
+        )
+    return place
+
+
+TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 """What traversability (z1) is made of: all of it lowers it."""
-
-VISIBILITY: Mapping[str, PixelFeature] = {
-    "canopy_height": PixelFeature(canopy_height, -1),
-    "canopy_cover": PixelFeature(canopy_cover, -1),
-    "openness": PixelFeature(openness, +1),
-}
+VISIBILITY = ("canopy_height", "canopy_cover", "openness")
 """What visibility (z2) is made of: canopy lowers it, openness raises it."""
 
 
-def pixel_features(terrain: xr.Dataset, features: Mapping[str, PixelFeature]) -> xr.Dataset:
-    """Every feature of a composite, as variables of dims (y, x)."""
+def pixel_features(
+    terrain: xr.Dataset, features: Iterable[str] | Mapping[str, PixelFeature]
+) -> xr.Dataset:
+    """Several features, as variables of dims (y, x).
+
+    Args:
+        terrain: DEM and DSM.
+        features: Names of registered features, or features by name.
+
+    Raises:
+        TrustboError: An unknown name.
+    """
+    if not isinstance(features, Mapping):
+        features = {name: feature_named(name) for name in features}
     return xr.Dataset({name: feature.compute(terrain) for name, feature in features.items()})
 
 
+def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
+    """Horn's rise of the ground to the east and to the north, shape (2, row, col)."""
+    out = np.empty((2, *dem.shape), dem.dtype)
+    stencil.gradient(np.pad(dem, 1, mode="edge"), pixel, out)
+    return out
+
+
+def _stencil(terrain: xr.Dataset, kernel: Callable, name: str, units: str) -> xr.DataArray:
+    """A 3 x 3 attribute; beyond the raster's edge the ground goes on level."""
+    dem = terrain["dem"]
+    z, pixel, out = dem.values, pixel_size(terrain), np.empty(dem.shape, dem.dtype)
+
+    def work(first: int, last: int) -> None:
+        block = np.empty((last - first + 2, z.shape[1] + 2), z.dtype)
+        block[1:-1, 1:-1] = z[first:last]
+        block[0, 1:-1], block[-1, 1:-1] = z[max(first - 1, 0)], z[min(last, len(z) - 1)]
+        block[:, 0], block[:, -1] = block[:, 1], block[:, -2]
+        kernel(block, pixel, out[first:last])
+
+    over_rows(work, len(z))
+    return _named(dem.copy(deep=False, data=out), name, units)
+
+
+def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:
+    """Mean over squares of half-width `radius` (m), of the pixels that have data."""
+    size: Any = [2 * max(1, round(radius / step)) + 1 for step in pixel_size(terrain)]
+    valid = np.isfinite(terrain["dem"].values)
+    total = ndimage.uniform_filter(np.where(valid, values, 0.0), size, mode="nearest")
+    weight = ndimage.uniform_filter(valid.astype(total.dtype), size, mode="nearest")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return terrain["dem"].copy(deep=False, data=np.where(valid, total / weight, np.nan))
+
+
 def _named(array: xr.DataArray, name: str, units: str) -> xr.DataArray:
-    array = array.astype(float).rename(name)
+    array = array.rename(name)
     array.attrs = {"units": units, "long_name": name.replace("_", " ")}
     return array

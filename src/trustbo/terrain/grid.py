@@ -1,12 +1,19 @@
 """The planning grid: which cell a position or a pixel belongs to, and means over cells."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numba import njit
+from numpy.typing import ArrayLike
+from rasterio.crs import CRS
+from rasterio.warp import transform as transform_points
 
 from trustbo.data import Cell
 from trustbo.errors import TerrainError, TrustboError, require_pair
+
+WGS84 = CRS.from_epsg(4326)
 
 
 @dataclass(frozen=True)
@@ -19,6 +26,7 @@ class Grid:
         top: y of the top edge, CRS metres.
         cell_height: North-south size of a cell, m.
         cell_width: East-west size of a cell, m.
+        crs: Coordinate reference system, as WKT; None without a terrain.
     """
 
     shape: tuple[int, int]
@@ -26,6 +34,7 @@ class Grid:
     top: float
     cell_height: float
     cell_width: float
+    crs: str | None = None
 
     @classmethod
     def over(cls, terrain: xr.Dataset, shape: tuple[int, int]) -> "Grid":
@@ -45,7 +54,15 @@ class Grid:
                 "raster."
             )
         left, bottom, right, top = terrain.rio.bounds(recalc=True)
-        return cls((rows, cols), left, top, (top - bottom) / rows, (right - left) / cols)
+        crs = terrain.rio.crs
+        return cls(
+            (rows, cols),
+            left,
+            top,
+            (top - bottom) / rows,
+            (right - left) / cols,
+            None if crs is None else crs.to_wkt(),
+        )
 
     def center(self, cell: Cell) -> tuple[float, float]:
         """X and y of a cell's centre, CRS metres."""
@@ -75,6 +92,25 @@ class Grid:
             raise TrustboError(f"position ({x:g}, {y:g}) is off the grid.")
         return row, col
 
+    def lonlat(self, cell: Cell) -> tuple[float, float]:
+        """Longitude and latitude of a cell's centre, degrees (WGS 84).
+
+        Raises:
+            TrustboError: The grid has no CRS.
+        """
+        x, y = self.center(cell)
+        lon, lat = transform_points(self._crs(), WGS84, [x], [y])[:2]
+        return lon[0], lat[0]
+
+    def cell_at_lonlat(self, lon: float, lat: float) -> Cell:
+        """The cell that holds a place given in degrees (WGS 84).
+
+        Raises:
+            TrustboError: The place is off the grid, or the grid has no CRS.
+        """
+        x, y = transform_points(WGS84, self._crs(), [lon], [lat])[:2]
+        return self.cell_at(x[0], y[0])
+
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
         """Mean over each cell's pixels that have data.
 
@@ -84,25 +120,108 @@ class Grid:
         Returns:
             Shape (row, col); NaN where a cell has no data.
         """
-        array = values.transpose("y", "x").values.astype(float)
-        known = np.isfinite(array)
-        total = self._sums(values, np.where(known, array, 0.0))
-        with np.errstate(invalid="ignore"):
-            return total / self._sums(values, known.astype(float))
+        sums = CellMeans(self, values)
+        sums.add(values.transpose("y", "x").values)
+        return sums.cells
 
     def cell_share(self, condition: xr.DataArray) -> np.ndarray:
         """Share of each cell's pixels where a condition holds, shape (row, col)."""
-        array = condition.transpose("y", "x").values.astype(float)
-        return self._sums(condition, array) / self._sums(condition, np.ones_like(array))
+        return self.cell_means(condition.astype(float))
 
-    def cells_along(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def cell_quantiles(self, values: xr.DataArray, q: float) -> np.ndarray:
+        """Quantile of each cell's pixels that have data, shape (row, col); NaN where none has."""
+        quantiles = CellQuantiles(self, values, q)
+        quantiles.add(values.transpose("y", "x").values)
+        return quantiles.cells
+
+    def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Row of the cells that pixels at `y` are in, and column of those at `x`."""
         rows, cols = self.shape
-        row = np.clip(((self.top - y) / self.cell_height).astype(int), 0, rows - 1)
-        return row, np.clip(((x - self.left) / self.cell_width).astype(int), 0, cols - 1)
+        row = ((self.top - np.asarray(y)) / self.cell_height).astype(int)
+        col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
+        return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
 
-    def _sums(self, like: xr.DataArray, array: np.ndarray) -> np.ndarray:
-        rows, cols = self.shape
-        row, col = self.cells_along(like["y"].values, like["x"].values)
-        label = row[:, None] * cols + col[None, :]
-        return np.bincount(label.ravel(), array.ravel(), rows * cols).reshape(rows, cols)
+    def _crs(self) -> CRS:
+        if self.crs is None:
+            raise TrustboError(
+                "this grid has no coordinate reference system: its workspace was not made from a "
+                "terrain. Use cell_at and center, in metres."
+            )
+        return CRS.from_user_input(self.crs)
+
+
+class CellMeans:
+    """Means over the pixels of each cell that have data, fed rows of pixels from north to south."""
+
+    def __init__(self, grid: Grid, like: xr.DataArray) -> None:
+        """Start with none.
+
+        Args:
+            grid: The cells.
+            like: Any raster of the whole terrain, dims (y, x).
+        """
+        self._row, self._edges = _ownership(grid, like)
+        self._total, self._count = np.zeros(grid.shape), np.zeros(grid.shape)
+
+    def add(self, values: np.ndarray, first: int = 0) -> None:
+        """Add rows of pixels, shape (row, col), the first of them row `first` of the raster."""
+        row = self._row[first : first + len(values)]
+        values = values.view(np.uint8) if values.dtype == bool else values
+        _add_rows(np.ascontiguousarray(values), row, self._edges, self._total, self._count)
+
+    @property
+    def cells(self) -> np.ndarray:
+        """Shape (row, col); NaN where a cell has no data."""
+        with np.errstate(invalid="ignore"):
+            return self._total / self._count
+
+
+class CellQuantiles:
+    """Likewise a quantile; one row of cells is held in memory."""
+
+    def __init__(self, grid: Grid, like: xr.DataArray, q: float) -> None:
+        """Start with none; `q` is in [0, 1]."""
+        self._row, self._edges = _ownership(grid, like)
+        self._q = q
+        self._pending: list[np.ndarray] = []
+        self.cells = np.full(grid.shape, np.nan)
+        """Shape (row, col); NaN where a cell has no data, or is not finished."""
+
+    def add(self, values: np.ndarray, first: int = 0) -> None:
+        """As `CellMeans.add`."""
+        row = self._row[first : first + len(values)]
+        for cell in np.unique(row):
+            self._pending.append(values[row == cell])
+            if first + np.searchsorted(row, cell, "right") == np.searchsorted(
+                self._row, cell, "right"
+            ):
+                self._finish(cell)
+
+    def _finish(self, row: int) -> None:
+        values = np.concatenate(self._pending)
+        self._pending = []
+        for col, (left, right) in enumerate(itertools.pairwise(self._edges)):
+            cell = values[:, left:right]
+            if np.isfinite(cell).any():
+                self.cells[row, col] = np.nanquantile(cell, self._q)
+
+
+def _ownership(grid: Grid, like: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
+    """Row of cells of each row of pixels; the first column of pixels of each column of cells."""
+    row, col = grid.cells_along(like["y"].values, like["x"].values)
+    return row, np.searchsorted(col, np.arange(grid.shape[1] + 1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+def _add_rows(values, row, edges, total, count):
+    for i in range(len(values)):
+        for cell in range(len(edges) - 1):
+            # Of one row of one cell: float64 sums of a vector's lanes.
+            s, n = 0.0, 0.0
+            for j in range(edges[cell], edges[cell + 1]):
+                v = values[i, j]
+                known = v == v
+                s += v if known else 0.0
+                n += 1.0 if known else 0.0
+            total[row[i], cell] += s
+            count[row[i], cell] += n

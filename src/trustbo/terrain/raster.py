@@ -1,33 +1,33 @@
 """Reading a DEM and a DSM into one aligned, metric dataset."""
 
 import warnings
-from os import PathLike
-from pathlib import Path
-from typing import Any
+from contextlib import ExitStack
 
 import numpy as np
-import rasterio
-import rioxarray
 import xarray as xr
-from pyproj import Proj
-from pyproj.exceptions import ProjError
 from rasterio.crs import CRS
-from rasterio.enums import Resampling
-from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioIOError
-from rasterio.transform import from_origin
-from rasterio.warp import transform as transform_points
 
-from trustbo.errors import TerrainError, require_positive
+from trustbo.errors import TerrainError
+from trustbo.terrain.align import on_one_grid
+from trustbo.terrain.source import (
+    RasterLike,
+    open_raster,
+    require_metric_crs,
+    require_regular,
+)
 
 CLIP_WARNING_SHARE = 0.02
+_ROWS = 256  # looked at together
 
 
 def read_terrain(
-    dem: str | PathLike[str],
-    dsm: str | PathLike[str],
+    dem: RasterLike,
+    dsm: RasterLike,
     *,
     crs: object = None,
     resolution: float | None = None,
+    nodata: float | None = None,
+    lazy: bool = False,
 ) -> xr.Dataset:
     """Read a digital elevation model (ground) and a digital surface model (canopy, roofs).
 
@@ -36,31 +36,46 @@ def read_terrain(
     The surface is clipped to be nowhere below the ground.
 
     Args:
-        dem: A raster GDAL can read, heights in metres, first band.
+        dem: Heights in metres, first band: a path or an address of anything that GDAL reads
+            (`/vsizip/...`, `https://...`); an open rasterio dataset, which stays open; a DataArray
+            as rioxarray gives it, in memory or lazy; or a Dataset of one such array. Missing are
+            NaN, infinity, what the raster's mask or alpha band hides and its nodata value; scale
+            and offset are applied.
         dsm: Likewise; any grid that overlaps the DEM's.
         crs: Coordinate reference system of rasters that carry none, e.g. `"EPSG:32633"`.
         resolution: Pixel size in metres of rasters that carry no georeference at all.
+        nodata: A further value that means missing, as stored in the rasters.
+        lazy: For rasters larger than the memory: leave the heights in the files. Both variables
+            are then float32 and read when a window of them is loaded, e.g. by
+            `terrain.isel(y=slice(0, 512)).load()`; NaN is not yet in common, nor the surface
+            clipped, which `clean` does to a window. Close the files with `terrain.close()`.
 
     Returns:
-        Dataset with `dem` and `dsm`, float64 in metres, dims (y, x) with north at the top, NaN
-        where either raster has no data; the CRS is in `spatial_ref`.
+        Dataset with `dem` and `dsm`, float64 in metres (float32 if lazy), dims (y, x) with north
+        at the top, NaN where either raster has no data; the CRS is in `spatial_ref`.
 
     Raises:
-        TerrainError: No raster, no CRS, a rotated grid, units other than metres, no overlap, or no
-            data at all.
+        TerrainError: No raster, no CRS, a rotated grid, units other than metres, no overlap, no
+            data at all, or a height of -999 m or beyond +-9000 m: a fill value that no tag
+            declares. With `lazy`, the last two cannot be known before a window is loaded: loading
+            raises for a fill value, and `clean` counts the valid pixels.
     """
-    ground = _open(dem, "dem", crs, resolution)
-    surface = _open(dsm, "dsm", crs, resolution)
-    if ground.rio.crs.is_geographic or _distorts(ground):
-        ground = ground.rio.reproject(
-            _utm(ground, dem), resampling=Resampling.bilinear, nodata=np.nan
+    with ExitStack() as closing:
+        ground, surface = (
+            open_raster(source, role, closing, crs=crs, resolution=resolution, nodata=nodata)
+            for source, role in ((dem, "dem"), (dsm, "dsm"))
         )
-    _require_overlap(ground, surface, dem, dsm)
-    if not _same_grid(ground, surface):
-        surface = surface.rio.reproject_match(
-            ground, resampling=Resampling.bilinear, nodata=np.nan
-        ).assign_coords(x=ground["x"], y=ground["y"])
-    return assemble_terrain(ground, surface)
+        ground, surface = on_one_grid(ground, surface)
+        if lazy:
+            terrain = _dataset(ground.array(np.float32), surface.array(np.float32))
+            terrain.set_close(closing.pop_all().close)
+            return terrain
+        heights = [raster.array(np.float64).load() for raster in (ground, surface)]
+    for raster, array in zip((ground, surface), heights, strict=True):
+        if not np.isfinite(array).any():
+            where = "" if raster is ground else " in the area of the DEM"
+            raise TerrainError(f"{raster.name} is all nodata{where}.")
+    return assemble_terrain(*heights)
 
 
 def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
@@ -74,44 +89,66 @@ def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
         TerrainError: No CRS, units other than metres, two different or irregular grids, or no
             pixel that has both heights.
     """
-    _require_metric_crs(dem)
+    require_metric_crs(dem.rio.crs, "the terrain")
     ground, surface = (
-        a.drop_vars("spatial_ref", errors="ignore").transpose("y", "x").astype(float)
+        a.drop_vars("spatial_ref", errors="ignore").transpose("y", "x").astype(float, copy=False)
         for a in (dem, dsm)
     )
-    _require_regular(ground)
+    for axis in ("y", "x"):
+        require_regular(ground[axis].values, axis, "the raster")
     if not _same_coordinates(ground, surface):
         raise TerrainError(
             f"dem {ground.shape} and dsm {surface.shape} are not on one grid; align them first, "
             "e.g. with dsm.rio.reproject_match(dem)."
         )
     surface = surface.assign_coords(x=ground["x"], y=ground["y"])
-    ground, surface = (a.sortby("x").sortby("y", ascending=False) for a in (ground, surface))
-    valid = np.isfinite(ground) & np.isfinite(surface)
-    if not valid.any():
+    terrain = xr.Dataset({"dem": ground, "dsm": surface})
+    terrain, clipped, valid = clean(_north_up(terrain))
+    if not valid:
         raise TerrainError(
             "no pixel has both a DEM and a DSM height: one of them is all nodata where they "
             "overlap. Check the nodata value of the rasters."
         )
-    below = float((surface < ground).where(valid).mean())
-    if below > CLIP_WARNING_SHARE:
-        warnings.warn(
-            f"the DSM lies below the DEM on {below:.1%} of pixels; it is raised to the DEM there. "
-            "Check that both share one vertical datum.",
-            stacklevel=3,
-        )
-    terrain = xr.Dataset(
-        {
-            "dem": ground.where(valid).assign_attrs(long_name="ground", units="m"),
-            "dsm": surface.where(surface > ground, ground)
-            .where(valid)
-            .assign_attrs(long_name="surface", units="m"),
-        }
+    warn_if_clipped(clipped, valid, stacklevel=4)
+    terrain.attrs = {"clipped_share": clipped / valid}
+    return _with_crs(terrain, dem.rio.crs)
+
+
+def clean(terrain: xr.Dataset) -> tuple[xr.Dataset, int, int]:
+    """Put NaN in common and raise the surface to the ground: what a lazy window still needs.
+
+    Args:
+        terrain: `dem` and `dsm` over (y, x), metres: of `read_terrain(..., lazy=True)`, or any
+            window of it. It is not changed.
+
+    Returns:
+        The same in memory, in floats; how many pixels were raised; how many have both heights.
+    """
+    ground, surface = (terrain[name].compute() for name in ("dem", "dsm"))
+    valid = np.isfinite(ground) & np.isfinite(surface)
+    clipped = int(((surface < ground) & valid).sum())
+    surface = surface.where(surface > ground, ground)
+    cleaned = terrain.assign(
+        dem=ground.where(valid).assign_attrs(long_name="ground", units="m"),
+        dsm=surface.where(valid).assign_attrs(long_name="surface", units="m"),
     )
-    terrain.attrs = {"clipped_share": below}
-    terrain = terrain.rio.write_crs(dem.rio.crs)
-    # From the coordinates: a transform stored before the raster was coarsened or cut is stale.
-    return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
+    return cleaned, clipped, int(valid.sum())
+
+
+def warn_if_clipped(clipped: int, valid: int, stacklevel: int = 2) -> None:
+    """Warn where the DSM lies below the DEM on over 2 % of the valid pixels.
+
+    Args:
+        clipped: Pixels that `clean` raised, summed over windows.
+        valid: Pixels with both heights, likewise.
+        stacklevel: Whose line the warning names, as in `warnings.warn`.
+    """
+    if clipped > CLIP_WARNING_SHARE * valid:
+        warnings.warn(
+            f"the DSM lies below the DEM on {clipped / valid:.1%} of pixels; it is raised to the "
+            "DEM there. Check that both share one vertical datum.",
+            stacklevel=stacklevel,
+        )
 
 
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
@@ -130,159 +167,75 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
         raise TerrainError(
             "the terrain has no CRS; set it, e.g. terrain.rio.write_crs('EPSG:32633')."
         )
+    require_metric_crs(crs, "the terrain")
+    if is_lazy(terrain):
+        for axis in ("y", "x"):
+            require_regular(terrain[axis].values, axis, "the raster")
+        return _with_crs(_north_up(terrain.transpose("y", "x")), crs)
     known = terrain.attrs.get("clipped_share", 0.0)
+    if _is_in_order(terrain):
+        return _with_crs(terrain.copy(), crs)
     result = assemble_terrain(terrain["dem"].rio.write_crs(crs), terrain["dsm"])
     result.attrs["clipped_share"] = max(known, result.attrs["clipped_share"])
     return result
 
 
+def is_lazy(terrain: xr.Dataset) -> bool:
+    """Whether its heights are still to be read."""
+    return not all(terrain[name].variable._in_memory for name in ("dem", "dsm"))
+
+
+def _north_up(terrain: xr.Dataset) -> xr.Dataset:
+    """Rows from north to south, columns from west to east."""
+    turned = {"y": terrain["y"][0] < terrain["y"][-1], "x": terrain["x"][0] > terrain["x"][-1]}
+    return terrain.isel({axis: slice(None, None, -1) for axis, turn in turned.items() if turn})
+
+
+def _is_in_order(terrain: xr.Dataset) -> bool:
+    """Whether a terrain is as `assemble_terrain` would make it: then no copy of it is made."""
+    dem, dsm = terrain["dem"], terrain["dsm"]
+    if not dem.dims == dsm.dims == ("y", "x") or {dem.dtype.kind, dsm.dtype.kind} != {"f"}:
+        return False
+    for axis in ("y", "x"):
+        require_regular(terrain[axis].values, axis, "the raster")
+    if terrain["y"][0] < terrain["y"][-1] or terrain["x"][0] > terrain["x"][-1]:
+        return False
+    known = False
+    for first in range(0, len(dem), _ROWS):
+        g, s = (a.values[first : first + _ROWS] for a in (dem, dsm))
+        valid = np.isfinite(g)
+        if (valid != np.isfinite(s)).any() or (s < g).any() or np.isinf(g).any():
+            return False
+        known |= bool(valid.any())
+    return known
+
+
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Pixel height and width in metres."""
-    width, height = terrain.rio.resolution(recalc=True)
-    return abs(height), abs(width)
+    y, x = (terrain[axis].values for axis in ("y", "x"))
+    return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
 
 
-def _open(
-    path: str | PathLike[str], role: str, crs: object, resolution: float | None
-) -> xr.DataArray:
-    """One raster in memory, with a CRS and a north-up grid."""
-    name = f"{role}: {str(path)!r}"
-    if not Path(path).exists():
-        raise TerrainError(f"{role}: there is no file {str(path)!r}.")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                transform = source.transform
-            opened: Any = rioxarray.open_rasterio(path, masked=True)
-            # Closed at once: what is still open when Python ends is reported as an error.
-            with opened:
-                raster = opened.isel(band=0, drop=True).load()
-    except RasterioIOError as error:
-        raise TerrainError(
-            f"{name} is no raster that GDAL can read ({error}); "
-            "give a GeoTIFF or another raster format."
-        ) from None
-    if transform.is_identity:
-        raster = _georeference(raster, name, crs, resolution)
-    elif transform.b or transform.d:
-        raise TerrainError(
-            f"{name} is on a rotated grid; warp it to north-up first, e.g. with gdalwarp."
-        )
-    if raster.rio.crs is None:
-        raster = raster.rio.write_crs(_given_crs(name, crs))
-    if not raster.rio.crs.is_geographic:
-        _require_metric_crs(raster, name)
-    if not np.isfinite(raster).any():
-        raise TerrainError(f"{name} is all nodata.")
-    return raster
-
-
-def _georeference(
-    raster: xr.DataArray, name: str, crs: object, resolution: float | None
-) -> xr.DataArray:
-    """Put a bare image at the origin, with a pixel size its user knows."""
-    if resolution is None or crs is None:
-        raise TerrainError(
-            f"{name} carries no georeference; pass both crs= and resolution= (metres), on the "
-            "command line --crs and --resolution."
-        )
-    if _given_crs(name, crs).is_geographic:
-        raise TerrainError(
-            f"crs {crs!r} is in degrees, but resolution= is in metres; give a metric one."
-        )
-    step = require_positive("resolution", resolution)
-    height = raster.sizes["y"] * step
-    return raster.rio.write_transform(from_origin(0.0, height, step, step)).assign_coords(
-        x=(np.arange(raster.sizes["x"]) + 0.5) * step,
-        y=height - (np.arange(raster.sizes["y"]) + 0.5) * step,
+def _dataset(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
+    """The lazy dataset, with what `assemble_terrain` says of the arrays and their place."""
+    terrain = xr.Dataset(
+        {
+            "dem": dem.assign_attrs(long_name="ground", units="m"),
+            "dsm": dsm.assign_attrs(long_name="surface", units="m"),
+        }
     )
+    return _with_crs(terrain, dem.rio.crs)
 
 
-def _given_crs(name: str, crs: object) -> CRS:
-    if crs is None:
-        raise TerrainError(
-            f"{name} has no coordinate reference system; pass crs=, e.g. "
-            '"EPSG:32633" (--crs on the command line).'
-        )
-    try:
-        return CRS.from_user_input(crs)
-    except CRSError:
-        raise TerrainError(f"crs {crs!r} is not one PROJ knows; give e.g. 'EPSG:32633'.") from None
-
-
-def _require_metric_crs(raster: xr.DataArray, name: str = "the terrain") -> None:
-    crs = raster.rio.crs
-    if crs is None:
-        raise TerrainError(f"{name} has no CRS; set it, e.g. dem.rio.write_crs('EPSG:32633').")
-    if crs.is_geographic:
-        raise TerrainError(
-            f"{name} is in degrees; reproject it, e.g. with "
-            "dem.rio.reproject(dem.rio.estimate_utm_crs())."
-        )
-    if abs(crs.linear_units_factor[1] - 1.0) > 1e-9:
-        raise TerrainError(
-            f"{name} is in {crs.linear_units}, but heights and distances must be in metres; warp "
-            "it to a metric CRS and convert its heights."
-        )
-
-
-def _require_regular(raster: xr.DataArray) -> None:
-    for axis in ("y", "x"):
-        steps = np.diff(raster[axis].values)
-        if not len(steps) or not np.allclose(steps, steps[0], rtol=1e-3) or steps[0] == 0.0:
-            raise TerrainError(
-                f"the raster's {axis} is not a regular axis of two pixels or more; resample it to "
-                "evenly spaced, sorted coordinates."
-            )
-
-
-def _distorts(raster: xr.DataArray) -> bool:
-    """Whether a metre on the map is more than 1 % off a metre on the ground."""
-    crs = raster.rio.crs
-    left, bottom, right, top = raster.rio.bounds()
-    lon, lat = transform_points(
-        crs, CRS.from_epsg(4326), [(left + right) / 2], [(bottom + top) / 2]
-    )[:2]
-    scale = Proj(crs.to_wkt()).get_factors(lon[0], lat[0]).areal_scale
-    return abs(np.sqrt(scale) - 1.0) > 0.01
-
-
-def _utm(raster: xr.DataArray, path: str | PathLike[str]) -> CRS:
-    try:
-        return raster.rio.estimate_utm_crs()
-    except (RuntimeError, ProjError):
-        bounds = ", ".join(f"{edge:.1f}" for edge in raster.rio.bounds())
-        raise TerrainError(
-            f"{str(path)!r} has CRS {raster.rio.crs.to_string()}, but its bounds ({bounds}) are no "
-            "place on Earth in it; give the CRS its coordinates are in."
-        ) from None
-
-
-def _require_overlap(
-    ground: xr.DataArray,
-    surface: xr.DataArray,
-    dem: str | PathLike[str],
-    dsm: str | PathLike[str],
-) -> None:
-    left, bottom, right, top = ground.rio.bounds()
-    box = surface.rio.transform_bounds(ground.rio.crs)
-    if box[0] >= right or box[2] <= left or box[1] >= top or box[3] <= bottom:
-        names = ", ".join(f"{e:.1f}" for e in (left, bottom, right, top))
-        other = ", ".join(f"{e:.1f}" for e in box)
-        raise TerrainError(
-            f"dem {str(dem)!r} and dsm {str(dsm)!r} do not overlap: in "
-            f"{ground.rio.crs.to_string()} they cover ({names}) and ({other}) as (left, bottom, "
-            "right, top). Give two rasters of one place."
-        )
-
-
-def _same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
-    return a.rio.crs == b.rio.crs and _same_coordinates(a, b)
+def _with_crs(terrain: xr.Dataset, crs: CRS) -> xr.Dataset:
+    # In place, as rioxarray would copy the heights.
+    terrain.rio.write_crs(crs, inplace=True)
+    # From the coordinates: a transform stored before the raster was coarsened or cut is stale.
+    return terrain.rio.write_transform(terrain.rio.transform(recalc=True), inplace=True)
 
 
 def _same_coordinates(a: xr.DataArray, b: xr.DataArray) -> bool:
-    """Whether two rasters' pixels coincide to a thousandth of a pixel."""
+    """Whether two arrays' pixels coincide to a thousandth of a pixel."""
     return a.shape == b.shape and all(
         np.allclose(a[axis], b[axis], rtol=0.0, atol=1e-3 * abs(float(a[axis][1] - a[axis][0])))
         for axis in ("x", "y")

@@ -1,9 +1,10 @@
 """Rays over a raster: does the ground block them, and how much canopy do they cross?
 
 Heights belong to pixel centres. A ray runs between two points given in pixel coordinates (row, col)
-and height, and is examined wherever it crosses a line through a row or a column of pixel centres,
-where heights are interpolated linearly along that line. Between two crossings everything is taken
-to change linearly, so the length inside the canopy layer is exact for that piecewise surface.
+and height. It is blocked if it lies below what blocks it anywhere where it crosses a line through a
+row or a column of pixel centres; heights are interpolated linearly along such lines. Metres inside
+the canopy are taken from the lines it crosses the more of, about one per pixel: between two of
+these everything changes linearly.
 """
 
 import math
@@ -11,12 +12,20 @@ import math
 import numpy as np
 from numba import njit
 
+from trustbo.terrain.parallel import over_rows
+
+# A division that checks for 0 would cost as much as the rest.
+_compiled = njit(
+    cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}
+)
+_CHUNK = 32
+
 BARE, WALL, TRANSMITTANCE = 0, 1, 2
 """What blocks sight: the ground; the surface, canopy included; or the ground, and canopy partly."""
 
 
-@njit(cache=True)
-def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crown_base):
+@_compiled
+def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crown_base, work):
     """Share of a beam that passes from `start` to `end`.
 
     Args:
@@ -28,6 +37,7 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
         mode: BARE, WALL or TRANSMITTANCE.
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Height of the canopy's lower edge as a share of its height.
+        work: `work_space()`, to be used again for the next ray.
 
     Returns:
         exp(-extinction * metres inside the canopy layer), or 0 where the ray is blocked, leaves the
@@ -40,138 +50,208 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
         return 0.0
     if max(r0, r1) > n_rows - 1 or max(c0, c1) > n_cols - 1:
         return 0.0
-    dr, dc, dz = r1 - r0, c1 - c0, z1 - z0
-    length = math.sqrt((dr * pixel[0]) ** 2 + (dc * pixel[1]) ** 2 + dz**2)
-    # Parameters t in [0, 1] of the next crossing of a row line and of a column line.
-    t_row, step_row = _first_crossing(r0, dr)
-    t_col, step_col = _first_crossing(c0, dc)
-    inside = 0.0
-    t_before, above_before, below_before, first = 0.0, 0.0, 0.0, True
-    while True:
-        t = min(t_row, t_col, 1.0)
-        last = t >= 1.0
-        r, c, z = r0 + t * dr, c0 + t * dc, z0 + t * dz
-        g, s = _heights(ground, surface, r, c)
-        if not g == g:  # no data
-            return 0.0
-        # At the far end, the target itself stands on the ground.
-        if not last and z < (s if mode == WALL else g):
-            return 0.0
-        if mode == TRANSMITTANCE:
-            above = z - (g + crown_base * (s - g))
-            below = s - z
-            if not first:
-                share = _share_inside(above_before, above, below_before, below)
-                inside += share * (t - t_before) * length
-                if extinction * inside > 20.0:
-                    return 0.0
-            elif t > 0.0:
-                g0, s0 = _heights(ground, surface, r0, c0)
-                share = _share_inside(z0 - (g0 + crown_base * (s0 - g0)), above, s0 - z0, below)
-                inside += share * t * length
-            t_before, above_before, below_before, first = t, above, below, False
-        if last:
-            return math.exp(-extinction * inside) if mode == TRANSMITTANCE else 1.0
-        if t_row <= t:
-            t_row += step_row
-        if t_col <= t:
-            t_col += step_col
+    dz = z1 - z0
+    rows = (n_cols, 1, r0, r1 - r0, c0, c1 - c0)  # strides across and along, and the ray there
+    cols = (1, n_cols, c0, c1 - c0, r0, r1 - r0)
+    most, fewest = (rows, cols) if abs(r1 - r0) >= abs(c1 - c0) else (cols, rows)
+    blocking = surface.reshape(-1) if mode == WALL else ground.reshape(-1)
+    if _is_blocked(blocking, fewest, z0, dz):
+        return 0.0
+    if mode != TRANSMITTANCE:
+        return 0.0 if _is_blocked(blocking, most, z0, dz) else 1.0
+    g0, s0 = _heights(ground, surface, r0, c0)
+    g1, s1 = _heights(ground, surface, r1, c1)
+    # Above the crowns' lower edge, and below their top, at either end.
+    start = (z0 - (g0 + crown_base * (s0 - g0)), s0 - z0)
+    end = (z1 - (g1 + crown_base * (s1 - g1)), s1 - z1)
+    inside = _share_in_canopy(
+        blocking, surface.reshape(-1), most, z0, dz, crown_base, start, end, work
+    )
+    if not inside >= 0.0:
+        return 0.0
+    length = math.sqrt(((r1 - r0) * pixel[0]) ** 2 + ((c1 - c0) * pixel[1]) ** 2 + dz**2)
+    return math.exp(-extinction * inside * length)
 
 
-@njit(cache=True)
-def _first_crossing(x, dx):
-    """Parameter of the first integer that x + t dx meets for t > 0, and the step between them."""
-    if dx > 0.0:
-        return (math.floor(x) + 1.0 - x) / dx, 1.0 / dx
-    if dx < 0.0:
-        return (math.ceil(x) - 1.0 - x) / dx, -1.0 / dx
-    return math.inf, math.inf
+@_compiled
+def work_space():
+    """Room for the lines that a ray crosses."""
+    return np.empty((4, _CHUNK + 1))
 
 
-@njit(cache=True)
+@_compiled
+def _crossings(x0, dx):
+    """The first line that x0 + t dx meets, its t, the way to the next, its t, and how many."""
+    if dx == 0.0:
+        return 0, 0.0, 0, 0.0, 0
+    way = 1 if dx > 0.0 else -1
+    line = math.floor(x0) + 1 if dx > 0.0 else math.ceil(x0) - 1
+    t, step = (line - x0) / dx, way / dx
+    # Not the end itself: the target stands on the ground.
+    return line, t, way, step, max(0, math.ceil((1.0 - t) / step - 1e-9))
+
+
+@_compiled
+def _is_blocked(heights, axis, z0, dz):
+    """Whether a ray lies below heights on one of the lines of an axis; missing ones block."""
+    across, along, x0, dx, y0, dy = axis
+    line, t, way, step, n = _crossings(x0, dx)
+    base, jump = line * across, way * across
+    for _ in range(n):
+        y = y0 + t * dy
+        j = int(y)
+        part = y - j
+        here = np.uint64(base + j * along)
+        # A neighbour without weight is not touched: there may be none.
+        beside = here + np.uint64(along if part > 1e-9 else 0)
+        h = heights[here] + part * (heights[beside] - heights[here])
+        z = z0 + t * dz
+        if not z >= h and not (part > 1.0 - 1e-9 and z >= heights[beside]):
+            return True
+        t += step
+        base += jump
+    return False
+
+
+@_compiled
+def _share_in_canopy(ground, surface, axis, z0, dz, crown_base, start, end, work):
+    """Share of the way inside the canopy, seen on the lines of an axis; -1 if blocked there.
+
+    Some lines at a time: first their heights, then plain vector operations.
+    """
+    across, along, x0, dx, y0, dy = axis
+    line, t0, way, step, n = _crossings(x0, dx)
+    base, jump = line * across, way * across
+    g, s, above, below = work[0], work[1], work[2], work[3]
+    above[0], below[0] = start
+    before, inside = 0.0, 0.0
+    for first in range(0, n, _CHUNK):
+        m = min(_CHUNK, n - first)
+        for k in range(m):
+            y = y0 + (t0 + (first + k) * step) * dy
+            j = int(y)
+            part = y - j
+            here = np.uint64(base + (first + k) * jump + j * along)
+            # A neighbour without weight is not touched: there may be none.
+            beside = here + np.uint64(along if part > 1e-9 else 0)
+            here = beside if part > 1.0 - 1e-9 else here
+            g[k] = ground[here] + part * (ground[beside] - ground[here])
+            s[k] = surface[here] + part * (surface[beside] - surface[here])
+        passed = 0.0
+        for k in range(m):
+            z = z0 + (t0 + (first + k) * step) * dz
+            passed += 1.0 if z >= g[k] else 0.0
+            above[k + 1] = z - (g[k] + crown_base * (s[k] - g[k]))
+            below[k + 1] = s[k] - z
+        if passed < m:
+            return -1.0
+        if first == 0 and m > 0:
+            inside += share_inside(above[0], above[1], below[0], below[1]) * t0
+        total = 0.0
+        for k in range(1 if first == 0 else 0, m):
+            total += share_inside(above[k], above[k + 1], below[k], below[k + 1])
+        inside += total * step
+        above[0], below[0] = above[m], below[m]
+        before = t0 + (first + m - 1) * step
+    return inside + share_inside(above[0], end[0], below[0], end[1]) * (1.0 - before)
+
+
+@_compiled
 def _heights(ground, surface, r, c):
-    """Bilinear heights of ground and surface; on a grid line this is linear along the line."""
+    """Bilinear heights of ground and surface; a neighbour without weight is not touched."""
     i = min(int(r), ground.shape[0] - 2)
     j = min(int(c), ground.shape[1] - 2)
     fr, fc = r - i, c - j
+    # To the nearer line where that is all there is to it.
+    fr = 0.0 if fr < 1e-9 else fr
+    fc = 0.0 if fc < 1e-9 else fc
+    i, fr = (i + 1, 0.0) if fr > 1.0 - 1e-9 else (i, fr)
+    j, fc = (j + 1, 0.0) if fc > 1.0 - 1e-9 else (j, fc)
+    k, m = i + (fr > 0.0), j + (fc > 0.0)
     a, b, d, e = (1 - fr) * (1 - fc), (1 - fr) * fc, fr * (1 - fc), fr * fc
-    # A weight of zero must not pick up a neighbour's NaN.
-    g, s = 0.0, 0.0
-    for w, k, m in ((a, i, j), (b, i, j + 1), (d, i + 1, j), (e, i + 1, j + 1)):
-        if w > 1e-9:
-            g += w * ground[k, m]
-            s += w * surface[k, m]
+    g = a * ground[i, j] + b * ground[i, m] + d * ground[k, j] + e * ground[k, m]
+    s = a * surface[i, j] + b * surface[i, m] + d * surface[k, j] + e * surface[k, m]
     return g, s
 
 
-@njit(cache=True)
-def _share_inside(a0, a1, b0, b1):
-    """Share of [0, 1] on which both linear functions a0..a1 and b0..b1 are positive."""
-    low, high = 0.0, 1.0
-    for x0, x1 in ((a0, a1), (b0, b1)):
-        if x0 <= 0.0 and x1 <= 0.0:
-            return 0.0
-        if x0 < 0.0:
-            low = max(low, -x0 / (x1 - x0))
-        elif x1 < 0.0:
-            high = min(high, x0 / (x0 - x1))
-    return max(0.0, high - low)
+@_compiled
+def share_inside(a0, a1, b0, b1):
+    """Share of the way on which both a0..a1 and b0..b1 are positive, without branches."""
+    zero = a0 - a0  # of their precision
+    one = zero + np.float32(1.0)
+    ta, tb = a0 / (a0 - a1), b0 / (b0 - b1)
+    low_a = (ta if a1 > zero else one) if a0 <= zero else zero
+    low_b = (tb if b1 > zero else one) if b0 <= zero else zero
+    high_a = (ta if a0 > zero else zero) if a1 < zero else one
+    high_b = (tb if b0 > zero else zero) if b1 < zero else one
+    low = low_a if low_a > low_b else low_b
+    high = high_a if high_a < high_b else high_b
+    return high - low if high > low else zero
 
 
-@njit(cache=True)
-def openness(ground, surface, pixel, reach, eye, target, n_rays, extinction, crown_base):
-    """Mean transmittance from each pixel to points `reach` metres away all around.
+def exposure(
+    ground: np.ndarray,
+    surface: np.ndarray,
+    pixel: tuple[float, float],
+    observers: np.ndarray,
+    reach: float,
+    heights: tuple[float, float],
+    canopy: tuple[float, float],
+    rows: slice,
+) -> np.ndarray:
+    """Mean transmittance from observers to every pixel, shape (row, col); 0 beyond their reach.
 
     Args:
         ground: DEM, shape (row, col), m.
         surface: DSM, shape (row, col), m.
         pixel: Pixel height and width, m.
-        reach: Length of the rays, m.
-        eye: Height of the sensor above ground, m.
-        target: Height of the targets above ground, m.
-        n_rays: Number of directions.
-        extinction: Extinction coefficient of the canopy, 1/m.
-        crown_base: Height of the canopy's lower edge as a share of its height.
-
-    Returns:
-        Shape (row, col), in [0, 1]; rays whose end is off the raster or without data do not count.
-        NaN where none counts.
+        observers: Row and column, fractions of pixels, shape (observer, 2).
+        reach: m.
+        heights: Of the observers and of what they look for, above ground, m.
+        canopy: Extinction (1/m) and crown base, see `ray_transmittance`.
+        rows: Of the pixels that are wanted; the others are NaN.
     """
-    n_rows, n_cols = ground.shape
-    angle = 2.0 * math.pi / n_rays * np.arange(n_rays)
-    # Rounded, so that a ray along the raster's edge does not leave it by a rounding error.
-    down = np.round(reach * np.sin(angle) / pixel[0], 9)
-    right = np.round(reach * np.cos(angle) / pixel[1], 9)
     result = np.full(ground.shape, np.nan)
-    for i in range(n_rows):
+    top, bottom, _ = rows.indices(len(ground))
+
+    def work(first: int, last: int) -> None:
+        limits = (top + first, top + last)
+        _exposure(ground, surface, pixel, observers, reach, heights, canopy, result, *limits)
+
+    over_rows(work, bottom - top)
+    return result
+
+
+@_compiled
+def _exposure(ground, surface, pixel, observers, reach, heights, canopy, result, first, last):
+    n_rows, n_cols = ground.shape
+    work = work_space()
+    for i in range(first, last):
         for j in range(n_cols):
             if not ground[i, j] == ground[i, j]:
                 continue
-            total, count = 0.0, 0
-            for k in range(n_rays):
-                r, c = i + down[k], j + right[k]
-                if r < 0.0 or c < 0.0 or r > n_rows - 1 or c > n_cols - 1:
+            total = 0.0
+            for k in range(len(observers)):
+                r, c = observers[k, 0], observers[k, 1]
+                if math.hypot((i - r) * pixel[0], (j - c) * pixel[1]) > reach:
                     continue
-                g, _ = _heights(ground, surface, r, c)
-                if not g == g:
-                    continue
+                # The outer half of the raster's edge pixels has the heights of their centres.
+                r, c = min(max(r, 0.0), n_rows - 1.0), min(max(c, 0.0), n_cols - 1.0)
                 total += ray_transmittance(
                     ground,
                     surface,
                     pixel,
-                    (float(i), float(j), ground[i, j] + eye),
-                    (r, c, g + target),
+                    (r, c, ground_height(ground, r, c) + heights[0]),
+                    (float(i), float(j), ground[i, j] + heights[1]),
                     TRANSMITTANCE,
-                    extinction,
-                    crown_base,
+                    canopy[0],
+                    canopy[1],
+                    work,
                 )
-                count += 1
-            if count:
-                result[i, j] = total / count
-    return result
+            result[i, j] = total / len(observers)
 
 
-@njit(cache=True)
+@_compiled
 def ground_height(ground, r, c):
     """Bilinear ground height at a position in pixel coordinates; NaN off the raster."""
     if r < 0.0 or c < 0.0 or r > ground.shape[0] - 1 or c > ground.shape[1] - 1:

@@ -1,6 +1,7 @@
 """What the planner and the simulator work on: awareness and passability of every cell."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Self
@@ -11,10 +12,18 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Team, default_features
 from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
-from trustbo.terrain import features as pixel
+from trustbo.terrain.awareness import Ingredients, cell_maps, ingredients
 from trustbo.terrain.composite import CompositeIndex
+from trustbo.terrain.features import (
+    TRAVERSABILITY,
+    VISIBILITY,
+    PixelFeature,
+    exposure,
+    openness,
+    require_observers,
+)
 from trustbo.terrain.grid import Grid
-from trustbo.terrain.raster import require_terrain
+from trustbo.terrain.raster import is_lazy, pixel_size, require_terrain
 
 MAX_MISSING = 0.5
 """A cell is impassable if more than this share of its pixels is missing or too steep."""
@@ -52,6 +61,9 @@ class Workspace:
         team: Team | None = None,
         *,
         scaling: str = "percentile",
+        features: Mapping[str, object] | None = None,
+        observers: ArrayLike | None = None,
+        aggregate: str | float = "mean",
     ) -> Self:
         """Derive traversability and visibility from a DEM and a DSM.
 
@@ -61,44 +73,50 @@ class Workspace:
         sight beyond one bound does not matter to overwatch.
 
         Args:
-            terrain: As `read_terrain` or `synthetic_terrain` give it.
+            terrain: As `read_terrain` or `synthetic_terrain` give it; of a lazily read one, only a
+                strip is in memory at a time, and maps of pixels are not kept.
             shape: Rows and columns of the planning grid.
             team: The robots; by default a lead and three.
             scaling: See `CompositeIndex`.
+            features: What awareness is made of, by name: names of pixel features for a composite
+                (see `terrain.FEATURES`), a mapping of names to `PixelFeature`, or one
+                `PixelFeature` in [0, 1] that is used as it is. By default traversability and
+                visibility, of `terrain.TRAVERSABILITY` and `terrain.VISIBILITY`.
+            observers: Where enemies may be, shape (observer, 2), x and y in CRS metres: the share
+                of them that see a pixel becomes one more feature, `exposure`.
+            aggregate: A cell has the `"mean"` of its pixels, or a quantile of theirs in [0, 1].
 
         Raises:
-            TerrainError: A grid too fine for the raster, or a dataset that is no terrain: without
-                dem, dsm or a metric CRS, or with irregular coordinates.
-            TrustboError: No cell is passable, or an unknown scaling.
+            TerrainError: A grid too fine for the raster, an observer off the terrain, or a dataset
+                that is no terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
+            TrustboError: No cell is passable, or an unknown scaling, feature or aggregate.
         """
         terrain = require_terrain(terrain)
+        lazy = is_lazy(terrain)
         team = Team() if team is None else team
         grid = Grid.over(terrain, shape)
-        reach = min(
-            max(robot.lidar_range for robot in team.robots),
-            float(np.hypot(grid.cell_height, grid.cell_width)),
+        asked = features or {"traversability": TRAVERSABILITY, "visibility": VISIBILITY}
+        chosen = _within_reach(ingredients(asked), terrain, grid, team)
+        if observers is not None:
+            place = require_observers(terrain, observers)
+            chosen["exposure"] = PixelFeature(
+                partial(exposure, observers=place), 1, np.inf, by_rows=True
+            )
+        maps = cell_maps(
+            terrain,
+            grid,
+            chosen,
+            max_slope=team.max_slope,
+            scaling=scaling,
+            aggregate=aggregate,
+            keep_pixels=not lazy,
         )
-        eye, target = team.robots[0].sensor_height, team.lead.target_height
-        openness = partial(pixel.openness, reach=reach, eye=eye, target=target)
-        ingredients = {
-            "traversability": dict(pixel.TRAVERSABILITY),
-            "visibility": dict(pixel.VISIBILITY)
-            | {"openness": pixel.PixelFeature(openness, pixel.VISIBILITY["openness"].sign)},
-        }
-        composites, maps = {}, {}
-        for name, parts in ingredients.items():
-            values = pixel.pixel_features(terrain, parts)
-            signs = {part: parts[part].sign for part in parts}
-            composites[name] = CompositeIndex(signs, scaling=scaling).fit(values)
-            maps[name] = composites[name].transform(values)
-        maps["passable"] = pixel.slope(terrain) <= team.max_slope
-        per_cell = np.stack([grid.cell_means(maps[name]) for name in ingredients], axis=-1)
-        passable = grid.cell_share(maps["passable"]) >= 1.0 - MAX_MISSING
+        passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
         workspace = cls.from_awareness(
-            np.repeat(per_cell[None], len(team.robots), axis=0),
-            passable & np.isfinite(per_cell).all(-1),
+            np.repeat(maps.awareness[None], len(team.robots), axis=0),
+            passable & np.isfinite(maps.awareness).all(-1),
             team=team,
-            features=tuple(ingredients),
+            features=tuple(chosen),
         )
         return dataclasses.replace(
             workspace,
@@ -106,8 +124,8 @@ class Workspace:
             passable=workspace.passable.assign_coords(_positions(grid)),
             grid=grid,
             terrain=terrain,
-            pixels=xr.Dataset(maps),
-            composites=composites,
+            pixels=maps.pixels,
+            composites=maps.composites,
         )
 
     @classmethod
@@ -216,6 +234,31 @@ class Workspace:
         free = np.argwhere(self.passable.values)
         nearest = free[np.argmin(((free - (row, col)) ** 2).sum(1))]
         return int(nearest[0]), int(nearest[1])
+
+
+def _within_reach(
+    features: dict[str, Ingredients], terrain: xr.Dataset, grid: Grid, team: Team
+) -> dict[str, Ingredients]:
+    """Openness as far as this team's lidar sees, within a bound and on this terrain."""
+    height, width = pixel_size(terrain)
+    rows, cols = terrain["dem"].shape
+    reach = min(
+        max(robot.lidar_range for robot in team.robots),
+        float(np.hypot(grid.cell_height, grid.cell_width)),
+        0.5 * min(rows * height, cols * width),
+    )
+    eye, target = team.robots[0].sensor_height, team.lead.target_height
+    ours = PixelFeature(
+        partial(openness, reach=reach, eye=eye, target=target), 1, reach, by_rows=True
+    )
+
+    def fitting(part: PixelFeature) -> PixelFeature:
+        return ours._replace(sign=part.sign) if part.compute is openness else part
+
+    return {
+        name: fitting(f) if isinstance(f, PixelFeature) else {n: fitting(p) for n, p in f.items()}
+        for name, f in features.items()
+    }
 
 
 def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:

@@ -1,4 +1,4 @@
-"""Figures: each function takes data and returns Axes; nothing is computed here but the layout."""
+"""Maps of trust, and what every map has: hillshade, scale, metres."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,11 +9,10 @@ import xarray as xr
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LightSource, ListedColormap, Normalize
+from matplotlib.colors import LightSource, Normalize
 from matplotlib.image import AxesImage
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
 from trustbo.terrain import Grid, Workspace, pixel_size
 
 if TYPE_CHECKING:
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
+SHADOW = 0.55
+"""How dark the darkest shadow of the hillshade is."""
 CLOSED = "0.75"
 """Grey of cells and pixels where no robot can go."""
 
@@ -51,7 +52,7 @@ def trust_maps(result: "Result", *, n_columns: int | None = None) -> np.ndarray:
     learned[:, *paths[0][0]] = np.nan
     low, high = np.nanmin(learned), np.nanmax(learned)
     grid = result.workspace.grid
-    tall = _tallness(grid)
+    tall = tallness(grid)
     n_columns = min(n_columns or (3 if tall < 2 else 5), len(maps))
     n_rows = -(-len(maps) // n_columns)
     width = 2.6 if tall < 2 else 1.5
@@ -69,74 +70,17 @@ def trust_maps(result: "Result", *, n_columns: int | None = None) -> np.ndarray:
         cell_map(ax, trust, result.workspace, low=low, high=high)
         draw_path(ax, path, grid)
         ax.set_title(title, fontsize=9)
+    draw_scale(panels[0], grid)
     for ax in panels[len(maps) :]:
         ax.set_visible(False)
-    _label_outer(axes, grid)
+    label_outer(axes, grid)
     extend = _extend(np.nanmin(everything) < low, np.nanmax(everything) > high)
     label = "expected trust"
     if not result.workspace.passable.all():
         label += " (grey: impassable)"
     colours = ScalarMappable(Normalize(low, high), COLOURS)
-    _colour_bar(figure, colours, axes, label, extend=extend, aspect=15 * n_rows)
+    colour_bar(figure, colours, axes, label, extend=extend, aspect=15 * n_rows)
     return panels[: len(maps)]
-
-
-def terrain_maps(workspace: Workspace) -> np.ndarray:
-    """The paper's Fig. 4: surface, traversability and visibility of a terrain.
-
-    Args:
-        workspace: A workspace made from a terrain.
-
-    Returns:
-        The three Axes.
-
-    Raises:
-        TrustboError: The workspace has no terrain.
-    """
-    terrain, pixels = workspace.terrain, workspace.pixels
-    if terrain is None or pixels is None:
-        raise TrustboError("terrain_maps needs a workspace made with Workspace.from_terrain.")
-    grid = workspace.grid
-    tall = _tallness(grid)
-    width = 3.6 if tall < 2 else 2.0
-    figure, axes = plt.subplots(
-        1,
-        3,
-        figsize=(3 * width + 1.8, width * tall + 0.7),
-        sharex=True,
-        sharey=True,
-        layout="constrained",
-    )
-    extent = _extent(grid)
-    dsm = terrain["dsm"].values
-    height, width = pixel_size(terrain)
-    lowest, highest = float(np.nanmin(dsm)), float(np.nanmax(dsm))
-    heights = Normalize(lowest, highest)
-    shaded = LightSource(azdeg=315, altdeg=45).shade(
-        np.nan_to_num(dsm, nan=lowest),
-        cmap=plt.get_cmap("cividis"),
-        norm=heights,
-        blend_mode="soft",
-        dx=width,
-        dy=height,
-    )
-    shaded[~np.isfinite(dsm)] = 1.0
-    axes[0].imshow(shaded, extent=extent)
-    axes[0].set_title("surface (DSM)", fontsize=9)
-    _colour_bar(figure, ScalarMappable(heights, "cividis"), axes[0], "height (m)")
-    for ax, name in zip(axes[1:], ("traversability", "visibility"), strict=True):
-        ax.imshow(pixels[name].values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
-        ax.set_title(name, fontsize=9)
-    steep = np.isfinite(dsm) & ~pixels["passable"].values
-    closed = np.where(steep, 1.0, np.nan)
-    axes[1].imshow(closed, cmap=ListedColormap([CLOSED]), extent=extent, interpolation="nearest")
-    for ax in axes:
-        ax.set_facecolor("white")
-        _grid_lines(ax, grid)
-    label = "index (0 worst, 1 best; grey: too steep)"
-    _colour_bar(figure, ScalarMappable(Normalize(0, 1), COLOURS), axes[1:], label)
-    _label_outer(axes[None], grid)
-    return axes
 
 
 def cell_map(
@@ -147,7 +91,7 @@ def cell_map(
     low: float | None = None,
     high: float | None = None,
 ) -> AxesImage:
-    """Draw a map of the planning cells; cells no robot can enter are grey.
+    """Draw a map of the planning cells over its terrain's hillshade; closed cells are grey.
 
     Args:
         ax: Where to draw.
@@ -161,9 +105,60 @@ def cell_map(
     """
     ax.set_facecolor(CLOSED)
     data = np.where(workspace.passable.values, values.transpose("row", "col").values, np.nan)
-    extent = _extent(workspace.grid)
-    return ax.imshow(
+    extent = extent_of(workspace.grid)
+    image = ax.imshow(
         data, cmap=COLOURS, vmin=low, vmax=high, extent=extent, interpolation="nearest"
+    )
+    draw_hillshade(ax, workspace)
+    return image
+
+
+def draw_hillshade(ax: Axes, workspace: Workspace, heights: str = "dem") -> None:
+    """Shadows over what is drawn already, if there is a terrain in memory.
+
+    Args:
+        ax: Where to draw.
+        workspace: Whose terrain.
+        heights: `"dem"` for the ground's, `"dsm"` for the surface's.
+    """
+    terrain = workspace.terrain
+    if terrain is None or workspace.pixels is None:
+        return
+    # At most some 800 pixels a side: more cannot be seen.
+    step = -(-max(terrain["dem"].shape) // 800)
+    dem = terrain[heights].values[::step, ::step]
+    height, width = pixel_size(terrain)
+    known = np.isfinite(dem)
+    ground = np.where(known, dem, np.nanmean(dem))
+    light = LightSource(azdeg=315, altdeg=45).hillshade(ground, dx=width * step, dy=height * step)
+    shadow = np.zeros((*dem.shape, 4))
+    shadow[..., 3] = np.where(known, SHADOW * (1.0 - light), 0.0)
+    ax.imshow(shadow, extent=extent_of(workspace.grid), interpolation="bilinear")
+
+
+def draw_scale(ax: Axes, grid: Grid) -> None:
+    """A bar of a round number of metres in the lower left corner."""
+    width = grid.shape[1] * grid.cell_width
+    magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
+    length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
+    outline = [patheffects.Stroke(linewidth=4.0, foreground="white"), patheffects.Normal()]
+    x, y = 0.04, 0.045  # of the axes
+    ax.plot(
+        [x, x + length / width],
+        [y, y],
+        transform=ax.transAxes,
+        color="black",
+        linewidth=2.0,
+        solid_capstyle="butt",
+        path_effects=outline,
+    )
+    ax.text(
+        x,
+        y + 0.02,
+        f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m",
+        transform=ax.transAxes,
+        fontsize=7,
+        path_effects=[patheffects.Stroke(linewidth=2.5, foreground="white"), patheffects.Normal()],
     )
 
 
@@ -182,7 +177,8 @@ def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     ax.plot(x[-1], y[-1], marker="*", markersize=11, **edge)
 
 
-def _colour_bar(figure, image, axes, label: str, **options) -> None:
+def colour_bar(figure, image, axes, label: str, **options) -> None:
+    """A colour bar in the figures' sizes."""
     bar = figure.colorbar(image, ax=axes, pad=0.02, **{"aspect": 18, "shrink": 0.9} | options)
     bar.set_label(label, fontsize=8)
     bar.ax.tick_params(labelsize=7)
@@ -197,11 +193,12 @@ def _corner(grid: Grid) -> np.ndarray:
     return np.array([grid.left, grid.top - grid.shape[0] * grid.cell_height])
 
 
-def _extent(grid: Grid) -> tuple[float, float, float, float]:
+def extent_of(grid: Grid) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of a map, m from its lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)
 
 
-def _tallness(grid: Grid) -> float:
+def tallness(grid: Grid) -> float:
     """Height over width, within what fits a page."""
     ratio = grid.shape[0] * grid.cell_height / (grid.shape[1] * grid.cell_width)
     return float(np.clip(ratio, 0.25, 5.0))
@@ -211,14 +208,16 @@ def _extend(below: bool, above: bool) -> str:
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
 
 
-def _grid_lines(ax: Axes, grid: Grid) -> None:
+def grid_lines(ax: Axes, grid: Grid) -> None:
+    """The edges of the cells."""
     for col in range(1, grid.shape[1]):
         ax.axvline(col * grid.cell_width, color="white", linewidth=0.3, alpha=0.5)
     for row in range(1, grid.shape[0]):
         ax.axhline(row * grid.cell_height, color="white", linewidth=0.3, alpha=0.5)
 
 
-def _label_outer(axes: np.ndarray, grid: Grid) -> None:
+def label_outer(axes: np.ndarray, grid: Grid) -> None:
+    """Axes in metres, labelled where nothing is beside them."""
     for ax in axes.ravel():
         ax.set_aspect("equal")
         ax.tick_params(labelsize=7)

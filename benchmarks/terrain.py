@@ -1,0 +1,329 @@
+"""Speed and memory of the terrain's features beside GDAL, xdem and xarray-spatial.
+
+Run: python benchmarks/terrain.py [attributes] [awareness] [visibility] [huge] [quick]
+
+All sections by default; `quick` leaves out the largest rasters. `gdaldem` is Debian's gdal-bin: it
+is installed with apt-get where that is possible, else its rows are left out. Every figure comes
+from a fresh process, is the median of 3 (of 1 from 10 000 x 10 000 pixels on), and leaves out what
+importing takes; our compiled code is cached on disk, as after any first use. Peak is the process'
+largest resident memory.
+"""
+
+import json
+import os
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.transform import from_origin
+from rasterio.windows import Window
+
+ATTRIBUTES = ("slope", "roughness", "tri", "tpi")
+GDALDEM = {"slope": ["slope"], "roughness": ["roughness"], "tri": ["TRI", "-alg", "Riley"],
+           "tpi": ["TPI"]}  # fmt: skip
+GDALDEM_TARGET = {1000: 4.0, 4000: 4.0, 10000: 2.0}
+
+
+# --- rasters ---
+
+
+def write_pair(folder, n):
+    """DEM and DSM of n x n pixels of 1 m, float32, made and written row block by row block."""
+    rng = np.random.default_rng(0)
+    files = folder / f"dem{n}.tif", folder / f"dsm{n}.tif"
+    profile = {"driver": "GTiff", "height": n, "width": n, "count": 1, "dtype": "float32",
+               "crs": "EPSG:32633", "transform": from_origin(5e5, 5e6, 1.0, 1.0),
+               "blockysize": 64, "bigtiff": "if_safer"}  # fmt: skip
+    x = np.arange(n)
+    with (
+        rasterio.open(files[0], "w", **profile) as dem,
+        rasterio.open(files[1], "w", **profile) as dsm,
+    ):
+        for top in range(0, n, 500):
+            y = np.arange(top, min(top + 500, n))[:, None]
+            ground = 30 * np.sin(x / 200) * np.cos(y / 150) + 2 * np.sin(x / 11 + y / 7)
+            ground = (ground + rng.normal(0, 0.05, ground.shape)).astype("float32")
+            trees = np.maximum(0, 12 * np.sin(x / 23) * np.sin(y / 17) - 4).astype("float32")
+            window = Window(0, top, n, len(y))
+            dem.write(ground, 1, window=window)
+            dsm.write(ground + trees, 1, window=window)
+    return files
+
+
+# --- workers, each in a process of its own: print seconds and peak ---
+
+
+def trustbo_files(dem, out):
+    """Four attributes, file to file, as gdaldem does it."""
+    import rioxarray
+
+    from trustbo import terrain
+
+    started = time.perf_counter()
+    with rioxarray.open_rasterio(dem) as opened:
+        ground = opened.isel(band=0, drop=True).load().to_dataset(name="dem")
+    with rasterio.open(dem) as source:
+        profile = source.profile | {"tiled": False}
+    for name in ATTRIBUTES:
+        values = getattr(terrain, name)(ground)
+        with rasterio.open(Path(out) / f"trustbo_{name}.tif", "w", **profile) as sink:
+            sink.write(values.values, 1)
+    return time.perf_counter() - started
+
+
+def trustbo_memory(dem, out):
+    """Four attributes, in memory."""
+    from trustbo import terrain
+
+    ground = in_memory(dem)
+    started = time.perf_counter()
+    for name in ATTRIBUTES:
+        getattr(terrain, name)(ground)
+    return time.perf_counter() - started
+
+
+def xrspatial_memory(dem, out):
+    import xrspatial
+
+    ground = in_memory(dem)["dem"]
+    for name in ATTRIBUTES:  # compiles
+        getattr(xrspatial, name)(ground[:50, :50])
+    started = time.perf_counter()
+    for name in ATTRIBUTES:
+        getattr(xrspatial, name)(ground)
+    return time.perf_counter() - started
+
+
+def xdem_memory(dem, out):
+    import xdem
+
+    ground = xdem.DEM(str(dem))
+    ground.load()
+    names = {"tri": "terrain_ruggedness_index", "tpi": "topographic_position_index"}
+    started = time.perf_counter()
+    xdem.terrain.get_terrain_attribute(ground, [names.get(name, name) for name in ATTRIBUTES])
+    return time.perf_counter() - started
+
+
+def in_memory(dem):
+    import rioxarray  # noqa: F401  # gives arrays their .rio
+    import xarray as xr
+
+    with rasterio.open(dem) as source:
+        values = source.read(1)
+    n = len(values)
+    y, x = 5e6 - 0.5 - np.arange(n), 5e5 + 0.5 + np.arange(n)
+    ground = xr.DataArray(values, {"y": y, "x": x}, ("y", "x")).rio.write_crs("EPSG:32633")
+    return ground.to_dataset(name="dem").assign_attrs(res=(1.0, 1.0))
+
+
+def trustbo_cells(dem, out):
+    """Traversability of 10 x 10 cells from a DEM in memory."""
+    from trustbo import terrain
+
+    ground = in_memory(dem)
+    ground["dsm"] = ground["dem"]
+    before = peak()
+    started = time.perf_counter()
+    features = {"traversability": ATTRIBUTES[:3]}
+    cells_of(ground, terrain, features)
+    return time.perf_counter() - started, peak() - before
+
+
+def cells_of(ground, terrain, features):
+    from trustbo.terrain.awareness import cell_maps, ingredients
+
+    grid = terrain.Grid.over(ground, (10, 10))
+    return cell_maps(ground, grid, ingredients(features), max_slope=0.8, keep_pixels=False)
+
+
+def xrspatial_cells(dem, out):
+    """The same three maps in full, and their averages over 10 x 10 cells."""
+    import xrspatial
+
+    ground = in_memory(dem)["dem"]
+    for name in ATTRIBUTES:
+        getattr(xrspatial, name)(ground[:50, :50])
+    before = peak()
+    started = time.perf_counter()
+    for name in ATTRIBUTES[:3]:
+        values = getattr(xrspatial, name)(ground).values
+        np.nanmean(values.reshape(10, len(values) // 10, 10, -1), axis=(1, 3))
+    return time.perf_counter() - started, peak() - before
+
+
+def trustbo_lazy(dem, out):
+    """Everything that a workspace needs, from files that are never whole in memory."""
+    import trustbo as tb
+
+    before = peak()
+    started = time.perf_counter()
+    terrain = tb.terrain.read_terrain(dem, str(dem).replace("dem", "dsm"), lazy=True)
+    tb.Workspace.from_terrain(terrain, (10, 10))
+    return time.perf_counter() - started, peak() - before
+
+
+def visibility(dem, out):
+    import rioxarray  # noqa: F401
+
+    from trustbo.terrain import assemble_terrain, openness
+
+    ground = in_memory(dem)["dem"].astype(float)
+    x = np.arange(len(ground))
+    trees = np.maximum(0.0, 12 * np.sin(x / 23) * np.sin(x[:, None] / 17) - 4)
+    terrain = assemble_terrain(ground, ground + trees)
+    openness(terrain, 40.0, n_rays=24)
+    started = time.perf_counter()
+    openness(terrain, 40.0, n_rays=24)
+    return time.perf_counter() - started
+
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def work(name, dem, out):
+    took = globals()[name](dem, out)
+    seconds, extra = took if isinstance(took, tuple) else (took, None)
+    print(json.dumps([seconds, peak(), extra]))
+
+
+# --- the tables ---
+
+
+def measure(name, dem, out, repeats):
+    """Median seconds, peak MB, and MB beyond the input."""
+    runs = []
+    for _ in range(repeats):
+        command = [sys.executable, "-W", "ignore", __file__, "work", name, str(dem), str(out)]
+        done = subprocess.run(command, capture_output=True, text=True, env=os.environ)
+        if done.returncode:
+            print(f"{name}: did not run here: {done.stderr.strip().splitlines()[-1]}", flush=True)
+            return None
+        runs.append(json.loads(done.stdout.splitlines()[-1]))
+    return statistics.median(r[0] for r in runs), max(r[1] for r in runs), runs[0][2]
+
+
+def gdaldem(dem, out, repeats):
+    """Median seconds of the four commands, and the largest peak."""
+    if not shutil.which("gdaldem"):
+        return None
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        for name, words in GDALDEM.items():
+            target = str(out / f"gdal_{name}.tif")
+            subprocess.run(["gdaldem", words[0], str(dem), target, *words[1:], "-q"], check=True)
+        seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds), float("nan"), None
+
+
+def row(label, result, base=None, target=None):
+    if result is None:
+        return
+    seconds, most, _ = result
+    ratio = "" if base is None else f"{base / seconds:.1f} x"
+    reached = (
+        ""
+        if target is None or base is None
+        else f"(target {target:g} x: {'yes' if base / seconds >= target else 'NO'})"
+    )
+    print(f"| {label:<52} | {seconds:9.3f} | {most:8.0f} | {ratio:>9} | {reached}", flush=True)
+
+
+def head(title):
+    print(f"\n## {title}\n\n| {'':<52} | {'seconds':>9} | {'peak MB':>8} | {'faster':>9} |")
+    print("|---|---:|---:|---:|")
+
+
+def attributes(folder, sizes):
+    for n in sizes:
+        dem, _ = write_pair(folder, n)
+        repeats = 3 if n < 10000 else 1
+        head(f"slope, roughness, TRI, TPI of {n} x {n} pixels")
+        reference = gdaldem(dem, folder, repeats)
+        base = None if reference is None else reference[0]
+        row("gdaldem, file to file, 4 runs", reference)
+        row(
+            "trustbo, file to file",
+            measure("trustbo_files", dem, folder, repeats),
+            base,
+            GDALDEM_TARGET[n],
+        )
+        row("trustbo, in memory", measure("trustbo_memory", dem, folder, repeats), base)
+        row("xarray-spatial, in memory", measure("xrspatial_memory", dem, folder, repeats), base)
+        if n <= 4000:
+            row("xdem, in memory", measure("xdem_memory", dem, folder, repeats), base)
+        if shutil.which("gdaldem"):
+            compare(folder)
+
+
+def compare(folder):
+    """Largest difference from gdaldem's numbers."""
+    for name in ATTRIBUTES:
+        with (
+            rasterio.open(folder / f"gdal_{name}.tif") as a,
+            rasterio.open(folder / f"trustbo_{name}.tif") as b,
+        ):
+            window = Window(1, 1, 900, 900)
+            theirs, ours = a.read(1, window=window), b.read(1, window=window)
+        ours = np.rad2deg(ours) if name == "slope" else ours
+        print(f"{name}: differs from gdaldem by {np.abs(ours - theirs).max():.2g} at most")
+
+
+def awareness(folder, sizes):
+    for n in sizes:
+        dem, _ = write_pair(folder, n)
+        repeats = 3 if n < 10000 else 1
+        head(f"DEM of {n} x {n} pixels in memory to traversability of 10 x 10 cells")
+        full = measure("xrspatial_cells", dem, folder, repeats)
+        base = None if full is None else full[0]
+        row("xarray-spatial: 3 whole maps, averaged", full)
+        ours = measure("trustbo_cells", dem, folder, repeats)
+        row("trustbo: sampled fit, strips, index per cell", ours, base, 10.0 if n == 4000 else None)
+        for label, result in (("xarray-spatial", full), ("trustbo", ours)):
+            if result is not None:
+                print(f"{label}: {result[2]:.0f} MB beyond the input")
+
+
+def huge(folder, n):
+    dem, _ = write_pair(folder, n)
+    head(f"workspace of {n} x {n} pixels, DEM and DSM on disk, openness included")
+    row("trustbo, lazy", measure("trustbo_lazy", dem, folder, 1))
+
+
+def main(*words):
+    sections = {w for w in words if w != "quick"} or {
+        "attributes",
+        "awareness",
+        "visibility",
+        "huge",
+    }
+    quick = "quick" in words
+    if not shutil.which("gdaldem"):
+        subprocess.run(["apt-get", "install", "-y", "-qq", "gdal-bin"], capture_output=True)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if "attributes" in sections:
+            attributes(folder, (1000, 4000) if quick else (1000, 4000, 10000))
+        if "awareness" in sections:
+            awareness(folder, (4000,) if quick else (4000, 10000))
+        if "visibility" in sections:
+            head("visibility index of 500 x 500 pixels, 24 rays of 40 m, with canopy")
+            row("trustbo", measure("visibility", write_pair(folder, 500)[0], folder, 3))
+        if "huge" in sections:
+            huge(folder, 4000 if quick else 20000)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["work"]:
+        work(*sys.argv[2:])
+    else:
+        main(*sys.argv[1:])

@@ -1,0 +1,218 @@
+"""From the features of pixels to the awareness of cells, strip by strip."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from trustbo.errors import TerrainError, TrustboError
+from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
+from trustbo.terrain.features import PixelFeature, feature_named, slope
+from trustbo.terrain.grid import CellMeans, CellQuantiles, Grid
+from trustbo.terrain.parallel import in_order
+from trustbo.terrain.raster import is_lazy, warn_if_clipped
+from trustbo.terrain.strips import Strip, sample_strips, strips
+
+Ingredients = PixelFeature | Mapping[str, PixelFeature]
+"""Of one awareness feature: a pixel feature in [0, 1] as it is, or those of a composite."""
+
+
+SAMPLE = 1 << 17
+"""Pixels that a composite of a larger raster than `MAX_PIXELS` is fitted on."""
+
+
+class CellMaps(NamedTuple):
+    """What a terrain comes down to."""
+
+    awareness: np.ndarray  # (row, col, feature), in [0, 1]; NaN where a cell has no data
+    passable_share: np.ndarray  # (row, col), of pixels that have data and are not too steep
+    composites: dict[str, CompositeIndex]
+    pixels: xr.Dataset | None
+    """The same per pixel, dims (y, x), if it was asked for."""
+
+
+def ingredients(features: Mapping[str, object]) -> dict[str, Ingredients]:
+    """Awareness features as they are asked for: by names of pixel features, or pixel features.
+
+    Raises:
+        TrustboError: An unknown name, or something that is no feature.
+    """
+    return {name: _ingredients(name, parts) for name, parts in features.items()}
+
+
+def _ingredients(name: str, parts: object) -> Ingredients:
+    if isinstance(parts, PixelFeature):
+        return parts
+    if isinstance(parts, str):
+        return feature_named(parts)
+    if isinstance(parts, Mapping) and all(isinstance(p, PixelFeature) for p in parts.values()):
+        chosen = dict(parts)
+    elif isinstance(parts, Iterable) and not isinstance(parts, Mapping):
+        chosen = {part: feature_named(part) for part in parts}
+    else:
+        chosen = {}
+    if not chosen:
+        raise TrustboError(
+            f"feature {name!r} must be names of pixel features, e.g. ['slope', 'tri'], a mapping "
+            f"of names to PixelFeature, or one PixelFeature; got {parts!r}."
+        )
+    return chosen
+
+
+def cell_maps(
+    terrain: xr.Dataset,
+    grid: Grid,
+    features: Mapping[str, Ingredients],
+    *,
+    max_slope: float,
+    scaling: str = "percentile",
+    aggregate: str | float = "mean",
+    composites: Mapping[str, CompositeIndex] | None = None,
+    keep_pixels: bool = True,
+) -> CellMaps:
+    """Awareness and passability of each cell.
+
+    A composite is fitted on all pixels of a raster of up to a million, on rows spread evenly over a
+    larger one; then
+    strip by strip each pixel's index is added to its cell, and no map of a feature is ever whole.
+
+    Args:
+        terrain: In memory, or lazily read.
+        grid: The cells.
+        features: What each awareness feature is made of.
+        max_slope: Steepest ground that is passable, rad.
+        scaling: See `CompositeIndex`.
+        aggregate: `"mean"` of a cell's pixels, or a quantile of theirs in [0, 1].
+        composites: Fitted ones to use, by feature; the others are fitted.
+        keep_pixels: Keep the indices of all pixels.
+
+    Raises:
+        TrustboError: A quantile outside [0, 1], or a feature to be used as it is outside [0, 1].
+    """
+    quantile = _require_aggregate(aggregate)
+    parts = [p for f in features.values() for p in _parts(f)]
+    halo = max(part.halo for part in parts)
+    whole = list(strips(terrain, halo)) if terrain["dem"].size <= MAX_PIXELS else None
+    known = _Memory(whole)
+    fitted = dict(composites or {})
+    to_fit = {n: f for n, f in features.items() if isinstance(f, Mapping) and n not in fitted}
+    if to_fit:
+        fitted |= _fit(terrain, to_fit, scaling, known, whole)
+    like = terrain["dem"]
+    cells: dict[str, CellMeans | CellQuantiles] = {
+        name: CellMeans(grid, like) if quantile is None else CellQuantiles(grid, like, quantile)
+        for name in features
+    }
+    cells["passable"] = CellMeans(grid, like)
+    maps: dict[str, list[np.ndarray]] = {name: [] for name in cells}
+
+    def indices(strip: Strip) -> tuple[Strip, dict[str, np.ndarray]]:
+        index = {name: known.index(strip, name, f, fitted) for name, f in features.items()}
+        return strip, index | {"passable": slope(strip.window).values[strip.core] <= max_slope}
+
+    n_clipped = n_valid = 0.0
+    for strip, index in in_order(indices, whole or strips(terrain, halo)):
+        first, last = strip.rows.start, strip.rows.stop
+        for name, values in index.items():
+            cells[name].add(values, first)
+            if keep_pixels:
+                maps[name].append(values)
+        own = (last - first) / strip.window.sizes["y"]
+        n_clipped, n_valid = n_clipped + own * strip.n_clipped, n_valid + own * strip.n_valid
+    if is_lazy(terrain):
+        warn_if_clipped(round(n_clipped), round(n_valid), stacklevel=4)
+    return CellMaps(
+        np.stack([cells[name].cells for name in features], axis=-1),
+        cells["passable"].cells,
+        {name: fitted[name] for name in features if name in fitted},
+        _assemble(like, maps) if keep_pixels else None,
+    )
+
+
+class _Memory:
+    """Features of a strip; of a terrain that is sampled whole, they are computed only once."""
+
+    def __init__(self, whole: Sequence[Strip] | None) -> None:
+        self._keep = whole is not None
+        self._known: dict[tuple[int, str], dict[str, np.ndarray]] = {}
+
+    def features(
+        self, strip: Strip, name: str, parts: Mapping[str, PixelFeature]
+    ) -> dict[str, np.ndarray]:
+        """Of the strip's pixels, each of shape (row, col)."""
+        key = (strip.rows.start, name)
+        if key in self._known:
+            return self._known[key]
+        values = {n: part.of_rows(strip.window, strip.core) for n, part in parts.items()}
+        if self._keep:
+            self._known[key] = values
+        return values
+
+    def index(
+        self, strip: Strip, name: str, f: Ingredients, fitted: Mapping[str, CompositeIndex]
+    ) -> np.ndarray:
+        """An awareness feature of the strip's pixels."""
+        if isinstance(f, Mapping):
+            values = self.features(strip, name, f)
+            columns = {n: np.ascontiguousarray(v).ravel() for n, v in values.items()}
+            return fitted[name].of_columns(columns).reshape(next(iter(values.values())).shape)
+        values = f.of_rows(strip.window, strip.core)
+        low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
+        if low < 0.0 or high > 1.0:
+            raise TrustboError(
+                f"feature {name!r} is used as it is and must lie in [0, 1]; it has {low:g} to "
+                f"{high:g}. Scale it, or make it a composite of one: {{{name!r}: [...]}}."
+            )
+        return values
+
+
+def _fit(
+    terrain: xr.Dataset,
+    features: Mapping[str, Mapping[str, PixelFeature]],
+    scaling: str,
+    known: _Memory,
+    whole: Sequence[Strip] | None,
+) -> dict[str, CompositeIndex]:
+    """Composites fitted on a sample of pixels; the features of each with its own halo."""
+    fitted = {}
+    for name, parts in features.items():
+        halo = max(part.halo for part in parts.values())
+        chosen = whole or sample_strips(terrain, halo, SAMPLE)
+        drawn = [known.features(strip, name, parts) for strip in chosen]
+        sample = xr.Dataset(
+            {p: ("pixel", np.concatenate([d[p].ravel() for d in drawn])) for p in parts}
+        )
+        signs = {part: feature.sign for part, feature in parts.items()}
+        try:
+            fitted[name] = CompositeIndex(signs, scaling=scaling).fit(sample)
+        except TerrainError as error:
+            raise TerrainError(f"{name}: {error}") from None
+    return fitted
+
+
+def _parts(f: Ingredients) -> list[PixelFeature]:
+    return list(f.values()) if isinstance(f, Mapping) else [f]
+
+
+def _assemble(like: xr.DataArray, maps: Mapping[str, list[np.ndarray]]) -> xr.Dataset:
+    """Whole maps of what each strip gave."""
+    whole = {name: np.concatenate(pieces) for name, pieces in maps.items()}
+    return xr.Dataset(
+        {
+            name: xr.DataArray(
+                values, like.coords, like.dims, attrs={} if name == "passable" else {"units": "1"}
+            )
+            for name, values in whole.items()
+        }
+    )
+
+
+def _require_aggregate(aggregate: str | float) -> float | None:
+    """The quantile to take, or None for the mean."""
+    if isinstance(aggregate, str):
+        if aggregate == "mean":
+            return None
+    elif not isinstance(aggregate, bool) and 0.0 <= aggregate <= 1.0:
+        return float(aggregate)
+    raise TrustboError(f'aggregate must be "mean" or a quantile in [0, 1]; got {aggregate!r}.')

@@ -1,0 +1,44 @@
+"""Work shared out among the cores, by threads: compiled code releases the GIL."""
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+_BLOCK = 64  # rows per piece of work: few enough for the caches
+_here = threading.local()
+
+
+def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
+    """Call `work(first, last)` on blocks of rows, on all cores unless this is a worker already."""
+    blocks = [(first, min(first + _BLOCK, n_rows)) for first in range(0, n_rows, _BLOCK)]
+    work(0, 0)  # compiles, if need be, in one thread
+    if len(blocks) == 1 or getattr(_here, "is_worker", False):
+        for block in blocks:
+            work(*block)
+        return
+    with ThreadPoolExecutor(n_cores()) as pool:
+        list(pool.map(lambda block: work(*block), blocks))
+
+
+def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Results in the order of the items, of which only as many as there are cores are alive."""
+
+    def alone(item: T) -> R:
+        _here.is_worker = True
+        return work(item)
+
+    pending: deque[Future[R]] = deque()
+    with ThreadPoolExecutor(n_cores()) as pool:
+        for item in items:
+            pending.append(pool.submit(alone, item))
+            if len(pending) > n_cores():
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def n_cores() -> int:
+    """Cores this process may use, which can be fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,76 @@
+"""A raster in horizontal strips with enough around them, so that memory is that of one strip."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from trustbo.terrain.raster import clean, is_lazy, pixel_size
+
+_PIXELS = 1 << 20  # of a strip: its arrays fit in the last cache
+_N_SAMPLED = 32
+
+
+class Strip(NamedTuple):
+    """Some rows of a raster, and those around them."""
+
+    window: xr.Dataset
+    """The rows and their halo, in memory."""
+    rows: slice
+    """Which rows of the raster they are."""
+    core: slice
+    """Where in the window they are."""
+    n_clipped: int
+    """Pixels of the window whose surface was raised to the ground."""
+    n_valid: int
+    """Pixels of the window that have both heights."""
+
+
+def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
+    """Go through a terrain from north to south.
+
+    Args:
+        terrain: In memory, or lazily read.
+        halo: How far around a pixel its features look, m; two pixels are always added.
+    """
+    n_rows, n_cols = terrain["dem"].shape
+    around = _halo_rows(terrain, halo)
+    step = max(_PIXELS // n_cols, 2 * around if around < n_rows else n_rows, 1)
+    for first in range(0, n_rows, step):
+        yield _strip(terrain, first, min(first + step, n_rows), around)
+
+
+def sample_strips(terrain: xr.Dataset, halo: float, n_pixels: int) -> Iterator[Strip]:
+    """Some rows spread evenly over a terrain, about `n_pixels` in all.
+
+    Args:
+        terrain: In memory, or lazily read.
+        halo: See `strips`.
+        n_pixels: How many are wanted.
+    """
+    n_rows, n_cols = terrain["dem"].shape
+    around = _halo_rows(terrain, halo)
+    wanted = -(-n_pixels // n_cols)
+    if wanted >= n_rows or around >= n_rows:
+        yield from strips(terrain, halo)
+        return
+    n_strips = min(_N_SAMPLED, wanted)
+    height = wanted // n_strips
+    for first in np.linspace(0, n_rows - height, n_strips).astype(int):
+        yield _strip(terrain, int(first), int(first) + height, around)
+
+
+def _halo_rows(terrain: xr.Dataset, halo: float) -> int:
+    n_rows = terrain["dem"].shape[0]
+    if np.isinf(halo):
+        return n_rows
+    return min(n_rows, int(np.ceil(halo / pixel_size(terrain)[0])) + 2)
+
+
+def _strip(terrain: xr.Dataset, first: int, last: int, around: int) -> Strip:
+    top, bottom = max(0, first - around), min(terrain["dem"].shape[0], last + around)
+    window, n_clipped, n_valid = terrain.isel(y=slice(top, bottom)), 0, 0
+    if is_lazy(terrain):
+        window, n_clipped, n_valid = clean(window.load())
+    return Strip(window, slice(first, last), slice(first - top, last - top), n_clipped, n_valid)
