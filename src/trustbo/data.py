@@ -36,9 +36,13 @@ class Robot:
         sensor_height: Height of the lidar above ground, m.
         target_height: Height of the point others aim at, m above ground; by default the lidar.
         max_slope: Steepest pitch or roll the robot stands, rad.
+        detection: Quality of the lidar: share of clear looks that find their target, in (0, 1].
+        acquire: How many looks in a row must find a target for a track, and contact, to begin.
+        drop: How many looks in a row must miss it for them to end.
 
     Raises:
-        TrustboError: A value is not positive, or an angle is beyond a quarter turn.
+        TrustboError: A value is not positive, an angle is beyond a quarter turn, a share over 1,
+            or a number of looks not whole.
     """
 
     speed: float = 2.0
@@ -48,10 +52,17 @@ class Robot:
     sensor_height: float = 1.0
     target_height: float = 1.0
     max_slope: float = np.pi / 4
+    detection: float = 1.0
+    acquire: int = 1
+    drop: int = 1
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             require_positive(f"Robot.{name}", value)
+        for name in ("acquire", "drop"):
+            require_whole(f"Robot.{name}", getattr(self, name), 1)
+        if self.detection > 1.0:
+            raise TrustboError(f"Robot.detection must be in (0, 1]; got {self.detection:g}.")
         for name in ("vertical_fov", "max_slope"):
             if getattr(self, name) >= np.pi / 2:
                 raise TrustboError(
@@ -111,6 +122,8 @@ class Bound:
         contact: Shape (tick, robot), whether each robot had contact. None where not recorded.
         exposure: How often each robot looked (ticks), shape (robot,); NaN where not recorded. The
             rate is the share of these with contact.
+        states: Motion and sensing of each robot, shape (tick, robot, state), see
+            `simulation.STATES`. None where not recorded.
 
     Raises:
         ShapeError: The arrays disagree on the number of robots.
@@ -127,6 +140,7 @@ class Bound:
     poses: np.ndarray | None = None
     contact: np.ndarray | None = None
     exposure: np.ndarray = None  # pyright: ignore[reportAssignmentType]
+    states: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name, n_axes in (("awareness", 2), ("contact_rate", 1), ("duration", 1)):

@@ -1,5 +1,6 @@
 """The loop: plan, run, learn, and plan again."""
 
+import inspect
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -132,7 +133,9 @@ def _iteration(campaign: Campaign, simulator: Simulator) -> dict[str, object]:
     plan = campaign.ask()
     trust_map = campaign.trust_map()
     t1 = clock()
-    mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
+    mission = simulator.run(
+        plan.path, seed=campaign.seed_of("mission"), **_number(campaign, simulator)
+    )
     t2 = clock()
     before = campaign.plans[-1] if campaign.plans else plan
     posterior = campaign.tell(mission)
@@ -148,6 +151,12 @@ def _iteration(campaign: Campaign, simulator: Simulator) -> dict[str, object]:
         "seconds_run": t2 - t1,
         "seconds_fit": clock() - t2,
     }
+
+
+def _number(campaign: Campaign, simulator: Simulator) -> dict[str, int]:
+    """The mission's number, for simulators of a changing world."""
+    takes_it = "mission" in inspect.signature(simulator.run).parameters
+    return {"mission": len(campaign.missions)} if takes_it else {}
 
 
 def _result(

@@ -16,43 +16,76 @@ ARRIVED = 0.5
 SLOWEST = 0.1
 """Share of its speed that a robot keeps on the steepest slope it stands."""
 _LEAST_STEPS = 5
+_compiled = njit(cache=True, error_model="numpy")
 _STATUS = ("ok", "stuck", "tipped", "timeout")
 
 
-def find_route(
-    surface: Surface,
-    robot: Robot,
-    start: np.ndarray,
-    goal: np.ndarray,
-    window: tuple[int, int, int, int],
-) -> np.ndarray | None:
-    """Fastest way over passable pixels, by A*.
+class Routes:
+    """Fastest ways over passable pixels, by A*; one that was found is kept.
 
-    Args:
-        surface: The terrain.
-        robot: Who drives: its speed falls with the slope.
-        start: x and y, CRS metres.
-        goal: x and y, CRS metres.
-        window: Pixels the route may use: first row, end row, first col, end col.
-
-    Returns:
-        Positions from start to goal, shape (point, 2), CRS metres; None if there is no way.
+    Robots of one make share them, and missions over one path ask for few.
     """
-    top, bottom, left, right = window
-    cut = (slice(top, bottom), slice(left, right))
-    slope = np.arctan(np.hypot(*surface.gradient[:, *cut]))
-    pace = np.where(surface.passable[cut], 1.0 / _speed_share(slope, robot.max_slope), np.inf)
-    ends = [surface.nearest(*p) for p in (start, goal)]
-    (r0, c0), (r1, c1) = ((int(r) - top, int(c) - left) for r, c in ends)
-    cells = _a_star(pace, surface.pixel, (r0, c0), (r1, c1))
-    if not len(cells):
-        return None
-    x = surface.origin[0] + (cells[:, 1] + left) * surface.pixel[1]
-    y = surface.origin[1] - (cells[:, 0] + top) * surface.pixel[0]
-    route = np.stack([x, y], axis=1)
-    route[0], route[-1] = start, goal
-    # A single-pixel route still needs two ends.
-    return route if len(route) > 1 else np.stack([start, goal])
+
+    def __init__(self, surface: Surface) -> None:
+        """Prepare; a robot's speed falls with the slope."""
+        self._surface = surface
+        self._slope = np.arctan(np.hypot(*surface.gradient))
+        self._paces: dict[float, np.ndarray] = {}
+        self._known: dict[tuple[object, ...], np.ndarray] = {}
+
+    def find(
+        self,
+        robot: Robot,
+        start: np.ndarray,
+        goal: np.ndarray,
+        window: tuple[int, int, int, int],
+    ) -> np.ndarray | None:
+        """Way from a position to another.
+
+        Args:
+            robot: Who drives.
+            start: x and y, CRS metres.
+            goal: x and y, CRS metres.
+            window: Pixels the route may use: first row, end row, first col, end col.
+
+        Returns:
+            Positions from start to goal, shape (point, 2), CRS metres; None if there is no way.
+        """
+        ends = [tuple(int(i) for i in self._surface.nearest(*p)) for p in (start, goal)]
+        key = (*ends, window, robot.max_slope)
+        if key not in self._known:
+            self._known[key] = self._search(ends[0], ends[1], window, robot.max_slope)
+        found = self._known[key]
+        if not len(found):
+            return None
+        if len(found) == 1:  # a single-pixel route still needs two ends
+            return np.stack([start, goal])
+        route = found.copy()
+        route[0], route[-1] = start, goal
+        return route
+
+    def _search(
+        self,
+        start: tuple[int, ...],
+        goal: tuple[int, ...],
+        window: tuple[int, int, int, int],
+        max_slope: float,
+    ) -> np.ndarray:
+        """Positions of the pixels from start to goal; empty if there is no way."""
+        surface = self._surface
+        if max_slope not in self._paces:
+            pace = 1.0 / _speed_share(self._slope, max_slope)
+            self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
+        top, bottom, left, right = window
+        cells = _a_star(
+            self._paces[max_slope][top:bottom, left:right],
+            surface.pixel,
+            (start[0] - top, start[1] - left),
+            (goal[0] - top, goal[1] - left),
+        )
+        x = surface.origin[0] + (cells[:, 1] + left) * surface.pixel[1]
+        y = surface.origin[1] - (cells[:, 0] + top) * surface.pixel[0]
+        return np.stack([x, y], axis=1)
 
 
 def drive(
@@ -98,12 +131,17 @@ def drive(
     return poses, _STATUS[code]
 
 
-@njit(cache=True)
+@_compiled
+def _squared(point, x, y):
+    return (point[0] - x) ** 2 + (point[1] - y) ** 2
+
+
+@_compiled
 def _speed_share(tilt, max_slope):
     return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
 
 
-@njit(cache=True)
+@_compiled
 def _a_star(pace, pixel, start, goal):
     """Cells of the cheapest way over a grid of paces (s per m, inf where closed); empty if none."""
     rows, cols = pace.shape
@@ -151,39 +189,42 @@ def _a_star(pace, pixel, start, goal):
     return cells
 
 
-@njit(cache=True)
+@_compiled
 def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip):
     speed, turn_rate, max_slope = limits
     rows, cols = gradient.shape[1:]
     x, y, aim = route[0, 0], route[0, 1], 1
     poses = np.empty((len(slip), 3))
-    dt = tick / n_steps
+    dt, steepest = tick / n_steps, math.tan(max_slope)
     for k in range(len(slip)):
         for _ in range(n_steps):
-            while (
-                aim < len(route) - 1
-                and math.hypot(route[aim, 0] - x, route[aim, 1] - y) < LOOKAHEAD
-            ):
+            while aim < len(route) - 1 and _squared(route[aim], x, y) < LOOKAHEAD**2:
                 aim += 1
             dx, dy = route[aim, 0] - x, route[aim, 1] - y
             error = (math.atan2(dy, dx) - heading + math.pi) % (2.0 * math.pi) - math.pi
             turn = min(turn_rate * dt, max(-turn_rate * dt, error))
             heading += turn
-            i = min(rows - 1, max(0, round((origin[1] - y) / pixel[0])))
-            j = min(cols - 1, max(0, round((x - origin[0]) / pixel[1])))
+            i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
+            j = min(cols - 1, max(0, int((x - origin[0]) / pixel[1] + 0.5)))
             gx, gy = gradient[0, i, j], gradient[1, i, j]
-            pitch = abs(math.atan(gx * math.cos(heading) + gy * math.sin(heading)))
-            roll = abs(math.atan(gy * math.cos(heading) - gx * math.sin(heading)))
-            if not (roll <= max_slope and pitch <= max_slope):  # unknown ground fails too
+            ahead, left = math.cos(heading), math.sin(heading)
+            # Tangents of pitch and roll.
+            pitch, roll = abs(gx * ahead + gy * left), abs(gy * ahead - gx * left)
+            if not (roll <= steepest and pitch <= steepest):  # unknown ground fails too
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
-                return poses[: k + 1], 2 if roll > max_slope else 1
+                return poses[: k + 1], 2 if roll > steepest else 1
             # A skid-steer robot turns on the spot until it faces its way.
-            v = speed * slip[k] * _speed_share(max(pitch, roll), max_slope)
+            v = speed * slip[k] * _speed_share(math.atan(max(pitch, roll)), max_slope)
             v *= max(0.0, math.cos(error - turn))
-            x += v * dt * math.cos(heading)
-            y += v * dt * math.sin(heading)
-            if aim == len(route) - 1 and math.hypot(route[-1, 0] - x, route[-1, 1] - y) < ARRIVED:
+            x += v * dt * ahead
+            y += v * dt * left
+            if aim == len(route) - 1 and _squared(route[-1], x, y) < ARRIVED**2:
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
                 return poses[: k + 1], 0
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
     return poses, 3
+
+
+def find_route(surface, robot, start, goal, window):  # noqa: ANN201
+    """One way; see `Routes.find`."""
+    return Routes(surface).find(robot, start, goal, window)

@@ -1,17 +1,24 @@
 """Bounding overwatch, simulated: who moves where, who sees whom, bound by bound."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+import xarray as xr
 
 from trustbo.data import Bound, Cell, Mission, Robot
-from trustbo.errors import TrustboError, require_positive, require_whole
-from trustbo.simulation.motion import drive, find_route
-from trustbo.simulation.positions import SPACING, Positions, surface_of
-from trustbo.simulation.sight import Sight, in_view, transmittance
-from trustbo.terrain import Workspace
+from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
+from trustbo.simulation.events import Degradation, Threat
+from trustbo.simulation.measure import Measure
+from trustbo.simulation.motion import drive
+from trustbo.simulation.positions import SPACING
+from trustbo.simulation.sensing import contact_of, new_tracks
+from trustbo.simulation.sight import Sight, chance, optics
+from trustbo.simulation.world import Worlds
+from trustbo.terrain import CompositeIndex, Workspace
+
+BOUNDING = ("successive", "alternate")
 
 
 class Simulator(Protocol):
@@ -26,10 +33,20 @@ class Simulator(Protocol):
 class _State:
     """Where everybody is; positions in CRS metres, headings in rad."""
 
-    cell: Cell
+    cells: tuple[Cell, Cell]  # of the lead, and of T2
     poses: np.ndarray  # (1 + robot, 3), the lead first
     time: float
     seed: int
+    tracks: np.ndarray  # (phase, robot, 2), see `sensing.new_tracks`
+
+
+class _Drive(NamedTuple):
+    """One bound's movements."""
+
+    poses: np.ndarray  # (tick, 1 + robot, 3)
+    lead_moves: np.ndarray  # (tick,), else T2 does
+    status: str
+    cells: tuple[Cell, Cell]
 
 
 class KinematicSimulator:
@@ -38,9 +55,12 @@ class KinematicSimulator:
     One bound: the lead drives to its waypoint in the next cell while T2 watches from its positions
     in the last; then T2 closes up to positions around the lead, chosen for sight of the waypoint
     after, while the lead watches. Each tick, each robot of T2 is in contact with the lead or not;
-    its contact rate is the share of the bound's ticks, both phases, with contact.
+    its contact rate is the share of the bound's ticks, both phases, with contact. With
+    `bounding="alternate"` T2 does not close up but passes the lead in the next bound, so that they
+    lead by turns; at the goal the one behind closes up.
 
-    `run` runs a path; `reset`, `run_bound` and `close` run it bound by bound.
+    `run` runs a path, `run_batch` many missions over one; `reset`, `run_bound` and `close` run one
+    bound by bound.
     """
 
     def __init__(
@@ -52,27 +72,33 @@ class KinematicSimulator:
         formation_radius: float = 8.0,
         bound_timeout: float = 600.0,
         lost_contact_after: float | None = None,
+        bounding: str = "successive",
+        threats: Sequence[Threat] = (),
+        degradations: Sequence[Degradation] = (),
+        realtime: Mapping[str, CompositeIndex] | None = None,
+        record_states: bool = False,
     ) -> None:
         """Prepare a terrain for simulation.
 
         Args:
-            workspace: A workspace made from a terrain.
+            workspace: A workspace made from a terrain in memory.
             sight: What hinders sight, or only its mode: "bare", "wall" or "transmittance".
             tick: Time between two looks, s.
             formation_radius: How far from the lead's waypoint T2 may stand, m.
             bound_timeout: A bound that takes longer ends the mission as "timeout", s.
             lost_contact_after: If no robot has had contact for this long, the mission ends as
                 "lost_contact", s. None: it goes on.
+            bounding: "successive" or "alternate".
+            threats: Regions that jam sight or forbid passage from some mission on.
+            degradations: Lidars of T2 that get worse from some mission on.
+            realtime: Fitted `CompositeIndex.realtime` by feature: measured awareness is then the
+                map's value fused with the robot's state. Rows to fit them on: `calibration`.
+            record_states: Keep each robot's state at each tick, `Bound.states`.
 
         Raises:
-            TrustboError: A workspace without terrain, an unknown sight mode, a value that is not
-                positive.
+            TrustboError: A workspace without terrain, an unknown sight mode, bounding or robot, a
+                value that is not positive.
         """
-        if workspace.terrain is None or workspace.pixels is None:
-            raise TrustboError(
-                "the kinematic simulator needs a terrain; make the workspace with "
-                "Workspace.from_terrain, or pass your own simulator."
-            )
         if not isinstance(sight, str | Sight):
             raise TrustboError(f"sight must be a mode's name or a Sight; got {sight!r}.")
         if require_positive("formation_radius", formation_radius) < SPACING:
@@ -83,21 +109,21 @@ class KinematicSimulator:
         self.workspace = workspace
         self.sight = Sight(sight) if isinstance(sight, str) else sight
         self.tick = require_positive("tick", tick)
+        self.formation_radius = formation_radius
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self.lost_contact_after = lost_contact_after
         if lost_contact_after is not None:
             require_positive("lost_contact_after", lost_contact_after)
-        self._surface = surface_of(workspace.terrain, workspace.pixels)
-        awareness = [workspace.pixels[str(f)].values for f in workspace.awareness["feature"].values]
-        self._awareness = np.stack(awareness, axis=-1)
-        self._positions = Positions(
-            workspace,
-            self._surface,
-            self.sight,
-            workspace.pixels["traversability"],
-            formation_radius,
+        self.bounding = require_choice("bounding", bounding, BOUNDING)
+        self.realtime, self.record_states = dict(realtime or {}), record_states
+        self._wants_states = record_states or bool(self.realtime)
+        self._worlds = Worlds(workspace, self.sight, formation_radius, threats, degradations)
+        self.threats, self.degradations = tuple(threats), tuple(degradations)
+        self._measure = Measure(
+            workspace, self._worlds.surface, self.sight, self.tick, self.realtime
         )
         self._state: _State | None = None
+        self._enter(0)
 
     def describe(self) -> dict[str, object]:
         """The settings that decide what a mission measures, for the record."""
@@ -107,47 +133,72 @@ class KinematicSimulator:
             "extinction": self.sight.extinction,
             "crown_base": self.sight.crown_base,
             "tick": self.tick,
+            "bounding": self.bounding,
+            "threats": len(self.threats),
+            "degradations": len(self.degradations),
+            "realtime": sorted(self.realtime),
         }
 
-    def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
+    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
         """Run a path, start to goal or as far as it goes.
 
         Args:
             path: Cells, each a neighbour of the last.
             seed: Same seed, same mission, on any machine.
+            mission: Its number in the campaign, from 0: threats and degradations go by it.
 
         Raises:
             TrustboError: A cell that is off the grid or impassable, or fewer than two cells.
         """
+        return self.run_batch(path, [seed], mission=mission)[0]
+
+    def run_batch(
+        self, path: Sequence[Cell], seeds: Sequence[int], *, mission: int = 0
+    ) -> list[Mission]:
+        """Run a path many times, faster than one by one; each as `run` does with its seed.
+
+        Args:
+            path: Cells, each a neighbour of the last.
+            seeds: Of the missions.
+            mission: See `run`.
+
+        Raises:
+            TrustboError: See `run`.
+        """
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         if len(cells) < 2:
             raise TrustboError(f"a path needs at least two cells; got {cells}.")
-        self.reset(cells[0], seed, next_cell=cells[1])
-        bounds: list[Bound] = []
+        self._enter(mission)
+        states = [self._start(cells[0], seed, cells[1]) for seed in seeds]
+        bounds: list[list[Bound]] = [[] for _ in states]
+        under_way = list(range(len(states)))
         for k, cell in enumerate(cells[1:], start=1):
             after = cells[k + 1] if k + 1 < len(cells) else None
-            bounds.append(self.run_bound(k, cell, next_cell=after))
-            if bounds[-1].status != "ok":
+            done = self._bounds([states[i] for i in under_way], k, cell, after)
+            for i, bound in zip(under_way, done, strict=True):
+                bounds[i].append(bound)
+            under_way = [i for i in under_way if bounds[i][-1].status == "ok"]
+            if not under_way:
                 break
-        self.close()
-        features = tuple(str(f) for f in self.workspace.awareness["feature"].values)
-        robots = self.workspace.team.names
-        return Mission(tuple(cells), tuple(bounds), bounds[-1].status, features, robots)
+        names = tuple(str(f) for f in self.workspace.awareness["feature"].values)
+        return [
+            Mission(tuple(cells), tuple(of), of[-1].status, names, self.workspace.team.names)
+            for of in bounds
+        ]
 
-    def reset(self, start: Cell, seed: int, *, next_cell: Cell | None = None) -> None:
+    def reset(
+        self, start: Cell, seed: int, *, next_cell: Cell | None = None, mission: int = 0
+    ) -> None:
         """Put the team into a cell.
 
         Args:
             start: The cell.
             seed: Decides slip and contacts of all bounds to come.
             next_cell: Where the lead will go first, if known: T2 takes positions that see it.
+            mission: See `run`.
         """
-        cell = self.workspace.require_cell("start", start)
-        here = self._positions.waypoint(cell)
-        positions = self._positions.formation(cell, next_cell)
-        poses = np.zeros((1 + len(positions), 3))
-        poses[0, :2], poses[1:, :2] = here, positions
-        self._state = _State(cell, poses, 0.0, require_whole("seed", seed, 0))
+        self._enter(mission)
+        self._state = self._start(start, seed, next_cell)
 
     def run_bound(self, k: int, cell: Cell, *, next_cell: Cell | None = None) -> Bound:
         """Run one bound.
@@ -155,7 +206,8 @@ class KinematicSimulator:
         Args:
             k: Number of the bound, 1 for the first.
             cell: The cell to enter.
-            next_cell: The cell after it, if known: T2 takes positions that see it.
+            next_cell: The cell after it, if known: T2 takes positions that see it. None: it is the
+                goal.
 
         Returns:
             What was measured; if the status is not "ok", up to where the bound ended.
@@ -163,54 +215,115 @@ class KinematicSimulator:
         Raises:
             TrustboError: `reset` was not called, or the cell is off the grid or impassable.
         """
-        state = self._state
-        if state is None:
+        if self._state is None:
             raise TrustboError("call reset(start, seed) before run_bound.")
-        cell = self.workspace.require_cell("cell", cell)
-        rng = np.random.default_rng([state.seed, k])
-        team, ticks_left = self.workspace.team, round(self.bound_timeout / self.tick)
-        leading, status = self._move(
-            state.poses[:1],
-            [team.lead],
-            [self._positions.waypoint(cell)],
-            (state.cell, cell),
-            ticks_left,
-            rng,
-        )
-        watching = np.repeat(state.poses[None, 1:], len(leading), axis=0)
-        poses = np.concatenate([leading, watching], axis=1)
-        moved_from = len(poses)
-        if status == "ok":
-            targets = list(self._positions.formation(cell, next_cell))
-            ticks_left -= len(leading)
-            closing, status = self._move(
-                state.poses[1:], team.robots, targets, (state.cell, cell), ticks_left, rng
-            )
-            waiting = np.repeat(leading[-1:], len(closing), axis=0)
-            poses = np.concatenate([poses, np.concatenate([waiting, closing], axis=1)])
-        contact = self._contact(poses, moved_from, rng)
-        poses, contact, status = self._cut_at_lost_contact(poses, contact, status)
-        # On failure in the first phase T2 has not moved: what it measured is where it stands.
-        awareness = self._measure(poses[min(moved_from, len(poses) - 1) :, 1:])
-        duration = np.full(len(team.robots), len(poses) * self.tick)
-        exposure = np.full(len(team.robots), len(contact))
-        bound = Bound(
-            cell,
-            awareness,
-            contact.mean(0),
-            duration,
-            status,
-            state.time,
-            poses,
-            contact,
-            exposure,
-        )
-        self._state = _State(cell, poses[-1], bound.t1, state.seed)
-        return bound
+        return self._bounds([self._state], k, self.workspace.require_cell("cell", cell), next_cell)[
+            0
+        ]
 
     def close(self) -> None:
         """Forget where everybody is."""
         self._state = None
+
+    def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
+        """What `CompositeIndex.realtime` is fitted on: robots on random bounds, without threats.
+
+        Args:
+            n_bounds: How many bounds, each from one passable cell to a neighbour.
+            seed: Same seed, same bounds.
+
+        Returns:
+            By feature, a Dataset (sample) of the map's value, `offline`, and the states of
+            `simulation.STATES`, averaged over a bound; one sample per robot and bound.
+        """
+        rng = np.random.default_rng(require_whole("seed", seed, 0))
+        plain = type(self)(self.workspace, sight=self.sight, tick=self.tick, record_states=True,
+                           formation_radius=self.formation_radius)  # fmt: skip
+        free, rows = np.argwhere(self.workspace.passable.values), []
+        for tried in range(20 * require_whole("n_bounds", n_bounds, 1)):
+            a = free[rng.integers(len(free))]
+            near = free[np.abs(free - a).max(1) == 1]
+            if len(near):
+                b = near[rng.integers(len(near))]
+                path = [(int(row), int(col)) for row, col in (a, b)]
+                rows.append(plain.run(path, seed=tried).bounds[0])
+            if len(rows) == n_bounds:
+                break
+        return self._measure.samples(rows)
+
+    def _enter(self, mission: int) -> None:
+        """Take the world as it is for a mission."""
+        self._now = self._worlds.at(require_whole("mission", mission, 0))
+        self._surface, self._positions, self._routes, *_ = self._now
+
+    # --- one bound ---
+
+    def _start(self, start: Cell, seed: int, next_cell: Cell | None) -> _State:
+        cell = self.workspace.require_cell("start", start)
+        here = self._positions.waypoint(cell)
+        positions = self._positions.formation(cell, next_cell)
+        poses = np.zeros((1 + len(positions), 3))
+        poses[0, :2], poses[1:, :2] = here, positions
+        tracks = new_tracks(len(positions))
+        return _State((cell, cell), poses, 0.0, require_whole("seed", seed, 0), tracks)
+
+    def _bounds(
+        self, states: Sequence[_State], k: int, cell: Cell, next_cell: Cell | None
+    ) -> list[Bound]:
+        """The same bound of several missions; their states move on."""
+        rngs = [np.random.default_rng([state.seed, k]) for state in states]
+        drives = [
+            self._drive(state, k, cell, next_cell, rng)
+            for state, rng in zip(states, rngs, strict=True)
+        ]
+        chances = self._chances(drives)
+        return [
+            self._measured(state, cell, drive, chance, rng)
+            for state, drive, chance, rng in zip(states, drives, chances, rngs, strict=True)
+        ]
+
+    def _drive(
+        self, state: _State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
+    ) -> _Drive:
+        """Who moves, and where to: the lead, then T2; or by turns."""
+        lead_goal, t2_goals = [self._positions.waypoint(cell)], None
+        turns = ["lead", "t2"]
+        if self.bounding == "alternate":
+            first = "lead" if k % 2 else "t2"
+            turns = [first] if next_cell is not None else [first, "t2" if k % 2 else "lead"]
+        poses, lead_moves, status, cells = state.poses[None], np.zeros(0, bool), "ok", state.cells
+        tracks: list[np.ndarray] = []
+        ticks_left = round(self.bound_timeout / self.tick)
+        for who in turns:
+            now = poses[-1]
+            if who == "lead":
+                moved, status = self._move(
+                    now[:1],
+                    [self.workspace.team.lead],
+                    lead_goal,
+                    (cells[0], cell),
+                    ticks_left,
+                    rng,
+                )
+                poses = np.concatenate(
+                    [moved, np.repeat(now[None, 1:], len(moved), axis=0)], axis=1
+                )
+                cells = (cell, cells[1]) if status == "ok" else cells
+            else:
+                t2_goals = list(self._positions.formation(cell, next_cell))
+                moved, status = self._move(
+                    now[1:], self.workspace.team.robots, t2_goals, (cells[1], cell), ticks_left, rng
+                )
+                poses = np.concatenate(
+                    [np.repeat(now[None, :1], len(moved), axis=0), moved], axis=1
+                )
+                cells = (cells[0], cell) if status == "ok" else cells
+            tracks.append(poses)
+            lead_moves = np.concatenate([lead_moves, np.full(len(moved), who == "lead")])
+            ticks_left -= len(moved)
+            if status != "ok":
+                break
+        return _Drive(np.concatenate(tracks), lead_moves, status, cells)
 
     def _move(
         self,
@@ -225,7 +338,7 @@ class KinematicSimulator:
         tracks, failures = [], []
         window = self._positions.window(*cells)
         for pose, robot, goal in zip(poses, robots, goals, strict=True):
-            route = find_route(self._surface, robot, pose[:2], goal, window)
+            route = self._routes.find(robot, pose[:2], goal, window)
             if route is None:
                 track, status = pose[None], "stuck"
             else:
@@ -239,41 +352,71 @@ class KinematicSimulator:
         held = [t[np.minimum(np.arange(n_ticks), len(t) - 1)] for t in tracks]
         return np.stack(held, axis=1), status
 
-    def _contact(self, poses: np.ndarray, n_leading: int, rng: np.random.Generator) -> np.ndarray:
-        """Whether each robot had contact, (tick, robot): T2's lidars first, then the lead's."""
+    def _chances(self, drives: Sequence[_Drive]) -> list[np.ndarray]:
+        """Probability that a look finds its target, (tick, robot): of all missions at once."""
         team = self.workspace.team
-        chance = np.zeros((len(poses), len(team.robots)))
-        for i, robot in enumerate(team.robots):
-            phases = ((slice(0, n_leading), robot, team.lead, 1 + i, 0),
-                      (slice(n_leading, None), team.lead, robot, 0, 1 + i))  # fmt: skip
-            for ticks, watcher, watched, a, b in phases:
-                sensor, target = poses[ticks, a, :2], poses[ticks, b, :2]
-                heights = (watcher.sensor_height, watched.target_height)
-                clear = transmittance(self._surface, self.sight, sensor, target, *heights)
-                view = in_view(self._surface, watcher, sensor, target, watched.target_height)
-                chance[ticks, i] = np.where(view, clear, 0.0)
-        return rng.random(chance.shape) < chance
+        poses = np.concatenate([drive.poses[..., :2] for drive in drives])
+        t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]
+        lead = np.repeat(poses[:, :1], len(team.robots), axis=1)
+        sensor = np.where(t2_looks[..., None], poses[:, 1:], lead).reshape(-1, 2)
+        target = np.where(t2_looks[..., None], lead, poses[:, 1:]).reshape(-1, 2)
+        by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
+        by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
+        glass = np.where(t2_looks[..., None], by_t2, by_lead).reshape(-1, 4)
+        found = chance(self._surface, self.sight, sensor, target, glass)
+        for mask, strength in self._now.jams:
+            inside = mask[self._surface.nearest(sensor[:, 0], sensor[:, 1])]
+            inside |= mask[self._surface.nearest(target[:, 0], target[:, 1])]
+            found[inside] *= 1.0 - strength
+        found = found.reshape(-1, len(team.robots))
+        found *= np.where(t2_looks, self._now.detection, team.lead.detection)
+        return np.split(found, np.cumsum([len(drive.poses) for drive in drives])[:-1])
 
-    def _cut_at_lost_contact(
-        self, poses: np.ndarray, contact: np.ndarray, status: str
-    ) -> tuple[np.ndarray, np.ndarray, str]:
-        if self.lost_contact_after is None:
-            return poses, contact, status
-        patience = max(1, round(self.lost_contact_after / self.tick))
-        alone = 0
-        for k, any_contact in enumerate(contact.any(1)):
-            alone = 0 if any_contact else alone + 1
-            if alone >= patience:
-                return poses[: k + 1], contact[: k + 1], "lost_contact"
-        return poses, contact, status
+    def _measured(
+        self,
+        state: _State,
+        cell: Cell,
+        drive: _Drive,
+        chances: np.ndarray,
+        rng: np.random.Generator,
+    ) -> Bound:
+        """Contact, awareness and the rest of one bound; its state moves on."""
+        team, n_robots = self.workspace.team, len(self.workspace.team.robots)
+        found = rng.random(chances.shape) < chances
+        contact = np.empty(found.shape, bool)
+        for phase, (who, watchers) in enumerate(
+            ((drive.lead_moves, team.robots), (~drive.lead_moves, [team.lead] * n_robots))
+        ):
+            contact[who] = contact_of(found[who], watchers, state.tracks[phase])
+        n_ticks, status = self._cut_at_lost_contact(contact, drive.status)
+        poses, contact = drive.poses[:n_ticks], contact[:n_ticks]
+        # If T2 has not moved yet, what it measured is where it stands.
+        closing = ~drive.lead_moves[:n_ticks]
+        closing[-1] |= not closing.any()
+        states = self._measure.states(poses[:, 1:]) if self._wants_states else None
+        awareness = self._measure(poses[closing, 1:], None if states is None else states[closing])
+        bound = Bound(
+            cell,
+            awareness,
+            contact.mean(0),
+            np.full(n_robots, n_ticks * self.tick),
+            status,
+            state.time,
+            poses,
+            contact,
+            np.full(n_robots, n_ticks),
+            states if self.record_states else None,
+        )
+        state.cells, state.poses, state.time = drive.cells, poses[-1], bound.t1
+        return bound
 
-    def _measure(self, poses: np.ndarray) -> np.ndarray:
-        """Mean awareness of the pixels each robot drove over, (robot, feature)."""
-        pixels = self._awareness[self._surface.nearest(poses[..., 0], poses[..., 1])]
-        # Once arrived, a robot waits for the others: those ticks say nothing about the way.
-        moved = np.any(np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2]) != 0.0, axis=-1)
-        moved[0] = True
-        weight = moved[..., None] & np.isfinite(pixels)
-        total = np.where(weight, pixels, 0.0).sum(0)
-        with np.errstate(invalid="ignore"):
-            return total / weight.sum(0)
+    def _cut_at_lost_contact(self, contact: np.ndarray, status: str) -> tuple[int, str]:
+        """How many ticks there are, and how the bound ends."""
+        if self.lost_contact_after is not None:
+            patience = max(1, round(self.lost_contact_after / self.tick))
+            alone = 0
+            for k, any_contact in enumerate(contact.any(1)):
+                alone = 0 if any_contact else alone + 1
+                if alone >= patience:
+                    return k + 1, "lost_contact"
+        return len(contact), status

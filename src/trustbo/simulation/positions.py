@@ -7,7 +7,7 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo.data import Cell
-from trustbo.simulation.sight import Sight, Surface, in_view, transmittance
+from trustbo.simulation.sight import Sight, Surface, chance, optics
 from trustbo.terrain import Workspace, pixel_size
 from trustbo.terrain.features import gradient
 
@@ -39,6 +39,8 @@ class Positions:
         self._ease = _smoothed(ease.values, surface.pixel)
         self._standable = _largest_region(surface.passable)
         self._radius = radius
+        self._waypoints: dict[Cell, np.ndarray] = {}
+        self._formations: dict[tuple[Cell, Cell | None], np.ndarray] = {}
         # Row and column of the cell that each row and column of pixels belongs to, ascending.
         self._cells = workspace.grid.cells_along(ease["y"].values, ease["x"].values)
 
@@ -57,6 +59,18 @@ class Positions:
 
     def waypoint(self, cell: Cell) -> np.ndarray:
         """Where the lead stops in a cell: its easiest standable pixel, rather near the middle."""
+        if cell not in self._waypoints:
+            self._waypoints[cell] = self._waypoint(cell)
+        return self._waypoints[cell]
+
+    def formation(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+        """Where T2 stands in a cell: (robot, 2), spread out, with sight of the next waypoint."""
+        key = cell, next_cell
+        if key not in self._formations:
+            self._formations[key] = self._formation(cell, next_cell)
+        return self._formations[key]
+
+    def _waypoint(self, cell: Cell) -> np.ndarray:
         row, col = self._pixels_of(cell)
         center = np.array(self._workspace.grid.center(cell))
         position = self._position(row, col)
@@ -64,8 +78,7 @@ class Positions:
         off_center = np.linalg.norm(position - center, axis=1) / size
         return position[np.argmax(self._ease[row, col] - off_center)]
 
-    def formation(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Where T2 stands in a cell: (robot, 2), spread out, with sight of the next waypoint."""
+    def _formation(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
         team, here = self._workspace.team, self.waypoint(cell)
         goal = here if next_cell is None else self.waypoint(next_cell)
         row, col = self._pixels_of(cell)
@@ -80,17 +93,9 @@ class Positions:
         aim = np.broadcast_to(goal, position.shape)
         chosen: list[np.ndarray] = []
         for robot in team.robots:
-            clear = transmittance(
-                self._surface,
-                self._sight,
-                position,
-                aim,
-                robot.sensor_height,
-                team.lead.target_height,
-            )
-            seen = in_view(self._surface, robot, position, aim, team.lead.target_height)
+            seen = chance(self._surface, self._sight, position, aim, optics(robot, team.lead))
             # Among equally good views the closer one; nobody on top of another if there is room.
-            score = np.where(seen, clear, 0.0) - 1e-3 * distance[near]
+            score = seen - 1e-3 * distance[near]
             gaps = [np.linalg.norm(position - other, axis=1) for other in chosen]
             crowded = np.min(gaps, axis=0) < SPACING if gaps else np.zeros(len(position), bool)
             chosen.append(position[np.argmax(score - 10.0 * crowded)])

@@ -11,6 +11,8 @@ from trustbo.data import Robot
 from trustbo.errors import TrustboError, require_choice
 from trustbo.terrain import rays
 
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
+
 SIGHT_MODES = {"bare": rays.BARE, "wall": rays.WALL, "transmittance": rays.TRANSMITTANCE}
 
 
@@ -68,87 +70,75 @@ class Surface(NamedTuple):
         )
 
 
-def transmittance(
-    surface: Surface,
-    sight: Sight,
-    sensor: np.ndarray,
-    target: np.ndarray,
-    sensor_height: float,
-    target_height: float,
+def optics(watcher: Robot, watched: Robot) -> np.ndarray:
+    """Sensor height (m), target height (m), range (m) and sine of the field of view, shape (4,)."""
+    return np.array([
+        watcher.sensor_height,
+        watched.target_height,
+        watcher.lidar_range,
+        math.sin(watcher.vertical_fov),
+    ])  # fmt: skip
+
+
+def chance(
+    surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Probability that a beam from a sensor reaches a target, whatever their distance.
+    """Probability that a look at a target finds it.
+
+    It is the share of beams that get through where the target is within the lidar's range and its
+    vertical field of view, which tilts with the robot, and 0 elsewhere.
 
     Args:
         surface: The terrain.
         sight: What hinders sight.
         sensor: Positions, shape (ray, 2), CRS metres.
         target: Positions, shape (ray, 2), CRS metres.
-        sensor_height: m above ground.
-        target_height: m above ground.
+        optics: See `optics`, shape (ray, 4) or (4,).
 
     Returns:
         Shape (ray,), in [0, 1].
     """
-
-    def end(position: np.ndarray, height: float) -> np.ndarray:
-        row, col = surface.to_pixel(position[:, 0], position[:, 1])
-        return np.stack([row, col, np.full(len(row), height)], axis=1)
-
-    return _transmittances(
+    start, end = (np.stack(surface.to_pixel(p[:, 0], p[:, 1]), axis=1) for p in (sensor, target))
+    return _chances(
         surface.ground,
         surface.canopy,
+        surface.gradient,
         surface.pixel,
-        end(sensor, sensor_height),
-        end(target, target_height),
+        start,
+        end,
+        np.broadcast_to(optics, (len(start), 4)),
         SIGHT_MODES[sight.mode],
         sight.extinction,
         sight.crown_base,
     )
 
 
-def in_view(
-    surface: Surface, robot: Robot, sensor: np.ndarray, target: np.ndarray, target_height: float
-) -> np.ndarray:
-    """Whether targets are within a robot's lidar range and vertical field of view.
-
-    The field of view tilts with the robot, which stands parallel to the ground.
-
-    Args:
-        surface: The terrain.
-        robot: Whose lidar.
-        sensor: The robot's positions, shape (ray, 2), CRS metres.
-        target: Positions, shape (ray, 2), CRS metres.
-        target_height: Height of the target above ground, m.
-
-    Returns:
-        Shape (ray,), bool.
-    """
-    here, there = (surface.nearest(p[:, 0], p[:, 1]) for p in (sensor, target))
-    rise = surface.ground[there] + target_height - surface.ground[here] - robot.sensor_height
-    d = np.column_stack([target - sensor, rise])
-    distance = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
-    dz_dx, dz_dy = surface.gradient[:, *here]
-    normal = np.column_stack([-dz_dx, -dz_dy, np.ones_like(dz_dx)])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    elevation = np.abs((d * normal).sum(1)) / distance
-    return (distance <= robot.lidar_range) & (elevation <= math.sin(robot.vertical_fov))
-
-
-@njit(cache=True)
-def _transmittances(ground, canopy, pixel, start, end, mode, extinction, crown_base):
+@_compiled
+def _chances(ground, canopy, gradient, pixel, start, end, optics, mode, extinction, crown_base):
     result, work = np.empty(len(start)), rays.work_space()
+    n_rows, n_cols = ground.shape
     for i in range(len(start)):
         # The outer half of the raster's edge pixels has the heights of their centres.
-        r0, c0 = _inward(start[i, 0], ground.shape[0]), _inward(start[i, 1], ground.shape[1])
-        r1, c1 = _inward(end[i, 0], ground.shape[0]), _inward(end[i, 1], ground.shape[1])
-        z0 = rays.ground_height(ground, r0, c0) + start[i, 2]
-        z1 = rays.ground_height(ground, r1, c1) + end[i, 2]
+        r0, c0 = _inward(start[i, 0], n_rows), _inward(start[i, 1], n_cols)
+        r1, c1 = _inward(end[i, 0], n_rows), _inward(end[i, 1], n_cols)
+        z0 = rays.ground_height(ground, r0, c0) + optics[i, 0]
+        z1 = rays.ground_height(ground, r1, c1) + optics[i, 1]
+        east, north, up = (c1 - c0) * pixel[1], (r0 - r1) * pixel[0], z1 - z0
+        distance = math.sqrt(east**2 + north**2 + up**2)
+        row = min(max(int(r0 + 0.5), 0), n_rows - 1)
+        col = min(max(int(c0 + 0.5), 0), n_cols - 1)
+        gx, gy = gradient[0, row, col], gradient[1, row, col]
+        # Height above the plane of the body, whose normal is (-gx, -gy, 1).
+        above = abs(up - gx * east - gy * north) / math.sqrt(1.0 + gx * gx + gy * gy)
+        if not (distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)):
+            result[i] = 0.0
+            continue
         result[i] = rays.ray_transmittance(
             ground, canopy, pixel, (r0, c0, z0), (r1, c1, z1), mode, extinction, crown_base, work
         )
     return result
 
 
-@njit(cache=True)
+@_compiled
 def _inward(x, n):
     return min(max(x, 0.0), n - 1.0) if -0.5 <= x <= n - 0.5 else x

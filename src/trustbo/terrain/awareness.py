@@ -1,6 +1,8 @@
 """From the features of pixels to the awareness of cells, strip by strip."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -8,8 +10,8 @@ import xarray as xr
 
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
-from trustbo.terrain.features import PixelFeature, feature_named, slope
-from trustbo.terrain.grid import CellMeans, CellQuantiles, Grid
+from trustbo.terrain.features import FEATURES, PixelFeature, feature_named
+from trustbo.terrain.grid import CellMeans, CellQuantiles, Grid, Sums
 from trustbo.terrain.parallel import in_order
 from trustbo.terrain.raster import is_lazy, warn_if_clipped
 from trustbo.terrain.strips import Strip, sample_strips, strips
@@ -18,7 +20,7 @@ Ingredients = PixelFeature | Mapping[str, PixelFeature]
 """Of one awareness feature: a pixel feature in [0, 1] as it is, or those of a composite."""
 
 
-SAMPLE = 1 << 17
+SAMPLE = 1 << 16
 """Pixels that a composite of a larger raster than `MAX_PIXELS` is fitted on."""
 
 
@@ -106,19 +108,26 @@ def cell_maps(
     }
     cells["passable"] = CellMeans(grid, like)
     maps: dict[str, list[np.ndarray]] = {name: [] for name in cells}
+    means = {n: c for n, c in cells.items() if isinstance(c, CellMeans)}
 
-    def indices(strip: Strip) -> tuple[Strip, dict[str, np.ndarray]]:
-        index = {name: known.index(strip, name, f, fitted) for name, f in features.items()}
-        return strip, index | {"passable": slope(strip.window).values[strip.core] <= max_slope}
+    def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
+        index = {"passable": known.passable(strip, max_slope)}
+        for name, f in features.items():
+            index[name] = known.index(strip, name, f, fitted)
+        sums = {name: of.sums(index[name], strip.rows.start) for name, of in means.items()}
+        wanted = index if keep_pixels else index.keys() - means.keys()
+        return strip, {name: index[name].copy() for name in wanted}, sums
 
     n_clipped = n_valid = 0.0
-    for strip, index in in_order(indices, whole or strips(terrain, halo)):
-        first, last = strip.rows.start, strip.rows.stop
+    for strip, index, sums in in_order(work, whole or strips(terrain, halo)):
+        for name, of_strip in sums.items():
+            means[name].merge(of_strip)
         for name, values in index.items():
-            cells[name].add(values, first)
+            if name not in means:
+                cells[name].add(values, strip.rows.start)
             if keep_pixels:
                 maps[name].append(values)
-        own = (last - first) / strip.window.sizes["y"]
+        own = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
         n_clipped, n_valid = n_clipped + own * strip.n_clipped, n_valid + own * strip.n_valid
     if is_lazy(terrain):
         warn_if_clipped(round(n_clipped), round(n_valid), stacklevel=4)
@@ -130,12 +139,26 @@ def cell_maps(
     )
 
 
+class _Rooms(threading.local):
+    """Arrays to be written to again and again: new memory costs more than what is written to it."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[object, ...], np.ndarray] = {}
+
+    def __call__(self, purpose: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        key = purpose, shape, dtype
+        if key not in self._known:
+            self._known[key] = np.empty(shape, dtype)
+        return self._known[key]
+
+
 class _Memory:
     """Features of a strip; of a terrain that is sampled whole, they are computed only once."""
 
     def __init__(self, whole: Sequence[Strip] | None) -> None:
         self._keep = whole is not None
         self._known: dict[tuple[int, str], dict[str, np.ndarray]] = {}
+        self._rooms = _Rooms()
 
     def features(
         self, strip: Strip, name: str, parts: Mapping[str, PixelFeature]
@@ -152,11 +175,13 @@ class _Memory:
     def index(
         self, strip: Strip, name: str, f: Ingredients, fitted: Mapping[str, CompositeIndex]
     ) -> np.ndarray:
-        """An awareness feature of the strip's pixels."""
+        """An awareness feature of the strip's pixels; to be used before the thread's next strip."""
         if isinstance(f, Mapping):
-            values = self.features(strip, name, f)
-            columns = {n: np.ascontiguousarray(v).ravel() for n, v in values.items()}
-            return fitted[name].of_columns(columns).reshape(next(iter(values.values())).shape)
+            if self._keep:
+                return fitted[name].of_columns(self.features(strip, name, f))
+            dem = strip.window.variables["dem"].values[strip.core]
+            out = self._rooms(name, dem.shape, dem.dtype)
+            return fitted[name].of_columns(_OneByOne(strip, f, self._rooms), out)
         values = f.of_rows(strip.window, strip.core)
         low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
         if low < 0.0 or high > 1.0:
@@ -165,6 +190,28 @@ class _Memory:
                 f"{high:g}. Scale it, or make it a composite of one: {{{name!r}: [...]}}."
             )
         return values
+
+    def passable(self, strip: Strip, max_slope: float) -> np.ndarray:
+        """Whether the strip's pixels are not too steep; likewise."""
+        room = partial(self._rooms, "part")
+        return FEATURES["slope"].of_rows(strip.window, strip.core, room) <= max_slope
+
+
+class _OneByOne(Mapping[str, np.ndarray]):
+    """Features of a strip, computed where they are asked for, in the place of the one before."""
+
+    def __init__(self, strip: Strip, parts: Mapping[str, PixelFeature], rooms: _Rooms) -> None:
+        self._strip, self._parts, self._room = strip, parts, partial(rooms, "part")
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        values = self._parts[name].of_rows(self._strip.window, self._strip.core, self._room)
+        return np.ascontiguousarray(values)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._parts)
+
+    def __len__(self) -> int:
+        return len(self._parts)
 
 
 def _fit(

@@ -146,8 +146,14 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         attrs = {"units": "1", "long_name": "index"}
         return like.copy(deep=False, data=index).rename(None).assign_attrs(attrs)
 
-    def of_columns(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        """As `transform`, of arrays of shape (sample,), which come first in their precision.
+    def of_columns(
+        self, columns: Mapping[str, np.ndarray], out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """As `transform`, of arrays of one shape.
+
+        Args:
+            columns: By feature; each is asked for once, one after the other.
+            out: Where to write; by default a new array.
 
         Raises:
             TrustboError: It has not been fitted.
@@ -156,17 +162,23 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             raise TrustboError("this CompositeIndex is not fitted; call fit, or load one.")
         weights = self.loadings_.values / np.where(self._varies, self._sd, 1.0)
         numbers = zip(self._low, self._high, self._mean, weights, strict=True)
-        first = next(iter(columns.values()))
-        score = np.zeros(first.size, first.dtype if first.dtype.kind == "f" else float)
+        score = out
         for name, of_feature in zip(self.signs, numbers, strict=True):
-            _add_score(score, columns[name], *np.asarray(of_feature, score.dtype))
+            column = columns[name]
+            if score is None:
+                score = np.empty(column.shape, column.dtype if column.dtype.kind == "f" else float)
+            if name == next(iter(self.signs)):
+                score[...] = 0.0
+            _add_score(score.reshape(-1), column.reshape(-1), *np.asarray(of_feature, score.dtype))
+        if score is None:
+            raise TrustboError("a CompositeIndex needs a feature at least; signs is empty.")
         if self._top - self._bottom < 1e-9:
             return np.where(np.isfinite(score), 0.5, np.nan)
         if self.scaling == "logistic" or self.method == "zheng2023":
             return 1.0 / (1.0 + np.exp(-score / self._spread))
-        score -= self._bottom
-        score /= self._top - self._bottom
-        return np.clip(score, 0.0, 1.0, out=score)
+        ends = np.asarray([self._bottom, self._top], score.dtype)
+        _to_unit(score.reshape(-1), *ends)
+        return score
 
     def to_dataset(self) -> xr.Dataset:
         """All of it as arrays (feature) and attributes, as `save` writes it."""
@@ -281,3 +293,13 @@ def _add_score(score, x, low, high, mean, weight):
         v = low if x[n] < low else x[n]
         v = high if v > high else v
         score[n] += (v - mean) * weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+def _to_unit(score, bottom, top):
+    zero, width = bottom - bottom, top - bottom
+    one = width / width
+    for n in range(len(score)):
+        v = (score[n] - bottom) / width
+        v = zero if v < zero else v
+        score[n] = one if v > one else v

@@ -35,9 +35,19 @@ class PixelFeature(NamedTuple):
     """How far around a pixel it looks, m; the pixels next to it are always there."""
     by_rows: bool = False
     """Whether `compute` takes `rows=`, the rows that are wanted; it may leave out the others."""
+    kernel: Callable | None = None
+    """Of `stencil`, if that is all it is: the way without labels, for strips."""
 
-    def of_rows(self, terrain: xr.Dataset, rows: slice) -> np.ndarray:
-        """Its values on some rows of a terrain, shape (row, col)."""
+    def of_rows(self, terrain: xr.Dataset, rows: slice, room: Callable | None = None) -> np.ndarray:
+        """Its values on some rows of a terrain, shape (row, col).
+
+        Args:
+            terrain: The terrain, or a strip of it.
+            rows: Which.
+            room: `room(shape, dtype)` gives an array to be written to; by default a new one.
+        """
+        if self.kernel is not None:
+            return _of_kernel(terrain, self.kernel, rows, room or np.empty)
         options = {"rows": rows} if self.by_rows else {}
         return self.compute(terrain, **options).values[rows]
 
@@ -50,13 +60,16 @@ class _Registrar(Protocol):
     def __call__[F: Compute](self, compute: F, /) -> F: ...
 
 
-def register_feature(name: str, *, sign: int, halo: float = 0.0) -> _Registrar:
+def register_feature(
+    name: str, *, sign: int, halo: float = 0.0, kernel: Callable | None = None
+) -> _Registrar:
     """Add a feature of one's own, to be used by its name.
 
     Args:
         name: A new one.
         sign: +1 if more of it raises the index it is part of, -1 if it lowers it.
         halo: How far around a pixel it looks, m, so that large rasters can be done in strips.
+        kernel: See `PixelFeature`.
 
     Returns:
         A decorator for a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), m) that
@@ -71,7 +84,7 @@ def register_feature(name: str, *, sign: int, halo: float = 0.0) -> _Registrar:
         raise TerrainError(f"need sign 1 or -1 and halo >= 0; got {sign!r} and {halo!r}.")
 
     def register[F: Compute](compute: F, /) -> F:
-        FEATURES[name] = PixelFeature(compute, sign, halo)
+        FEATURES[name] = PixelFeature(compute, sign, halo, kernel=kernel)
         return compute
 
     return register
@@ -86,13 +99,13 @@ def feature_named(name: str) -> PixelFeature:
     return FEATURES[require_choice("feature", name, FEATURES)]
 
 
-@register_feature("slope", sign=-1)
+@register_feature("slope", sign=-1, kernel=stencil.slope)
 def slope(terrain: xr.Dataset) -> xr.DataArray:
     """Slope of the ground, rad, by Horn's (1981) 3 x 3 stencil."""
     return _stencil(terrain, stencil.slope, "slope", "rad")
 
 
-@register_feature("aspect", sign=1)
+@register_feature("aspect", sign=1, kernel=stencil.aspect)
 def aspect(terrain: xr.Dataset) -> xr.DataArray:
     """Direction of the steepest descent, rad clockwise from grid north; NaN where flat.
 
@@ -101,31 +114,31 @@ def aspect(terrain: xr.Dataset) -> xr.DataArray:
     return _stencil(terrain, stencil.aspect, "aspect", "rad")
 
 
-@register_feature("curvature", sign=1)
+@register_feature("curvature", sign=1, kernel=stencil.curvature)
 def curvature(terrain: xr.Dataset) -> xr.DataArray:
     """Minus the Laplacian of the ground, 1/m: positive on ridges, negative in hollows."""
     return _stencil(terrain, stencil.curvature, "curvature", "1/m")
 
 
-@register_feature("roughness", sign=-1)
+@register_feature("roughness", sign=-1, kernel=stencil.roughness)
 def roughness(terrain: xr.Dataset) -> xr.DataArray:
     """Highest minus lowest ground in the 3 x 3 window, m (GDAL's roughness)."""
     return _stencil(terrain, stencil.roughness, "roughness", "m")
 
 
-@register_feature("tri", sign=-1)
+@register_feature("tri", sign=-1, kernel=stencil.tri)
 def tri(terrain: xr.Dataset) -> xr.DataArray:
     """Terrain ruggedness index, m: root sum of squared steps to the 8 neighbours (Riley 1999)."""
     return _stencil(terrain, stencil.tri, "tri", "m")
 
 
-@register_feature("tpi", sign=1)
+@register_feature("tpi", sign=1, kernel=stencil.tpi)
 def tpi(terrain: xr.Dataset) -> xr.DataArray:
     """Topographic position index, m: height above the mean of the 8 neighbours."""
     return _stencil(terrain, stencil.tpi, "tpi", "m")
 
 
-@register_feature("step_height", sign=-1)
+@register_feature("step_height", sign=-1, kernel=stencil.step_height)
 def step_height(terrain: xr.Dataset) -> xr.DataArray:
     """Largest step up or down to one of the 8 neighbours, m."""
     return _stencil(terrain, stencil.step_height, "step_height", "m")
@@ -320,18 +333,25 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 def _stencil(terrain: xr.Dataset, kernel: Callable, name: str, units: str) -> xr.DataArray:
     """A 3 x 3 attribute; beyond the raster's edge the ground goes on level."""
-    dem = terrain["dem"]
-    z, pixel, out = dem.values, pixel_size(terrain), np.empty(dem.shape, dem.dtype)
+    values = _of_kernel(terrain, kernel, slice(None), np.empty)
+    return _named(terrain["dem"].copy(deep=False, data=values), name, units)
+
+
+def _of_kernel(terrain: xr.Dataset, kernel: Callable, rows: slice, room: Callable) -> np.ndarray:
+    z, pixel = terrain.variables["dem"].values, pixel_size(terrain)
+    top, bottom, _ = rows.indices(len(z))
+    out = room((bottom - top, z.shape[1]), z.dtype)
 
     def work(first: int, last: int) -> None:
-        block = np.empty((last - first + 2, z.shape[1] + 2), z.dtype)
-        block[1:-1, 1:-1] = z[first:last]
-        block[0, 1:-1], block[-1, 1:-1] = z[max(first - 1, 0)], z[min(last, len(z) - 1)]
+        i, j = top + first, top + last
+        block = np.empty((j - i + 2, z.shape[1] + 2), z.dtype)
+        block[1:-1, 1:-1] = z[i:j]
+        block[0, 1:-1], block[-1, 1:-1] = z[max(i - 1, 0)], z[min(j, len(z) - 1)]
         block[:, 0], block[:, -1] = block[:, 1], block[:, -2]
         kernel(block, pixel, out[first:last])
 
-    over_rows(work, len(z))
-    return _named(dem.copy(deep=False, data=out), name, units)
+    over_rows(work, len(out))
+    return out
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:

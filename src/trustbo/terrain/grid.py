@@ -13,6 +13,8 @@ from rasterio.warp import transform as transform_points
 from trustbo.data import Cell
 from trustbo.errors import TerrainError, TrustboError, require_pair
 
+Sums = tuple[np.ndarray, np.ndarray]
+"""Over each cell's pixels that have data, and their number, each of shape (row, col)."""
 WGS84 = CRS.from_epsg(4326)
 
 
@@ -165,9 +167,20 @@ class CellMeans:
 
     def add(self, values: np.ndarray, first: int = 0) -> None:
         """Add rows of pixels, shape (row, col), the first of them row `first` of the raster."""
+        self.merge(self.sums(values, first))
+
+    def sums(self, values: np.ndarray, first: int = 0) -> Sums:
+        """What `merge` adds: as `add`, but without changing anything, so that threads may."""
         row = self._row[first : first + len(values)]
         values = values.view(np.uint8) if values.dtype == bool else values
-        _add_rows(np.ascontiguousarray(values), row, self._edges, self._total, self._count)
+        total, count = np.zeros_like(self._total), np.zeros_like(self._count)
+        _add_rows(np.ascontiguousarray(values), row, self._edges, total, count)
+        return total, count
+
+    def merge(self, sums: Sums) -> None:
+        """Add what `sums` gave."""
+        self._total += sums[0]
+        self._count += sums[1]
 
     @property
     def cells(self) -> np.ndarray:
@@ -215,13 +228,12 @@ def _ownership(grid: Grid, like: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
 def _add_rows(values, row, edges, total, count):
     for i in range(len(values)):
+        of_row = values[i]
         for cell in range(len(edges) - 1):
-            # Of one row of one cell: float64 sums of a vector's lanes.
-            s, n = 0.0, 0.0
+            s, n_missing = 0.0, 0
             for j in range(edges[cell], edges[cell + 1]):
-                v = values[i, j]
-                known = v == v
-                s += v if known else 0.0
-                n += 1.0 if known else 0.0
+                v = of_row[j]
+                s += v if v == v else 0.0
+                n_missing += v != v
             total[row[i], cell] += s
-            count[row[i], cell] += n
+            count[row[i], cell] += edges[cell + 1] - edges[cell] - n_missing

@@ -212,7 +212,7 @@ def _is_in_order(terrain: xr.Dataset) -> bool:
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Pixel height and width in metres."""
-    y, x = (terrain[axis].values for axis in ("y", "x"))
+    y, x = (terrain.variables[axis].values for axis in ("y", "x"))
     return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
 
 

@@ -8,7 +8,7 @@ import xarray as xr
 
 from trustbo.terrain.raster import clean, is_lazy, pixel_size
 
-_PIXELS = 1 << 20  # of a strip: its arrays fit in the last cache
+_PIXELS = 1 << 19  # of a strip: the few arrays it takes fit in the caches
 _N_SAMPLED = 32
 
 

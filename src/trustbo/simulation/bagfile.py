@@ -1,0 +1,183 @@
+"""ROS bags as files: their messages, read and written by rosbags."""
+
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trustbo.errors import TrustboError
+from trustbo.simulation.messages import CONTACT_TYPES, POSE_TYPES, READERS, Messages, stamp_of
+from trustbo.simulation.recording import Series
+
+STORAGES = ("sqlite3", "mcap")
+_NO_ROSBAGS = 'ROS bags need rosbags: pip install "trustbo[ros]".'
+
+
+class Record(NamedTuple):
+    """A message, and when it is recorded."""
+
+    time: int
+    """ns."""
+    topic: str
+    kind: str
+    message: Any
+
+
+class Bag:
+    """A bag that is open for reading."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        """Set up; `reader` is rosbags'."""
+        self._path, self._reader = path, reader
+        self.types: dict[str, str] = {c.topic: c.msgtype for c in reader.connections}
+
+    def require(self, topics: Sequence[str]) -> None:
+        """Check that topics are there.
+
+        Raises:
+            TrustboError: One is not; the message lists those that are.
+        """
+        missing = [topic for topic in topics if topic not in self.types]
+        if missing:
+            there = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.types.items()))
+            raise TrustboError(
+                f"{str(self._path)!r} lacks {', '.join(missing)}; it has {there or 'no topics'}. "
+                "Topics with other names: topics=Topics(...)."
+            )
+
+    def robots(self, topic: str) -> tuple[str, ...]:
+        """The robots that have a topic, by name; `topic` has `{robot}` in their place."""
+        pattern = re.escape(topic).replace(re.escape("{robot}"), "([^/]+)")
+        found = (re.fullmatch(pattern, name) for name in self.types)
+        return tuple(sorted(match[1] for match in found if match))
+
+    def collect(self, topics: Mapping[str, tuple[str, ...]]) -> dict[str, Series]:
+        """What was recorded on each of some topics, each with the types it may have.
+
+        Raises:
+            TrustboError: A topic of another type, a message that makes no sense, a damaged bag, or
+                a clock that goes backwards.
+        """
+        times: dict[str, list[int]] = {topic: [] for topic in topics}
+        values: dict[str, list[Any]] = {topic: [] for topic in topics}
+        stamps = dict.fromkeys(topics, 0)
+        for topic, time, message in self._messages(topics):
+            types = topics[topic]
+            stamp = stamp_of(message) if types is POSE_TYPES else time
+            if stamp < stamps[topic]:
+                raise TrustboError(
+                    f"the clock of {topic} goes backwards: its message {len(times[topic])} is of "
+                    f"{stamp / 1e9:.9f} s, the one before of {stamps[topic] / 1e9:.9f} s."
+                )
+            stamps[topic] = stamp
+            times[topic].append(time)
+            try:
+                values[topic].append(READERS[types](message))
+            except TrustboError as error:
+                raise TrustboError(f"{topic}: {error}") from None
+        return {
+            topic: Series(np.array(times[topic], np.int64), _as_array(values[topic], topics[topic]))
+            for topic in topics
+        }
+
+    def _messages(self, topics: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time in ns and message of all messages on some topics."""
+        chosen = [c for c in self._reader.connections if c.topic in topics]
+        for c in chosen:
+            if c.msgtype not in topics[c.topic]:
+                raise TrustboError(
+                    f"{c.topic} is {c.msgtype}; it must be {' or '.join(topics[c.topic])}."
+                )
+        if not chosen:  # of none chosen, rosbags reads all
+            return
+        try:
+            for connection, time, raw in self._reader.messages(connections=chosen):
+                message = self._reader.deserialize(raw, connection.msgtype)
+                yield connection.topic, time, message
+        except Exception as error:  # whatever rosbags makes of a damaged file
+            raise _unreadable(self._path, error) from None
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Bag]:
+    """Open a bag for reading.
+
+    Raises:
+        TrustboError: No rosbags; no such file or folder; not a bag.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise TrustboError(_NO_ROSBAGS) from None
+    if not path.exists():
+        raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
+    try:
+        # Bags of ROS 2 before Iron do not say what their types are.
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except Exception as error:  # as above
+        raise _unreadable(path, error) from None
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+def write_messages(
+    path: Path, version: int, storage: str, records: Callable[[Messages], Iterable[Record]]
+) -> None:
+    """Write a bag whole or not at all.
+
+    Args:
+        path: The file or folder, which must not exist; its folder is made if need be.
+        version: Of ROS, 1 or 2.
+        storage: Of ROS 2, one of `STORAGES`.
+        records: Gives the messages in order of time, made by what it is called with.
+
+    Raises:
+        TrustboError: No rosbags.
+    """
+    try:
+        from rosbags import rosbag1, rosbag2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise TrustboError(_NO_ROSBAGS) from None
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    serialize = store.serialize_ros1 if version == 1 else store.serialize_cdr
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+        file = Path(folder) / path.name  # files within a bag are named after it
+        if version == 1:
+            writer: Any = rosbag1.Writer(file)
+        else:
+            plugin = rosbag2.StoragePlugin[storage.upper()]
+            writer = rosbag2.Writer(file, version=8, storage_plugin=plugin)
+        connections: dict[str, Any] = {}
+        with writer:
+            for time, topic, kind, message in records(Messages(store.types)):
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                writer.write(connections[topic], time, serialize(message, kind))
+        os.replace(file, path)
+
+
+def _as_array(values: Sequence[Any], types: tuple[str, ...]) -> np.ndarray:
+    """The records along the first axis."""
+    if types is POSE_TYPES:
+        return np.array(values, dtype=float).reshape(-1, 3)
+    if types is CONTACT_TYPES:
+        return np.array(values, dtype=bool)
+    return np.fromiter(values, dtype=object, count=len(values))
+
+
+def _unreadable(path: Path, error: Exception) -> TrustboError:
+    return TrustboError(
+        f"{str(path)!r} cannot be read as a ROS bag ({error or type(error).__name__}); give a "
+        "whole .bag file of ROS 1, or the folder of a bag of ROS 2 with its metadata.yaml."
+    )

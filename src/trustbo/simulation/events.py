@@ -1,0 +1,120 @@
+"""A world that changes: threats that appear, and lidars that degrade."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rasterio.features import geometry_mask
+from rasterio.transform import Affine
+
+from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
+from trustbo.simulation.sight import Surface
+
+KINDS = ("jam", "forbid")
+
+
+@dataclass(frozen=True)
+class Threat:
+    """A region that jams sight, or that nobody may enter, for some missions.
+
+    Attributes:
+        kind: `"jam"`: looks from or at a robot inside find only 1 - `strength` of what they would;
+            `"forbid"`: no way leads through.
+        center: x and y of a circle, CRS metres.
+        radius: Of the circle, m.
+        polygon: Corners (x, y) of a region instead of a circle.
+        strength: Of a jam, in (0, 1].
+        first_mission: The first it is there for; missions count from 0.
+        last_mission: The last; None: for good.
+
+    Raises:
+        TrustboError: Neither a circle nor a polygon, an unknown kind, or a value out of range.
+    """
+
+    kind: str
+    center: tuple[float, float] | None = None
+    radius: float | None = None
+    polygon: Sequence[tuple[float, float]] | None = None
+    strength: float = 1.0
+    first_mission: int = 0
+    last_mission: int | None = None
+
+    def __post_init__(self) -> None:
+        require_choice("threat", self.kind, KINDS)
+        require_missions(self.first_mission, self.last_mission)
+        if (self.polygon is None) == (self.center is None or self.radius is None):
+            raise TrustboError("a threat is either a circle, center and radius, or a polygon.")
+        if self.polygon is not None and len(self.polygon) < 3:
+            raise TrustboError(f"a polygon needs three corners; got {self.polygon}.")
+        if self.radius is not None:
+            require_positive("radius", self.radius)
+        if not 0.0 < self.strength <= 1.0:
+            raise TrustboError(f"strength must be in (0, 1]; got {self.strength!r}.")
+
+    def is_there(self, mission: int) -> bool:
+        """Whether a mission meets it."""
+        return is_between(mission, self.first_mission, self.last_mission)
+
+    def mask(self, surface: Surface) -> np.ndarray:
+        """The pixels whose centres are inside, shape (row, col)."""
+        rows, cols = surface.ground.shape
+        if self.polygon is not None:
+            height, width = surface.pixel
+            corner = Affine.translation(
+                surface.origin[0] - width / 2, surface.origin[1] + height / 2
+            )
+            shape = {"type": "Polygon", "coordinates": [[*self.polygon, self.polygon[0]]]}
+            transform = corner @ Affine.scale(width, -height)
+            return geometry_mask([shape], (rows, cols), transform, invert=True)
+        x, y = self.center or (0.0, 0.0)
+        row, col = surface.to_pixel(np.asarray(x), np.asarray(y))
+        away = np.hypot(
+            (np.arange(rows)[:, None] - row) * surface.pixel[0],
+            (np.arange(cols) - col) * surface.pixel[1],
+        )
+        return away <= (self.radius or 0.0)
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """A lidar of T2 that gets worse from some mission on.
+
+    Attributes:
+        robot: Its name.
+        detection: Share of the looks that still find what they should.
+        first_mission: The first it holds for; missions count from 0.
+        last_mission: The last; None: for good.
+
+    Raises:
+        TrustboError: A value out of range.
+    """
+
+    robot: str
+    detection: float
+    first_mission: int = 0
+    last_mission: int | None = None
+
+    def __post_init__(self) -> None:
+        require_missions(self.first_mission, self.last_mission)
+        if not 0.0 <= self.detection <= 1.0:
+            raise TrustboError(f"detection must be in [0, 1]; got {self.detection!r}.")
+
+    def is_there(self, mission: int) -> bool:
+        """Whether a mission meets it."""
+        return is_between(mission, self.first_mission, self.last_mission)
+
+
+def is_between(mission: int, first: int, last: int | None) -> bool:
+    """Whether first <= mission <= last; without a last, for good."""
+    return first <= mission and (last is None or mission <= last)
+
+
+def require_missions(first: int, last: int | None) -> None:
+    """Refuse numbers that are no range of missions.
+
+    Raises:
+        TrustboError: They are none.
+    """
+    require_whole("first_mission", first, 0)
+    if last is not None:
+        require_whole("last_mission", last, first)

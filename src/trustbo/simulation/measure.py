@@ -1,0 +1,162 @@
+"""What a robot measures on its way: its motion, what it can see, and the awareness of both."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Bound, Robot
+from trustbo.errors import require_choice
+from trustbo.simulation.sight import Sight, Surface
+from trustbo.terrain import CompositeIndex, Workspace, openness, pixel_size
+
+STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
+"""Of a robot at a tick: speed over that on level ground; rad; rad; m; share of clear beams."""
+
+_PARTS, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
+
+
+class Measure:
+    """Awareness that robots measure where they drive."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        surface: Surface,
+        sight: Sight,
+        tick: float,
+        realtime: Mapping[str, CompositeIndex],
+    ) -> None:
+        """Prepare.
+
+        Args:
+            workspace: The maps and the team.
+            surface: The terrain.
+            sight: What hinders sight.
+            tick: Time between two poses, s.
+            realtime: See `KinematicSimulator`.
+
+        Raises:
+            TrustboError: A real-time index of an unknown feature.
+        """
+        self._workspace, self._surface, self._sight, self._tick = workspace, surface, sight, tick
+        self._names = [str(name) for name in workspace.awareness["feature"].values]
+        for feature in realtime:
+            require_choice("awareness feature", feature, self._names)
+        self._realtime = realtime
+        pixels = workspace.pixels
+        assert pixels is not None  # noqa: S101  # `Worlds` has refused others
+        self._maps = np.stack([pixels[name].values for name in self._names], axis=-1)
+
+    def __call__(self, poses: np.ndarray, states: np.ndarray | None) -> np.ndarray:
+        """Mean awareness along the way, shape (robot, feature).
+
+        Args:
+            poses: Shape (tick, robot, 3).
+            states: Shape (tick, robot, state), for real-time indices; None without.
+        """
+        values = self._maps[self._surface.nearest(poses[..., 0], poses[..., 1])]
+        for m, name in enumerate(self._names):
+            index = self._realtime.get(name)
+            if index is not None and states is not None:
+                columns = {n: states[..., i].ravel() for i, n in enumerate(STATES)}
+                columns["offline"] = values[..., m].ravel()
+                fused = index.of_columns({n: columns[n] for n in index.signs})
+                values[..., m] = fused.reshape(values.shape[:-1])
+        # Once arrived, a robot waits for the others: those ticks say nothing about the way.
+        moved = np.any(np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2]) != 0.0, axis=-1)
+        moved[0] = True
+        weight = moved[..., None] & np.isfinite(values)
+        total = np.where(weight, values, 0.0).sum(0)
+        with np.errstate(invalid="ignore"):
+            return total / weight.sum(0)
+
+    def states(self, poses: np.ndarray) -> np.ndarray:
+        """`STATES` of each robot at each tick, shape (tick, robot, state)."""
+        motion = _motion(self._surface, self._workspace.team.robots, poses, self._tick)
+        seen = self._lidar.at(self._surface.nearest(poses[..., 0], poses[..., 1]))
+        return np.concatenate([motion, seen], axis=-1)
+
+    def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
+        """By feature, the map's value and the states of each robot on each bound, (sample)."""
+        rows = [
+            np.concatenate(
+                [Measure.__call__(self._plain, b.poses[:, 1:], None), b.states.mean(0)], 1
+            )
+            for b in bounds
+            if b.poses is not None and b.states is not None
+        ]
+        table, n = np.concatenate(rows), len(self._names)
+        states = {name: ("sample", table[:, n + i]) for i, name in enumerate(STATES)}
+        return {
+            name: xr.Dataset({"offline": ("sample", table[:, m]), **states})
+            for m, name in enumerate(self._names)
+        }
+
+    @cached_property
+    def _plain(self) -> "Measure":
+        return Measure(self._workspace, self._surface, self._sight, self._tick, {})
+
+    @cached_property
+    def _lidar(self) -> "_LidarMaps":
+        return _LidarMaps.of(self._workspace, self._surface, self._sight)
+
+
+class _LidarMaps(NamedTuple):
+    """How far a lidar's beams get from each pixel, and how many get as far as they can."""
+
+    return_range: np.ndarray  # (row, col), m
+    visible_share: np.ndarray  # (row, col)
+
+    @classmethod
+    def of(cls, workspace: Workspace, surface: Surface, sight: Sight) -> Self:
+        """Of a team's lidar, by rays all around.
+
+        The mean range of returns is the integral of the share of beams that get so far.
+        """
+        terrain, team = workspace.terrain, workspace.team
+        assert terrain is not None  # noqa: S101  # `Worlds` has refused others
+        sides = [
+            n * step for n, step in zip(surface.ground.shape, pixel_size(terrain), strict=True)
+        ]
+        reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
+        eye, target = team.robots[0].sensor_height, team.lead.target_height
+        shares = [np.ones(surface.ground.shape)]
+        for part in _PARTS:
+            share = openness(
+                terrain,
+                part * reach,
+                eye=eye,
+                target=target,
+                n_rays=_N_RAYS,
+                extinction=sight.extinction,
+                crown_base=sight.crown_base,
+            )
+            shares.append(np.nan_to_num(share.values))
+        return_range = np.asarray(reach * np.trapezoid(shares, [0.0, *_PARTS], axis=0))
+        return cls(return_range, shares[-1])
+
+    def at(self, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """Range and share at pixels (row, col), along a new last axis."""
+        return np.stack([self.return_range[pixels], self.visible_share[pixels]], axis=-1)
+
+
+def _motion(
+    surface: Surface, robots: Sequence[Robot], poses: np.ndarray, tick: float
+) -> np.ndarray:
+    """Speed ratio, and size of pitch and roll, of each robot at each tick, (tick, robot, 3)."""
+    row, col = surface.nearest(poses[..., 0], poses[..., 1])
+    gx, gy = surface.gradient[:, row, col]
+    ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
+    speed = np.hypot(way[..., 0], way[..., 1]) / tick
+    return np.stack(
+        [
+            np.minimum(speed / np.array([robot.speed for robot in robots]), 1.0),
+            np.abs(np.arctan(gx * ahead + gy * left)),
+            np.abs(np.arctan(gy * ahead - gx * left)),
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,124 @@
+"""ROS messages of standard types: how trustbo writes and reads them."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trustbo.errors import TrustboError, require_pair, require_whole
+
+TEXT = "std_msgs/msg/String"
+FLAG = "std_msgs/msg/Bool"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
+POSE = "geometry_msgs/msg/PoseStamped"
+
+MARKER_TYPES = (TEXT, "std_msgs/msg/Int32MultiArray")
+STATUS_TYPES = (TEXT,)
+CONTACT_TYPES = (FLAG, "std_msgs/msg/Float32", "std_msgs/msg/Float64")
+AWARENESS_TYPES = (NUMBERS, "std_msgs/msg/Float32MultiArray")
+POSE_TYPES = ("nav_msgs/msg/Odometry", POSE, "geometry_msgs/msg/PoseWithCovarianceStamped")
+
+
+class Messages:
+    """Makes messages of one version of ROS."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        """Set up; `types` are the message classes by name, as rosbags has them."""
+        self._types = types
+
+    def text(self, text: str) -> Any:
+        """A string."""
+        return self._types[TEXT](data=text)
+
+    def flag(self, value: bool) -> Any:
+        """A truth value."""
+        return self._types[FLAG](data=bool(value))
+
+    def numbers(self, values: np.ndarray, names: Sequence[str]) -> Any:
+        """A vector whose one axis is labelled with the names of its entries."""
+        axis = self._types["std_msgs/msg/MultiArrayDimension"](
+            label=",".join(names), size=len(values), stride=len(values)
+        )
+        layout = self._types["std_msgs/msg/MultiArrayLayout"](dim=[axis], data_offset=0)
+        return self._types[NUMBERS](layout=layout, data=np.asarray(values, dtype=np.float64))
+
+    def pose(self, time: int, pose: np.ndarray) -> Any:
+        """A pose (x, y, heading) at a time in ns, in the frame `map`."""
+        x, y, heading = (float(value) for value in pose)
+        stamp = self._types["builtin_interfaces/msg/Time"](
+            sec=time // 1_000_000_000, nanosec=time % 1_000_000_000
+        )
+        head = self._types["std_msgs/msg/Header"]
+        number = {"seq": 0} if "seq" in head.__dataclass_fields__ else {}  # of ROS 1 alone
+        header = head(stamp=stamp, frame_id="map", **number)
+        turn = self._types["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0)
+        )
+        place = self._types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0)
+        both = self._types["geometry_msgs/msg/Pose"](position=place, orientation=turn)
+        return self._types[POSE](header=header, pose=both)
+
+
+def read_marker(message: Any) -> dict[str, Any]:
+    """Fields of a marker: `bound`, `cell`, and `path`, `robots`, `features`, empty if not said.
+
+    Raises:
+        TrustboError: It is neither JSON with a bound and a cell, nor [bound, row, col].
+    """
+    try:
+        if isinstance(message.data, str):
+            said = json.loads(message.data)
+        else:
+            bound, *cell = message.data.tolist()
+            said = {"bound": bound, "cell": cell}
+        return {
+            "bound": require_whole("bound", said["bound"], 0),
+            "cell": require_pair("cell", said["cell"]),
+            "path": tuple(require_pair("path", cell) for cell in said.get("path", ())),
+            "robots": tuple(map(str, said.get("robots", ()))),
+            "features": tuple(map(str, said.get("features", ()))),
+        }
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise TrustboError(
+            "a marker must be JSON with a bound and a cell, or [bound, row, col]; got "
+            f"{message.data!r}."
+        ) from None
+
+
+def read_numbers(message: Any) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names, empty if it has none, and values of a vector.
+
+    Raises:
+        TrustboError: There are other names than values.
+    """
+    values = np.asarray(message.data, dtype=float)
+    label = message.layout.dim[0].label if len(message.layout.dim) else ""
+    names = tuple(name.strip() for name in label.split(",")) if label.strip() else ()
+    if names and len(names) != len(values):
+        raise TrustboError(f"it has {len(values)} values named {label!r}.")
+    return names, values
+
+
+def read_pose(message: Any) -> np.ndarray:
+    """Position x and y, and heading in rad from the x axis, in [-pi, pi]; shape (3,)."""
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    p, q = pose.position, pose.orientation
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    return np.array([p.x, p.y, yaw])
+
+
+def stamp_of(message: Any) -> int:
+    """The time in a message's header, ns."""
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+READERS: dict[tuple[str, ...], Callable[[Any], Any]] = {
+    MARKER_TYPES: read_marker,
+    STATUS_TYPES: lambda message: str(message.data),
+    CONTACT_TYPES: lambda message: bool(message.data > 0.5),
+    AWARENESS_TYPES: read_numbers,
+    POSE_TYPES: read_pose,
+}
+"""What a message of some types says."""

@@ -1,0 +1,158 @@
+"""From time-stamped records, such as a robot's log, to missions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError
+
+_NEVER = np.iinfo(np.int64).max
+_NS = 1e9  # in a second
+
+
+class Series(NamedTuple):
+    """Values with the times at which they were recorded, ascending."""
+
+    time: np.ndarray  # (record,), ns
+    value: np.ndarray  # (record, ...)
+
+    def between(self, after: int, until: int) -> "Series":
+        """The records later than `after`, up to and with `until`."""
+        first, last = np.searchsorted(self.time, (after, until), side="right")
+        return Series(self.time[first:last], self.value[first:last])
+
+
+class Marker(NamedTuple):
+    """Where a bound begins; bound 0 is the start of a mission, in its start cell."""
+
+    time: int
+    """ns."""
+    bound: int
+    cell: Cell
+    path: tuple[Cell, ...] = ()
+    """The planned path, start first, if bound 0 knows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What was recorded of a team, by one clock.
+
+    A bound lasts from its marker to the first status after it, else to the last look of any robot
+    before the next marker. A record stamped as the next marker still belongs to the bound before.
+
+    Attributes:
+        markers: Where bounds begin.
+        status: How bounds ended; the last of a mission is the mission's.
+        contact: One for each robot: whether it had contact, each time it looked.
+        awareness: One for each robot: shape (record, feature), the last of a bound counts.
+        poses: The lead first, then each robot: x, y and heading, shape (record, 3). Empty where
+            not recorded.
+    """
+
+    markers: Sequence[Marker]
+    status: Series
+    contact: Sequence[Series]
+    awareness: Sequence[Series]
+    poses: Sequence[Series] = ()
+
+    def missions(self, features: tuple[str, ...], robots: tuple[str, ...]) -> list[Mission]:
+        """The missions that were recorded; one without bounds is left out.
+
+        Raises:
+            TrustboError: Markers out of turn, or what `Mission` refuses.
+        """
+        markers = sorted(self.markers, key=lambda marker: (marker.time, marker.bound))
+        starts = [i for i, marker in enumerate(markers) if marker.bound == 0]
+        if not starts or starts[0] > 0:
+            raise TrustboError(
+                "a recording begins with the marker of bound 0, the start cell; "
+                f"this one has bounds {[marker.bound for marker in markers]}."
+            )
+        missions = []
+        for first, end in zip(starts, [*starts[1:], len(markers)], strict=True):
+            until = markers[end].time if end < len(markers) else _NEVER
+            if end - first > 1:
+                try:
+                    missions.append(self._mission(markers[first:end], until, features, robots))
+                except TrustboError as error:
+                    raise TrustboError(f"mission {len(missions)}: {error}") from None
+        return missions
+
+    def _mission(
+        self,
+        markers: Sequence[Marker],
+        until: int,
+        features: tuple[str, ...],
+        robots: tuple[str, ...],
+    ) -> Mission:
+        start, cells = markers[0], tuple(marker.cell for marker in markers)
+        for k, marker in enumerate(markers):
+            if marker.bound != k:
+                raise TrustboError(f"bound {marker.bound} follows bound {k - 1}.")
+        path = start.path or cells
+        if path[0] != cells[0]:
+            raise TrustboError(f"it starts in {cells[0]}, but its path in {path[0]}.")
+        poses = [_continuous(series, start.time, until) for series in self.poses]
+        ends = [*(marker.time for marker in markers[2:]), until]
+        bounds = []
+        for marker, end in zip(markers[1:], ends, strict=True):
+            try:
+                bounds.append(self._bound(marker, end, start.time, poses, len(features)))
+            except TrustboError as error:
+                raise TrustboError(f"bound {marker.bound}: {error}") from None
+        said = self.status.between(markers[-1].time, until).value
+        status = str(said[-1]) if len(said) else "ok"
+        if status == "ok" and len(bounds) < len(path) - 1:
+            status = "aborted"  # nobody said why it went no further
+        return Mission(path, tuple(bounds), status, features, robots)
+
+    def _bound(
+        self, marker: Marker, until: int, start: int, poses: Sequence[Series], n_features: int
+    ) -> Bound:
+        said = self.status.between(marker.time, until)
+        end = int(said.time[0]) if len(said.time) else until
+        looks = [series.between(marker.time, end) for series in self.contact]
+        if not len(said.time):
+            end = max((int(look.time[-1]) for look in looks if len(look.time)), default=marker.time)
+        n_looks = np.array([len(look.time) for look in looks])
+        ticks = looks[int(np.argmax(n_looks))].time
+        measured = [series.between(marker.time, until).value for series in self.awareness]
+        unknown = np.full(n_features, np.nan)
+        seconds = (end - marker.time) / _NS if end > marker.time else np.nan
+        return Bound(
+            marker.cell,
+            np.stack([values[-1] if len(values) else unknown for values in measured]),
+            np.array([look.value.mean() if len(look.value) else np.nan for look in looks]),
+            np.full(len(looks), seconds),
+            str(said.value[0]) if len(said.time) else "ok",
+            (marker.time - start) / _NS,
+            np.stack([_held(series, ticks) for series in poses], axis=1) if poses else None,
+            np.stack([_aligned(look, ticks) for look in looks], axis=1) if n_looks.all() else None,
+            np.where(n_looks > 0, n_looks, np.nan),
+        )
+
+
+def _aligned(look: Series, ticks: np.ndarray) -> np.ndarray:
+    """Looks tick by tick: in turn if there are as many, else the last at each tick."""
+    if len(look.time) == len(ticks):
+        return look.value
+    return look.value[np.maximum(np.searchsorted(look.time, ticks, side="right") - 1, 0)]
+
+
+def _held(series: Series, ticks: np.ndarray) -> np.ndarray:
+    """The last record at each tick, shape (tick, ...); NaN before the first."""
+    last = np.searchsorted(series.time, ticks, side="right") - 1
+    known = np.concatenate([np.full((1, 3), np.nan), series.value])
+    return known[last + 1]
+
+
+def _continuous(poses: Series, start: int, until: int) -> Series:
+    """The poses of a mission, and the last before it; headings without jumps from its start on."""
+    first, last = np.searchsorted(poses.time, (start, until), side="right")
+    values = poses.value[max(first - 1, 0) : last].copy()
+    own = slice(min(first, 1), None)
+    values[own, 2] = np.unwrap(values[own, 2])
+    return Series(poses.time[max(first - 1, 0) : last], values)

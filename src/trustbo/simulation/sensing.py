@@ -1,0 +1,44 @@
+"""What a lidar makes of its looks: tracks."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+
+from trustbo.data import Robot
+
+
+def new_tracks(n_robots: int) -> np.ndarray:
+    """Nobody tracked yet: (phase, robot, (tracked, run of contrary looks))."""
+    return np.zeros((2, n_robots, 2), np.int64)
+
+
+def contact_of(found: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
+    """Contact from looks: a track begins after some finds in a row, and ends after some misses.
+
+    Args:
+        found: Whether each look found its target, shape (tick, robot).
+        watchers: Whose lidar looks, one per robot: they say how many finds and misses.
+        tracks: State of the tracks, shape (robot, 2); it is moved on.
+
+    Returns:
+        Shape (tick, robot), bool.
+    """
+    limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
+    contact = np.empty(found.shape, bool)
+    _track(found, limits, tracks, contact)
+    return contact
+
+
+@njit(cache=True)
+def _track(found, limits, tracks, contact):
+    for k in range(found.shape[0]):
+        for i in range(found.shape[1]):
+            tracked = tracks[i, 0]
+            if found[k, i] != (tracked == 1):
+                tracks[i, 1] += 1
+                if tracks[i, 1] >= limits[i, tracked]:
+                    tracks[i, 0], tracks[i, 1] = 1 - tracked, 0
+            else:
+                tracks[i, 1] = 0
+            contact[k, i] = tracks[i, 0] == 1

@@ -1,0 +1,203 @@
+"""Missions as a table in long form: one row per mission, bound and robot.
+
+Columns: `mission` (a label), `bound` (a number), `robot` (a name), `row` and `col` of the cell
+entered, `contact_rate` (or `contact_time` and `duration`, s), and one for each awareness feature.
+Optional: `duration` (s), `exposure` (ticks), `t0` (s), `status` of the bound and `mission_status`.
+A blank is "not measured". Bound 0 is the start cell and measures nothing; bounds after the last one
+that measured anything were planned, not run: rows of either need no robot. A feature that is called
+as one of these columns takes the prefix `awareness_`, e.g. `awareness_exposure`.
+"""
+
+import csv
+import math
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import ShapeError, TrustboError, require_pair
+from trustbo.files import write_file
+from trustbo.simulation.rows import KEYS, Row, column_of, features_of, parse_rows, read_columns
+
+
+def read_table(
+    table: Any,
+    *,
+    start: Cell | None = None,
+    features: Sequence[str] | None = None,
+    robots: Sequence[str] | None = None,
+) -> list[Mission]:
+    """Read missions from a table in long form (see this module).
+
+    Args:
+        table: Path of a CSV file with a header, or a DataFrame (or a mapping of columns).
+        start: The start cell of missions that have no row of bound 0.
+        features: Columns that are awareness features; by default all that are not known otherwise.
+        robots: Names in the order wanted; by default that of the table's rows.
+
+    Returns:
+        The missions, in the order of the table. Ticks (poses and contacts) are not in a table.
+
+    Raises:
+        TrustboError: A missing file, column, bound or robot; a row that is there twice; a value of
+            the wrong kind; rows of one bound that disagree; or what `Mission` refuses.
+    """
+    columns = read_columns(table)
+    names = features_of(columns) if features is None else tuple(features)
+    rows = parse_rows(columns, names)
+    team = tuple(dict.fromkeys(r.robot for r in rows if r.robot)) if robots is None else robots
+    missions: dict[str, dict[int, dict[str, Row]]] = {}
+    for row in rows:
+        if row.robot and row.robot not in team:
+            raise TrustboError(f"row {row.line}: robot {row.robot!r} is not one of {tuple(team)}.")
+        of_bound = missions.setdefault(row.mission, {}).setdefault(row.bound, {})
+        if row.robot in of_bound:
+            raise TrustboError(
+                f"mission {row.mission}, bound {row.bound}, robot {row.robot!r} is there twice, in "
+                f"rows {of_bound[row.robot].line} and {row.line}."
+            )
+        of_bound[row.robot] = row
+    return [_mission(label, own, start, names, tuple(team)) for label, own in missions.items()]
+
+
+def write_table(missions: Sequence[Mission], path: str | PathLike[str]) -> None:
+    """Write missions as a CSV file that `read_table` reads back, but for their ticks.
+
+    Args:
+        missions: All with the same robots and features.
+        path: The file; written whole or not at all.
+
+    Raises:
+        ShapeError: No missions, or missions that disagree on robots or features.
+    """
+    require_same_team(missions)
+    features = [column_of(name) for name in missions[0].features]
+    measured = ["contact_rate", "duration", "exposure", "t0", "status", "mission_status", *features]
+    lines: list[list[object]] = [[*KEYS, *measured]]
+    for j, mission in enumerate(missions):
+        for k, cell in enumerate(mission.path):
+            bound = mission.bounds[k - 1] if 1 <= k <= len(mission.bounds) else None
+            for i, robot in enumerate(mission.robots):
+                own: list[object] = [""] * len(measured)
+                if bound is not None:
+                    rates = (bound.contact_rate[i], bound.duration[i], bound.exposure[i], bound.t0)
+                    own = [*map(_text, rates), bound.status, mission.status]
+                    own += map(_text, bound.awareness[i])
+                lines.append([j, k, robot, *cell, *own])
+
+    def write(file: Path) -> None:
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream, lineterminator="\n").writerows(lines)
+
+    write_file(path, write)
+
+
+def require_same_team(missions: Sequence[Mission]) -> None:
+    """Check that there are missions, all with the same robots and features.
+
+    Raises:
+        ShapeError: There are none, or they disagree.
+    """
+    if isinstance(missions, Mission) or not missions:
+        raise ShapeError(f"give a list of at least one mission; got {missions!r}.")
+    first = missions[0]
+    for j, mission in enumerate(missions):
+        if (mission.robots, mission.features) != (first.robots, first.features):
+            raise ShapeError(
+                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
+                f"0 has {first.robots} and {first.features}; all must agree."
+            )
+
+
+def _mission(
+    label: str,
+    rows: dict[int, dict[str, Row]],
+    start: Cell | None,
+    features: tuple[str, ...],
+    team: tuple[str, ...],
+) -> Mission:
+    """One mission from its rows, by bound and robot."""
+    cells = _cells(label, rows, start)
+    run = [k for k in rows if k and not all(row.is_blank for row in rows[k].values())]
+    if not run:
+        raise TrustboError(f"mission {label} measured nothing: no bound of it has a value.")
+    bounds: list[Bound] = []
+    for k in range(1, max(run) + 1):
+        t0 = bounds[-1].t1 if bounds else 0.0
+        bounds.append(_bound(f"mission {label}, bound {k}", cells[k], rows[k], team, t0))
+    said = [row.mission_status for own in rows.values() for row in own.values()]
+    status = _agreed(f"mission {label}", "mission_status", said) or bounds[-1].status
+    try:
+        return Mission(cells, tuple(bounds), status, features, team)
+    except TrustboError as error:
+        raise TrustboError(f"mission {label}: {error}") from None
+
+
+def _cells(label: str, rows: dict[int, dict[str, Row]], start: Cell | None) -> tuple[Cell, ...]:
+    """The path that a mission's rows tell."""
+    if 0 not in rows and start is None:
+        raise TrustboError(
+            f"mission {label} has no row of bound 0, its start cell; add one, or give start."
+        )
+    for row in rows.get(0, {}).values():
+        if not (math.isnan(row.numbers["contact_rate"]) and math.isnan(row.numbers["duration"])):
+            raise TrustboError(
+                f"row {row.line}: bound 0 is the start cell and measures nothing; number the "
+                "bounds from 1."
+            )
+    cells = [] if 0 in rows else [require_pair("start", start)]
+    for k in range(len(cells), max(rows) + 1):
+        if k not in rows:
+            raise TrustboError(f"mission {label} has bounds {sorted(rows)}, but no bound {k}.")
+        of_bound = [row.cell for row in rows[k].values()]
+        cells.append(_agreed(f"mission {label}, bound {k}", "cell", of_bound))
+    return tuple(cells)
+
+
+def _bound(where: str, cell: Cell, rows: dict[str, Row], team: tuple[str, ...], t0: float) -> Bound:
+    """One bound from its rows, by robot; `t0` is for rows that do not say when it started."""
+    for robot in team:
+        if robot not in rows:
+            raise TrustboError(f"{where} has no row for robot {robot!r}.")
+    own = [rows[robot] for robot in team]
+    said = [row.numbers["t0"] for row in own if not math.isnan(row.numbers["t0"])]
+    began = _agreed(where, "t0", said) if said else t0
+    status = _agreed(where, "status", [row.status for row in own]) or "ok"
+    awareness = np.array([row.awareness for row in own])
+    duration, exposure = (
+        np.array([row.numbers[n] for row in own]) for n in ("duration", "exposure")
+    )
+    try:
+        rate = np.array([_rate(row) for row in own])
+        return Bound(cell, awareness, rate, duration, status, began, exposure=exposure)
+    except TrustboError as error:
+        raise TrustboError(f"{where}: {error}") from None
+
+
+def _rate(row: Row) -> float:
+    """The contact rate, which may be given as a time; both must agree."""
+    rate, time, total = (row.numbers[n] for n in ("contact_rate", "contact_time", "duration"))
+    if time > total:
+        raise TrustboError(f"contact_time = {time:g} s exceeds duration = {total:g} s.")
+    if math.isnan(rate):
+        return time / total if total else math.nan  # Bound refuses a duration of 0
+    if abs(rate * total - time) > 1e-6 * total:
+        raise TrustboError(
+            f"contact_rate = {rate:g} of {total:g} s is not contact_time = {time:g} s; give one."
+        )
+    return rate
+
+
+def _agreed(where: str, what: str, values: Sequence[Any]) -> Any:
+    """The one value that all rows share, blanks apart; "" if all are blank."""
+    distinct = list(dict.fromkeys(value for value in values if value != ""))
+    if len(distinct) > 1:
+        raise TrustboError(f"{where}: rows disagree on {what}: {distinct[0]} and {distinct[1]}.")
+    return distinct[0] if distinct else ""
+
+
+def _text(number: float) -> str:
+    return "" if math.isnan(number) else repr(float(number))

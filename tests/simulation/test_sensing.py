@@ -1,0 +1,225 @@
+"""Tracks, worse lidars, threats, states: what a mission measures, and why."""
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.data import Robot, Team
+from trustbo.errors import TrustboError
+from trustbo.simulation import STATES, Degradation, KinematicSimulator, Threat
+from trustbo.simulation.sensing import contact_of, new_tracks
+from trustbo.terrain import CompositeIndex, Workspace, synthetic_terrain
+
+PATH = [(2, 0), (1, 1), (0, 2)]
+
+
+@pytest.fixture(scope="module")
+def flat():
+    terrain = synthetic_terrain((90.0, 90.0), seed=5, relief=0.5)
+    terrain["dsm"] = terrain["dem"].copy()
+    return Workspace.from_terrain(terrain, (3, 3), features={"traversability": ["slope", "tri"]})
+
+
+@pytest.fixture(scope="module")
+def wooded():
+    return Workspace.from_terrain(synthetic_terrain((90.0, 90.0), seed=5, relief=6.0), (3, 3))
+
+
+def track_by_hand(looks, acquire, drop):
+    """The same rule, said plainly."""
+    tracked, streak, contact = False, 0, []
+    for found in looks:
+        streak = streak + 1 if found != tracked else 0
+        if streak == (drop if tracked else acquire):
+            tracked, streak = not tracked, 0
+        contact.append(tracked)
+    return contact
+
+
+@pytest.mark.parametrize(("acquire", "drop"), [(1, 1), (3, 1), (1, 4), (2, 3)])
+def test_a_track_begins_after_some_finds_and_ends_after_some_misses(acquire, drop):
+    looks = np.random.default_rng(0).random((200, 3)) < 0.6
+    robots = [Robot(acquire=acquire, drop=drop)] * 3
+    tracks = new_tracks(3)
+    contact = np.concatenate(  # in two pieces: the state is carried over
+        [contact_of(part, robots, tracks[0]) for part in (looks[:77], looks[77:])]
+    )
+    for i in range(3):
+        assert contact[:, i].tolist() == track_by_hand(looks[:, i], acquire, drop)
+    if acquire == drop == 1:
+        np.testing.assert_array_equal(contact, looks)
+
+
+def test_a_worse_lidar_has_less_contact(flat):
+    poor = Robot(detection=0.6)
+    team = Team(robots=(poor, Robot(), Robot()))
+    workspace = Workspace.from_terrain(flat.terrain, (3, 3), team, features={"z": ["slope", "tri"]})
+    with pytest.raises(KeyError):  # waypoints go by traversability
+        KinematicSimulator(workspace)
+    workspace = Workspace.from_terrain(
+        flat.terrain, (3, 3), team, features={"traversability": ["slope", "tri"]}
+    )
+    missions = KinematicSimulator(workspace, sight="bare").run_batch(PATH, range(20))
+    watching = [m.contact_rate for m in missions]
+    rates = np.mean(watching, axis=(0, 1))
+    # T2 looks about half of the time, then the lead does, whose lidar is good.
+    leading = np.mean([b.contact[:, 1].mean() for m in missions for b in m.bounds])
+    assert leading == 1.0
+    assert 0.7 < rates[0] < 0.9
+    np.testing.assert_array_equal(rates[1:], 1.0)
+    with pytest.raises(TrustboError, match=r"Robot.detection must be in \(0, 1\]; got 1.5"):
+        Robot(detection=1.5)
+    with pytest.raises(
+        TrustboError, match=r"Robot.acquire must be a whole number from 1 on; got 0.5"
+    ):
+        Robot(acquire=0.5)
+
+
+def test_a_lidar_that_degrades_is_noticed_by_the_model(flat):
+    simulator = KinematicSimulator(
+        flat, sight="bare", degradations=[Degradation("r2", 0.2, first_mission=6)]
+    )
+    missions = [simulator.run(PATH, seed=j, mission=j) for j in range(12)]
+    before, after = (
+        np.mean([m.contact_rate for m in part], axis=(0, 1))
+        for part in (missions[:6], missions[6:])
+    )
+    np.testing.assert_array_equal(before, 1.0)
+    assert after[1] < 0.75
+    np.testing.assert_array_equal(after[[0, 2]], 1.0)
+    # Half a log unit of noise on the same rates for every robot keeps the likelihood finite.
+    noisy = [
+        tb.Mission.from_arrays(
+            m.path,
+            m.awareness,
+            np.clip(
+                m.contact_rate - np.random.default_rng(j).uniform(0.0, 0.05, m.contact_rate.shape),
+                0,
+                1,
+            ),
+        )
+        for j, m in enumerate(missions)
+    ]
+    model = tb.models.CoupledTrust(inter_robot="none")
+    early, late = (
+        tb.models.fit(part, model, "exact", check=False)["latent"]["trust_mean"].mean(
+            ("mission", "bound")
+        )
+        for part in (noisy[:6], noisy[6:])
+    )
+    drop = (early - late).values
+    assert drop[1] > 0.2
+    assert (np.abs(drop[[0, 2]]) < 0.1).all()
+
+
+def test_a_jam_hides_those_inside_while_it_is_there(flat):
+    x, y = flat.grid.center((1, 1))
+    jam = Threat("jam", center=(x, y), radius=40.0, first_mission=2, last_mission=3)
+    simulator = KinematicSimulator(flat, sight="bare", threats=[jam])
+    rates = [simulator.run(PATH, seed=0, mission=j).contact_rate[0].mean() for j in range(5)]
+    assert rates[0] == rates[1] == rates[4] == 1.0
+    assert rates[2] == rates[3] < 0.3
+    half = KinematicSimulator(
+        flat, sight="bare", threats=[Threat("jam", (x, y), 40.0, strength=0.5)]
+    )
+    assert rates[2] < half.run(PATH, seed=0).contact_rate[0].mean() < 1.0
+
+
+def test_nobody_goes_through_forbidden_ground(flat):
+    grid = flat.grid
+    wall = [(grid.left, grid.top - 40.0), (grid.left + 90.0, grid.top - 40.0),
+            (grid.left + 90.0, grid.top - 44.0), (grid.left, grid.top - 44.0)]  # fmt: skip
+    simulator = KinematicSimulator(flat, threats=[Threat("forbid", polygon=wall, first_mission=1)])
+    assert simulator.run(PATH, seed=0).status == "ok"
+    cut_off = simulator.run(PATH, seed=0, mission=1)
+    assert cut_off.status == "stuck"
+    assert all((b.poses[..., 1] < grid.top - 44.0).all() for b in cut_off.bounds)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"kind": "smoke", "center": (0, 0), "radius": 1}, "unknown threat 'smoke'; choose one of jam"),
+        ({"kind": "jam"}, "either a circle, center and radius, or a polygon"),
+        ({"kind": "jam", "polygon": [(0, 0), (1, 1)]}, "a polygon needs three corners"),
+        ({"kind": "jam", "center": (0, 0), "radius": -1}, "radius must be positive"),
+        ({"kind": "jam", "center": (0, 0), "radius": 1, "strength": 0}, r"strength must be in \(0, 1\]"),
+        ({"kind": "jam", "center": (0, 0), "radius": 1, "first_mission": 3, "last_mission": 2},
+         "last_mission must be a whole number from 3 on"),
+    ],
+)  # fmt: skip
+def test_impossible_threats_are_refused(arguments, message):
+    with pytest.raises(TrustboError, match=message):
+        Threat(**arguments)
+
+
+def test_impossible_degradations_are_refused(flat):
+    with pytest.raises(TrustboError, match=r"detection must be in \[0, 1\]; got 2"):
+        Degradation("r1", 2)
+    with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of r1, r2, r3"):
+        KinematicSimulator(flat, degradations=[Degradation("r9", 0.5)])
+
+
+def test_a_batch_is_the_missions_one_by_one(wooded):
+    simulator = KinematicSimulator(wooded, record_states=True)
+    batch = simulator.run_batch(PATH, [3, 4, 3])
+    for seed, mission in zip([3, 4, 3], batch, strict=True):
+        alone = KinematicSimulator(wooded, record_states=True).run(PATH, seed=seed)
+        assert alone.status == mission.status
+        for one, other in zip(alone.bounds, mission.bounds, strict=True):
+            for name in ("awareness", "contact_rate", "duration", "poses", "contact", "states"):
+                np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert not np.array_equal(batch[0].contact_rate, batch[1].contact_rate)
+
+
+def test_states_are_those_of_the_way(wooded):
+    bound = KinematicSimulator(wooded, record_states=True).run(PATH, seed=0).bounds[0]
+    assert bound.states.shape == (len(bound.poses), 3, len(STATES))
+    states = dict(zip(STATES, np.moveaxis(bound.states, -1, 0), strict=True))
+    standing = (np.diff(bound.poses[:, 1:, :2], axis=0) == 0.0).all(-1)
+    np.testing.assert_array_equal(states["speed_ratio"][1:][standing], 0.0)
+    assert states["speed_ratio"].max() > 0.5
+    assert (np.hypot(states["pitch"], states["roll"]) < np.pi / 4).all()
+    assert ((states["visible_share"] >= 0.0) & (states["visible_share"] <= 1.0)).all()
+    assert (states["return_range"] <= 45.0 + 1e-9).all()
+    assert KinematicSimulator(wooded).run(PATH, seed=0).bounds[0].states is None
+
+
+@pytest.mark.filterwarnings("ignore:the first component of", "ignore:.*enters its composite")
+def test_measured_awareness_can_be_fused_with_the_robots_states(wooded):
+    plain = KinematicSimulator(wooded)
+    samples = plain.calibration(n_bounds=80)
+    indices = {name: CompositeIndex.realtime(name).fit(samples[name]) for name in samples}
+    fused = KinematicSimulator(wooded, realtime=indices).run(PATH, seed=0)
+    mapped = plain.run(PATH, seed=0)
+    np.testing.assert_array_equal(fused.contact_rate, mapped.contact_rate)
+    assert ((fused.awareness >= 0.0) & (fused.awareness <= 1.0)).all()
+    assert not np.allclose(fused.awareness, mapped.awareness)
+    with pytest.raises(TrustboError, match="unknown awareness feature 'trust'"):
+        KinematicSimulator(wooded, realtime={"trust": indices["visibility"]})
+
+
+def test_alternate_bounding_leads_by_turns(wooded):
+    path = [(2, 0), (2, 1), (1, 1), (0, 2)]
+    mission = KinematicSimulator(wooded, bounding="alternate").run(path, seed=0)
+    assert mission.status == "ok"
+    moving = [(np.ptp(b.poses[..., :2], axis=0) > 1e-9).any(-1) for b in mission.bounds]
+    assert moving[0].tolist() == [True, False, False, False]  # the lead
+    assert moving[1].tolist() == [False, True, True, True]  # T2 passes it
+    assert moving[2].all()  # the lead reaches the goal, and T2 closes up
+    ends = [wooded.grid.cell_at(x, y) for x, y in mission.bounds[-1].poses[-1, :, :2]]
+    assert ends == [(0, 2)] * 4
+    with pytest.raises(TrustboError, match="unknown bounding 'leapfrog'; choose one of successive"):
+        KinematicSimulator(wooded, bounding="leapfrog")
+
+
+def test_iterate_tells_the_simulator_which_mission_it_is(flat):
+    jam = Threat("jam", flat.grid.center((1, 1)), 60.0, first_mission=1, strength=0.9)
+    simulator = KinematicSimulator(flat, sight="bare", threats=[jam])
+    model = tb.models.PooledTrust(observation="censored")
+    result = tb.iterate(
+        flat, (2, 0), (0, 2), n_iterations=2, simulator=simulator, model=model, progress=False
+    )
+    first, second = (m.contact_rate.mean() for m in result.missions)
+    assert first == 1.0
+    assert second < 0.5
