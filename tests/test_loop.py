@@ -193,7 +193,7 @@ def test_a_run_that_dies_over_an_older_result_leaves_none_or_its_own(
     def fail(missions):
         raise OSError("disk full")
 
-    monkeypatch.setattr("trustbo.archive.missions_to_tree", fail)
+    monkeypatch.setattr("trustbo.records.missions_to_tree", fail)
     with pytest.raises(OSError, match="disk full"):
         run(workspace, checkpoint=tmp_path)
     with pytest.raises(tb.TrustboError, match="holds no result"):

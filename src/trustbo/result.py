@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from trustbo import archive
+from trustbo import archive, records
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
 from trustbo.files import to_json, write_file, write_text
@@ -88,7 +88,7 @@ class Result:
                 file.unlink()
         _write_tree(folder / "posterior.nc", self.posterior)
         trees = {
-            "missions.nc": archive.missions_to_tree(self.missions),
+            "missions.nc": records.missions_to_tree(self.missions),
             "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
         }
         for name, tree in trees.items():
@@ -121,12 +121,12 @@ def load_result(directory: str | PathLike[str]) -> Result:
     record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     # A run killed while it saved may have left one mission more than the record knows of.
     n = record["n_missions"]
-    history = archive.read_tree(folder / "history.nc").to_dataset().isel(iteration=slice(n))
-    missions = archive.missions_from_tree(archive.read_tree(folder / "missions.nc"))[:n]
+    history = records.read_tree(folder / "history.nc").to_dataset().isel(iteration=slice(n))
+    missions = records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n]
     return Result(
-        archive.workspace_from_tree(archive.read_tree(folder / "workspace.nc")),
+        archive.workspace_from_tree(records.read_tree(folder / "workspace.nc")),
         missions,
-        [archive.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n)],
+        [records.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n)],
         [(int(row), int(col)) for row, col in record["path"]],
         np.array(record["trust"]),
         record["value"],

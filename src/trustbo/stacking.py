@@ -37,17 +37,9 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
         ShapeError: No missions, or missions that disagree on robots or features.
         TrustboError: An awareness value is NaN (contact rates may be missing, awareness may not).
     """
-    if isinstance(missions, Mission):
-        raise ShapeError("missions must be a list of missions; got one. Write [mission].")
-    if not missions:
-        raise ShapeError("no missions to learn from; give at least one.")
+    require_same_team(missions)
     first = missions[0]
     for j, mission in enumerate(missions):
-        if (mission.robots, mission.features) != (first.robots, first.features):
-            raise ShapeError(
-                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
-                f"0 has {first.robots} and {first.features}; all must agree."
-            )
         if np.isnan(mission.awareness.sum()):
             k, i, m = np.argwhere(np.isnan(mission.awareness))[0]
             raise TrustboError(
@@ -64,6 +56,25 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
         batch.contact_rate[j, : len(mission.bounds)] = mission.contact_rate
         batch.exposure[j, : len(mission.bounds)] = mission.exposure
     return batch
+
+
+def require_same_team(missions: Sequence[Mission]) -> None:
+    """Check that there are missions, all with the same robots and features.
+
+    Raises:
+        ShapeError: There are none, or they disagree.
+    """
+    if isinstance(missions, Mission):
+        raise ShapeError("missions must be a list of missions; got one. Write [mission].")
+    if not missions:
+        raise ShapeError("there are no missions; give at least one.")
+    first = missions[0]
+    for j, mission in enumerate(missions):
+        if (mission.robots, mission.features) != (first.robots, first.features):
+            raise ShapeError(
+                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
+                f"0 has {first.robots} and {first.features}; all must agree."
+            )
 
 
 def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:

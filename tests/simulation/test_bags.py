@@ -198,7 +198,7 @@ def test_bags_are_not_written_over_others_nor_under_a_wrong_name(tmp_path):
             write_bag([mission()], tmp_path / name, version=version)
     with pytest.raises(TrustboError, match="unknown storage 'zip'; choose one of sqlite3, mcap"):
         write_bag([mission()], tmp_path / "new", storage="zip")
-    with pytest.raises(ShapeError, match="give a list of at least one mission; got"):
+    with pytest.raises(ShapeError, match="there are no missions; give at least one"):
         write_bag([], tmp_path / "new")
     for robots, message in (
         (("r 1", "r2"), "robot 'r 1' cannot be in a topic"),

@@ -217,6 +217,6 @@ def test_only_missions_of_one_team_make_a_table(tmp_path):
     with pytest.raises(ShapeError, match=r"mission 1 has robots \('a', 'b'\) and features"):
         write_table([*missions(), *missions(robots=("a", "b"))][1::2], tmp_path / "missions.csv")
     for nothing in ([], missions()[0]):
-        with pytest.raises(ShapeError, match="give a list of at least one mission"):
+        with pytest.raises(ShapeError, match=r"give at least one|must be a list of missions"):
             write_table(nothing, tmp_path / "missions.csv")
     assert list(tmp_path.iterdir()) == []

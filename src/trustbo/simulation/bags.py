@@ -62,7 +62,7 @@ from trustbo.simulation.messages import (
     Messages,
 )
 from trustbo.simulation.recording import Marker, Recording, Series
-from trustbo.simulation.tables import require_same_team
+from trustbo.stacking import require_same_team
 from trustbo.terrain import Workspace
 
 _NS = 1_000_000_000  # in a second

@@ -1,52 +1,21 @@
 """Bounding overwatch, simulated: who moves where, who sees whom, bound by bound."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Bound, Cell, Mission, Robot
 from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
+from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive
 from trustbo.simulation.positions import SPACING
-from trustbo.simulation.sensing import contact_of, new_tracks
+from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, new_tracks
 from trustbo.simulation.sight import Sight, chance, optics
 from trustbo.simulation.world import Worlds
 from trustbo.terrain import CompositeIndex, Workspace
-
-BOUNDING = ("successive", "alternate")
-
-
-class Simulator(Protocol):
-    """Whatever runs a path: this package's simulator, yours, or real robots."""
-
-    def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
-        """Run a path from its first cell to its last, or as far as it goes."""
-        ...
-
-
-@dataclass(eq=False)
-class _State:
-    """Where everybody is; positions in CRS metres, headings in rad."""
-
-    cells: tuple[Cell, Cell]  # of the lead, and of T2
-    poses: np.ndarray  # (1 + robot, 3), the lead first
-    time: float
-    seed: int
-    tracks: np.ndarray  # (phase, robot, 2), see `sensing.new_tracks`
-
-
-class _Drive(NamedTuple):
-    """One bound's movements."""
-
-    poses: np.ndarray  # (tick, 1 + robot, 3)
-    lead_moves: np.ndarray  # (tick,), else T2 does
-    status: str
-    cells: tuple[Cell, Cell]
 
 
 class KinematicSimulator:
@@ -122,7 +91,7 @@ class KinematicSimulator:
         self._measure = Measure(
             workspace, self._worlds.surface, self.sight, self.tick, self.realtime
         )
-        self._state: _State | None = None
+        self._state: State | None = None
         self._enter(0)
 
     def describe(self) -> dict[str, object]:
@@ -258,17 +227,17 @@ class KinematicSimulator:
 
     # --- one bound ---
 
-    def _start(self, start: Cell, seed: int, next_cell: Cell | None) -> _State:
+    def _start(self, start: Cell, seed: int, next_cell: Cell | None) -> State:
         cell = self.workspace.require_cell("start", start)
         here = self._positions.waypoint(cell)
         positions = self._positions.formation(cell, next_cell)
         poses = np.zeros((1 + len(positions), 3))
         poses[0, :2], poses[1:, :2] = here, positions
         tracks = new_tracks(len(positions))
-        return _State((cell, cell), poses, 0.0, require_whole("seed", seed, 0), tracks)
+        return State((cell, cell), poses, 0.0, require_whole("seed", seed, 0), tracks)
 
     def _bounds(
-        self, states: Sequence[_State], k: int, cell: Cell, next_cell: Cell | None
+        self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
     ) -> list[Bound]:
         """The same bound of several missions; their states move on."""
         rngs = [np.random.default_rng([state.seed, k]) for state in states]
@@ -283,47 +252,33 @@ class KinematicSimulator:
         ]
 
     def _drive(
-        self, state: _State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
-    ) -> _Drive:
+        self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
+    ) -> Drive:
         """Who moves, and where to: the lead, then T2; or by turns."""
-        lead_goal, t2_goals = [self._positions.waypoint(cell)], None
-        turns = ["lead", "t2"]
-        if self.bounding == "alternate":
-            first = "lead" if k % 2 else "t2"
-            turns = [first] if next_cell is not None else [first, "t2" if k % 2 else "lead"]
-        poses, lead_moves, status, cells = state.poses[None], np.zeros(0, bool), "ok", state.cells
-        tracks: list[np.ndarray] = []
+        team, cells, status = self.workspace.team, list(state.cells), "ok"
+        poses, lead_moves = [state.poses[None]], []
         ticks_left = round(self.bound_timeout / self.tick)
-        for who in turns:
-            now = poses[-1]
+        for who in turns(self.bounding, k, next_cell is None):
             if who == "lead":
-                moved, status = self._move(
-                    now[:1],
-                    [self.workspace.team.lead],
-                    lead_goal,
-                    (cells[0], cell),
-                    ticks_left,
-                    rng,
-                )
-                poses = np.concatenate(
-                    [moved, np.repeat(now[None, 1:], len(moved), axis=0)], axis=1
-                )
-                cells = (cell, cells[1]) if status == "ok" else cells
+                i, them, robots = 0, slice(0, 1), (team.lead,)
+                goals = self._positions.waypoint(cell)[None]
             else:
-                t2_goals = list(self._positions.formation(cell, next_cell))
-                moved, status = self._move(
-                    now[1:], self.workspace.team.robots, t2_goals, (cells[1], cell), ticks_left, rng
-                )
-                poses = np.concatenate(
-                    [np.repeat(now[None, :1], len(moved), axis=0), moved], axis=1
-                )
-                cells = (cells[0], cell) if status == "ok" else cells
-            tracks.append(poses)
-            lead_moves = np.concatenate([lead_moves, np.full(len(moved), who == "lead")])
+                i, them, robots = 1, slice(1, None), team.robots
+                goals = self._positions.formation(cell, next_cell)
+            now = poses[-1][-1]
+            way = cells[i], cell
+            moved, status = self._move(now[them], robots, list(goals), way, ticks_left, rng)
+            part = np.repeat(now[None], len(moved), axis=0)
+            part[:, them] = moved
+            poses.append(part)
+            lead_moves.append(np.full(len(moved), who == "lead"))
             ticks_left -= len(moved)
             if status != "ok":
                 break
-        return _Drive(np.concatenate(tracks), lead_moves, status, cells)
+            cells[i] = cell
+        return Drive(
+            np.concatenate(poses[1:]), np.concatenate(lead_moves), status, (cells[0], cells[1])
+        )
 
     def _move(
         self,
@@ -352,7 +307,7 @@ class KinematicSimulator:
         held = [t[np.minimum(np.arange(n_ticks), len(t) - 1)] for t in tracks]
         return np.stack(held, axis=1), status
 
-    def _chances(self, drives: Sequence[_Drive]) -> list[np.ndarray]:
+    def _chances(self, drives: Sequence[Drive]) -> list[np.ndarray]:
         """Probability that a look finds its target, (tick, robot): of all missions at once."""
         team = self.workspace.team
         poses = np.concatenate([drive.poses[..., :2] for drive in drives])
@@ -374,9 +329,9 @@ class KinematicSimulator:
 
     def _measured(
         self,
-        state: _State,
+        state: State,
         cell: Cell,
-        drive: _Drive,
+        drive: Drive,
         chances: np.ndarray,
         rng: np.random.Generator,
     ) -> Bound:
@@ -388,7 +343,10 @@ class KinematicSimulator:
             ((drive.lead_moves, team.robots), (~drive.lead_moves, [team.lead] * n_robots))
         ):
             contact[who] = contact_of(found[who], watchers, state.tracks[phase])
-        n_ticks, status = self._cut_at_lost_contact(contact, drive.status)
+        n_ticks, status = len(contact), drive.status
+        if self.lost_contact_after is not None:
+            patience = max(1, round(self.lost_contact_after / self.tick))
+            n_ticks, status = cut_at_lost_contact(contact, patience, status)
         poses, contact = drive.poses[:n_ticks], contact[:n_ticks]
         # If T2 has not moved yet, what it measured is where it stands.
         closing = ~drive.lead_moves[:n_ticks]
@@ -409,14 +367,3 @@ class KinematicSimulator:
         )
         state.cells, state.poses, state.time = drive.cells, poses[-1], bound.t1
         return bound
-
-    def _cut_at_lost_contact(self, contact: np.ndarray, status: str) -> tuple[int, str]:
-        """How many ticks there are, and how the bound ends."""
-        if self.lost_contact_after is not None:
-            patience = max(1, round(self.lost_contact_after / self.tick))
-            alone = 0
-            for k, any_contact in enumerate(contact.any(1)):
-                alone = 0 if any_contact else alone + 1
-                if alone >= patience:
-                    return k + 1, "lost_contact"
-        return len(contact), status

@@ -5,10 +5,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
-import xarray as xr
-
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_pair
+from trustbo.records import missions_from_tree, read_tree
 from trustbo.simulation.tables import read_table
 
 ON_MISSING = ("error", "next")
@@ -80,14 +79,8 @@ class ReplayBackend:
         """
         file = Path(path)
         file = file / "missions.nc" if file.is_dir() else file
-        if not file.is_file():
-            raise TrustboError(f"there is no file {str(file)!r}; give a missions.nc.")
         try:
-            with xr.open_datatree(file, engine="netcdf4") as tree:
-                tree.load()
-                missions = _missions_of(
-                    *(tree[name].to_dataset() for name in ("missions", "ticks"))
-                )
+            missions = missions_from_tree(read_tree(file))
         except (OSError, KeyError) as error:
             raise TrustboError(
                 f"{str(file)!r} holds no missions ({error}); give the missions.nc of a result."
@@ -220,31 +213,3 @@ class ReplayBackend:
 
 def _text(path: Sequence[Cell]) -> str:
     return " ".join(f"{row},{col}" for row, col in path)
-
-
-def _missions_of(table: xr.Dataset, ticks: xr.Dataset) -> list[Mission]:
-    """Missions from the arrays that a result saves them as."""
-    robots, features = (tuple(str(n) for n in table[d].values) for d in ("robot", "feature"))
-    owner = ticks["mission"].values, ticks["bound"].values
-    missions = []
-    for j in range(table.sizes["mission"]):
-        one = table.isel(mission=j)
-        path = tuple((int(r), int(c)) for r, c in one["path"].values if r >= 0)
-        bounds = []
-        for k in range(int(one["n_bounds"])):
-            row, mine = one.isel(bound=k), (owner[0] == j) & (owner[1] == k)
-            bounds.append(
-                Bound(
-                    path[k + 1],
-                    row["awareness"].values,
-                    row["contact_rate"].values,
-                    row["duration"].values,
-                    str(row["bound_status"].values),
-                    float(row["start"]),
-                    ticks["pose"].values[mine] if mine.any() else None,
-                    ticks["contact"].values[mine].astype(bool) if mine.any() else None,
-                    row["exposure"].values,
-                )
-            )
-        missions.append(Mission(path, tuple(bounds), str(one["status"].values), features, robots))
-    return missions

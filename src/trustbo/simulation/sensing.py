@@ -42,3 +42,13 @@ def _track(found, limits, tracks, contact):
             else:
                 tracks[i, 1] = 0
             contact[k, i] = tracks[i, 0] == 1
+
+
+def cut_at_lost_contact(contact: np.ndarray, patience: int, status: str) -> tuple[int, str]:
+    """How many ticks a bound has that ends when nobody has had contact for `patience` ticks."""
+    alone = 0
+    for k, any_contact in enumerate(contact.any(1)):
+        alone = 0 if any_contact else alone + 1
+        if alone >= patience:
+            return k + 1, "lost_contact"
+    return len(contact), status

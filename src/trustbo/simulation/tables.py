@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import ShapeError, TrustboError, require_pair
+from trustbo.errors import TrustboError, require_pair
 from trustbo.files import write_file
 from trustbo.simulation.rows import KEYS, Row, column_of, features_of, parse_rows, read_columns
+from trustbo.stacking import require_same_team
 
 
 def read_table(
@@ -93,23 +94,6 @@ def write_table(missions: Sequence[Mission], path: str | PathLike[str]) -> None:
             csv.writer(stream, lineterminator="\n").writerows(lines)
 
     write_file(path, write)
-
-
-def require_same_team(missions: Sequence[Mission]) -> None:
-    """Check that there are missions, all with the same robots and features.
-
-    Raises:
-        ShapeError: There are none, or they disagree.
-    """
-    if isinstance(missions, Mission) or not missions:
-        raise ShapeError(f"give a list of at least one mission; got {missions!r}.")
-    first = missions[0]
-    for j, mission in enumerate(missions):
-        if (mission.robots, mission.features) != (first.robots, first.features):
-            raise ShapeError(
-                f"mission {j} has robots {mission.robots} and features {mission.features}, mission "
-                f"0 has {first.robots} and {first.features}; all must agree."
-            )
 
 
 def _mission(

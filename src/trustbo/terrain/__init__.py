@@ -2,10 +2,8 @@
 
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import (
-    FEATURES,
     TRAVERSABILITY,
     VISIBILITY,
-    PixelFeature,
     aspect,
     canopy_cover,
     canopy_height,
@@ -13,7 +11,6 @@ from trustbo.terrain.features import (
     exposure,
     openness,
     pixel_features,
-    register_feature,
     roughness,
     slope,
     step_height,
@@ -24,6 +21,7 @@ from trustbo.terrain.features import (
 from trustbo.terrain.grid import Grid
 from trustbo.terrain.lidar import read_lidar
 from trustbo.terrain.raster import assemble_terrain, pixel_size, read_terrain
+from trustbo.terrain.registry import FEATURES, PixelFeature, register_feature
 from trustbo.terrain.synthetic import synthetic_terrain
 from trustbo.terrain.workspace import Workspace
 

@@ -14,7 +14,7 @@ from rasterio.warp import calculate_default_transform, reproject, transform_boun
 from rasterio.warp import transform as transform_points
 
 from trustbo.errors import TerrainError
-from trustbo.terrain.source import Raster
+from trustbo.terrain.rasterview import Raster
 
 # A warp is computed by blocks: of so many columns of the result, of so many pixels of the source.
 BLOCK = 2048

@@ -10,10 +10,10 @@ import xarray as xr
 
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
-from trustbo.terrain.features import FEATURES, PixelFeature, feature_named
 from trustbo.terrain.grid import CellMeans, CellQuantiles, Grid, Sums
 from trustbo.terrain.parallel import in_order
 from trustbo.terrain.raster import is_lazy, warn_if_clipped
+from trustbo.terrain.registry import FEATURES, PixelFeature, feature_named
 from trustbo.terrain.strips import Strip, sample_strips, strips
 
 Ingredients = PixelFeature | Mapping[str, PixelFeature]

@@ -1,17 +1,23 @@
 """Attributes of every pixel that make ground hard to cross or sight hard to keep."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from trustbo.errors import ShapeError, TerrainError, require_choice, require_whole
+from trustbo.errors import ShapeError, TerrainError, require_whole
 from trustbo.terrain import fan, rays, stencil
-from trustbo.terrain.parallel import over_rows
 from trustbo.terrain.raster import pixel_size
+from trustbo.terrain.registry import (
+    FEATURES,
+    PixelFeature,
+    feature_named,
+    register_feature,
+    values_of_kernel,
+)
 
 CANOPY_THRESHOLD = 2.0
 """Vegetation at least this high (m) counts as canopy."""
@@ -19,84 +25,6 @@ COVER_RADIUS = 5.0
 """Half-width of the squares over which canopy is averaged, m."""
 REACH = 50.0
 """Length of the rays of openness, m."""
-
-Compute = Callable[..., xr.DataArray]
-"""Of a terrain, Dataset of `dem` and `dsm` over (y, x)."""
-
-
-class PixelFeature(NamedTuple):
-    """A named attribute of pixels, and how it enters an index."""
-
-    compute: Compute
-    """Of a terrain or a strip of one, dims (y, x)."""
-    sign: int
-    """+1 if more of it raises the index it is part of, -1 if it lowers it."""
-    halo: float = 0.0
-    """How far around a pixel it looks, m; the pixels next to it are always there."""
-    by_rows: bool = False
-    """Whether `compute` takes `rows=`, the rows that are wanted; it may leave out the others."""
-    kernel: Callable | None = None
-    """Of `stencil`, if that is all it is: the way without labels, for strips."""
-
-    def of_rows(self, terrain: xr.Dataset, rows: slice, room: Callable | None = None) -> np.ndarray:
-        """Its values on some rows of a terrain, shape (row, col).
-
-        Args:
-            terrain: The terrain, or a strip of it.
-            rows: Which.
-            room: `room(shape, dtype)` gives an array to be written to; by default a new one.
-        """
-        if self.kernel is not None:
-            return _of_kernel(terrain, self.kernel, rows, room or np.empty)
-        options = {"rows": rows} if self.by_rows else {}
-        return self.compute(terrain, **options).values[rows]
-
-
-FEATURES: dict[str, PixelFeature] = {}
-"""Every feature known by name."""
-
-
-class _Registrar(Protocol):
-    def __call__[F: Compute](self, compute: F, /) -> F: ...
-
-
-def register_feature(
-    name: str, *, sign: int, halo: float = 0.0, kernel: Callable | None = None
-) -> _Registrar:
-    """Add a feature of one's own, to be used by its name.
-
-    Args:
-        name: A new one.
-        sign: +1 if more of it raises the index it is part of, -1 if it lowers it.
-        halo: How far around a pixel it looks, m, so that large rasters can be done in strips.
-        kernel: See `PixelFeature`.
-
-    Returns:
-        A decorator for a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), m) that
-        returns a DataArray (y, x), NaN where unknown.
-
-    Raises:
-        TerrainError: The name is taken, or the sign neither 1 nor -1.
-    """
-    if name in FEATURES:
-        raise TerrainError(f"there is a feature {name!r} already; take another name.")
-    if sign not in (1, -1) or not halo >= 0.0:
-        raise TerrainError(f"need sign 1 or -1 and halo >= 0; got {sign!r} and {halo!r}.")
-
-    def register[F: Compute](compute: F, /) -> F:
-        FEATURES[name] = PixelFeature(compute, sign, halo, kernel=kernel)
-        return compute
-
-    return register
-
-
-def feature_named(name: str) -> PixelFeature:
-    """A registered feature.
-
-    Raises:
-        TrustboError: There is none of that name.
-    """
-    return FEATURES[require_choice("feature", name, FEATURES)]
 
 
 @register_feature("slope", sign=-1, kernel=stencil.slope)
@@ -333,25 +261,8 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 def _stencil(terrain: xr.Dataset, kernel: Callable, name: str, units: str) -> xr.DataArray:
     """A 3 x 3 attribute; beyond the raster's edge the ground goes on level."""
-    values = _of_kernel(terrain, kernel, slice(None), np.empty)
+    values = values_of_kernel(terrain, kernel, slice(None), np.empty)
     return _named(terrain["dem"].copy(deep=False, data=values), name, units)
-
-
-def _of_kernel(terrain: xr.Dataset, kernel: Callable, rows: slice, room: Callable) -> np.ndarray:
-    z, pixel = terrain.variables["dem"].values, pixel_size(terrain)
-    top, bottom, _ = rows.indices(len(z))
-    out = room((bottom - top, z.shape[1]), z.dtype)
-
-    def work(first: int, last: int) -> None:
-        i, j = top + first, top + last
-        block = np.empty((j - i + 2, z.shape[1] + 2), z.dtype)
-        block[1:-1, 1:-1] = z[i:j]
-        block[0, 1:-1], block[-1, 1:-1] = z[max(i - 1, 0)], z[min(j, len(z) - 1)]
-        block[:, 0], block[:, -1] = block[:, 1], block[:, -2]
-        kernel(block, pixel, out[first:last])
-
-    over_rows(work, len(out))
-    return out
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:

@@ -6,11 +6,9 @@ import os
 import threading
 import warnings
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from os import PathLike
-from typing import Any
 
 import numpy as np
 import rasterio
@@ -20,15 +18,14 @@ from rasterio.crs import CRS
 from rasterio.enums import MaskFlags
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
-from rasterio.transform import array_bounds, from_origin
+from rasterio.transform import from_origin
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 from rioxarray.exceptions import MissingSpatialDimensionError
-from xarray.backends import BackendArray
-from xarray.core import indexing
 
 from trustbo.errors import TerrainError, require_positive
 from trustbo.terrain.decode import decoder, require_real, scaling, tagged
+from trustbo.terrain.rasterview import Raster
 
 type RasterLike = str | PathLike[str] | DatasetReader | WarpedVRT | xr.DataArray | xr.Dataset
 
@@ -42,73 +39,6 @@ def _close_all() -> None:
     """Close what a lazy terrain left open: rasterio can no longer do so when Python is gone."""
     for dataset in list(_opened):
         dataset.close()
-
-
-@dataclass(frozen=True, eq=False)
-class Raster:
-    """Heights on a north-up grid, read window by window.
-
-    Attributes:
-        name: What messages call it.
-        crs: Its coordinate reference system.
-        transform: From (column, row) of a pixel's upper left corner to (x, y) in the CRS.
-        shape: Rows and columns.
-        read: Heights of a slice of rows and a slice of columns, float64, NaN where missing.
-    """
-
-    name: str
-    crs: CRS
-    transform: Affine
-    shape: tuple[int, int]
-    read: Callable[[slice, slice], np.ndarray]
-
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """Left, bottom, right and top in the CRS."""
-        return array_bounds(*self.shape, self.transform)
-
-    def array(self, dtype: type[np.floating]) -> xr.DataArray:
-        """The heights as dims (y, x), read when a window of them is loaded."""
-        lazy: Any = indexing.LazilyIndexedArray(_Heights(self, dtype))
-        rows, cols = (np.arange(n) + 0.5 for n in self.shape)
-        coords = {
-            "y": self.transform.f + rows * self.transform.e,
-            "x": self.transform.c + cols * self.transform.a,
-        }
-        return xr.DataArray(indexing.CopyOnWriteArray(lazy), coords, ("y", "x")).rio.write_crs(
-            self.crs
-        )
-
-
-class _Heights(BackendArray):
-    """What xarray reads a raster's windows through."""
-
-    def __init__(self, raster: Raster, dtype: type[np.floating]) -> None:
-        self.raster, self.shape, self.dtype = raster, raster.shape, np.dtype(dtype)
-
-    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
-        return indexing.explicit_indexing_adapter(
-            key, self.shape, indexing.IndexingSupport.BASIC, self._window
-        )
-
-    def _window(self, key: tuple[int | slice, ...]) -> np.ndarray:
-        spans = [
-            range(n)[k] if isinstance(k, slice) else range(k, k + 1)
-            for k, n in zip(key, self.shape, strict=True)
-        ]
-        if not all(spans):
-            return np.empty(
-                [len(s) for s, k in zip(spans, key, strict=True) if isinstance(k, slice)]
-            )
-        try:
-            window = self.raster.read(*(slice(span[0], span[-1] + 1) for span in spans))
-        except RasterioError as error:
-            raise TerrainError(
-                f"{self.raster.name} could not be read ({error}); it is damaged, out of reach, or "
-                "was closed before it was read."
-            ) from None
-        steps = (slice(None, None, k.step) if isinstance(k, slice) else 0 for k in key)
-        return window[tuple(steps)].astype(self.dtype, copy=False)
 
 
 def open_raster(

@@ -17,13 +17,13 @@ from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import (
     TRAVERSABILITY,
     VISIBILITY,
-    PixelFeature,
     exposure,
     openness,
     require_observers,
 )
 from trustbo.terrain.grid import Grid
 from trustbo.terrain.raster import is_lazy, pixel_size, require_terrain
+from trustbo.terrain.registry import PixelFeature
 
 MAX_MISSING = 0.5
 """A cell is impassable if more than this share of its pixels is missing or too steep."""
