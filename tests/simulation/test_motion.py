@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from trustbo.data import Robot
-from trustbo.simulation.motion import _a_star, drive, find_route
+from trustbo.simulation.motion import Routes, _a_star, drive
 from trustbo.simulation.positions import _largest_region
 from trustbo.simulation.sight import Surface
 
@@ -57,16 +57,16 @@ def test_no_way_gives_no_route():
     passable = np.ones((60, 60), bool)
     passable[:, 30] = False
     surface = flat_surface(passable=passable)
-    route = find_route(
-        surface, Robot(), np.array([5.0, -5.0]), np.array([50.0, -5.0]), (0, 60, 0, 60)
+    route = Routes(surface).find(
+        Robot(), np.array([5.0, -5.0]), np.array([50.0, -5.0]), (0, 60, 0, 60)
     )
     assert route is None
 
 
 def test_on_flat_ground_a_robot_arrives_at_its_speed():
     surface = flat_surface()
-    route = find_route(
-        surface, Robot(), np.array([5.0, -30.0]), np.array([45.0, -30.0]), (0, 60, 0, 60)
+    route = Routes(surface).find(
+        Robot(), np.array([5.0, -30.0]), np.array([45.0, -30.0]), (0, 60, 0, 60)
     )
     poses, status = drive(surface, Robot(), route, 0.0, 0.5, 1000, np.random.default_rng(0))
     assert status == "ok"

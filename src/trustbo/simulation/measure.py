@@ -82,9 +82,7 @@ class Measure:
     def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
         """By feature, the map's value and the states of each robot on each bound, (sample)."""
         rows = [
-            np.concatenate(
-                [Measure.__call__(self._plain, b.poses[:, 1:], None), b.states.mean(0)], 1
-            )
+            np.concatenate([self(b.poses[:, 1:], None), b.states.mean(0)], axis=1)
             for b in bounds
             if b.poses is not None and b.states is not None
         ]
@@ -94,10 +92,6 @@ class Measure:
             name: xr.Dataset({"offline": ("sample", table[:, m]), **states})
             for m, name in enumerate(self._names)
         }
-
-    @cached_property
-    def _plain(self) -> "Measure":
-        return Measure(self._workspace, self._surface, self._sight, self._tick, {})
 
     @cached_property
     def _lidar(self) -> "_LidarMaps":

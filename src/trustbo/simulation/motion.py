@@ -223,8 +223,3 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
                 return poses[: k + 1], 0
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
     return poses, 3
-
-
-def find_route(surface, robot, start, goal, window):  # noqa: ANN201
-    """One way; see `Routes.find`."""
-    return Routes(surface).find(robot, start, goal, window)

@@ -1,5 +1,6 @@
 """Bounding overwatch, simulated: who moves where, who sees whom, bound by bound."""
 
+import copy
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -206,8 +207,10 @@ class KinematicSimulator:
             `simulation.STATES`, averaged over a bound; one sample per robot and bound.
         """
         rng = np.random.default_rng(require_whole("seed", seed, 0))
-        plain = type(self)(self.workspace, sight=self.sight, tick=self.tick, record_states=True,
-                           formation_radius=self.formation_radius)  # fmt: skip
+        plain = copy.copy(self)
+        plain.record_states = plain._wants_states = True
+        plain._measure = Measure(self.workspace, self._worlds.surface, self.sight, self.tick, {})
+        plain._worlds = Worlds(self.workspace, self.sight, self.formation_radius)
         free, rows = np.argwhere(self.workspace.passable.values), []
         for tried in range(20 * require_whole("n_bounds", n_bounds, 1)):
             a = free[rng.integers(len(free))]
@@ -218,7 +221,7 @@ class KinematicSimulator:
                 rows.append(plain.run(path, seed=tried).bounds[0])
             if len(rows) == n_bounds:
                 break
-        return self._measure.samples(rows)
+        return plain._measure.samples(rows)
 
     def _enter(self, mission: int) -> None:
         """Take the world as it is for a mission."""

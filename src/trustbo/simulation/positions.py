@@ -123,14 +123,14 @@ def surface_of(terrain: xr.Dataset, pixels: xr.Dataset) -> Surface:
     return Surface(
         ground=terrain["dem"].values.astype(float),
         canopy=terrain["dsm"].values.astype(float),
-        gradient=gradient(_filled(terrain["dem"].values.astype(float)), pixel_size(terrain)),
+        gradient=gradient(filled(terrain["dem"].values.astype(float)), pixel_size(terrain)),
         passable=pixels["passable"].values.astype(bool),
         pixel=pixel_size(terrain),
         origin=(float(terrain["x"][0]), float(terrain["y"][0])),
     )
 
 
-def _filled(dem: np.ndarray) -> np.ndarray:
+def filled(dem: np.ndarray) -> np.ndarray:
     """Missing heights replaced by the nearest known: a robot may brush the edge of the data."""
     nearest: Any = ndimage.distance_transform_edt(
         ~np.isfinite(dem), return_distances=False, return_indices=True

@@ -1,0 +1,272 @@
+"""Missions with the physics of MuJoCo: robots that slip, get stuck, tip over and collide."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from trustbo.data import Cell, Robot
+from trustbo.errors import require_positive
+from trustbo.simulation.motion import ARRIVED, LOOKAHEAD, SLOWEST
+from trustbo.simulation.overwatch import KinematicSimulator
+from trustbo.simulation.sight import Surface
+from trustbo.simulation.vehicle import Physics, crop, grip_of, require_mujoco, wheel_speeds
+from trustbo.terrain import Workspace
+
+MARGIN = 5.0
+"""Ground simulated around the pixels that a route may use, m."""
+CONTROL = 0.05
+"""Longest time between two commands to the wheels, s."""
+TIPPED, ON_ITS_SIDE = math.radians(75.0), math.radians(60.0)
+"""Angle of a body with the vertical, and with the ground's normal, beyond which it has tipped."""
+PROGRESS = 0.25
+"""How far along its route a robot must come not to count as stuck, m."""
+CLEARANCE, WARY = 1.3, 4.0
+"""How far a robot keeps its middle from another's, and from where on it heeds it, m."""
+JUST_NOW = 3.0
+"""A robot that fails so soon after it touched another one has collided, s."""
+STILL = 0.05
+"""A robot at its goal has moved if it was shoved, or has slid, so far, m."""
+SLOW = 1.5
+"""Below this speed, a robot that reaches its goal stops there, m/s."""
+GRIP_SD, SLIP_SD = 0.1, 0.05
+"""Spread (log) of a robot's grip from drive to drive, and of a side's wheel speed in a tick."""
+
+
+class MujocoBackend(KinematicSimulator):
+    """Skid-steer robots with weight, grip and torque on the DEM as a heightfield.
+
+    Bounds, formations, routes and contacts are those of `KinematicSimulator`; how robots get along
+    their routes is physics. They are Husky-sized (1.0 x 0.7 x 0.4 m, 50 kg) whatever their
+    `Robot`, whose `max_slope` decides how high their weight sits and how well their wheels grip:
+    they tip over and slide some degrees beyond it. They steer for a point ahead, slow down on
+    slopes as the kinematic ones do, and go round each other.
+
+    A mission ends as `"tipped"` if a body leans 75 degrees, or 60 degrees from the ground under it;
+    as `"stuck"` if a robot comes no farther along its route for `stuck_after` seconds, has no
+    route, or slides off the ground around the two cells; as `"collision"` instead if it touched
+    another one just before; as `"timeout"` after `bound_timeout`; as `"aborted"` if the physics
+    breaks down.
+
+    Only robots that move are in the physics: those that watch are no obstacles, nor is vegetation.
+    Same seed, same mission, on one machine with one version of MuJoCo.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        *,
+        friction: float | None = None,
+        stuck_after: float = 15.0,
+        step: float = 0.01,
+        **options: Any,
+    ) -> None:
+        """Prepare a terrain for simulation.
+
+        Args:
+            workspace: A workspace made from a terrain.
+            friction: Mean friction coefficient of the wheels on the ground; None: as much as each
+                robot needs for its `max_slope`.
+            stuck_after: How long a robot may come no farther before it counts as stuck, s.
+            step: Longest physics step, s.
+            **options: `sight`, `tick` and whatever else `KinematicSimulator` takes.
+
+        Raises:
+            TrustboError: MuJoCo is not installed, a value that is not positive, or what
+                `KinematicSimulator` refuses.
+        """
+        require_mujoco()
+        super().__init__(workspace, **options)
+        self.friction = None if friction is None else require_positive("friction", friction)
+        self.stuck_after = require_positive("stuck_after", stuck_after)
+        self.step = require_positive("step", step)
+
+    def describe(self) -> dict[str, object]:
+        """The settings that decide what a mission measures, for the record."""
+        return {
+            **super().describe(),
+            "friction": self.friction,
+            "stuck_after": self.stuck_after,
+            "step": self.step,
+            "mujoco": require_mujoco().__version__,
+        }
+
+    def _move(
+        self,
+        poses: np.ndarray,
+        robots: Sequence[Robot],
+        goals: Sequence[np.ndarray],
+        cells: tuple[Cell, Cell],
+        max_ticks: int,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, str]:
+        """Drive several robots at once; poses (tick, robot, 3) until all are there or one fails."""
+        window = self._positions.window(*cells)
+        legs: list[_Leg] = []
+        for pose, robot, goal in zip(poses, robots, goals, strict=True):
+            route = self._routes.find(robot, pose[:2], goal, window)
+            if route is None:
+                return poses[None].copy(), "stuck"
+            legs.append(_Leg(route, robot))
+        n_commands = math.ceil(self.tick / CONTROL)
+        n_steps = math.ceil(self.tick / n_commands / self.step)
+        grip = np.array([self.friction or grip_of(robot) for robot in robots])
+        grip *= np.exp(GRIP_SD * rng.standard_normal(len(robots)))
+        slip = np.exp(SLIP_SD * rng.standard_normal((max(1, max_ticks), len(robots), 2)))
+        physics = Physics(
+            crop(self._surface, window, MARGIN),
+            robots,
+            grip.tolist(),
+            self.tick / n_commands / n_steps,
+        )
+        convoy = _Convoy(physics, legs, self._surface, self.stuck_after)
+        physics.place(poses)
+        track, status = [poses], "underway"
+        for slip_now in slip:
+            for _ in range(n_commands):
+                status = convoy.advance(slip_now, self.tick / n_commands, n_steps)
+                if status != "underway":
+                    break
+            track.append(convoy.record(track[-1]))
+            if status != "underway":
+                break
+        return np.stack(track[1:]), "timeout" if status == "underway" else status
+
+
+class _Convoy:
+    """Robots that drive at the same time, each along its own route."""
+
+    def __init__(
+        self, physics: Physics, legs: "list[_Leg]", surface: Surface, stuck_after: float
+    ) -> None:
+        """Set out; the surface's gradient tells who lies on its side."""
+        self._physics, self._legs = physics, legs
+        self._surface, self._stuck_after = surface, stuck_after
+        self._untouched = np.full(len(legs), np.inf)  # s
+
+    def advance(self, slip: np.ndarray, seconds: float, n_steps: int) -> str:
+        """Command the wheels once and let the physics run; how things stand then.
+
+        Args:
+            slip: What the wheels' speeds are multiplied with, shape (robot, side).
+            seconds: How long.
+            n_steps: In how many steps.
+
+        Returns:
+            "underway", or the status that the drive ends with.
+        """
+        physics, legs, poses = self._physics, self._legs, self._physics.poses
+        tilt = np.arccos(np.clip(physics.up[:, 2], -1.0, 1.0))
+        asked = np.zeros((len(legs), 2))
+        for i, leg in enumerate(legs):
+            if not leg.arrived:
+                others = np.delete(poses[:, :2], i, axis=0)
+                asked[i] = leg.steer(poses[i], tilt[i], others)
+        # What slipping wheels fall short of is asked of them on top; who has arrived brakes.
+        short = np.clip(asked - physics.rates, -1.0, 1.0)
+        short[[leg.arrived for leg in legs]] = 0.0
+        physics.command(wheel_speeds(*(asked + short).T) * slip)
+        physics.advance(n_steps)
+        if not physics.is_finite:
+            return "aborted"
+        poses, speed = physics.poses, physics.speed
+        self._untouched = np.where(physics.touching, 0.0, self._untouched + seconds)
+        hit = self._untouched < JUST_NOW
+        tipped = self._has_tipped(poses)
+        if tipped.any():
+            return "collision" if hit[tipped].any() else "tipped"
+        for leg, pose, v in zip(legs, poses, speed, strict=True):
+            leg.look(pose[:2], v, seconds)
+        stuck = physics.off_ground | [leg.idle >= self._stuck_after for leg in legs]
+        if stuck.any():
+            return "collision" if hit[stuck].any() else "stuck"
+        return "ok" if all(leg.arrived for leg in legs) else "underway"
+
+    def record(self, last: np.ndarray) -> np.ndarray:
+        """The poses to record after those last recorded, shape (robot, 3).
+
+        A robot that only creeps at its goal has not moved: it measures no more of its way.
+        """
+        if not self._physics.is_finite:
+            return last
+        poses = self._physics.poses
+        still = np.linalg.norm(poses[:, :2] - last[:, :2], axis=1) < STILL
+        still &= [leg.arrived for leg in self._legs]
+        return np.where(still[:, None], last, poses)
+
+    def _has_tipped(self, poses: np.ndarray) -> np.ndarray:
+        up = self._physics.up
+        dz_dx, dz_dy = self._surface.gradient[:, *self._surface.nearest(poses[:, 0], poses[:, 1])]
+        along_normal = up[:, 2] - dz_dx * up[:, 0] - dz_dy * up[:, 1]
+        along_normal /= np.sqrt(1.0 + dz_dx**2 + dz_dy**2)
+        return (up[:, 2] < math.cos(TIPPED)) | (along_normal < math.cos(ON_ITS_SIDE))
+
+
+class _Leg:
+    """One robot's way to its goal: the route, how far along it has come, and how to go on."""
+
+    def __init__(self, route: np.ndarray, robot: Robot) -> None:
+        """Set out; `route` has shape (point, 2), CRS metres."""
+        along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1)))
+        self._along = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / 0.25) + 1))
+        self._points = np.column_stack([np.interp(self._along, along, xy) for xy in route.T])
+        self._robot, self._reach = robot, LOOKAHEAD + 0.25 * robot.speed
+        self._at, self._best = 0, 0.0
+        self.idle, self.arrived = 0.0, False
+
+    def look(self, position: np.ndarray, speed: float, seconds: float) -> None:
+        """Note where the robot has come to, so many seconds after the last look.
+
+        Who slides past the goal has not arrived.
+        """
+        near = self._points[self._at : self._at + 12]
+        self._at += int(np.argmin(((near - position) ** 2).sum(1)))
+        there = math.dist(position, self._points[-1]) < ARRIVED
+        self.arrived |= there and speed < SLOW
+        if self.arrived or self._along[self._at] >= self._best + PROGRESS:
+            self._best, self.idle = float(self._along[self._at]), 0.0
+        else:
+            self.idle += seconds
+
+    def steer(self, pose: np.ndarray, tilt: float, others: np.ndarray) -> tuple[float, float]:
+        """Speed, m/s, and yaw rate, rad/s, towards a point ahead, round other robots.
+
+        Args:
+            pose: x, y and heading.
+            tilt: Angle of the body with the vertical, rad.
+            others: Positions of the other robots, shape (robot, 2), CRS metres.
+        """
+        robot, left = self._robot, math.dist(pose[:2], self._points[-1])
+        ahead = np.searchsorted(self._along, self._along[self._at] + self._reach)
+        dx, dy = self._points[min(int(ahead), len(self._points) - 1)] - pose[:2]
+        bearing = _around(math.atan2(dy, dx), left, others - pose[:2])
+        error = _wrapped(bearing - pose[2])
+        share = max(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / robot.max_slope)
+        # Slow enough to stop at the goal, and on the spot until it faces its way.
+        speed = min(robot.speed * share, 2.0 * left) * max(0.0, math.cos(error))
+        return speed, min(robot.turn_rate, max(-robot.turn_rate, 2.0 * error))
+
+
+def _around(bearing: float, left: float, others: np.ndarray) -> float:
+    """The bearing to steer for, bent so as to pass other robots with clearance.
+
+    Args:
+        bearing: To the point steered for, rad.
+        left: Distance to the goal, m.
+        others: Where the other robots are as seen from here, shape (robot, 2), m.
+    """
+    for x, y in others:
+        gap = math.hypot(x, y)
+        if gap > min(left + 0.5, WARY):
+            continue
+        off = _wrapped(bearing - math.atan2(y, x))
+        least = math.asin(min(1.0, CLEARANCE / max(gap, 1e-6)))
+        if abs(off) < least:
+            # On the nearer side; head on, everybody keeps to the right.
+            bearing += (least if off > 1e-3 else -least) - off
+    return _wrapped(bearing)
+
+
+def _wrapped(angle: float) -> float:
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -1,0 +1,300 @@
+"""Skid-steer vehicles on a heightfield, in MuJoCo: their make, and how they stand and move."""
+
+import math
+from collections.abc import Sequence
+from types import ModuleType
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.data import Robot
+from trustbo.errors import TrustboError
+from trustbo.simulation.positions import filled
+from trustbo.simulation.sight import Surface
+
+# A Husky: 1.0 x 0.7 x 0.4 m over all, 50 kg.
+MASS, WHEEL_MASS = 50.0, 2.5
+WHEEL_RADIUS, WHEEL_WIDTH = 0.165, 0.12
+WHEELBASE, TRACK = 0.66, 0.57
+"""Distances of the axles, and of the left and right wheels, m."""
+STIFFNESS, DAMPING = 5000.0, 400.0
+"""Of the spring that carries each wheel, N/m and N s/m: it keeps all four on rough ground."""
+TORQUE = 80.0
+"""Most that a motor gives its wheel, N m: enough to spin it on any grip."""
+TIP_MARGIN, GRIP_MARGIN = math.radians(8.0), math.radians(12.0)
+"""How far beyond its `max_slope` a robot tips over on rigid springs, and slides, rad."""
+APART = 1.1
+"""How far apart the middles of robots are put, m."""
+SETTLING = 1.0
+"""Longest wait until robots put on the ground are at rest, s."""
+_BODY, _CLEARANCE = (0.90, 0.45, 0.24), 0.13  # length, width, height; above ground, m
+_LOWEST, _HIGHEST = 0.10, 0.40  # where the centre of mass may be, m above ground
+_WHEELS = np.array([(x * WHEELBASE, y * TRACK) for x in (0.5, -0.5) for y in (0.5, -0.5)])
+_HULL = MASS - len(_WHEELS) * WHEEL_MASS
+# Wheels slip sideways in a turn: a skid-steer robot yaws as if its track were so much wider, by
+# the balance of Coulomb friction; with the grip of a climber, by 40 % more (measured).
+_YAW_TRACK = 1.4 * (TRACK + WHEELBASE**2 / TRACK)
+
+
+class Ground(NamedTuple):
+    """A crop of the terrain, in metres from its own middle and from its lowest point."""
+
+    heights: np.ndarray  # (row, col), m, row 0 in the south
+    pixel: tuple[float, float]  # height, width of a pixel, m
+    center: tuple[float, float]  # x and y of the middle, CRS metres
+
+    @property
+    def half_size(self) -> np.ndarray:
+        """Half the extent between the outer pixels' centres along x and y, m."""
+        rows, cols = self.heights.shape
+        return 0.5 * np.array([(cols - 1) * self.pixel[1], (rows - 1) * self.pixel[0]])
+
+    def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Bilinear height, m, at positions in metres from the middle."""
+        rows, cols = self.heights.shape
+        col = np.clip((x + self.half_size[0]) / self.pixel[1], 0.0, cols - 1.001)
+        row = np.clip((y + self.half_size[1]) / self.pixel[0], 0.0, rows - 1.001)
+        i, j = row.astype(int), col.astype(int)
+        s, t = row - i, col - j
+        south = (1.0 - t) * self.heights[i, j] + t * self.heights[i, j + 1]
+        north = (1.0 - t) * self.heights[i + 1, j] + t * self.heights[i + 1, j + 1]
+        return (1.0 - s) * south + s * north
+
+
+def crop(surface: Surface, window: tuple[int, int, int, int], margin: float) -> Ground:
+    """The ground of a window of pixels and a margin around it.
+
+    Missing heights are the nearest known; beyond the terrain's edge, the edge goes on.
+
+    Args:
+        surface: The terrain.
+        window: First row, end row, first col, end col.
+        margin: m.
+    """
+    (height, width), (rows, cols) = surface.pixel, surface.ground.shape
+    more = [math.ceil(margin / size) for size in surface.pixel]
+    row = np.arange(window[0] - more[0], window[1] + more[0])
+    col = np.arange(window[2] - more[1], window[3] + more[1])
+    cut = np.ix_(np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1))
+    heights = filled(surface.ground[cut])[::-1]
+    x = surface.origin[0] + 0.5 * float(col[0] + col[-1]) * width
+    y = surface.origin[1] - 0.5 * float(row[0] + row[-1]) * height
+    return Ground(heights - heights.min(), surface.pixel, (x, y))
+
+
+def grip_of(robot: Robot) -> float:
+    """Friction coefficient with which a robot climbs its `max_slope`, and a little more."""
+    return math.tan(min(robot.max_slope + GRIP_MARGIN, math.radians(80.0)))
+
+
+def center_of_mass(robot: Robot) -> float:
+    """Height above ground, m, at which a robot tips over a little beyond its `max_slope`."""
+    angle = min(robot.max_slope + TIP_MARGIN, math.radians(85.0))
+    return min(_HIGHEST, max(_LOWEST, 0.5 * TRACK / math.tan(angle)))
+
+
+class Physics:
+    """Robots on a ground, driven by the speeds of their left and right wheels.
+
+    Poses are x, y (CRS metres) and heading (rad from east, anticlockwise).
+    """
+
+    def __init__(
+        self, ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step: float
+    ) -> None:
+        """Build the model.
+
+        Args:
+            ground: Where.
+            robots: Who; how steep they stand decides where their centre of mass is.
+            grip: Friction coefficient of each robot's wheels.
+            step: Physics step, s.
+
+        Raises:
+            TrustboError: MuJoCo is not installed.
+        """
+        self._mujoco, self._ground, self._step = require_mujoco(), ground, step
+        self.model = self._mujoco.MjModel.from_xml_string(_model(ground, robots, grip, step))
+        self.model.hfield_data[:] = (ground.heights / _relief(ground)).ravel()
+        self.data = self._mujoco.MjData(self.model)
+        self._bodies = [self.model.body(f"robot{i}").id for i in range(len(robots))]
+        # Views of what MuJoCo works on, one row per robot.
+        self._qpos = self.data.qpos.reshape(len(robots), -1)
+        self._qvel = self.data.qvel.reshape(len(robots), -1)
+        self._brake = self.model.dof_frictionloss.reshape(len(robots), -1)[:, 7::2]
+
+    def place(self, poses: np.ndarray) -> None:
+        """Put the robots on the ground, parallel to it, and wait until they are at rest.
+
+        Args:
+            poses: Shape (robot, 3); robots that would stand in each other are moved apart.
+        """
+        local = poses - [*self._ground.center, 0.0]
+        local[:, :2] = _spread(local[:, :2])
+        for qpos, (x, y, heading) in zip(self._qpos, local, strict=True):
+            qpos[:7] = self._standing(x, y, heading)
+        self.command(np.zeros((len(poses), 2)))
+        for _ in range(round(SETTLING / 0.1)):
+            self.advance(round(0.1 / self._step))
+            if np.abs(self._qvel[:, :6]).max() < 0.02:
+                break
+
+    def command(self, speeds: np.ndarray) -> None:
+        """Set speeds of the left and right wheels, (robot, 2), m/s; (0, 0) is the parking brake."""
+        self.data.ctrl[:] = np.tile(speeds, 2).ravel() / WHEEL_RADIUS
+        parked = (speeds == 0.0).all(1)
+        self._brake[:] = np.where(parked, TORQUE, 0.0)[:, None]
+
+    def advance(self, n_steps: int) -> None:
+        """Let so many physics steps pass."""
+        self._mujoco.mj_step(self.model, self.data, n_steps)
+
+    @property
+    def poses(self) -> np.ndarray:
+        """Shape (robot, 3)."""
+        ahead = self._axes[0]
+        heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+        return np.column_stack([self._qpos[:, :2] + self._ground.center, heading])
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Speed ahead, m/s, and yaw rate, rad/s, of the bodies, shape (robot, 2)."""
+        ahead = (self._qvel[:, :3] * self._axes[0]).sum(1)
+        return np.column_stack([ahead, self._qvel[:, 5]])
+
+    @property
+    def speed(self) -> np.ndarray:
+        """Speed of the bodies whichever way they go, shape (robot,), m/s."""
+        return np.linalg.norm(self._qvel[:, :3], axis=1)
+
+    @property
+    def up(self) -> np.ndarray:
+        """Unit vectors out of the robots' roofs, shape (robot, 3)."""
+        return self._axes[1]
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all motion is still in numbers."""
+        return bool(np.isfinite(self._qpos).all() and np.isfinite(self._qvel).all())
+
+    @property
+    def off_ground(self) -> np.ndarray:
+        """Whether each robot has left the ground's crop, shape (robot,)."""
+        inside = (np.abs(self._qpos[:, :2]) < self._ground.half_size).all(1)
+        return ~inside | (self._qpos[:, 2] < -1.0)
+
+    @property
+    def touching(self) -> np.ndarray:
+        """Whether each robot touches another one, shape (robot,)."""
+        bodies = self.model.body_rootid[self.model.geom_bodyid[self.data.contact.geom]]
+        return np.isin(self._bodies, bodies[(bodies > 0).all(1)])
+
+    @property
+    def _axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Forward and upward axes of the bodies, each (robot, 3), from their quaternions."""
+        w, x, y, z = self._qpos[:, 3:7].T
+        ahead = (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y))
+        up = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
+        return np.column_stack(ahead), np.column_stack(up)
+
+    def _standing(self, x: float, y: float, heading: float) -> np.ndarray:
+        """Position and quaternion of a robot whose wheels touch the ground, shape (7,)."""
+        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+        wheels = _WHEELS @ turn.T
+        z = self._ground.height(x + wheels[:, 0], y + wheels[:, 1])
+        # The plane closest to the ground under the wheels, raised until it is above all four.
+        slope = np.linalg.lstsq(wheels, z - z.mean(), rcond=None)[0]
+        base = float((z - wheels @ slope).max())
+        up = np.array([*-slope, 1.0]) / np.sqrt(1.0 + slope @ slope)
+        ahead = np.array([*turn[:, 0], slope @ turn[:, 0]])
+        ahead /= np.linalg.norm(ahead)
+        rotation, quaternion = np.column_stack([ahead, np.cross(up, ahead), up]), np.empty(4)
+        self._mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+        return np.array([x, y, base + (WHEEL_RADIUS + 0.005) / up[2], *quaternion])
+
+
+def wheel_speeds(speed: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
+    """Speeds of the left and right wheels, (robot, 2), m/s, for a speed and a yaw rate."""
+    aside = 0.5 * _YAW_TRACK * yaw_rate
+    return np.column_stack([speed - aside, speed + aside])
+
+
+def require_mujoco() -> ModuleType:
+    """The MuJoCo package.
+
+    Raises:
+        TrustboError: It is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        raise TrustboError('MujocoBackend needs MuJoCo: pip install "trustbo[mujoco]".') from None
+    return mujoco
+
+
+def _spread(xy: np.ndarray) -> np.ndarray:
+    """Positions (robot, 2) of which those too close have been pushed apart."""
+    xy, turn = xy.copy(), 2.0 * np.pi * np.arange(len(xy)) / len(xy)
+    for _ in range(100):
+        gap = xy[:, None] - xy
+        distance = np.linalg.norm(gap, axis=2) + APART * np.eye(len(xy))
+        if (distance >= APART - 1e-3).all():
+            break
+        # Those on one spot leave it in different directions.
+        xy += (
+            0.01 * (distance.min(1) < 1e-3)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
+        )
+        push = np.maximum(0.0, APART - distance) / np.maximum(distance, 1e-3)
+        xy += 0.5 * (push[..., None] * gap).sum(1)
+    return xy
+
+
+def _relief(ground: Ground) -> float:
+    """Height of the heightfield, m; MuJoCo wants one above 0."""
+    return max(float(ground.heights.max()), 1e-3)
+
+
+def _model(ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step: float) -> str:
+    """The model in MJCF, MuJoCo's XML."""
+    (rows, cols), (x, y) = ground.heights.shape, ground.half_size
+    bodies = "".join(_body(i, r, g) for i, (r, g) in enumerate(zip(robots, grip, strict=True)))
+    motors = "".join(
+        f'<velocity joint="axle{i}_{k}" kv="60" forcerange="{-TORQUE} {TORQUE}"/>'
+        for i in range(len(robots))
+        for k in range(len(_WHEELS))
+    )
+    return f"""<mujoco>
+    <option timestep="{step}" integrator="implicitfast" cone="elliptic" impratio="10">
+      <flag autoreset="disable"/>
+    </option>
+    <asset>
+      <hfield name="ground" nrow="{rows}" ncol="{cols}" size="{x} {y} {_relief(ground)} 5"/>
+    </asset>
+    <worldbody><geom type="hfield" hfield="ground" friction="0.01"/>{bodies}</worldbody>
+    <actuator>{motors}</actuator>
+    </mujoco>"""
+
+
+def _body(i: int, robot: Robot, grip: float) -> str:
+    """One vehicle; its origin is on the axles' plane, between the wheels."""
+    length, width, height = _BODY
+    # Where the hull's mass must be for that of hull and wheels to be where it is wanted.
+    raised = (center_of_mass(robot) - WHEEL_RADIUS) * MASS / _HULL
+    inertia = [_HULL / 12.0 * (a * a + b * b)
+               for a, b in ((width, height), (length, height), (length, width))]  # fmt: skip
+    # The springs are at rest under the hull's weight.
+    sag = -0.25 * _HULL * 9.81 / STIFFNESS
+    wheels = "".join(
+        f'<body pos="{x} {y} 0"><joint type="slide" axis="0 0 1" range="-0.08 0.08" limited="true" '
+        f'springref="{sag}" stiffness="{STIFFNESS}" damping="{DAMPING}"/>'
+        f'<joint name="axle{i}_{k}" axis="0 1 0" damping="0.05" armature="0.1" '
+        f'solimpfriction="0.999 0.999 0.001"/>'
+        f'<geom type="ellipsoid" size="{WHEEL_RADIUS} {0.5 * WHEEL_WIDTH} {WHEEL_RADIUS}" '
+        f'mass="{WHEEL_MASS}" friction="{grip}"/></body>'
+        for k, (x, y) in enumerate(_WHEELS)
+    )
+    return f"""<body name="robot{i}"><freejoint/>
+      <inertial pos="0 0 {raised}" mass="{_HULL}" diaginertia="{" ".join(map(str, inertia))}"/>
+      <geom type="box" size="{0.5 * length} {0.5 * width} {0.5 * height}"
+            pos="0 0 {_CLEARANCE - WHEEL_RADIUS + 0.5 * height}" friction="0.4" priority="1"/>
+      {wheels}</body>"""
