@@ -33,7 +33,8 @@ def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     with ThreadPoolExecutor(n_cores()) as pool:
         for item in items:
             pending.append(pool.submit(alone, item))
-            if len(pending) > n_cores():
+            del item
+            if len(pending) >= n_cores():
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()

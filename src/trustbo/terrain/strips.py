@@ -36,7 +36,7 @@ def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
     """
     n_rows, n_cols = terrain["dem"].shape
     around = _halo_rows(terrain, halo)
-    step = max(_PIXELS // n_cols, 2 * around if around < n_rows else n_rows, 1)
+    step = max(_PIXELS // n_cols, around // 2, 1)
     for first in range(0, n_rows, step):
         yield _strip(terrain, first, min(first + step, n_rows), around)
 
