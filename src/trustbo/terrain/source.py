@@ -31,6 +31,8 @@ type RasterLike = str | PathLike[str] | DatasetReader | WarpedVRT | xr.DataArray
 
 # A GDAL dataset serves one thread at a time.
 GDAL_LOCK = threading.Lock()
+# Blocks that GDAL keeps, bytes; by default a twentieth of the machine's memory. A strip needs few.
+CACHE = 64_000_000
 _opened: weakref.WeakSet[DatasetReader] = weakref.WeakSet()
 
 
@@ -163,7 +165,7 @@ def _from_dataset(
 
     def read(rows: slice, cols: slice) -> np.ndarray:
         window = Window.from_slices(rows, cols)
-        with GDAL_LOCK:
+        with GDAL_LOCK, rasterio.Env(GDAL_CACHEMAX=CACHE):
             stored = dataset.read(1, window=window)
             missing = dataset.read_masks(1, window=window) == 0 if masked else None
         return decode(stored, missing, rows.start, cols.start)
