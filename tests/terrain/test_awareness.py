@@ -8,15 +8,19 @@ import xarray as xr
 
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import (
+    TRAVERSABILITY,
+    Grid,
     PixelFeature,
     Workspace,
     canopy_cover,
     exposure,
+    pixel_features,
     read_terrain,
     slope,
     strips,
     synthetic_terrain,
 )
+from trustbo.terrain.awareness import cell_maps, ingredients
 
 
 @pytest.fixture(scope="module")
@@ -166,3 +170,16 @@ def test_pixel_maps_are_those_of_the_terrain(terrain):
     assert set(workspace.pixels) == {"traversability", "visibility", "passable"}
     xr.testing.assert_equal(workspace.pixels["y"], terrain["y"])
     assert workspace.pixels["visibility"].isnull().sum() == 40
+
+
+def test_with_the_same_composites_a_larger_raster_s_way_gives_the_same(terrain, thin):
+    """Feature by feature in one place, the slope of `passable` used again: pixel by pixel equal."""
+    features = ingredients({"traversability": TRAVERSABILITY, "cover": ["canopy_cover", "tri"]})
+    grid = Grid.over(terrain, (4, 3))
+    strip_by_strip = cell_maps(terrain, grid, features, max_slope=0.3)
+    composites = strip_by_strip.composites
+    for name, parts in features.items():
+        whole = composites[name].transform(pixel_features(terrain, parts))
+        np.testing.assert_allclose(strip_by_strip.pixels[name], whole, rtol=0, atol=1e-9)
+    steep = slope(terrain).values <= 0.3
+    np.testing.assert_array_equal(strip_by_strip.pixels["passable"], steep)

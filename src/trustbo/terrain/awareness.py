@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.errors import TerrainError, TrustboError
+from trustbo.terrain import stencil
 from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
 from trustbo.terrain.grid import CellMeans, CellQuantiles, Grid, Sums
 from trustbo.terrain.parallel import in_order
@@ -20,7 +21,7 @@ Ingredients = PixelFeature | Mapping[str, PixelFeature]
 """Of one awareness feature: a pixel feature in [0, 1] as it is, or those of a composite."""
 
 
-SAMPLE = 1 << 16
+SAMPLE = 1 << 15
 """Pixels that a composite of a larger raster than `MAX_PIXELS` is fitted on."""
 
 
@@ -193,18 +194,26 @@ class _Memory:
 
     def passable(self, strip: Strip, max_slope: float) -> np.ndarray:
         """Whether the strip's pixels are not too steep; likewise."""
-        room = partial(self._rooms, "part")
+        room = partial(self._rooms, "slope")
         return FEATURES["slope"].of_rows(strip.window, strip.core, room) <= max_slope
 
 
 class _OneByOne(Mapping[str, np.ndarray]):
-    """Features of a strip, computed where they are asked for, in the place of the one before."""
+    """Features of a strip, computed where they are asked for, in the place of the one before.
+
+    Slope is there already: `passable` came first.
+    """
 
     def __init__(self, strip: Strip, parts: Mapping[str, PixelFeature], rooms: _Rooms) -> None:
-        self._strip, self._parts, self._room = strip, parts, partial(rooms, "part")
+        self._strip, self._parts, self._rooms = strip, parts, rooms
 
     def __getitem__(self, name: str) -> np.ndarray:
-        values = self._parts[name].of_rows(self._strip.window, self._strip.core, self._room)
+        part = self._parts[name]
+        if part.kernel is stencil.slope:
+            dem = self._strip.window.variables["dem"].values[self._strip.core]
+            return self._rooms("slope", dem.shape, dem.dtype)
+        room = partial(self._rooms, "part")
+        values = part.of_rows(self._strip.window, self._strip.core, room)
         return np.ascontiguousarray(values)
 
     def __iter__(self) -> Iterator[str]:
