@@ -132,17 +132,19 @@ def draw_hillshade(ax: Axes, workspace: Workspace, heights: str = "dem") -> None
     ground = np.where(known, dem, np.nanmean(dem))
     light = LightSource(azdeg=315, altdeg=45).hillshade(ground, dx=width * step, dy=height * step)
     shadow = np.zeros((*dem.shape, 4))
-    shadow[..., 3] = np.where(known, SHADOW * (1.0 - light), 0.0)
+    # Level ground, lit at 45 degrees, keeps its colour: that of the colour bar.
+    level = np.sin(np.deg2rad(45.0))
+    shadow[..., 3] = np.where(known, SHADOW * np.clip(1.0 - light / level, 0.0, 1.0), 0.0)
     ax.imshow(shadow, extent=extent_of(workspace.grid), interpolation="bilinear")
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """A bar of a round number of metres in the lower left corner."""
+    """A bar of a round number of metres in the lower right corner."""
     width = grid.shape[1] * grid.cell_width
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
     outline = [patheffects.Stroke(linewidth=4.0, foreground="white"), patheffects.Normal()]
-    x, y = 0.04, 0.045  # of the axes
+    x, y = 0.96 - length / width, 0.045  # of the axes
     ax.plot(
         [x, x + length / width],
         [y, y],
