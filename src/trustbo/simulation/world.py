@@ -54,6 +54,7 @@ class Worlds:
         self._ease = workspace.pixels["traversability"]
         self._threats, self._degradations = tuple(threats), tuple(degradations)
         self._known: dict[object, World] = {}
+        self._grounds: dict[object, tuple[Surface, Positions, Routes]] = {}
 
     def at(self, mission: int) -> World:
         """As it is for a mission, counted from 0."""
@@ -65,17 +66,20 @@ class Worlds:
         return self._known[key]
 
     def _make(self, threats: Sequence[Threat], worse: Sequence[Degradation]) -> World:
-        surface, team = self.surface, self._workspace.team
-        closed = [threat.mask(surface) for threat in threats if threat.kind == "forbid"]
-        if closed:
-            surface = surface._replace(passable=surface.passable & ~np.any(closed, axis=0))
+        team = self._workspace.team
         detection = np.array([robot.detection for robot in team.robots])
         for degradation in worse:
             detection[team.names.index(degradation.robot)] *= degradation.detection
-        return World(
-            surface,
-            Positions(self._workspace, surface, self._sight, self._ease, self._radius),
-            Routes(surface),
-            tuple((t.mask(surface), t.strength) for t in threats if t.kind == "jam"),
-            detection,
-        )
+        jams = tuple((t.mask(self.surface), t.strength) for t in threats if t.kind == "jam")
+        return World(*self._ground([t for t in threats if t.kind == "forbid"]), jams, detection)
+
+    def _ground(self, closing: Sequence[Threat]) -> tuple[Surface, Positions, Routes]:
+        """Where robots can go; jams and worse lidars leave it as it is, and its routes known."""
+        key = tuple(map(id, closing))
+        if key not in self._grounds:
+            surface = self.surface
+            for threat in closing:
+                surface = surface._replace(passable=surface.passable & ~threat.mask(surface))
+            positions = Positions(self._workspace, surface, self._sight, self._ease, self._radius)
+            self._grounds[key] = surface, positions, Routes(surface)
+        return self._grounds[key]

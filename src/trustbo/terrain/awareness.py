@@ -77,8 +77,8 @@ def cell_maps(
     """Awareness and passability of each cell.
 
     A composite is fitted on all pixels of a raster of up to a million, on rows spread evenly over a
-    larger one; then
-    strip by strip each pixel's index is added to its cell, and no map of a feature is ever whole.
+    larger one; then strip by strip each pixel's index is added to its cell, and no map of a feature
+    is ever whole.
 
     Args:
         terrain: In memory, or lazily read.
