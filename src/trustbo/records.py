@@ -10,6 +10,9 @@ import xarray as xr
 from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
 
+STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
+"""Of a robot at a tick: speed over that on level ground; rad; rad; m; share of clear beams."""
+
 
 def read_tree(path: Path) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
@@ -24,7 +27,11 @@ def read_tree(path: Path) -> xr.DataTree:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Missions as arrays padded with NaN, and every tick of theirs in one long table."""
+    """Missions as arrays padded with NaN, and every tick of theirs in one long table.
+
+    Raises:
+        TrustboError: States that are not those of the ticks.
+    """
     n_steps = max(len(mission.path) for mission in missions)
     shape = (len(missions), n_steps - 1)
     robots, features = missions[0].robots, missions[0].features
@@ -80,6 +87,7 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
                     ticks["pose"].values[mine] if mine.any() else None,
                     ticks["contact"].values[mine].astype(bool) if mine.any() else None,
                     row["exposure"].values,
+                    _states_of(ticks, mine),
                 )
             )
         missions.append(Mission(path, tuple(bounds), str(one["status"].values), features, robots))
@@ -87,7 +95,7 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
 
 
 def _ticks(missions: Sequence[Mission]) -> xr.Dataset:
-    """Poses and contacts of all ticks that were recorded, one after the other."""
+    """Poses, contacts and states of all ticks that were recorded, one after the other."""
     recorded: list[tuple[int, int, Any]] = [
         (j, k, bound)
         for j, mission in enumerate(missions)
@@ -99,12 +107,38 @@ def _ticks(missions: Sequence[Mission]) -> xr.Dataset:
     # An empty table first: there may be no ticks at all.
     poses = [np.empty((0, 1 + n_robots, 3)), *(bound.poses for _, _, bound in recorded)]
     contacts = [np.empty((0, n_robots), bool), *(bound.contact for _, _, bound in recorded)]
+    states = {}
+    if any(bound.states is not None for _, _, bound in recorded):
+        values = [_states(f"mission {j}, bound {k + 1}", bound) for j, k, bound in recorded]
+        states["states"] = (("tick", "robot", "state"), np.concatenate(values))
     return xr.Dataset(
         {
             "mission": ("tick", np.repeat([j for j, _, _ in recorded], lengths).astype(int)),
             "bound": ("tick", np.repeat([k for _, k, _ in recorded], lengths).astype(int)),
             "pose": (("tick", "member", "component"), np.concatenate(poses)),
             "contact": (("tick", "robot"), np.concatenate(contacts)),
+            **states,
         },
-        {"component": ["x", "y", "heading"]},
+        {"component": ["x", "y", "heading"], **({"state": list(STATES)} if states else {})},
     )
+
+
+def _states(where: str, bound: Any) -> np.ndarray:
+    """States of a bound's ticks, NaN where not recorded."""
+    shape = (*np.shape(bound.contact), len(STATES))
+    if bound.states is None:
+        return np.full(shape, np.nan)
+    if np.shape(bound.states) != shape:
+        raise TrustboError(
+            f"{where}: states must be {shape}, (tick, robot, state), see simulation.STATES; got "
+            f"{np.shape(bound.states)}."
+        )
+    return bound.states
+
+
+def _states_of(ticks: xr.Dataset, mine: np.ndarray) -> np.ndarray | None:
+    """The states of some ticks, (tick, robot, state); None where not recorded."""
+    if "states" not in ticks or not mine.any():
+        return None
+    states = ticks["states"].values[mine]
+    return None if np.isnan(states).all() else states

@@ -1,6 +1,7 @@
 """ROS bags: what is written comes back, and what cannot be kept or read is refused."""
 
 import sys
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ import xarray as xr
 import trustbo as tb
 from trustbo.data import Bound, Mission
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.simulation import KinematicSimulator
+from trustbo.simulation import STATES, KinematicSimulator
 from trustbo.simulation.bags import Topics, read_bag, write_bag
 from trustbo.simulation.replay import ReplayBackend
 
@@ -29,7 +30,7 @@ def workspace():
 @pytest.fixture(scope="module")
 def simulated(workspace):
     """Two missions that reached the goal, and one that ran out of time on its way."""
-    simulator = KinematicSimulator(workspace)
+    simulator = KinematicSimulator(workspace, record_states=True)
     hasty = KinematicSimulator(workspace, bound_timeout=20.0)
     return [*(simulator.run(PATH, seed=seed) for seed in range(2)), hasty.run(PATH, seed=2)]
 
@@ -65,6 +66,7 @@ def assert_same(got, expected):
                 np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
             assert a.contact.dtype == bool
             np.testing.assert_array_equal(a.poses[..., :2], b.poses[..., :2])
+            np.testing.assert_array_equal(a.states, b.states)
             # A quaternion keeps a heading but for the rounding of a sine and an arctangent.
             np.testing.assert_allclose(a.poses[..., 2], b.poses[..., 2], rtol=0.0, atol=1e-13)
 
@@ -134,6 +136,19 @@ def test_topics_may_have_other_names(tmp_path):
         read_bag(tmp_path / "log")
     with pytest.raises(TrustboError, match=r"Topics\.contact must name the robot's place, e\.g\."):
         Topics(contact="/contact")
+
+
+def test_states_that_some_bounds_lack_stay_unknown(tmp_path):
+    states = np.random.default_rng(1).normal(size=(5, 2, len(STATES)))
+    bounds = [replace(b, states=s) for b, s in zip(mission().bounds, (None, states), strict=True)]
+    one = replace(mission(), bounds=tuple(bounds))
+    write_bag([one], tmp_path / "log")
+    back = read_bag(tmp_path / "log")[0]
+    assert back.bounds[0].states is None
+    np.testing.assert_array_equal(back.bounds[1].states, states)
+    short = replace(one, bounds=(bounds[0], replace(bounds[1], states=states[:3])))
+    with pytest.raises(TrustboError, match=r"bound 2 has states .*: \(3, 2, 5\)"):
+        write_bag([short], tmp_path / "other")
 
 
 def test_without_awareness_that_of_the_map_is_learned_from(workspace, simulated, tmp_path):

@@ -1,5 +1,7 @@
 """Replayed missions: each once, on the path asked for, with what they measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -8,6 +10,7 @@ from simulators import ModelSimulator
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.records import missions_from_tree, missions_to_tree
 from trustbo.simulation.replay import ReplayBackend
 from trustbo.simulation.tables import write_table
 
@@ -142,12 +145,16 @@ def test_a_replayed_result_gives_its_posterior_again(workspace, recorded, tmp_pa
         assert_same_result(run(workspace, simulator=backend), recorded)
 
 
-def test_a_saved_mission_comes_back_with_its_ticks(tmp_path):
+@pytest.mark.parametrize("with_states", [False, True])
+def test_a_saved_mission_comes_back_with_its_ticks(with_states, tmp_path):
     terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3))
+    simulator = tb.simulation.KinematicSimulator(workspace, record_states=with_states)
     result = tb.iterate(
-        tb.Workspace.from_terrain(terrain, (3, 3)),
+        workspace,
         (2, 0),
         (0, 2),
+        simulator=simulator,
         n_iterations=1,
         sampler="exact",
         progress=False,
@@ -158,6 +165,8 @@ def test_a_saved_mission_comes_back_with_its_ticks(tmp_path):
         assert (a.cell, a.t0, a.status) == (b.cell, b.t0, b.status)
         for name in ("poses", "contact", "awareness", "contact_rate", "duration", "exposure"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        np.testing.assert_array_equal(a.states, b.states)
+        assert (a.states is not None) == with_states
 
 
 def test_bad_input_is_named(tmp_path):
@@ -177,3 +186,21 @@ def test_bad_input_is_named(tmp_path):
     for name in ("other.nc", "text.nc"):
         with pytest.raises(TrustboError, match=rf"{name}' holds no missions"):
             ReplayBackend.from_netcdf(tmp_path / name)
+
+
+def test_states_of_some_bounds_only_come_back_for_these():
+    simulator = {}
+    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3))
+    for keep in (True, False):
+        simulator[keep] = tb.simulation.KinematicSimulator(workspace, record_states=keep)
+    missions = [simulator[keep].run([(2, 0), (1, 1)], seed=0) for keep in (True, False)]
+    tree = missions_to_tree(missions)
+    assert [str(name) for name in tree["ticks"]["state"].values] == list(tb.simulation.STATES)
+    with_states, without = missions_from_tree(tree)
+    np.testing.assert_array_equal(with_states.bounds[0].states, missions[0].bounds[0].states)
+    assert without.bounds[0].states is None
+    assert "states" not in missions_to_tree(missions[1:])["ticks"]
+    short = replace(missions[0].bounds[0], states=missions[0].bounds[0].states[:3])
+    with pytest.raises(TrustboError, match=r"mission 0, bound 1: states must be .*\(3, 3, 5\)"):
+        missions_to_tree([replace(missions[0], bounds=(short,))])

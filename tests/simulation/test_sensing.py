@@ -8,6 +8,7 @@ from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
 from trustbo.simulation import STATES, Degradation, KinematicSimulator, Threat
 from trustbo.simulation.sensing import contact_of, new_tracks
+from trustbo.simulation.sight import Sight, chance
 from trustbo.terrain import CompositeIndex, Workspace, synthetic_terrain
 
 PATH = [(2, 0), (1, 1), (0, 2)]
@@ -176,6 +177,26 @@ def test_states_are_those_of_the_way(wooded):
     assert KinematicSimulator(wooded).run(PATH, seed=0).bounds[0].states is None
 
 
+@pytest.mark.parametrize("mode", ["bare", "wall", "transmittance"])
+def test_states_see_as_far_as_the_simulator_s_sight(wooded, mode):
+    """Shares of beams beside rays cast one by one, all around some pixels."""
+    reach, robot = 20.0, Robot(lidar_range=20.0)
+    workspace = Workspace.from_terrain(wooded.terrain, (3, 3), Team(robots=(robot,)))
+    simulator = KinematicSimulator(workspace, sight=mode)
+    lidar, surface = simulator._measure._lidar, simulator._surface
+    rows, cols = np.random.default_rng(0).integers(21, 90 - 21, (2, 40))
+    here = np.stack([surface.origin[0] + cols, surface.origin[1] - rows], axis=1).astype(float)
+    angle = 2.0 * np.pi / 12 * np.arange(12)
+    there = here[:, None] + reach * np.stack([np.cos(angle), -np.sin(angle)], axis=1)
+    ends = np.repeat(here, 12, axis=0), there.reshape(-1, 2)
+    cast = chance(surface, Sight(mode), *ends, np.array([1.0, 1.0, np.inf, 1.0]))
+    shares = lidar.visible_share[rows, cols]
+    if mode == "wall":  # which also tests the lines that a ray crosses the fewer of
+        assert np.abs(shares - cast.reshape(-1, 12).mean(1)).mean() < 0.02
+    else:
+        np.testing.assert_allclose(shares, cast.reshape(-1, 12).mean(1), atol=1e-4)
+
+
 @pytest.mark.filterwarnings("ignore:the first component of", "ignore:.*enters its composite")
 def test_measured_awareness_can_be_fused_with_the_robots_states(wooded):
     plain = KinematicSimulator(wooded)
@@ -186,6 +207,9 @@ def test_measured_awareness_can_be_fused_with_the_robots_states(wooded):
     np.testing.assert_array_equal(fused.contact_rate, mapped.contact_rate)
     assert ((fused.awareness >= 0.0) & (fused.awareness <= 1.0)).all()
     assert not np.allclose(fused.awareness, mapped.awareness)
+    # Missions that are measured together do not see each other's states.
+    batch = KinematicSimulator(wooded, realtime=indices).run_batch(PATH, [4, 0, 2])
+    np.testing.assert_array_equal(batch[1].awareness, fused.awareness)
     with pytest.raises(TrustboError, match="unknown awareness feature 'trust'"):
         KinematicSimulator(wooded, realtime={"trust": indices["visibility"]})
 

@@ -144,3 +144,11 @@ def test_range_and_field_of_view_limit_sight():
     tilted = flat._replace(gradient=np.stack([np.full((40, 40), -0.1), np.zeros((40, 40))]))
     glass = optics(Robot(vertical_fov=np.deg2rad(6.0)), Robot(target_height=3.0))
     assert chance(tilted, Sight("bare"), here, there, glass) == pytest.approx(0.0)
+
+
+def test_one_position_is_in_the_pixel_that_many_are_in():
+    surface = surface_of(np.zeros((40, 30)))._replace(pixel=(0.5, 2.0), origin=(3.0, 7.0))
+    x, y = np.random.default_rng(0).uniform(-30.0, 80.0, (2, 500)).round(1)  # halves too
+    rows, cols = surface.nearest(x, y)
+    one_by_one = [surface.pixel_at(*p) for p in zip(x.tolist(), y.tolist(), strict=True)]
+    assert one_by_one == list(zip(rows.tolist(), cols.tolist(), strict=True))

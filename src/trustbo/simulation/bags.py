@@ -26,21 +26,22 @@ topic                type                           meaning, and when it is publ
                      geometry_msgs/PoseStamped,     PoseStamped: a mission knows no speeds.
                      PoseWithCovarianceStamped,
                      optional
+/<robot>/state       as of awareness, optional      `Bound.states` at a tick; the label names
+                                                    entries of `simulation.STATES`.
 ==================== ============================== ===============================================
 
 All times are those at which messages were recorded, whole nanoseconds. A bound lasts from its
 marker to its status, else to the last look before the next marker; a message stamped as the next
 marker belongs to the bound before. The contact rate is the share of a robot's looks with contact,
 the exposure their number. If robots looked unequally often, `Bound.contact` has the ticks of the
-one that looked most. Poses are those last known at each tick, x and y as recorded: in CRS metres if
-their frame is; headings go on without jumps. Awareness that nobody published is NaN, which
-`Campaign.tell` takes from the map.
+one that looked most. Poses and states are those last known at each tick, x and y as recorded: in
+CRS metres if their frame is; headings go on without jumps. Awareness that nobody published is NaN,
+which `Campaign.tell` takes from the map.
 """
 
 import json
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
@@ -48,6 +49,7 @@ import numpy as np
 
 from trustbo.data import FEATURES, Mission, default_features
 from trustbo.errors import TrustboError, require_choice
+from trustbo.records import STATES
 from trustbo.simulation.bagfile import STORAGES, Record, opened, write_messages
 from trustbo.simulation.messages import (
     AWARENESS_TYPES,
@@ -60,48 +62,13 @@ from trustbo.simulation.messages import (
     STATUS_TYPES,
     TEXT,
     Messages,
+    Topics,
 )
 from trustbo.simulation.recording import Marker, Recording, Series
 from trustbo.stacking import require_same_team
 from trustbo.terrain import Workspace
 
 _NS = 1_000_000_000  # in a second
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Names of topics; `{robot}` stands for the name of a robot, or of the lead.
-
-    Attributes:
-        bound: Where bounds begin.
-        status: How they ended.
-        contact: Contact of each robot.
-        awareness: Awareness of each robot.
-        pose: Pose of each robot and the lead.
-        lead: Name of the lead.
-
-    Raises:
-        TrustboError: One that is each robot's own lacks `{robot}`.
-    """
-
-    bound: str = "/mission/bound"
-    status: str = "/mission/status"
-    contact: str = "/{robot}/contact"
-    awareness: str = "/{robot}/awareness"
-    pose: str = "/{robot}/odom"
-    lead: str = "lead"
-
-    def __post_init__(self) -> None:
-        for name in ("contact", "awareness", "pose"):
-            if getattr(self, name).count("{robot}") != 1:
-                raise TrustboError(
-                    f"Topics.{name} must name the robot's place, e.g. '/{{robot}}/{name}'; got "
-                    f"{getattr(self, name)!r}."
-                )
-
-    def of(self, kind: str, robots: Sequence[str]) -> list[str]:
-        """The topics of one kind, e.g. "contact", of some robots."""
-        return [getattr(self, kind).replace("{robot}", robot) for robot in robots]
 
 
 def read_bag(
@@ -141,7 +108,9 @@ def read_bag(
             bag.require(poses)
         else:
             poses = []
+        states = [topic for topic in names.of("state", robots) if topic in bag.types]
         read: dict[str, tuple[str, ...]] = {names.status: STATUS_TYPES}
+        read |= dict.fromkeys(states, AWARENESS_TYPES)
         read |= dict.fromkeys(contact, CONTACT_TYPES)
         read |= dict.fromkeys(awareness, AWARENESS_TYPES) | dict.fromkeys(poses, POSE_TYPES)
         series = bag.collect(read)
@@ -154,6 +123,7 @@ def read_bag(
         [series[topic] for topic in contact],
         [_by_feature(topic, series[topic], features) for topic in awareness],
         [series[topic] for topic in poses],
+        [_by_feature(topic, series[topic], STATES) for topic in states],
     )
     try:
         return recording.missions(features, robots)
@@ -171,8 +141,7 @@ def write_bag(
 ) -> None:
     """Write missions as a ROS bag that `read_bag` reads back; see this module for its topics.
 
-    What comes back is what was written, times to the nanosecond, headings up to whole turns; but
-    `Bound.states` are not kept.
+    What comes back is what was written, times to the nanosecond, headings up to whole turns.
 
     Args:
         missions: All with the same robots and features, and with a contact of every tick.
@@ -239,6 +208,8 @@ def _require_ticks(where: str, mission: Mission) -> None:
             what = "an exposure that is not the number of its ticks"
         elif not (bound.duration == bound.duration[0]).all():
             what = "no duration, or not one for all robots"
+        elif bound.states is not None and bound.states.shape != (*contact.shape, len(STATES)):
+            what = f"states that are not (tick, robot, state): {bound.states.shape}"
         elif bound.t0 < ended - 1e-6:
             what = f"a start at {bound.t0:g} s, before the last ends at {ended:g} s"
         else:
@@ -251,7 +222,9 @@ def _records(
     j: int, mission: Mission, start: int, names: Topics, make: Messages
 ) -> Iterator[Record]:
     """The messages of one mission that starts at a time in ns."""
-    contact, awareness = (names.of(kind, mission.robots) for kind in ("contact", "awareness"))
+    contact, awareness, states = (
+        names.of(kind, mission.robots) for kind in ("contact", "awareness", "state")
+    )
     poses = names.of("pose", (names.lead, *mission.robots))
     path = [[int(row), int(col)] for row, col in mission.path]
     plan = {"path": path, "robots": mission.robots, "features": mission.features}
@@ -265,12 +238,15 @@ def _records(
         yield Record(begin, names.bound, TEXT, make.text(json.dumps(marker)))
         looks = np.asarray(bound.contact)
         tracks = np.empty((len(looks), 0)) if bound.poses is None else bound.poses
-        for tick, (look, track) in enumerate(zip(looks, tracks, strict=True), start=1):
+        known = np.empty((len(looks), 0)) if bound.states is None else bound.states
+        for tick, (look, track, now) in enumerate(zip(looks, tracks, known, strict=True), start=1):
             time = begin + (end - begin) * tick // len(looks)
             for topic, flag in zip(contact, look, strict=True):
                 yield Record(time, topic, FLAG, make.flag(flag))
             for topic, pose in zip(poses if len(track) else (), track, strict=True):
                 yield Record(time, topic, POSE, make.pose(time, pose))
+            for topic, state in zip(states if len(now) else (), now, strict=True):
+                yield Record(time, topic, NUMBERS, make.numbers(state, STATES))
         for topic, values in zip(awareness, bound.awareness, strict=True):
             yield Record(end, topic, NUMBERS, make.numbers(values, mission.features))
         yield Record(end, names.status, TEXT, make.text(bound.status))

@@ -39,6 +39,12 @@ class Drive(NamedTuple):
     status: str
     cells: tuple[Cell, Cell]
 
+    def closing(self, n_ticks: int) -> np.ndarray:
+        """In which of its first ticks T2 moves; if it has not yet, it measures where it stands."""
+        closing = ~self.lead_moves[:n_ticks]
+        closing[-1] |= not closing.any()
+        return closing
+
 
 def turns(bounding: str, k: int, is_last: bool) -> tuple[str, ...]:
     """Who moves in bound k, one after the other: the `"lead"`, `"t2"`."""

@@ -9,13 +9,13 @@ import xarray as xr
 
 from trustbo.data import Bound, Robot
 from trustbo.errors import require_choice
+from trustbo.records import STATES
 from trustbo.simulation.sight import Sight, Surface
 from trustbo.terrain import CompositeIndex, Workspace, openness, pixel_size
 
-STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
-"""Of a robot at a tick: speed over that on level ground; rad; rad; m; share of clear beams."""
-
 _PARTS, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
+_OPAQUE = 1e6
+"""Extinction of a canopy that lets nothing through, 1/m."""
 
 
 class Measure:
@@ -50,28 +50,31 @@ class Measure:
         assert pixels is not None  # noqa: S101  # `Worlds` has refused others
         self._maps = np.stack([pixels[name].values for name in self._names], axis=-1)
 
-    def __call__(self, poses: np.ndarray, states: np.ndarray | None) -> np.ndarray:
-        """Mean awareness along the way, shape (robot, feature).
+    def __call__(self, ways: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> np.ndarray:
+        """Mean awareness along some ways, shape (way, robot, feature).
 
         Args:
-            poses: Shape (tick, robot, 3).
-            states: Shape (tick, robot, state), for real-time indices; None without.
+            ways: Poses of each, shape (tick, robot, 3).
+            states: Of each, shape (tick, robot, state), for real-time indices; empty without.
         """
+        poses = np.concatenate(ways)
+        starts = np.cumsum([0, *(len(way) for way in ways[:-1])])
         values = self._maps[self._surface.nearest(poses[..., 0], poses[..., 1])]
         for m, name in enumerate(self._names):
             index = self._realtime.get(name)
-            if index is not None and states is not None:
-                columns = {n: states[..., i].ravel() for i, n in enumerate(STATES)}
+            if index is not None and states:
+                known = np.concatenate(states)
+                columns = {n: known[..., i].ravel() for i, n in enumerate(STATES)}
                 columns["offline"] = values[..., m].ravel()
                 fused = index.of_columns({n: columns[n] for n in index.signs})
                 values[..., m] = fused.reshape(values.shape[:-1])
         # Once arrived, a robot waits for the others: those ticks say nothing about the way.
         moved = np.any(np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2]) != 0.0, axis=-1)
-        moved[0] = True
+        moved[starts] = True
         weight = moved[..., None] & np.isfinite(values)
-        total = np.where(weight, values, 0.0).sum(0)
+        total = np.add.reduceat(np.where(weight, values, 0.0), starts, axis=0)
         with np.errstate(invalid="ignore"):
-            return total / weight.sum(0)
+            return total / np.add.reduceat(weight, starts, axis=0, dtype=np.int64)
 
     def states(self, poses: np.ndarray) -> np.ndarray:
         """`STATES` of each robot at each tick, shape (tick, robot, state)."""
@@ -82,7 +85,7 @@ class Measure:
     def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
         """By feature, the map's value and the states of each robot on each bound, (sample)."""
         rows = [
-            np.concatenate([self(b.poses[:, 1:], None), b.states.mean(0)], axis=1)
+            np.concatenate([self([b.poses[:, 1:]], [])[0], b.states.mean(0)], axis=1)
             for b in bounds
             if b.poses is not None and b.states is not None
         ]
@@ -108,7 +111,8 @@ class _LidarMaps(NamedTuple):
     def of(cls, workspace: Workspace, surface: Surface, sight: Sight) -> Self:
         """Of a team's lidar, by rays all around.
 
-        The mean range of returns is the integral of the share of beams that get so far.
+        The mean range of returns is the integral of the share of beams that get so far. What
+        hinders sight hinders them: for "wall", a canopy that is opaque from the ground up.
         """
         terrain, team = workspace.terrain, workspace.team
         assert terrain is not None  # noqa: S101  # `Worlds` has refused others
@@ -117,6 +121,8 @@ class _LidarMaps(NamedTuple):
         ]
         reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
         eye, target = team.robots[0].sensor_height, team.lead.target_height
+        canopy = {"bare": (0.0, sight.crown_base), "wall": (_OPAQUE, 0.0)}
+        extinction, crown_base = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
         shares = [np.ones(surface.ground.shape)]
         for part in _PARTS:
             share = openness(
@@ -125,8 +131,8 @@ class _LidarMaps(NamedTuple):
                 eye=eye,
                 target=target,
                 n_rays=_N_RAYS,
-                extinction=sight.extinction,
-                crown_base=sight.crown_base,
+                extinction=extinction,
+                crown_base=crown_base,
             )
             shares.append(np.nan_to_num(share.values))
         return_range = np.asarray(reach * np.trapezoid(shares, [0.0, *_PARTS], axis=0))

@@ -1,8 +1,9 @@
-"""ROS messages of standard types: how trustbo writes and reads them."""
+"""ROS messages of standard types: their topics, and how trustbo writes and reads them."""
 
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,44 @@ STATUS_TYPES = (TEXT,)
 CONTACT_TYPES = (FLAG, "std_msgs/msg/Float32", "std_msgs/msg/Float64")
 AWARENESS_TYPES = (NUMBERS, "std_msgs/msg/Float32MultiArray")
 POSE_TYPES = ("nav_msgs/msg/Odometry", POSE, "geometry_msgs/msg/PoseWithCovarianceStamped")
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Names of topics; `{robot}` stands for the name of a robot, or of the lead.
+
+    Attributes:
+        bound: Where bounds begin.
+        status: How they ended.
+        contact: Contact of each robot.
+        awareness: Awareness of each robot.
+        pose: Pose of each robot and the lead.
+        state: State of each robot.
+        lead: Name of the lead.
+
+    Raises:
+        TrustboError: One that is each robot's own lacks `{robot}`.
+    """
+
+    bound: str = "/mission/bound"
+    status: str = "/mission/status"
+    contact: str = "/{robot}/contact"
+    awareness: str = "/{robot}/awareness"
+    pose: str = "/{robot}/odom"
+    lead: str = "lead"
+    state: str = "/{robot}/state"
+
+    def __post_init__(self) -> None:
+        for name in ("contact", "awareness", "pose", "state"):
+            if getattr(self, name).count("{robot}") != 1:
+                raise TrustboError(
+                    f"Topics.{name} must name the robot's place, e.g. '/{{robot}}/{name}'; got "
+                    f"{getattr(self, name)!r}."
+                )
+
+    def of(self, kind: str, robots: Sequence[str]) -> list[str]:
+        """The topics of one kind, e.g. "contact", of some robots."""
+        return [getattr(self, kind).replace("{robot}", robot) for robot in robots]
 
 
 class Messages:

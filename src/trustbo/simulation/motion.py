@@ -51,7 +51,7 @@ class Routes:
         Returns:
             Positions from start to goal, shape (point, 2), CRS metres; None if there is no way.
         """
-        ends = [tuple(int(i) for i in self._surface.nearest(*p)) for p in (start, goal)]
+        ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
         key = (*ends, window, robot.max_slope)
         if key not in self._known:
             self._known[key] = self._search(ends[0], ends[1], window, robot.max_slope)
@@ -115,7 +115,6 @@ def drive(
     Returns:
         Poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
-    slip = np.exp(0.05 * rng.standard_normal(max_ticks))
     poses, code = _drive(
         surface.gradient,
         surface.pixel,
@@ -126,14 +125,22 @@ def drive(
         tick,
         # Short enough that no step leaps over the goal.
         max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED))),
-        slip,
+        rng.standard_normal(max_ticks),
     )
     return poses, _STATUS[code]
 
 
 @_compiled
-def _squared(point, x, y):
-    return (point[0] - x) ** 2 + (point[1] - y) ** 2
+def _squared(route, i, x, y):
+    return (route[i, 0] - x) ** 2 + (route[i, 1] - y) ** 2
+
+
+@_compiled
+def _within_a_turn(angle):
+    """The same angle in [-pi, pi); a remainder takes long, and is rarely needed."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @_compiled
@@ -197,11 +204,12 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
     poses = np.empty((len(slip), 3))
     dt, steepest = tick / n_steps, math.tan(max_slope)
     for k in range(len(slip)):
+        pace = speed * math.exp(0.05 * slip[k])
         for _ in range(n_steps):
-            while aim < len(route) - 1 and _squared(route[aim], x, y) < LOOKAHEAD**2:
+            while aim < len(route) - 1 and _squared(route, aim, x, y) < LOOKAHEAD**2:
                 aim += 1
             dx, dy = route[aim, 0] - x, route[aim, 1] - y
-            error = (math.atan2(dy, dx) - heading + math.pi) % (2.0 * math.pi) - math.pi
+            error = _within_a_turn(math.atan2(dy, dx) - heading)
             turn = min(turn_rate * dt, max(-turn_rate * dt, error))
             heading += turn
             i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
@@ -214,11 +222,11 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
                 return poses[: k + 1], 2 if roll > steepest else 1
             # A skid-steer robot turns on the spot until it faces its way.
-            v = speed * slip[k] * _speed_share(math.atan(max(pitch, roll)), max_slope)
-            v *= max(0.0, math.cos(error - turn))
+            v = pace * _speed_share(math.atan(max(pitch, roll)), max_slope)
+            v *= 1.0 if error == turn else max(0.0, math.cos(error - turn))
             x += v * dt * ahead
             y += v * dt * left
-            if aim == len(route) - 1 and _squared(route[-1], x, y) < ARRIVED**2:
+            if aim == len(route) - 1 and _squared(route, aim, x, y) < ARRIVED**2:
                 poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
                 return poses[: k + 1], 0
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading

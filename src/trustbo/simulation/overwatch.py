@@ -13,8 +13,8 @@ from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive
 from trustbo.simulation.positions import SPACING
-from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, new_tracks
-from trustbo.simulation.sight import Sight, chance, optics
+from trustbo.simulation.sensing import Looks, contact_of, cut_at_lost_contact, new_tracks
+from trustbo.simulation.sight import Sight, chance
 from trustbo.simulation.world import Worlds
 from trustbo.terrain import CompositeIndex, Workspace
 
@@ -92,6 +92,8 @@ class KinematicSimulator:
         self._measure = Measure(
             workspace, self._worlds.surface, self.sight, self.tick, self.realtime
         )
+        team = workspace.team
+        self._watchers = team.robots, (team.lead,) * len(team.robots)
         self._state: State | None = None
         self._enter(0)
 
@@ -248,11 +250,42 @@ class KinematicSimulator:
             self._drive(state, k, cell, next_cell, rng)
             for state, rng in zip(states, rngs, strict=True)
         ]
-        chances = self._chances(drives)
-        return [
-            self._measured(state, cell, drive, chance, rng)
-            for state, drive, chance, rng in zip(states, drives, chances, rngs, strict=True)
+        looked = [
+            self._looked(state, drive, chances, rng)
+            for state, drive, chances, rng in zip(
+                states, drives, self._chances(drives), rngs, strict=True
+            )
         ]
+        ways = [
+            drive.poses[: len(contact)] for drive, (contact, _) in zip(drives, looked, strict=True)
+        ]
+        closing = [drive.closing(len(way)) for drive, way in zip(drives, ways, strict=True)]
+        moved = [self._measure.states(way[:, 1:]) if self._wants_states else None for way in ways]
+        awareness = self._measure(
+            [way[own, 1:] for way, own in zip(ways, closing, strict=True)],
+            [x[own] for x, own in zip(moved, closing, strict=True) if x is not None],
+        )
+        bounds = []
+        for state, done, way, look, x, z in zip(
+            states, drives, ways, looked, moved, awareness, strict=True
+        ):
+            contact, status = look
+            n_ticks, n_robots = contact.shape
+            bound = Bound(
+                cell,
+                z,
+                contact.mean(0),
+                np.full(n_robots, n_ticks * self.tick),
+                status,
+                state.time,
+                way,
+                contact,
+                np.full(n_robots, n_ticks),
+                x if self.record_states else None,
+            )
+            state.cells, state.poses, state.time = done.cells, way[-1], bound.t1
+            bounds.append(bound)
+        return bounds
 
     def _drive(
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
@@ -312,61 +345,27 @@ class KinematicSimulator:
 
     def _chances(self, drives: Sequence[Drive]) -> list[np.ndarray]:
         """Probability that a look finds its target, (tick, robot): of all missions at once."""
-        team = self.workspace.team
-        poses = np.concatenate([drive.poses[..., :2] for drive in drives])
-        t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]
-        lead = np.repeat(poses[:, :1], len(team.robots), axis=1)
-        sensor = np.where(t2_looks[..., None], poses[:, 1:], lead).reshape(-1, 2)
-        target = np.where(t2_looks[..., None], lead, poses[:, 1:]).reshape(-1, 2)
-        by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
-        by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
-        glass = np.where(t2_looks[..., None], by_t2, by_lead).reshape(-1, 4)
-        found = chance(self._surface, self.sight, sensor, target, glass)
+        looks = Looks.of(self.workspace.team, drives)
+        found = chance(self._surface, self.sight, looks.sensor, looks.target, looks.glass)
         for mask, strength in self._now.jams:
-            inside = mask[self._surface.nearest(sensor[:, 0], sensor[:, 1])]
-            inside |= mask[self._surface.nearest(target[:, 0], target[:, 1])]
+            inside = mask[self._surface.nearest(looks.sensor[:, 0], looks.sensor[:, 1])]
+            inside |= mask[self._surface.nearest(looks.target[:, 0], looks.target[:, 1])]
             found[inside] *= 1.0 - strength
-        found = found.reshape(-1, len(team.robots))
-        found *= np.where(t2_looks, self._now.detection, team.lead.detection)
+        found = found.reshape(-1, len(self.workspace.team.robots))
+        found *= np.where(looks.t2_looks, self._now.detection, self.workspace.team.lead.detection)
         return np.split(found, np.cumsum([len(drive.poses) for drive in drives])[:-1])
 
-    def _measured(
-        self,
-        state: State,
-        cell: Cell,
-        drive: Drive,
-        chances: np.ndarray,
-        rng: np.random.Generator,
-    ) -> Bound:
-        """Contact, awareness and the rest of one bound; its state moves on."""
-        team, n_robots = self.workspace.team, len(self.workspace.team.robots)
+    def _looked(
+        self, state: State, drive: Drive, chances: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, str]:
+        """Contact at each tick, (tick, robot), up to where the bound ends, and how it ends."""
         found = rng.random(chances.shape) < chances
         contact = np.empty(found.shape, bool)
-        for phase, (who, watchers) in enumerate(
-            ((drive.lead_moves, team.robots), (~drive.lead_moves, [team.lead] * n_robots))
-        ):
+        for phase, watchers in enumerate(self._watchers):
+            who = drive.lead_moves == (phase == 0)
             contact[who] = contact_of(found[who], watchers, state.tracks[phase])
         n_ticks, status = len(contact), drive.status
         if self.lost_contact_after is not None:
             patience = max(1, round(self.lost_contact_after / self.tick))
             n_ticks, status = cut_at_lost_contact(contact, patience, status)
-        poses, contact = drive.poses[:n_ticks], contact[:n_ticks]
-        # If T2 has not moved yet, what it measured is where it stands.
-        closing = ~drive.lead_moves[:n_ticks]
-        closing[-1] |= not closing.any()
-        states = self._measure.states(poses[:, 1:]) if self._wants_states else None
-        awareness = self._measure(poses[closing, 1:], None if states is None else states[closing])
-        bound = Bound(
-            cell,
-            awareness,
-            contact.mean(0),
-            np.full(n_robots, n_ticks * self.tick),
-            status,
-            state.time,
-            poses,
-            contact,
-            np.full(n_robots, n_ticks),
-            states if self.record_states else None,
-        )
-        state.cells, state.poses, state.time = drive.cells, poses[-1], bound.t1
-        return bound
+        return contact[:n_ticks], status

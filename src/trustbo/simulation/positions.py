@@ -120,10 +120,11 @@ class Positions:
 
 def surface_of(terrain: xr.Dataset, pixels: xr.Dataset) -> Surface:
     """A workspace's terrain as the arrays that sight and motion work on."""
+    ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     return Surface(
-        ground=terrain["dem"].values.astype(float),
-        canopy=terrain["dsm"].values.astype(float),
-        gradient=gradient(filled(terrain["dem"].values.astype(float)), pixel_size(terrain)),
+        ground=ground,
+        canopy=canopy,
+        gradient=gradient(filled(ground), pixel_size(terrain)),
         passable=pixels["passable"].values.astype(bool),
         pixel=pixel_size(terrain),
         origin=(float(terrain["x"][0]), float(terrain["y"][0])),

@@ -50,6 +50,7 @@ class Recording:
         awareness: One for each robot: shape (record, feature), the last of a bound counts.
         poses: The lead first, then each robot: x, y and heading, shape (record, 3). Empty where
             not recorded.
+        states: One for each robot: shape (record, state). Empty where not recorded.
     """
 
     markers: Sequence[Marker]
@@ -57,6 +58,7 @@ class Recording:
     contact: Sequence[Series]
     awareness: Sequence[Series]
     poses: Sequence[Series] = ()
+    states: Sequence[Series] = ()
 
     def missions(self, features: tuple[str, ...], robots: tuple[str, ...]) -> list[Mission]:
         """The missions that were recorded; one without bounds is left out.
@@ -121,6 +123,8 @@ class Recording:
         ticks = looks[int(np.argmax(n_looks))].time
         measured = [series.between(marker.time, until).value for series in self.awareness]
         unknown = np.full(n_features, np.nan)
+        moved = [series.between(marker.time, end) for series in self.states]
+        kept = len(moved) == len(looks) and all(len(series.time) for series in moved)
         seconds = (end - marker.time) / _NS if end > marker.time else np.nan
         return Bound(
             marker.cell,
@@ -132,6 +136,7 @@ class Recording:
             np.stack([_held(series, ticks) for series in poses], axis=1) if poses else None,
             np.stack([_aligned(look, ticks) for look in looks], axis=1) if n_looks.all() else None,
             np.where(n_looks > 0, n_looks, np.nan),
+            np.stack([_held(series, ticks) for series in moved], axis=1) if kept else None,
         )
 
 
@@ -145,7 +150,7 @@ def _aligned(look: Series, ticks: np.ndarray) -> np.ndarray:
 def _held(series: Series, ticks: np.ndarray) -> np.ndarray:
     """The last record at each tick, shape (tick, ...); NaN before the first."""
     last = np.searchsorted(series.time, ticks, side="right") - 1
-    known = np.concatenate([np.full((1, 3), np.nan), series.value])
+    known = np.concatenate([np.full((1, *series.value.shape[1:]), np.nan), series.value])
     return known[last + 1]
 
 

@@ -1,11 +1,38 @@
-"""What a lidar makes of its looks: tracks."""
+"""Who looks at whom, and what a lidar makes of its looks: tracks."""
 
 from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numba import njit
 
-from trustbo.data import Robot
+from trustbo.data import Robot, Team
+from trustbo.simulation.bounding import Drive
+from trustbo.simulation.sight import optics
+
+
+class Looks(NamedTuple):
+    """Looks between the lead and each robot of T2: by those who stand, at those who move."""
+
+    sensor: np.ndarray  # (tick * robot, 2), CRS metres
+    target: np.ndarray  # likewise
+    glass: np.ndarray  # (tick * robot, 4), see `sight.optics`
+    t2_looks: np.ndarray  # (tick, 1), else the lead does
+
+    @classmethod
+    def of(cls, team: Team, drives: Sequence[Drive]) -> Self:
+        """The looks of some bounds, one after the other."""
+        poses = np.concatenate([drive.poses[..., :2] for drive in drives])
+        t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]
+        lead = np.repeat(poses[:, :1], len(team.robots), axis=1)
+        by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
+        by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
+        return cls(
+            np.where(t2_looks[..., None], poses[:, 1:], lead).reshape(-1, 2),
+            np.where(t2_looks[..., None], lead, poses[:, 1:]).reshape(-1, 2),
+            np.where(t2_looks[..., None], by_t2, by_lead).reshape(-1, 4),
+            t2_looks,
+        )
 
 
 def new_tracks(n_robots: int) -> np.ndarray:

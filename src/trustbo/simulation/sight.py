@@ -65,9 +65,15 @@ class Surface(NamedTuple):
         row, col = self.to_pixel(np.asarray(x), np.asarray(y))
         rows, cols = self.ground.shape
         return (
-            np.clip(np.rint(row), 0, rows - 1).astype(int),
-            np.clip(np.rint(col), 0, cols - 1).astype(int),
+            np.minimum(np.maximum(np.rint(row), 0), rows - 1).astype(int),
+            np.minimum(np.maximum(np.rint(col), 0), cols - 1).astype(int),
         )
+
+    def pixel_at(self, x: float, y: float) -> tuple[int, int]:
+        """Row and column of the pixel that one position is in."""
+        rows, cols = self.ground.shape
+        row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
+        return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:
@@ -98,15 +104,20 @@ def chance(
     Returns:
         Shape (ray,), in [0, 1].
     """
-    start, end = (np.stack(surface.to_pixel(p[:, 0], p[:, 1]), axis=1) for p in (sensor, target))
+    ends = _ends(
+        surface.ground,
+        surface.gradient,
+        surface.pixel,
+        surface.origin,
+        sensor,
+        target,
+        np.broadcast_to(optics, (len(sensor), 4)),
+    )
     return _chances(
         surface.ground,
         surface.canopy,
-        surface.gradient,
         surface.pixel,
-        start,
-        end,
-        np.broadcast_to(optics, (len(start), 4)),
+        ends,
         SIGHT_MODES[sight.mode],
         sight.extinction,
         sight.crown_base,
@@ -114,13 +125,19 @@ def chance(
 
 
 @_compiled
-def _chances(ground, canopy, gradient, pixel, start, end, optics, mode, extinction, crown_base):
-    result, work = np.empty(len(start)), rays.work_space()
+def _ends(ground, gradient, pixel, origin, sensor, target, optics):
+    """Row, col and height of both ends of each ray, shape (ray, 6); NaN where it is out of view.
+
+    A loop of its own: the processor waits for the heights of many rays at once.
+    """
     n_rows, n_cols = ground.shape
-    for i in range(len(start)):
+    ends = np.empty((len(sensor), 6))
+    for i in range(len(sensor)):
         # The outer half of the raster's edge pixels has the heights of their centres.
-        r0, c0 = _inward(start[i, 0], n_rows), _inward(start[i, 1], n_cols)
-        r1, c1 = _inward(end[i, 0], n_rows), _inward(end[i, 1], n_cols)
+        r0 = _inward((origin[1] - sensor[i, 1]) / pixel[0], n_rows)
+        c0 = _inward((sensor[i, 0] - origin[0]) / pixel[1], n_cols)
+        r1 = _inward((origin[1] - target[i, 1]) / pixel[0], n_rows)
+        c1 = _inward((target[i, 0] - origin[0]) / pixel[1], n_cols)
         z0 = rays.ground_height(ground, r0, c0) + optics[i, 0]
         z1 = rays.ground_height(ground, r1, c1) + optics[i, 1]
         east, north, up = (c1 - c0) * pixel[1], (r0 - r1) * pixel[0], z1 - z0
@@ -130,11 +147,23 @@ def _chances(ground, canopy, gradient, pixel, start, end, optics, mode, extincti
         gx, gy = gradient[0, row, col], gradient[1, row, col]
         # Height above the plane of the body, whose normal is (-gx, -gy, 1).
         above = abs(up - gx * east - gy * north) / math.sqrt(1.0 + gx * gx + gy * gy)
-        if not (distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)):
+        seen = distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)
+        ends[i, 0], ends[i, 1], ends[i, 2] = r0, c0, z0 if seen else math.nan
+        ends[i, 3], ends[i, 4], ends[i, 5] = r1, c1, z1
+    return ends
+
+
+@_compiled
+def _chances(ground, canopy, pixel, ends, mode, extinction, crown_base):
+    result, work = np.empty(len(ends)), rays.work_space()
+    for i in range(len(ends)):
+        start = (ends[i, 0], ends[i, 1], ends[i, 2])
+        end = (ends[i, 3], ends[i, 4], ends[i, 5])
+        if math.isnan(start[2]):
             result[i] = 0.0
             continue
         result[i] = rays.ray_transmittance(
-            ground, canopy, pixel, (r0, c0, z0), (r1, c1, z1), mode, extinction, crown_base, work
+            ground, canopy, pixel, start, end, mode, extinction, crown_base, work
         )
     return result
 

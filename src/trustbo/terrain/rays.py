@@ -18,13 +18,15 @@ from trustbo.terrain.parallel import over_rows
 _compiled = njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}
 )
+# Handing arrays to a function, which counts references, costs as much as crossing ten lines.
+_inlined = njit(cache=True, inline="always", nogil=True, error_model="numpy")
 _CHUNK = 32
 
 BARE, WALL, TRANSMITTANCE = 0, 1, 2
 """What blocks sight: the ground; the surface, canopy included; or the ground, and canopy partly."""
 
 
-@_compiled
+@_inlined
 def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crown_base, work):
     """Share of a beam that passes from `start` to `end`.
 
@@ -117,7 +119,8 @@ def _is_blocked(heights, axis, z0, dz):
 def _share_in_canopy(ground, surface, axis, z0, dz, crown_base, start, end, work):
     """Share of the way inside the canopy, seen on the lines of an axis; -1 if blocked there.
 
-    Some lines at a time: first their heights, then plain vector operations.
+    Some lines at a time: first their heights, then plain vector operations, of whole vectors, as
+    the rest would take as long as these; what is too much does not count.
     """
     across, along, x0, dx, y0, dy = axis
     line, t0, way, step, n = _crossings(x0, dx)
@@ -127,29 +130,32 @@ def _share_in_canopy(ground, surface, axis, z0, dz, crown_base, start, end, work
     before, inside = 0.0, 0.0
     for first in range(0, n, _CHUNK):
         m = min(_CHUNK, n - first)
+        full = (m + 15) & -16
+        t, pixels = t0 + first * step, base + first * jump
         for k in range(m):
-            y = y0 + (t0 + (first + k) * step) * dy
+            y = y0 + t * dy
             j = int(y)
             part = y - j
-            here = np.uint64(base + (first + k) * jump + j * along)
+            here = np.uint64(pixels + j * along)
             # A neighbour without weight is not touched: there may be none.
             beside = here + np.uint64(along if part > 1e-9 else 0)
             here = beside if part > 1.0 - 1e-9 else here
             g[k] = ground[here] + part * (ground[beside] - ground[here])
+            if not z0 + t * dz >= g[k]:
+                return -1.0
             s[k] = surface[here] + part * (surface[beside] - surface[here])
-        passed = 0.0
-        for k in range(m):
+            t += step
+            pixels += jump
+        for k in range(full):
             z = z0 + (t0 + (first + k) * step) * dz
-            passed += 1.0 if z >= g[k] else 0.0
             above[k + 1] = z - (g[k] + crown_base * (s[k] - g[k]))
             below[k + 1] = s[k] - z
-        if passed < m:
-            return -1.0
         if first == 0 and m > 0:
             inside += share_inside(above[0], above[1], below[0], below[1]) * t0
         total = 0.0
-        for k in range(1 if first == 0 else 0, m):
-            total += share_inside(above[k], above[k + 1], below[k], below[k + 1])
+        for k in range(full):
+            share = share_inside(above[k], above[k + 1], below[k], below[k + 1])
+            total += share if (first + k > 0) & (k < m) else 0.0
         inside += total * step
         above[0], below[0] = above[m], below[m]
         before = t0 + (first + m - 1) * step
