@@ -124,3 +124,42 @@ def path_value(objective, path, u, beta0, x0):
         "bottleneck": lambda: min(trust),
         "stationary": lambda: math.prod(map(sigma, settled)),
     }[objective]()
+
+
+def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", toll=None):
+    """Values of many paths at once; the recursion is that of equation (1).
+
+    Args:
+        objective: Its name.
+        paths: Flat indices of cells, shape (path, length), start first, filled up with anything.
+        n_cells: Cells of each path, shape (path,).
+        u: Drift, shape (robot, cell).
+        transition: B0, shape (robot, robot).
+        x0: Trust at the start.
+        team: "mean" or "min".
+        toll: What each path's metres cost, shape (path,).
+    """
+    combine = np.mean if team == "mean" else np.min
+    x = np.full((len(paths), len(u)), x0)
+    settled_in = np.zeros(u.shape[1])
+    if objective == "stationary":
+        settled_in = combine(np.linalg.solve(np.eye(len(u)) - transition, u), axis=0)
+    toll = np.zeros(len(paths)) if toll is None else toll
+    total, success, least, stationary, last = (np.zeros(len(paths)) for _ in range(5))
+    least[:] = np.inf
+    for k in range(1, paths.shape[1]):
+        on = k < n_cells
+        x = x @ transition.T + u[:, paths[:, k]].T
+        trust = combine(x, axis=1)
+        last = np.where(on, trust, last)
+        total += np.where(on, trust, 0.0)
+        least = np.where(on, np.minimum(least, trust), least)
+        success += np.where(on, np.log1p(np.exp(-trust)), 0.0)
+        stationary += np.where(on, np.log1p(np.exp(-settled_in[paths[:, k]])), 0.0)
+    return {
+        "terminal": 1.0 / (1.0 + np.exp(toll - last)),
+        "mean": total / (n_cells - 1) - toll,
+        "success": np.exp(-success),
+        "bottleneck": least,
+        "stationary": np.exp(-stationary - toll),
+    }[objective]

@@ -14,7 +14,7 @@ from trustbo.campaign import Campaign
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.models import TrustModel, diagnostics
-from trustbo.planning import Plan, Policy
+from trustbo.planning import AwarenessBelief, Plan, Policy
 from trustbo.result import Result, require_folder
 from trustbo.simulation import KinematicSimulator, Simulator
 from trustbo.terrain import Workspace
@@ -36,6 +36,9 @@ def iterate(
     forgetting: float = 1.0,
     connectivity: int = 8,
     max_bounds: int | str | None = None,
+    team: str = "mean",
+    length_weight: float = 0.0,
+    awareness: str | AwarenessBelief = "map",
     checkpoint: str | PathLike[str] | None = None,
     callbacks: Sequence[Callable[[Campaign, Mission], None]] = (),
     seed: int = 0,
@@ -49,8 +52,7 @@ def iterate(
         goal: Last cell.
         n_iterations: How many missions.
         model: The trust model; by default `PooledTrust()`.
-        policy: `"greedy"`, `"thompson"`, `"random"`, or a callable
-            `policy(key, draws, planner) -> Plan`.
+        policy: A name of `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
         objective: `"terminal"` (the paper's), `"mean"`, `"success"`, `"bottleneck"` or
             `"stationary"`; see `Planner`.
         sampler: `"nuts"`, `"exact"` or `"joint"`; see `trustbo.models.fit`.
@@ -62,6 +64,9 @@ def iterate(
         forgetting: How much a mission counts relative to the next, in (0, 1]; see `Campaign`.
         connectivity: 4, or 8 to allow diagonal bounds too.
         max_bounds: Which paths are admissible; see `Planner`.
+        team: The team's trust is the `"mean"` or the `"min"` of its robots'.
+        length_weight: What a metre of the path costs; see `Planner`.
+        awareness: `"map"`, or `"belief"`, which missions correct; see `Campaign`.
         checkpoint: A folder in which the result so far is saved after each mission.
         callbacks: Each called as `callback(campaign, mission)` after each mission.
         seed: Same seed, same result.
@@ -89,6 +94,9 @@ def iterate(
         forgetting=forgetting,
         connectivity=connectivity,
         max_bounds=max_bounds,
+        team=team,
+        length_weight=length_weight,
+        awareness=awareness,
         seed=seed,
     )
     runner = KinematicSimulator(workspace) if simulator is None else simulator

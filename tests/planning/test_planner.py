@@ -123,7 +123,7 @@ def test_bad_options_list_the_good_ones(workspace):
         Planner(*ends, max_bounds=3)
     with pytest.raises(TrustboError, match="unknown max_bounds 'long'; choose one of shortest"):
         Planner(*ends, max_bounds="long")
-    with pytest.raises(TrustboError, match="choose one of greedy, thompson, random"):
+    with pytest.raises(TrustboError, match="choose one of greedy, optimistic, thompson"):
         resolve_policy("bold")
     with pytest.raises(TrustboError, match="policy must be a name or a callable; got 3"):
         resolve_policy(3)
@@ -131,8 +131,8 @@ def test_bad_options_list_the_good_ones(workspace):
 
 def test_planning_is_for_one_draw_and_evaluating_for_whole_paths(workspace, draws):
     planner = Planner(workspace, (4, 0), (0, 5))
-    for refused in (planner.plan, planner.trust_map, planner.cost_map):
-        with pytest.raises(ShapeError, match=r"one draw at a time: beta0 has shape \(300,\)"):
+    for refused in (planner.plan,):
+        with pytest.raises(ShapeError, match=r"one draw at a time: .* axes \(300,\)"):
             refused(draws)
     with pytest.raises(TrustboError, match=r"no bound leads from \(4, 0\) to \(0, 5\)"):
         planner.evaluate([(4, 0), (0, 5)], PARAMS)

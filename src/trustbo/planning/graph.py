@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import networkx as nx
 import numpy as np
+from numba import njit
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
@@ -14,11 +15,22 @@ MOVES: Mapping[int, Steps] = {
     4: ((-1, 0), (0, -1), (0, 1), (1, 0)),
     8: ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)),
 }
-"""Moves to the neighbouring cells, by connectivity."""
+"""Moves to the neighbouring cells, by connectivity; the reverse of move m is the m-th from last."""
 
 
 class NoPathError(TrustboError, nx.NetworkXNoPath):
     """The goal cannot be reached from the start."""
+
+
+def require_connectivity(connectivity: int) -> int:
+    """Return it if it is 4 or 8.
+
+    Raises:
+        TrustboError: It is not.
+    """
+    if connectivity not in MOVES:
+        raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
+    return connectivity
 
 
 def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:
@@ -34,33 +46,70 @@ def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:
     Raises:
         TrustboError: Another connectivity.
     """
-    if connectivity not in MOVES:
-        raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
+    moves = MOVES[require_connectivity(connectivity)]
     grid, passable = workspace.grid, workspace.passable.values
     graph = nx.DiGraph()
     for row, col in np.argwhere(passable).tolist():
         x, y = grid.center((row, col))
         graph.add_node((row, col), x=x, y=y)
+    lengths = move_lengths(workspace, connectivity).tolist()
     for row, col in list(graph):
-        for down, right in MOVES[connectivity]:
+        for (down, right), length in zip(moves, lengths, strict=True):
             other = (row + down, col + right)
             if other in graph:
-                length = float(np.hypot(down * grid.cell_height, right * grid.cell_width))
                 graph.add_edge((row, col), other, length=length)
     return graph
 
 
-def fewest_bounds(graph: nx.DiGraph, start: Cell, goal: Cell) -> dict[Cell, int]:
-    """Fewest bounds from every cell to the goal.
+def move_lengths(workspace: Workspace, connectivity: int) -> np.ndarray:
+    """Metres of each move, in the order of `MOVES`."""
+    size = workspace.grid.cell_height, workspace.grid.cell_width
+    return np.hypot(*(np.array(MOVES[connectivity]) * size).T)
+
+
+def fewest_bounds(passable: np.ndarray, cell: Cell, connectivity: int) -> np.ndarray:
+    """Fewest bounds between a cell and every other, shape (row, col); -1 where there is no way."""
+    rows, cols = passable.shape
+    # A margin that none can enter: no move has to ask whether it leaves the grid.
+    known = np.full((rows + 2, cols + 2), -1, np.int32)
+    known[1:-1, 1:-1][~passable] = _CLOSED
+    known[[0, -1]] = known[:, [0, -1]] = _CLOSED
+    steps = np.array(MOVES[connectivity]) @ (cols + 2, 1)
+    _breadth_first(known.ravel(), (cell[0] + 1) * (cols + 2) + cell[1] + 1, steps)
+    return np.maximum(known[1:-1, 1:-1], -1)
+
+
+_CLOSED = -2
+
+
+@njit(cache=True, nogil=True)
+def _breadth_first(known, start, steps):
+    queue = np.empty(len(known), np.int32)
+    queue[0], known[start] = start, 0
+    first, last = 0, 1
+    while first < last:
+        c = queue[first]
+        first += 1
+        for step in steps:
+            if known[c + step] == -1:
+                known[c + step] = known[c] + 1
+                queue[last] = c + step
+                last += 1
+
+
+def require_way(
+    passable: np.ndarray, to_goal: np.ndarray, start: Cell, goal: Cell, connectivity: int
+) -> None:
+    """Refuse ends that are not connected.
 
     Raises:
-        NoPathError: None leads there from the start.
+        NoPathError: Saying how many cells can be reached.
     """
-    to_goal = dict(nx.single_target_shortest_path_length(graph, goal))
-    if start not in to_goal:
-        n_reached = len(nx.descendants(graph, start)) + 1
+    if to_goal[start] < 0:
+        n_reached = int((fewest_bounds(passable, start, connectivity) >= 0).sum())
+        n_goal = int((to_goal >= 0).sum())
         raise NoPathError(
-            f"no path from {start} to {goal}: {n_reached} of {len(graph)} passable cells can be "
-            "reached from the start. Choose a goal among them, or a team with a larger max_slope."
+            f"no path from {start} to {goal}: {n_reached} of {int(passable.sum())} passable cells "
+            f"can be reached from the start, and the goal from {n_goal}. Choose ends in one part, "
+            "or a team with a larger max_slope."
         )
-    return to_goal

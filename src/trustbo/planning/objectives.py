@@ -1,4 +1,4 @@
-"""What a path is worth: expected trust along it, and the five objectives made of that."""
+"""What a path is worth: the five objectives, from the team's expected trust along it."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -7,62 +7,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from trustbo.models import TrustParams
-from trustbo.models.params import check_params
 
+class Aim(NamedTuple):
+    """What a path should be best at."""
 
-def roll_trust(
-    params: TrustParams, awareness: ArrayLike, x0: ArrayLike | None = None
-) -> np.ndarray:
-    """Expected trust along a path, equation (3) without its noise.
-
-    Args:
-        params: Parameters, each with leading axes (...,) such as (draw,).
-        awareness: Shape (bound, robot, feature).
-        x0: Expected trust before the first bound, shape () or (...,); by default `params.x0_mean`.
-
-    Returns:
-        Shape (..., bound, robot).
-
-    Raises:
-        ShapeError: The number of features differs from that of `params.beta`.
-    """
-    u = drift(params, awareness)
-    x = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)[..., None]
-    beta0 = np.asarray(params.beta0, dtype=float)[..., None]
-    trust = np.empty(u.shape)
-    for k in range(u.shape[-2]):
-        x = beta0 * x + u[..., k, :]
-        trust[..., k, :] = x
-    return trust
-
-
-def drift(params: TrustParams, awareness: ArrayLike) -> np.ndarray:
-    """U = beta . z + b, what one bound adds to trust.
-
-    Args:
-        params: Parameters with leading axes (...,).
-        awareness: Shape (*place, feature).
-
-    Returns:
-        Shape (..., *place).
-
-    Raises:
-        ShapeError: The number of features differs from that of `params.beta`.
-    """
-    z, beta = np.asarray(awareness, dtype=float), np.asarray(params.beta, dtype=float)
-    check_params(params, None, z.shape[-1])
-    b = np.asarray(params.b, dtype=float)
-    return np.tensordot(beta, z, (-1, -1)) + b.reshape(b.shape + (1,) * (z.ndim - 1))
+    objective: str
+    length_weight: float = 0.0
+    """What a metre of the path costs, in units of trust (or of log probability)."""
 
 
 class PathTrust(NamedTuple):
-    """What the value of a path is computed from, each of shape (bound,)."""
+    """What the value of a path is computed from; leading axes (...,) such as (draw,)."""
 
     trust: np.ndarray
-    """The team's expected trust after each bound."""
-    stationary: np.ndarray
-    """The level that trust would settle at in each cell, u / (1 - beta0)."""
+    """The team's expected trust after each bound, shape (..., bound)."""
+    settled: np.ndarray
+    """The level that trust would settle at in each cell, u / (1 - beta0), likewise."""
+    toll: np.ndarray | float = 0.0
+    """The path's length times `length_weight`."""
 
 
 def softplus(x: ArrayLike) -> np.ndarray:
@@ -70,16 +32,21 @@ def softplus(x: ArrayLike) -> np.ndarray:
     return np.logaddexp(0.0, x)
 
 
-OBJECTIVES: Mapping[str, Callable[[PathTrust], float]] = {
-    "terminal": lambda path: float(expit(path.trust[-1])),
-    "mean": lambda path: float(path.trust.mean()),
-    "success": lambda path: float(np.exp(-softplus(-path.trust).sum())),
-    "bottleneck": lambda path: float(path.trust.min()),
-    "stationary": lambda path: float(np.exp(-softplus(-path.stationary).sum())),
+OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = {
+    "terminal": lambda path: expit(path.trust[..., -1] - path.toll),
+    "mean": lambda path: path.trust.mean(-1) - path.toll,
+    "success": lambda path: np.exp(-softplus(-path.trust).sum(-1)),
+    "bottleneck": lambda path: path.trust.min(-1),
+    "stationary": lambda path: np.exp(-softplus(-path.settled).sum(-1) - path.toll),
 }
-"""Value of a path, to be maximised.
+"""Value of a path, to be maximised; the toll is the path's metres times `length_weight`.
 
-terminal: sigma(x^K), one minus the paper's cost (6). mean: mean trust over the bounds. success:
-product of sigma(x^k), the probability that every bound succeeds. bottleneck: least trust on the
-way. stationary: as success, with the level trust would settle at in each cell, free of history.
+terminal: sigma(x^K - toll), one minus the paper's cost (6) where there is none. mean: mean trust
+over the bounds, less the toll. success: product of sigma(x^k), the probability that every bound
+succeeds. bottleneck: least trust on the way. stationary: as success, with the level trust would
+settle at in each cell, free of history, times exp(-toll).
 """
+ADDITIVE = ("terminal", "mean", "stationary")
+"""The objectives that can take a length weight."""
+LABELLED = ("success", "bottleneck")
+"""The objectives that need the whole history of a path, and beta0 >= 0."""

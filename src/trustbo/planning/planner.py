@@ -2,63 +2,52 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
 
-import networkx as nx
 import numpy as np
 import xarray as xr
-from scipy.special import expit
+from numpy.typing import ArrayLike
+from scipy.special import expit, logit
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_pair, require_whole
-from trustbo.models import TrustParams
-from trustbo.planning import search
-from trustbo.planning.graph import MOVES, cell_graph, fewest_bounds
-from trustbo.planning.objectives import OBJECTIVES, PathTrust, drift, roll_trust
-from trustbo.planning.trustmap import best_trust
+from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models.params import Params
+from trustbo.planning import maps
+from trustbo.planning import posterior as over_draws
+from trustbo.planning.course import Course
+from trustbo.planning.dynamics import Dynamics, roll_trust
+from trustbo.planning.engines import (
+    Answer,
+    choose_engine,
+    expected_paths,
+    plan_compiled,
+    require_valid,
+)
+from trustbo.planning.objectives import (
+    ADDITIVE,
+    LABELLED,
+    OBJECTIVES,
+    Aim,
+    PathTrust,
+    softplus,
+)
+from trustbo.planning.plan import QUANTILES, Plan
+from trustbo.planning.posterior import DrawnPaths
+from trustbo.planning.reference import plan_networkx
+from trustbo.planning.setting import Setting, draws_of
+from trustbo.planning.values import path_length, path_value
 from trustbo.terrain import Workspace
 
-DEFAULT_SLACK = 8
-"""Bounds beyond the fewest possible that `success` and `bottleneck` may take by default."""
+EXACT = 1e-12
+"""A plan is exact if no path can be better by more, in trust or log probability."""
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A path and what is expected of it.
-
-    Attributes:
-        path: Cells, start first.
-        trust: Expected trust after each bound, shape (bound, robot).
-        value: The objective, to be maximised (see `OBJECTIVES`).
-        objective: Its name.
-        exact: Whether no admissible path is better.
-        bound: Largest value that any admissible path can have; `value` where exact.
-        revisits: How often the path enters a cell again.
-        engine: What computed it.
-        seconds: How long that took.
-    """
-
-    path: tuple[Cell, ...]
-    trust: np.ndarray
-    value: float
-    objective: str
-    exact: bool
-    bound: float
-    revisits: int
-    engine: str
-    seconds: float
-
-
-class Planner:
+class Planner(Setting):
     """Finds the most trustworthy path of a workspace, exactly.
 
     Attributes:
-        graph: The `networkx.DiGraph` of passable cells (see `cell_graph`).
-        to_goal: Fewest bounds to the goal, by cell; cells that are missing cannot reach it.
-        shortest: Fewest bounds from start to goal.
-        longest: Most bounds an admissible path may have.
-        u_turns: Whether an admissible path may turn straight back.
+        objective: What paths should be best at.
+        engine: What finds them.
     """
 
     def __init__(
@@ -71,6 +60,9 @@ class Planner:
         connectivity: int = 8,
         max_bounds: int | str | None = None,
         revisit: bool = True,
+        team: str = "mean",
+        length_weight: float = 0.0,
+        engine: str = "auto",
         backend: str | None = None,
     ) -> None:
         """Prepare to plan.
@@ -88,119 +80,208 @@ class Planner:
                 at most that many bounds (default for success and bottleneck: shortest + 8).
                 Without effect on stationary, which is over all simple paths.
             revisit: Whether walks of success and bottleneck may enter a cell twice.
+            team: The team's trust is the `"mean"` or the `"min"` (least) of its robots'.
+            length_weight: What a metre of the path costs, for terminal, mean (in units of trust)
+                and stationary (in units of log probability).
+            engine: `"networkx"`, the reference; `"numba"`, compiled; or `"auto"`: networkx for
+                single plans on up to 50 x 50 cells. All find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
 
         Raises:
-            TrustboError: Start or goal off the grid, impassable, or equal; an unknown objective;
-                `max_bounds` below the fewest possible.
+            TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
+                `max_bounds` below the fewest possible; a length weight that is negative, or for
+                success or bottleneck.
             NoPathError: The goal cannot be reached.
         """
         self.objective = require_choice("objective", objective, OBJECTIVES)
-        self.workspace, self.connectivity, self.revisit = workspace, connectivity, revisit
-        self.start = workspace.require_cell("start", start)
-        self.goal = workspace.require_cell("goal", goal)
-        if self.start == self.goal:
-            raise TrustboError(f"start and goal are the same cell {self.start}; choose two.")
-        self.graph = cell_graph(workspace, connectivity)
-        self.to_goal = fewest_bounds(self.graph, self.start, self.goal)
-        self.shortest = self.to_goal[self.start]
-        self._from_start = dict(nx.single_source_shortest_path_length(self.graph, self.start))
-        if max_bounds is None:
-            labelled = objective in ("success", "bottleneck")
-            max_bounds = self.shortest + DEFAULT_SLACK if labelled else "shortest+2"
-        self.longest = self._most_bounds(max_bounds)
-        self.u_turns = not isinstance(max_bounds, str)
-        self._backend = backend
+        self.engine, self._backend = engine, backend
+        choose_engine(engine, 0, 1)
+        self._aim = Aim(objective, _require_length_weight(length_weight, objective))
+        if max_bounds is None and objective not in LABELLED:
+            max_bounds = "shortest+2"
+        course = Course(workspace, start, goal, connectivity, max_bounds, revisit)
+        super().__init__(workspace, course, team)
 
-    def plan(self, params: TrustParams) -> Plan:
+    def plan(self, params: Params, *, x0: ArrayLike | None = None) -> Plan:
         """The best admissible path for given parameters.
 
         Args:
-            params: Parameters without leading axes.
+            params: Parameters of any model, without leading axes.
+            x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
 
         Raises:
-            ShapeError: Parameters with leading axes, or of other features.
+            ShapeError: Parameters with leading axes, or of other robots or features.
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        _require_one_draw(params)
         started = time.perf_counter()
-        path = self._search(self._recursion(params))
-        plan = self.evaluate(path, params)
-        seconds = time.perf_counter() - started
-        return replace(plan, exact=True, bound=plan.value, engine="networkx", seconds=seconds)
+        _require_one_draw(params)
+        path, slack, engine = self._find(self.dynamics(params, x0))
+        plan = self.evaluate(path, params, x0=x0)
+        return replace(
+            plan,
+            exact=slack <= EXACT,
+            bound=self._bound(plan.value, slack),
+            engine=engine,
+            seconds=time.perf_counter() - started,
+        )
 
-    def evaluate(self, path: Sequence[Cell], params: TrustParams) -> Plan:
+    def best_path(self, moves: Dynamics) -> tuple[Cell, ...]:
+        """The best admissible path for dynamics of your own, such as an optimistic drift.
+
+        Args:
+            moves: Without leading axes; see `dynamics`.
+
+        Raises:
+            TrustboError: beta0 is outside the range the objective is exact for.
+        """
+        return self._find(moves)[0]
+
+    def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
+        """The path with the best expectation over draws of terminal trust, or of mean trust.
+
+        Exact for the posterior as it is given, correlations between parameters included, because
+        both are linear in the cells' drifts. `value` is that of the mean terminal trust, or the
+        mean of mean trust.
+
+        Args:
+            posterior: What `fit` returned, or draws with leading axis (draw,).
+
+        Raises:
+            TrustboError: Another objective, or `team="min"`.
+        """
+        started = time.perf_counter()
+        params = draws_of(posterior)
+        moves = self.dynamics(params)
+        if self.objective not in ("terminal", "mean") or len(moves.views) > 1:
+            raise TrustboError(
+                "an expectation over draws is planned exactly for 'terminal' and 'mean' of a "
+                f"team's mean trust; got {self.objective!r} with team={self.team!r}."
+            )
+        path = self.course.cells(expected_paths(self.course, moves, self._aim).paths[0])
+        plan = self.evaluate(path, params)
+        return replace(
+            plan, exact=True, bound=plan.value, engine="numba",
+            seconds=time.perf_counter() - started,
+        )  # fmt: skip
+
+    def plan_draws(
+        self,
+        posterior: Params | xr.DataTree,
+        *,
+        n_draws: int | None = None,
+        seed: int = 0,
+    ) -> DrawnPaths:
+        """The best path under every draw.
+
+        Args:
+            posterior: What `fit` returned, or draws with leading axis (draw,).
+            n_draws: How many of them, taken at random without replacement; by default all.
+            seed: Same seed, same draws.
+
+        Raises:
+            TrustboError: beta0 of a draw is outside the range the objective is exact for.
+        """
+        params, chosen = over_draws.choose(draws_of(posterior), n_draws, seed)
+        moves = self.dynamics(params, draws=chosen)
+        require_valid(moves, self.objective)
+        engine = choose_engine(self.engine, self.course.passable.size, len(chosen))
+        if engine == "numba":
+            answer = plan_compiled(self.course, moves, self._aim)
+        else:
+            paths = [
+                plan_networkx(self.course, moves.draw(d), self._aim, self._backend)
+                for d in range(len(chosen))
+            ]
+            answer = Answer(over_draws.padded(self.course, paths), np.zeros(len(paths)))
+        return DrawnPaths(self.course, moves, self._aim, answer.paths, answer.slack, chosen)
+
+    def evaluate(
+        self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
+    ) -> Plan:
         """What is expected of a given path; `exact` is False and `bound` NaN.
 
         Args:
             path: Cells from start to goal, each a neighbour of the last.
-            params: Parameters without leading axes.
+            params: One draw of parameters, or many, or a posterior: then `trust` and `value` are
+                those of mean trust over draws, and `bands` its quantiles.
+            x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            ShapeError: Parameters with leading axes, or of other features.
+            ShapeError: Parameters of other robots or features.
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
-        _require_one_draw(params)
-        cells = self.require_path(path)
-        awareness = self.workspace.awareness.values[:, *zip(*cells[1:], strict=True)]
-        trust = roll_trust(params, np.swapaxes(awareness, 0, 1))
-        u = drift(params, awareness).mean(0)
-        beta0 = float(np.asarray(params.beta0))
-        settled = u / (1.0 - beta0) if beta0 != 1.0 else np.full_like(u, np.nan)
-        value = OBJECTIVES[self.objective](PathTrust(trust.mean(1), settled))
-        revisits = len(cells) - len(set(cells))
-        return Plan(cells, trust, value, self.objective, False, np.nan, revisits, "given", 0.0)
+        cells, grid = self.require_path(path), self.workspace.grid
+        draws, (rows, cols) = draws_of(params), np.array(cells).T
+        z = self.awareness if draws.leading else self.mean_awareness
+        along = z[..., rows[1:], cols[1:], :]  # ([draw], robot, bound, feature)
+        if along.ndim == 4:
+            along = along[np.arange(draws.leading[0]) % len(along)]
+        many = roll_trust(draws, np.swapaxes(along, -3, -2), x0)
+        many = many.reshape(-1, *many.shape[-2:])
+        trust = many.mean(0)
+        team = trust.mean(1) if self.team == "mean" else trust.min(1)
+        if self.objective == "stationary":
+            value = path_value(self.dynamics(draws, x0), self._aim, self.course, cells).mean()
+        else:
+            value = self._value(team, cells)
+        return Plan(
+            cells,
+            np.stack([grid.x[cols], grid.y[rows]], axis=1),
+            path_length(self.course, cells),
+            trust,
+            np.quantile(many, QUANTILES, axis=0),
+            float(value),
+            float(np.exp(-softplus(-team).sum())),
+            self.objective,
+            False,
+            np.nan,
+            len(cells) - len(set(cells)),
+            "given",
+            0.0,
+        )
 
-    def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
-        """The path as a tuple of cells, if a team can take it.
+    def bands(self, path: Sequence[Cell], posterior: Params | xr.DataTree) -> np.ndarray:
+        """`Plan.bands` of a path over draws, shape (quantile, bound, robot)."""
+        return self.evaluate(path, posterior).bands
 
-        Raises:
-            TrustboError: It is broken, or does not lead from start to goal; the cell is named.
+    # --- maps ---
+
+    def trust_map(
+        self,
+        params: Params | xr.DataTree,
+        *,
+        per_robot: bool = False,
+        x0: ArrayLike | None = None,
+    ) -> xr.DataArray:
+        """Largest expected trust with which each cell can be reached, dims (row, col).
+
+        See `maps.trust_map`.
         """
-        cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
-        if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:
-            raise TrustboError(f"a path must lead from {self.start} to {self.goal}; got {cells}.")
-        for a, b in pairwise(cells):
-            if not self.graph.has_edge(a, b):
-                raise TrustboError(f"the path is broken: no bound leads from {a} to {b}.")
-        return cells
+        return maps.trust_map(self, params, per_robot=per_robot, x0=x0)
 
-    def trust_map(self, params: TrustParams, *, per_robot: bool = False) -> xr.DataArray:
-        """Largest expected trust with which each cell can be reached.
+    def cost_map(
+        self,
+        params: Params | xr.DataTree,
+        *,
+        per_robot: bool = False,
+        x0: ArrayLike | None = None,
+    ) -> xr.DataArray:
+        """The paper's cost f = 1 - sigma(trust) of reaching each cell; as `trust_map`."""
+        return maps.cost_map(self, params, per_robot=per_robot, x0=x0)
 
-        Over the paths to each cell with the fewest possible bounds, or, unless `max_bounds` is
-        "shortest", up to two more without turning straight back: with the default `max_bounds`,
-        the goal's value is the terminal trust of the `terminal` plan. Longer walks, which an int
-        admits, are left out, for they loiter to gather trust.
-
-        Args:
-            params: Parameters without leading axes.
-            per_robot: One map per robot instead of the team's.
-
-        Returns:
-            DataArray (row, col), or (robot, row, col); NaN where no robot can go.
-
-        Raises:
-            ShapeError: Parameters with leading axes, or of other features.
-        """
-        _require_one_draw(params)
-        u = drift(params, self.workspace.awareness.values)
-        u = u if per_robot else u.mean(0)
-        beta0, x0 = float(np.asarray(params.beta0)), float(np.asarray(params.x0_mean))
-        slack = min(2, self.longest - self.shortest)
-        values = best_trust(u, beta0, x0, self._from_start, MOVES[self.connectivity], slack)
-        like = self.workspace.awareness.isel(feature=0, drop=True)
-        like = like if per_robot else like.isel(robot=0, drop=True)
-        return like.copy(data=values).rename("trust").assign_attrs(long_name="expected trust")
-
-    def cost_map(self, params: TrustParams, *, per_robot: bool = False) -> xr.DataArray:
-        """The paper's cost f = 1 - sigma(trust) of reaching each cell; axes as `trust_map`."""
-        trust = self.trust_map(params, per_robot=per_robot)
-        cost = trust.copy(data=1.0 - expit(trust.values)).rename("cost")
-        return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
+    def trust_summary(
+        self,
+        posterior: Params | xr.DataTree,
+        *,
+        per_robot: bool = False,
+        n_draws: int = 200,
+        seed: int = 0,
+    ) -> xr.Dataset:
+        """Mean and sd over draws of the trust map, and the mean cost; see `maps.trust_summary`."""
+        return maps.trust_summary(self, posterior, per_robot=per_robot, n_draws=n_draws, seed=seed)
 
     def path_posterior(
-        self, posterior: TrustParams | xr.DataTree, *, n_draws: int = 200, seed: int = 0
+        self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0
     ) -> xr.DataArray:
         """P(cell on the best path), from the best path under each of some draws.
 
@@ -212,64 +293,49 @@ class Planner:
         Returns:
             DataArray (row, col), in [0, 1].
         """
-        if isinstance(posterior, xr.DataTree):
-            posterior = TrustParams.from_posterior(posterior)
-        n = len(np.asarray(posterior.beta0))
-        chosen = np.random.default_rng(seed).choice(n, min(n, n_draws), replace=False)
-        like = self.workspace.passable
-        count = np.zeros(like.shape)
-        for index in chosen:
-            for cell in set(self.plan(posterior.draw(int(index))).path):
-                count[cell] += 1.0
-        share = like.copy(data=count / len(chosen)).rename("path_probability")
+        drawn = self.plan_draws(posterior, n_draws=n_draws, seed=seed)
+        share = self.workspace.passable.copy(data=drawn.share()).rename("path_probability")
         return share.assign_attrs(long_name="P(cell on the best path)")
 
-    def _recursion(self, params: TrustParams) -> search.Recursion:
-        u = drift(params, self.workspace.awareness.values).mean(0)
-        drifts = {cell: float(u[cell]) for cell in self.graph}
-        beta0, x0 = float(np.asarray(params.beta0)), float(np.asarray(params.x0_mean))
-        return search.Recursion(beta0, drifts, x0)
+    def _find(self, moves: Dynamics) -> tuple[tuple[Cell, ...], float, str]:
+        """A best path, by how much it could be better at most, and the engine."""
+        require_valid(moves, self.objective)
+        engine = choose_engine(self.engine, self.course.passable.size, 1)
+        if engine == "networkx":
+            return plan_networkx(self.course, moves, self._aim, self._backend), 0.0, engine
+        answer = plan_compiled(self.course, _stacked(moves), self._aim)
+        return self.course.cells(answer.paths[0]), float(answer.slack[0]), engine
 
-    def _search(self, recursion: search.Recursion) -> search.Path:
-        ends = (self.graph, self.start, self.goal)
-        if self.objective == "stationary":
-            return search.best_stationary(*ends, recursion, self._backend)
-        if self.objective in ("success", "bottleneck"):
-            return search.best_labelled(
-                *ends, self.to_goal, recursion, self.longest, self.objective, revisit=self.revisit
-            )
-        candidates = []
-        for n_bounds in range(self.shortest, self.longest + 1):
-            weights = search.additive_weights(self.objective, recursion.beta0, n_bounds)
-            path = search.best_additive(
-                *ends,
-                self.to_goal,
-                recursion.u,
-                weights,
-                u_turns=self.u_turns,
-                backend=self._backend,
-            )
-            if path is not None:
-                us = np.array([recursion.u[cell] for cell in path[1:]])
-                start = recursion.x0 * recursion.beta0 * weights[0]
-                candidates.append((float(weights @ us + start), path))
-        return max(candidates, key=lambda candidate: candidate[0])[1]
+    def _value(self, team: np.ndarray, cells: tuple[Cell, ...]) -> float:
+        toll = self._aim.length_weight * path_length(self.course, cells)
+        return float(OBJECTIVES[self.objective](PathTrust(team, team, toll)))
 
-    def _most_bounds(self, max_bounds: int | str) -> int:
-        named = {"shortest": self.shortest, "shortest+2": self.shortest + 2}
-        if isinstance(max_bounds, str):
-            return named[require_choice("max_bounds", max_bounds, named)]
-        if require_whole("max_bounds", max_bounds, 1) < self.shortest:
-            raise TrustboError(
-                f"max_bounds = {max_bounds} is below the fewest possible from {self.start} to "
-                f"{self.goal}, which is {self.shortest}."
-            )
-        return int(max_bounds)
+    def _bound(self, value: float, slack: float) -> float:
+        """The value a plan could have at most, its search having left this much slack."""
+        if slack <= 1e-12:
+            return value
+        if self.objective == "terminal":
+            return float(expit(logit(value) + slack))
+        return value * float(np.exp(slack)) if self.objective == "success" else value + slack
 
 
-def _require_one_draw(params: TrustParams) -> None:
-    if np.ndim(params.beta0) or np.ndim(params.beta) != 1:
+def _require_one_draw(params: Params) -> None:
+    if params.leading:
         raise ShapeError(
-            f"give one draw at a time: beta0 has shape {np.shape(params.beta0)}. "
-            "Use params.draw(i) or params.mean()."
+            f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
+            "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
         )
+
+
+def _require_length_weight(length_weight: float, objective: str) -> float:
+    if not 0.0 <= length_weight < np.inf:
+        raise TrustboError(f"length_weight must be finite and >= 0; got {length_weight!r}.")
+    if length_weight and objective not in ADDITIVE:
+        raise TrustboError(
+            f"length_weight is for {', '.join(ADDITIVE)}; the objective is {objective!r}."
+        )
+    return float(length_weight)
+
+
+def _stacked(moves: Dynamics) -> Dynamics:
+    return Dynamics(moves.transition[None], moves.drift[None], moves.start[None], moves.views)

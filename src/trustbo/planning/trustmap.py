@@ -1,18 +1,78 @@
 """The trust map: with how much expected trust can each cell be reached?"""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.planning.graph import Steps
+from trustbo.planning.course import Course
+from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.engines import plan_compiled
+from trustbo.planning.graph import MOVES, Steps
+from trustbo.planning.objectives import Aim
+from trustbo.planning.values import trust_along
+
+
+def best_map(course: Course, moves: Dynamics) -> np.ndarray:
+    """Largest expected trust of the team with which each cell can be reached.
+
+    Over the paths to each cell with the fewest possible bounds, or, unless the course is of
+    "shortest" paths, up to two more without turning straight back.
+
+    Args:
+        course: Where.
+        moves: With a leading axis (draw,).
+
+    Returns:
+        Shape (draw, row, col); NaN where a cell cannot be reached.
+    """
+    slack = min(2, course.longest - course.shortest)
+    fewest = np.where(course.bounds_from_start >= 0, course.bounds_from_start, np.inf)
+    if moves.is_scalar:
+        beta0, x0 = moves.transition[:, 0, 0], moves.start[:, 0]
+        return best_trust(moves.drift[:, 0], beta0, x0, fewest, MOVES[course.connectivity], slack)
+    values = np.full((len(moves.start), *fewest.shape), np.nan)
+    for row, col in np.argwhere(np.isfinite(fewest)).tolist():
+        values[:, row, col] = _trust_at(course, moves, (row, col), slack)
+    return values
+
+
+def robot_maps(course: Course, moves: Dynamics) -> np.ndarray:
+    """The same for each robot by itself, shape (draw, robot, row, col).
+
+    Args:
+        course: Where.
+        moves: With a leading axis (draw,), its states the robots.
+    """
+    n_robots = moves.start.shape[-1]
+    alone = (moves.transition == moves.transition * np.eye(n_robots)).all()
+    maps = []
+    for i in range(n_robots):
+        one = slice(i, i + 1)
+        own = moves._replace(views=np.eye(n_robots)[one])
+        if alone:
+            own = Dynamics(
+                moves.transition[:, one, one], moves.drift[:, one], moves.start[:, one], np.eye(1)
+            )
+        maps.append(best_map(course, own))
+    return np.stack(maps, axis=1)
+
+
+def _trust_at(course: Course, moves: Dynamics, cell: Cell, slack: int) -> np.ndarray:
+    """Where one number does not say all about the team: the best path to each cell by itself."""
+    if cell == course.start:
+        return (moves.start @ moves.views.T).min(-1)
+    kind = ("shortest", "shortest+1", "shortest+2")[slack]
+    there = Course(course.workspace, course.start, cell, course.connectivity, kind, revisit=True)
+    paths = plan_compiled(there, moves, Aim("terminal")).paths
+    return np.array(
+        [trust_along(moves.draw(d), there.cells(path))[-1] for d, path in enumerate(paths)]
+    )
 
 
 def best_trust(
     u: np.ndarray,
-    beta0: float,
-    x0: float,
-    n_bounds: Mapping[Cell, int],
+    beta0: np.ndarray,
+    x0: np.ndarray,
+    fewest: np.ndarray,
     moves: Steps,
     slack: int = 0,
 ) -> np.ndarray:
@@ -23,25 +83,21 @@ def best_trust(
     without U-turns enters no cell twice: a loop takes three bounds, more than there are to spare.
 
     Args:
-        u: Drift of each cell, shape (*batch, row, col); each batch element is maximised by itself.
-        beta0: Autoregression.
-        x0: Expected trust at the start.
-        n_bounds: Fewest bounds from the start, by cell; cells that are missing cannot be reached.
+        u: Drift of each cell, shape (draw, row, col).
+        beta0: Autoregression, shape (draw,).
+        x0: Expected trust at the start, shape (draw,).
+        fewest: Fewest bounds from the start, shape (row, col); inf where there is no way.
         moves: Steps to the neighbouring cells.
         slack: How many bounds more than the fewest possible a path may take, 0 to 2.
 
     Returns:
-        Shape (*batch, row, col); NaN where a cell cannot be reached.
+        Shape (draw, row, col); NaN where a cell cannot be reached.
     """
-    rows, cols = u.shape[-2:]
-    batch = u.shape[:-2]
-    fewest = np.full((rows, cols), np.inf)
-    for cell, k in n_bounds.items():
-        fewest[cell] = k
+    beta0 = beta0[:, None, None]
     start = fewest == 0
-    best = np.where(start, x0, np.full(u.shape, -np.inf))
+    best = np.where(start, x0[:, None, None], np.full(u.shape, -np.inf))
     # Most and least trust on arrival by each move; the start is arrived at by a move of its own.
-    most = np.full((len(moves) + 1, *batch, rows, cols), -np.inf)
+    most = np.full((len(moves) + 1, *u.shape), -np.inf)
     most[-1] = best
     least = np.where(np.isfinite(most), most, np.inf)
     reverse = [moves.index((-down, -right)) for down, right in moves]

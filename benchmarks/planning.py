@@ -1,0 +1,232 @@
+"""Speed of planning beside networkx and scipy.
+
+Run: python benchmarks/planning.py [quick]
+
+Peers get what they are good at: networkx a graph that is built once and whose weights are set
+anew for each draw; scipy a CSR matrix likewise. All find the same costs (checked to 1e-9). Medians
+of 5 (networkx: of 1, on fewer draws, scaled); uses all cores that the process may.
+"""
+
+import gc
+import statistics
+import sys
+import time
+
+import networkx as nx
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from trustbo.models import PooledTrust, TrustParams, sample_prior
+from trustbo.planning import Planner
+from trustbo.planning.course import Course
+from trustbo.planning.values import entry_cost
+from trustbo.terrain import Workspace
+
+QUICK = "quick" in sys.argv
+
+
+def seconds(work, repeats=5):
+    work()
+    took = []
+    for _ in range(repeats):
+        gc.collect()
+        started = time.perf_counter()
+        work()
+        took.append(time.perf_counter() - started)
+    return statistics.median(took)
+
+
+def once(work):
+    started = time.perf_counter()
+    result = work()
+    return time.perf_counter() - started, result
+
+
+def workspace_of(n, kind="open", seed=0):
+    """One robot on n x n cells: smooth features; a maze has walls with one gap each."""
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(size=(n, n, 2))
+    if n > 10:
+        z = gaussian_filter(rng.normal(size=(n, n, 2)), (n / 40, n / 40, 0))
+        z = (z - z.min()) / (z.max() - z.min())
+    passable = np.ones((n, n), bool)
+    if kind == "maze":
+        passable[1::4, :-1] = False
+        passable[3::4, 1:] = False
+        passable[-1], passable[-2, -1] = True, True
+    return Workspace.from_awareness(z[None], passable)
+
+
+def csr_of(course):
+    """Edges by their targets, in CSR order: weights are then one fancy index away."""
+    neighbours = course.neighbours
+    rows, moves = np.nonzero(neighbours >= 0)
+    cols = neighbours[rows, moves]
+    n = len(neighbours)
+    return csr_matrix((np.ones(len(cols)), (rows, cols)), shape=(n, n))
+
+
+def line(label, took, ours=None, note=""):
+    ratio = "" if ours is None else f"{took / ours:8.1f} x"
+    print(f"| {label:<52} | {1e3 * took:12.3f} ms | {ratio:>10} | {note}", flush=True)
+
+
+def many_draws(n, n_networkx):
+    """1000 draws of the posterior on n x n cells."""
+    print(f"\n## 1000 draws, {n} x {n} cells, each draw's best path\n")
+    print(f"| {'':<52} | {'all 1000':>15} | {'of ours':>10} |\n|---|---:|---:|---|")
+    workspace = workspace_of(n)
+    ends = (workspace, (n - 1, 0), (0, n - 1))
+    draws = sample_prior(PooledTrust(), 2, 1000, seed=0)
+    planner = Planner(*ends, "stationary")
+    ours = seconds(lambda: planner.plan_draws(draws))
+    drawn = planner.plan_draws(draws)
+    line("trustbo, stationary (a history-free cost)", ours)
+
+    costs = entry_cost(planner.course.passable, planner.dynamics(draws))
+    start, goal = planner.course.flat(planner.start), planner.course.flat(planner.goal)
+    matrix = csr_of(planner.course)
+
+    def scipy_loop():
+        totals = np.empty(len(costs))
+        for d, cost in enumerate(costs):
+            matrix.data = cost.ravel()[matrix.indices]
+            totals[d] = dijkstra(matrix, indices=start)[goal]
+        return totals
+
+    took, totals = once(scipy_loop)
+    np.testing.assert_allclose(np.exp(-totals), drawn.values, rtol=1e-9)
+    line("scipy.sparse.csgraph.dijkstra, reused matrix", took, ours, target(took / ours, 5))
+
+    graph = planner.graph
+    some = range(0, 1000, 1000 // n_networkx)
+
+    def networkx_loop():
+        totals = []
+        for d in some:
+            cost = costs[d]
+            for _, b, data in graph.edges(data=True):
+                data["weight"] = cost[b]
+            totals.append(nx.dijkstra_path_length(graph, planner.start, planner.goal))
+        return totals
+
+    took, totals = once(networkx_loop)
+    np.testing.assert_allclose(np.exp(-np.array(totals)), drawn.values[list(some)], rtol=1e-9)
+    took *= 1000 / len(some)
+    line("networkx, reused graph", took, ours, target(took / ours, 50 if n == 10 else 150))
+    if n == 10:
+        print(f"\n5 ms for 1000 draws: {'yes' if ours <= 5e-3 else 'NO'} ({1e3 * ours:.1f} ms)")
+
+    planner = Planner(*ends, "terminal")
+    planner.plan_draws(draws)
+    ours = seconds(lambda: planner.plan_draws(draws))
+    print()
+    line("trustbo, terminal, shortest + 2 bounds", ours)
+    if n > 10:
+        return
+    by_networkx, few = Planner(*ends, "terminal", engine="networkx"), 20
+    took, drawn = once(lambda: by_networkx.plan_draws(draws, n_draws=few))
+    compiled = planner.plan_draws(draws, n_draws=few)
+    np.testing.assert_allclose(compiled.values, drawn.values, rtol=1e-9)
+    line("our reference on networkx (layered graph)", took * 1000 / few, ours)
+
+
+def target(ratio, least):
+    return f"target {least} x: {'yes' if ratio >= least else 'NO'}"
+
+
+def large(n, kind):
+    """One plan on n x n cells, from an array to a path."""
+    print(f"\n## one plan, {n} x {n} cells, {kind}, from an array\n")
+    print(f"| {'':<52} | {'seconds':>15} | {'of ours':>10} |\n|---|---:|---:|---|")
+    workspace = workspace_of(n, kind)
+    params = TrustParams(0.6, np.array([0.8, 0.6]), -0.2, 0.1, 0.1)
+    ends = (workspace, (0, 0), (n - 1, n - 1))
+
+    def trustbo_plan():
+        return Planner(*ends, "stationary", engine="numba").plan(params)
+
+    ours, plan = seconds(trustbo_plan), trustbo_plan()
+    line("trustbo, stationary, Planner and plan", ours, None, f"{len(plan.path)} cells")
+    planner = Planner(*ends, "stationary")
+    cost = entry_cost(planner.course.passable, planner.dynamics(params))
+    start, goal = planner.course.flat(planner.start), planner.course.flat(planner.goal)
+
+    def scipy_plan():
+        course = Course(workspace, (0, 0), (n - 1, n - 1), 8, "shortest+2", True)
+        matrix = csr_of(course)
+        matrix.data = cost.ravel()[matrix.indices]
+        return dijkstra(matrix, indices=start, return_predecessors=True)[0][goal]
+
+    took, total = once(scipy_plan)
+    np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-7)
+    line("scipy.sparse.csgraph.dijkstra, matrix built", took, ours, target(took / ours, 5))
+    took, total = once(lambda: heap(cost, start, goal))
+    took, total = once(lambda: heap(cost, start, goal))
+    np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-7)
+    line("a binary heap, compiled", took, ours, f"target, not over 2 x it: "
+         f"{'yes' if ours <= 2 * took else 'NO'}")  # fmt: skip
+    if not QUICK:
+        took, total = once(lambda: networkx_plan(cost, (0, 0), (n - 1, n - 1)))
+        np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-7)
+        line("networkx, graph built", took, ours, target(took / ours, 500))
+
+
+def networkx_plan(cost, start, goal):
+    rows, cols = cost.shape
+    graph = nx.DiGraph()
+    for r, c in np.argwhere(np.isfinite(cost)).tolist():
+        for i in range(max(0, r - 1), min(rows, r + 2)):
+            for j in range(max(0, c - 1), min(cols, c + 2)):
+                if (i, j) != (r, c) and cost[i, j] < np.inf:
+                    graph.add_edge((r, c), (i, j), weight=cost[i, j])
+    return nx.dijkstra_path_length(graph, start, goal)
+
+
+def heap(cost, start, goal):
+    """Dijkstra with a binary heap, compiled by numba too."""
+    return _heap(cost, start, goal)
+
+
+def _make_heap():
+    import heapq
+
+    from numba import njit
+
+    @njit
+    def dijkstra_heap(cost, start, goal):
+        rows, cols = cost.shape
+        known = np.full((rows, cols), np.inf)
+        known[start // cols, start % cols] = 0.0
+        queue = [(0.0, start)]
+        while queue:
+            total, c = heapq.heappop(queue)
+            r, k = c // cols, c % cols
+            if c == goal:
+                return total
+            if total > known[r, k]:
+                continue
+            for i in range(max(0, r - 1), min(rows, r + 2)):
+                for j in range(max(0, k - 1), min(cols, k + 2)):
+                    if total + cost[i, j] < known[i, j]:
+                        known[i, j] = total + cost[i, j]
+                        heapq.heappush(queue, (known[i, j], i * cols + j))
+        return np.inf
+
+    return dijkstra_heap
+
+
+_heap = _make_heap()
+
+
+def main():
+    many_draws(10, 200)
+    many_draws(100, 5)
+    for kind in ("open", "maze"):
+        large(300 if QUICK else 1000, kind)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""Where paths may lead: one start, one goal, and which paths between them are admissible."""
+
+import operator
+from collections.abc import Sequence
+from functools import cached_property
+
+import networkx as nx
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
+from trustbo.planning.graph import (
+    MOVES,
+    NoPathError,
+    cell_graph,
+    fewest_bounds,
+    move_lengths,
+    require_connectivity,
+    require_way,
+)
+from trustbo.planning.layers import Layers, build_layers
+from trustbo.terrain import Workspace
+
+DEFAULT_SLACK = 8
+"""Bounds beyond the fewest possible that `success` and `bottleneck` may take by default."""
+
+SIMPLE = ("shortest", "shortest+1", "shortest+2")
+"""Values of `max_bounds` whose paths, which do not turn straight back, enter no cell twice."""
+
+
+class Course:
+    """Start, goal and the admissible paths between them; what engines need of the grid.
+
+    Attributes:
+        start: First cell.
+        goal: Last cell; a path ends when it enters it.
+        shortest: Fewest bounds from start to goal.
+        longest: Most bounds an admissible path may have.
+        u_turns: Whether an admissible path may turn straight back.
+        revisit: Whether it may enter a cell twice.
+        steps: Moves to neighbouring cells, shape (move, 2).
+        lengths: Metres of each, shape (move,).
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        start: Cell,
+        goal: Cell,
+        connectivity: int,
+        max_bounds: int | str | None,
+        revisit: bool,
+    ) -> None:
+        """See `Planner`; `max_bounds` None is `DEFAULT_SLACK` more than the fewest."""
+        self.workspace, self.connectivity = workspace, require_connectivity(connectivity)
+        self.start = workspace.require_cell("start", start)
+        self.goal = workspace.require_cell("goal", goal)
+        if self.start == self.goal:
+            raise TrustboError(f"start and goal are the same cell {self.start}; choose two.")
+        self.passable = workspace.passable.values
+        self.steps = np.array(MOVES[connectivity])
+        self.lengths = move_lengths(workspace, connectivity)
+        self.bounds_to_goal = fewest_bounds(self.passable, self.goal, connectivity)
+        require_way(self.passable, self.bounds_to_goal, self.start, self.goal, connectivity)
+        self.shortest = int(self.bounds_to_goal[self.start])
+        self.longest = self._most_bounds(max_bounds)
+        self.u_turns = not isinstance(max_bounds, str)
+        self.revisit = revisit
+
+    @cached_property
+    def graph(self) -> nx.DiGraph:
+        """The `networkx.DiGraph` of passable cells (see `cell_graph`)."""
+        return cell_graph(self.workspace, self.connectivity)
+
+    @cached_property
+    def to_goal(self) -> dict[Cell, int]:
+        """Fewest bounds to the goal, by cell; cells that are missing cannot reach it."""
+        return _by_cell(self.bounds_to_goal)
+
+    @cached_property
+    def bounds_from_start(self) -> np.ndarray:
+        """Fewest bounds from the start, shape (row, col); -1 where there is no way."""
+        return fewest_bounds(self.passable, self.start, self.connectivity)
+
+    @cached_property
+    def layers(self) -> Layers:
+        """The grid unrolled over the bounds that are left."""
+        return build_layers(
+            self.bounds_to_goal,
+            self.bounds_from_start,
+            self.steps,
+            self.longest,
+            u_turns=self.u_turns,
+        )
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """Cells that can be entered from each, flat indices, shape (cell, move); -1 where none."""
+        rows, cols = self.passable.shape
+        row, col = np.divmod(np.arange(rows * cols)[:, None], cols)
+        i, j = row + self.steps[:, 0], col + self.steps[:, 1]
+        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
+        other = np.where(inside, i * cols + j, 0)
+        both = self.passable.ravel()[other] & self.passable.ravel()[:, None]
+        return np.where(inside & both, other, -1)
+
+    def onward(self, done: Sequence[Cell]) -> "Course":
+        """What is left of this course for a team that has made some bounds.
+
+        Args:
+            done: The cells entered so far, start first.
+
+        Raises:
+            TrustboError: They are no way from the start, or end at the goal.
+            NoPathError: Too few bounds are left to reach the goal.
+        """
+        here = self.workspace.require_cell("done[-1]", done[-1])
+        if done[0] != self.start:
+            raise TrustboError(f"the mission began at {done[0]}; the course at {self.start}.")
+        left = self.longest - (len(done) - 1)
+        fewest = int(self.bounds_to_goal[here])
+        if here != self.goal and not 0 < fewest <= left:
+            raise NoPathError(
+                f"from {here} to {self.goal} it takes {fewest} bounds, but {left} are left."
+            )
+        kind = left
+        if not self.u_turns:
+            kind = SIMPLE[min(left - fewest, len(SIMPLE) - 1)]
+        return Course(
+            self.workspace, here, self.goal, self.connectivity, kind, revisit=self.revisit
+        )
+
+    def flat(self, cell: Cell) -> int:
+        """Index of a cell in row-major order."""
+        return cell[0] * self.passable.shape[1] + cell[1]
+
+    def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
+        """Cells of flat indices, up to the first that is negative."""
+        rows, cols = np.divmod(flat[flat >= 0], self.passable.shape[1])
+        return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
+
+    def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
+        """The path as a tuple of cells, if a team can take it.
+
+        Raises:
+            TrustboError: It is broken, or does not lead from start to goal; the cell is named.
+        """
+        try:
+            where = np.array([operator.index(i) for cell in path for i in cell]).reshape(-1, 2)
+            cells = tuple(zip(*where.T.tolist(), strict=True))
+        except (TypeError, ValueError):
+            cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
+            where = np.array(cells)
+        if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:
+            raise TrustboError(
+                f"a path must lead from {self.start} to {self.goal}; got {_shortened(cells)}."
+            )
+        step = np.diff(where, axis=0)
+        inside = ((where[1:] >= 0) & (where[1:] < self.passable.shape)).all(1)
+        far = np.abs(step).sum(1) if self.connectivity == 4 else np.abs(step).max(1)
+        there = np.where(inside[:, None], where[1:], 0)
+        broken = (far != 1) | ~inside | ~self.passable[*there.T]
+        if broken.any():
+            k = int(np.argmax(broken))
+            raise TrustboError(
+                f"the path is broken: no bound leads from {cells[k]} to {cells[k + 1]}."
+            )
+        return cells
+
+    def _most_bounds(self, max_bounds: int | str | None) -> int:
+        if max_bounds is None:
+            return self.shortest + DEFAULT_SLACK
+        named = {name: self.shortest + extra for extra, name in enumerate(SIMPLE)}
+        if isinstance(max_bounds, str):
+            return named[require_choice("max_bounds", max_bounds, named)]
+        if require_whole("max_bounds", max_bounds, 1) < self.shortest:
+            raise TrustboError(
+                f"max_bounds = {max_bounds} is below the fewest possible from {self.start} to "
+                f"{self.goal}, which is {self.shortest}."
+            )
+        return int(max_bounds)
+
+
+def _by_cell(bounds: np.ndarray) -> dict[Cell, int]:
+    cells = np.argwhere(bounds >= 0)
+    return {(r, c): int(bounds[r, c]) for r, c in cells.tolist()}
+
+
+def _shortened(cells: tuple[Cell, ...]) -> str:
+    return str(cells) if len(cells) <= 10 else f"{len(cells)} cells from {cells[0]} to {cells[-1]}"

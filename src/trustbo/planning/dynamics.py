@@ -1,0 +1,178 @@
+"""How expected trust moves: one linear recursion for every model, and what a path makes of it."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from trustbo.errors import ShapeError
+from trustbo.models.params import CoupledParams, Params, RobotParams, check_params
+
+TEAMS = ("mean", "min")
+"""What the team's trust is: the mean of its robots', or the least."""
+
+
+class Dynamics(NamedTuple):
+    """Expected trust x_k = transition x_{k-1} + drift(cell), x_0 = start; leading axes (...,).
+
+    Fields: transition (..., state, state), drift (..., state, row, col), start (..., state), and
+    views (view, state): the team's trust is the least of `views @ x`. The states are the robots;
+    or, where all have one beta0 and the team's trust is their mean, just that mean.
+    """
+
+    transition: np.ndarray
+    drift: np.ndarray
+    start: np.ndarray
+    views: np.ndarray
+
+    @property
+    def is_scalar(self) -> bool:
+        """Whether one number says all about the team."""
+        return self.views.shape == (1, 1)
+
+    def draw(self, index: int) -> "Dynamics":
+        """One draw, without its leading axis."""
+        return Dynamics(self.transition[index], self.drift[index], self.start[index], self.views)
+
+    def flat(self) -> "Dynamics":
+        """With exactly one leading axis (draw,)."""
+
+        def one(value: np.ndarray, core: int) -> np.ndarray:
+            return value.reshape(-1, *value.shape[value.ndim - core :])
+
+        return Dynamics(one(self.transition, 2), one(self.drift, 3), one(self.start, 1), self.views)
+
+    def settled(self) -> np.ndarray:
+        """The team's trust if it stayed in each cell for ever, (..., row, col)."""
+        if self.is_scalar:
+            return self.drift[..., 0, :, :] / (1.0 - self.transition)
+        n_states = self.start.shape[-1]
+        gain = np.linalg.inv(np.eye(n_states) - self.transition)
+        levels = np.einsum("vs,...st,...trc->...vrc", self.views, gain, self.drift)
+        return levels.min(-3)
+
+
+def dynamics(
+    params: Params, awareness: ArrayLike, team: str = "mean", x0: ArrayLike | None = None
+) -> Dynamics:
+    """The recursion of expected trust under parameters with leading axes (...,).
+
+    Args:
+        params: Of any model.
+        awareness: Shape (robot, row, col, feature), or (draw, robot, row, col, feature) with one
+            map for each draw of the parameters.
+        team: `"mean"` or `"min"`.
+        x0: Expected trust before the first bound, shape () or (robot,), with leading axes or not;
+            by default `params.x0_mean`.
+
+    Raises:
+        ShapeError: The number of robots or features differs from that of the parameters.
+    """
+    z = np.asarray(awareness, dtype=float)
+    n_robots, leading = z.shape[-4], params.leading
+    start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
+    if x0 is None:
+        start = start[..., None]
+    elif not start.ndim:
+        start = start[None]
+    start = np.broadcast_to(start, (*leading, n_robots))
+    if isinstance(params, RobotParams | CoupledParams) or team == "min":
+        views = np.eye(n_robots) if team == "min" else np.full((1, n_robots), 1.0 / n_robots)
+        return Dynamics(transition(params, n_robots), drift(params, z), start, views)
+    beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
+    # The mean of the robots obeys the same equation.
+    u = drift(params, z.mean(-4, keepdims=True) if n_robots > 1 else z)
+    return Dynamics(
+        np.broadcast_to(beta0, (*leading, 1, 1)), u, start.mean(-1, keepdims=True), np.eye(1)
+    )
+
+
+def transition(params: Params, n_robots: int) -> np.ndarray:
+    """B0 of equation (1), shape (..., robot, robot); diagonal where robots do not interact."""
+    if isinstance(params, CoupledParams):
+        return np.asarray(params.B0, dtype=float)
+    beta0 = np.asarray(params.beta0, dtype=float)
+    if not isinstance(params, RobotParams):
+        beta0 = beta0[..., None]
+    return np.broadcast_to(beta0, (*params.leading, n_robots))[..., None] * np.eye(n_robots)
+
+
+def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
+    """What one bound adds to each robot's trust, u = sum_m beta_m z_m + b.
+
+    Args:
+        params: Parameters with leading axes (...,).
+        awareness: Shape (robot, row, col, feature), or with a leading axis (draw,) like the
+            parameters'.
+
+    Returns:
+        Shape (..., robot, row, col).
+
+    Raises:
+        ShapeError: The number of robots or features differs from that of the parameters.
+    """
+    z = np.asarray(awareness, dtype=float)
+    check_params(params, z.shape[-4], z.shape[-1])
+    if z.ndim == 5 and params.leading != z.shape[:1]:
+        raise ShapeError(
+            f"{z.shape[0]} maps of awareness need as many draws of the parameters; got "
+            f"{params.leading}."
+        )
+    b = np.asarray(params.b, dtype=float)
+    if isinstance(params, CoupledParams):
+        u = np.einsum("...mai,...ircm->...arc", np.asarray(params.B, dtype=float), z)
+    elif isinstance(params, RobotParams):
+        u = np.einsum("...im,...ircm->...irc", np.asarray(params.beta, dtype=float), z)
+    else:
+        beta = np.asarray(params.beta, dtype=float)
+        u = np.tensordot(beta, z, (-1, -1)) if z.ndim == 4 else np.einsum("dm,dircm->dirc", beta, z)
+        b = b[..., None]
+    return u + b[..., None, None]
+
+
+def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:
+    """Expected trust along a path, equations (1) and (3) without their noise.
+
+    Args:
+        params: Parameters of any model, with leading axes (...,) such as (draw,).
+        awareness: Shape (bound, robot, feature), or (draw, bound, robot, feature) with one for each
+            draw of the parameters.
+        x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
+            `params.x0_mean`.
+
+    Returns:
+        Shape (..., bound, robot).
+
+    Raises:
+        ShapeError: The number of robots or features differs from that of the parameters.
+    """
+    z = np.asarray(awareness, dtype=float)
+    along = np.moveaxis(z, -3, -2)[..., None, :]  # (..., robot, bound, 1, feature): a map, one wide
+    moves = dynamics(params, along, "min", x0)
+    return roll(moves.transition, moves.drift[..., 0], moves.start)
+
+
+def roll(transition: np.ndarray, drift: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """The recursion itself: drift (..., state, bound), returns x of shape (..., bound, state)."""
+    leading, (n_states, n_bounds) = drift.shape[:-2], drift.shape[-2:]
+    trust = np.empty((*leading, n_bounds, n_states))
+    _roll(
+        np.broadcast_to(transition, (*leading, n_states, n_states)).reshape(-1, n_states, n_states),
+        np.ascontiguousarray(drift).reshape(-1, n_states, n_bounds),
+        np.broadcast_to(start, (*leading, n_states)).reshape(-1, n_states),
+        trust.reshape(-1, n_bounds, n_states),
+    )
+    return trust
+
+
+@njit(cache=True, nogil=True)
+def _roll(transition, drift, start, trust):
+    for d in range(len(drift)):
+        for k in range(drift.shape[2]):
+            for s in range(drift.shape[1]):
+                total = drift[d, s, k]
+                for r in range(drift.shape[1]):
+                    x = start[d, r] if k == 0 else trust[d, k - 1, r]
+                    total += transition[d, s, r] * x
+                trust[d, k, s] = total

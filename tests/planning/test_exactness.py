@@ -1,0 +1,144 @@
+"""Every engine against every admissible path written out, for every model and team."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from references import path_values, walks
+
+from trustbo.models import CoupledParams, RobotParams, TrustParams
+from trustbo.planning import Planner
+from trustbo.terrain import Workspace
+
+BETA0 = {
+    "terminal": (-0.8, 0.0, 0.3, 0.7, 1.0, 1.3),
+    "mean": (-0.8, 0.0, 0.3, 0.7, 1.0, 1.3),
+    "success": (0.0, 0.3, 0.7, 1.0, 1.3),
+    "bottleneck": (0.0, 0.3, 0.7, 1.0, 1.3),
+    "stationary": (-0.8, 0.0, 0.3, 0.7),
+}
+CELL = 20.0
+
+
+@cache
+def course(n, connectivity, seed, extra, kind):
+    """A random map of obstacles whose corners are connected, and all its admissible paths."""
+    rng = np.random.default_rng([n, connectivity, seed])
+    ends, kind = ((n - 1, 0), (0, n - 1)), dict(kind)
+    while True:
+        passable = rng.uniform(size=(n, n)) > rng.uniform(0.1, 0.15)
+        passable[ends[0]] = passable[ends[1]] = True
+        workspace = Workspace.from_awareness(np.full((1, n, n, 1), 0.5), passable)
+        try:
+            shortest = Planner(workspace, *ends, connectivity=connectivity).shortest
+        except ValueError:
+            continue
+        longest = n * n if extra is None else shortest + extra
+        paths = list(walks(passable.tolist(), *ends, longest, connectivity, **kind))
+        if len(paths) < 200_000:
+            break
+    n_cells = np.array([len(path) for path in paths])
+    flat = np.zeros((len(paths), n_cells.max()), int)
+    length = np.empty(len(paths))
+    for i, path in enumerate(paths):
+        cells = np.array(path)
+        flat[i, : len(path)] = cells @ (n, 1)
+        length[i] = np.hypot(*np.diff(cells * CELL, axis=0).T).sum()
+    return passable, shortest, flat, n_cells, length
+
+
+def admissible(objective, n, connectivity):
+    """What `max_bounds` is, and which walks these are: what can be enumerated."""
+    if objective in ("terminal", "mean"):
+        return 2, "shortest+2", (("u_turns", False),)
+    if objective == "stationary":
+        return None, None, (("simple", True),)
+    extra = 2 if connectivity == 4 and n == 4 else 1
+    return extra, extra, ()
+
+
+def random_problem(model, n, n_robots, beta0, rng):
+    """Awareness and parameters; drift and transition by their definitions."""
+    z = rng.uniform(size=(n_robots, n, n, 2))
+    noise = 0.1 * np.eye(n_robots)
+    if model == "pooled":
+        beta, b = rng.normal(size=2), rng.normal(-0.3, 0.5)
+        params = TrustParams(beta0, beta, b, 0.1, 0.1)
+        return z, params, (z @ beta + b).reshape(n_robots, -1), beta0 * np.eye(n_robots)
+    if model == "hierarchical":
+        own = beta0 * rng.uniform(0.7, 1.0, n_robots)
+        beta, b = rng.normal(size=(n_robots, 2)), rng.normal(-0.3, 0.5, n_robots)
+        params = RobotParams(own, beta, b, np.full(n_robots, 0.1), np.full(n_robots, 0.1))
+        u = np.stack([z[i] @ beta[i] + b[i] for i in range(n_robots)])
+        return z, params, u.reshape(n_robots, -1), np.diag(own)
+    B0 = beta0 * np.eye(n_robots) + rng.normal(0.0, 0.1, (n_robots, n_robots)) * (
+        1 - np.eye(n_robots)
+    )
+    B, b = rng.normal(size=(2, n_robots, n_robots)), rng.normal(-0.3, 0.5, n_robots)
+    u = sum(np.tensordot(B[m], z[..., m], 1) for m in range(2)) + b[:, None, None]
+    return z, CoupledParams(B0, B, b, noise, noise), u.reshape(n_robots, -1), B0
+
+
+def plan_and_best(objective, model, n, connectivity, seed, beta0, *, team="mean", weight=0.0):
+    """What each engine plans, and the best of all paths."""
+    rng = np.random.default_rng([seed, n, connectivity, int(10 * abs(beta0))])
+    extra, cap, kind = admissible(objective, n, connectivity)
+    passable, shortest, paths, n_cells, length = course(n, connectivity, seed % 3, extra, kind)
+    n_robots = (1, 3)[seed % 2] if model == "pooled" else 3
+    z, params, u, transition = random_problem(model, n, n_robots, beta0, rng)
+    workspace = Workspace.from_awareness(z, passable, CELL)
+    values = path_values(
+        objective, paths, n_cells, u, transition, 0.5, team=team, toll=weight * length
+    )
+    cap = cap if isinstance(cap, str) or cap is None else shortest + cap
+    plans = [
+        Planner(
+            workspace,
+            (n - 1, 0),
+            (0, n - 1),
+            objective,
+            connectivity=connectivity,
+            max_bounds=cap,
+            team=team,
+            length_weight=weight,
+            engine=engine,
+        ).plan(params)
+        for engine in ("networkx", "numba")
+    ]
+    return plans, values.max()
+
+
+def check(plans, best):
+    for plan in plans:
+        assert plan.exact
+        np.testing.assert_allclose(plan.value, best, rtol=1e-9, atol=1e-300)
+    # Cell by cell: no two paths of these maps are worth the same, but by their least trust.
+    assert plans[0].path == plans[1].path or plans[0].objective == "bottleneck"
+
+
+@pytest.mark.parametrize(("n", "connectivity"), [(4, 4), (4, 8), (5, 4), (5, 8)])
+@pytest.mark.parametrize("objective", list(BETA0))
+def test_both_engines_find_the_best_of_all_admissible_paths(objective, n, connectivity):
+    if objective == "stationary" and (n, connectivity) == (5, 8):
+        pytest.skip("its simple paths are too many to write out")
+    for seed in range(6):
+        for beta0 in BETA0[objective]:
+            check(*plan_and_best(objective, "pooled", n, connectivity, seed, beta0))
+
+
+@pytest.mark.parametrize("team", ["mean", "min"])
+@pytest.mark.parametrize("model", ["pooled", "hierarchical", "coupled"])
+@pytest.mark.parametrize("objective", list(BETA0))
+def test_vector_trust_is_planned_exactly_too(objective, model, team):
+    if model == "pooled" and team == "mean":
+        pytest.skip("above")
+    for seed in range(4):
+        for beta0 in (0.3, 0.7):
+            check(*plan_and_best(objective, model, 4, 8, seed, beta0, team=team))
+
+
+@pytest.mark.parametrize("objective", ["terminal", "mean", "stationary"])
+@pytest.mark.parametrize("team", ["mean", "min"])
+def test_a_length_weight_is_paid_per_metre(objective, team):
+    for seed in range(4):
+        check(*plan_and_best(objective, "pooled", 4, 8, seed, 0.7, team=team, weight=0.004))
