@@ -1,5 +1,7 @@
 """Ask and tell: whatever runs the missions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulators import ModelSimulator
@@ -13,7 +15,7 @@ from trustbo import (
     TrustboError,
     Workspace,
 )
-from trustbo.models import CoupledTrust, PooledTrust, fit
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, fit, sample_prior
 from trustbo.planning import policies
 
 ENDS = ((3, 0), (0, 3))
@@ -92,7 +94,7 @@ def test_a_refused_posterior_leaves_the_campaign_as_it_was(workspace, monkeypatc
     def refuse(*args, **kwargs):
         raise PosteriorError("R-hat of beta0 is 1.5")
 
-    monkeypatch.setattr("trustbo.campaign.fit", refuse)
+    monkeypatch.setattr("trustbo.learning.fit", refuse)
     with pytest.raises(PosteriorError):
         campaign.tell(ModelSimulator(workspace).run(plan.path, seed=0))
     assert (campaign.missions, campaign.posteriors, campaign.plans) == ([], [], [])
@@ -110,7 +112,19 @@ def test_a_policy_of_one_s_own(workspace):
 
 def test_a_policy_that_gives_no_plan_is_refused(workspace):
     campaign = Campaign(workspace, *ENDS, policy=lambda key, posterior, planner: [(3, 0)])
-    with pytest.raises(TrustboError, match=r"the policy must return a Plan; got \[\(3, 0\)\]"):
+    with pytest.raises(TrustboError, match=r"'<lambda>' must return a Plan; got \[\(3, 0\)\]"):
+        campaign.ask()
+
+
+def test_a_policy_that_returns_a_broken_path_is_named_with_the_cell(workspace):
+    def leaps(key, posterior, planner):
+        plan = planner.plan(posterior.mean())
+        return replace(plan, path=((3, 0), (1, 1), (0, 3)))
+
+    campaign = Campaign(workspace, *ENDS, policy=leaps)
+    with pytest.raises(
+        TrustboError, match=r"policy 'leaps': the path is broken: .* from \(3, 0\) to \(1, 1\)"
+    ):
         campaign.ask()
 
 
@@ -123,7 +137,7 @@ def test_recommending_is_greedy_whatever_the_policy(workspace):
 
 def test_bad_names_and_ends_are_refused_at_once(workspace):
     for options, message in (
-        ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, thompson, random"),
+        ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, optimistic"),
         ({"objective": "best"}, "unknown objective 'best'"),
         ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of nuts, exact"),
         ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_draw, prior_mean"),
@@ -164,8 +178,10 @@ def test_the_later_code_s_updating_is_offered_with_a_warning(workspace):
 
 
 def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
-    with pytest.raises(TrustboError, match="planned with PooledTrust for now; got Coupled"):
-        Campaign(workspace, *ENDS, model=CoupledTrust())
+    with pytest.raises(TrustboError, match='"moment_matched" is for PooledTrust; got Coupled'):
+        Campaign(workspace, *ENDS, model=CoupledTrust(), update="moment_matched")
+    with pytest.raises(TrustboError, match="unknown awareness 'guess'; choose one of map, belief"):
+        Campaign(workspace, *ENDS, awareness="guess")
     with pytest.raises(TrustboError, match="model must be a trust model"):
         Campaign(workspace, *ENDS, model="pooled")
     with pytest.raises(TrustboError, match=r"forgetting must be in \(0, 1\]; got 1.5"):
@@ -184,3 +200,38 @@ def test_a_campaign_with_censored_rates(workspace):
     campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
     assert campaign.posterior.attrs["sampler"] == "joint"
     assert campaign.ask().exact
+
+
+@pytest.mark.parametrize("initial", ["prior_draw", "prior_mean"])
+@pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
+def test_every_model_can_be_planned_with(workspace, model, initial):
+    campaign = Campaign(workspace, *ENDS, model=model, team="min", initial=initial)
+    plan = campaign.ask()
+    assert plan.trust.shape[1] == 3
+    assert plan.value == pytest.approx(1.0 / (1.0 + np.exp(-plan.trust[-1].min())))
+
+
+def test_plans_carry_bands_over_the_draws_they_are_made_from(workspace):
+    campaign = Campaign(workspace, *ENDS, model=HierarchicalTrust())
+    campaign.belief = sample_prior(campaign.model, 2, 50, seed=0, n_robots=3)
+    plan = campaign.ask()
+    assert plan.bands.shape == (4, *plan.trust.shape)
+    assert (plan.bands[-1] > plan.bands[0]).all()
+
+
+def test_a_belief_learns_the_awareness_that_missions_measure(workspace):
+    truth = Workspace.from_awareness(np.clip(workspace.awareness.values + 0.2, 0.0, 1.0))
+    campaign = Campaign(workspace, *ENDS, sampler="exact", awareness="belief")
+    plan = campaign.ask()
+    campaign.tell(ModelSimulator(truth).run(plan.path, seed=0))
+    cell = plan.path[1]
+    before = np.abs(workspace.awareness.values - truth.awareness.values)[:, *cell].mean()
+    believed = campaign.awareness.mean()
+    after = np.abs(believed - truth.awareness.values)[:, *cell].mean()
+    assert after < 0.5 * before
+    assert campaign.ask().path[0] == ENDS[0]
+    assert campaign.settings["awareness"] == "belief"
+    # What was not measured comes from what is believed, not from the map.
+    blind = ModelSimulator(truth, blind=True).run(plan.path, seed=1)
+    campaign.tell(blind)
+    np.testing.assert_allclose(campaign.missions[1].awareness[0], believed[:, *cell])

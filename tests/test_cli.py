@@ -105,7 +105,7 @@ def test_demo_runs_on_the_rasters_it_writes(tmp_path):
         (("--start", "9,9"), "start (9, 9) is outside the grid of 3 rows and 3 columns"),
         (("--goal", "2,0"), "start and goal are the same cell (2, 0)"),
         (("--start", "2;0"), "--start must be two whole numbers as 9,0; got '2;0'"),
-        (("--policy", "bold"), "unknown policy 'bold'; choose one of greedy, thompson, random"),
+        (("--policy", "bold"), "unknown policy 'bold'; choose one of greedy, optimistic, thompson"),
         (("--objective", "best"), "unknown objective 'best'; choose one of terminal, mean"),
         (("--iterations", "0"), "n_iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),

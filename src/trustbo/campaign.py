@@ -1,34 +1,32 @@
 """A campaign: ask for a path, run it by whatever means, tell what was measured."""
 
+import time
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import cast
+from importlib.metadata import version
+from os import PathLike
+from typing import Any, Self
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from jax import random
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
-from trustbo.models import (
-    PooledTrust,
-    TrustModel,
-    TrustParams,
-    fit,
-    moment_matched,
-    params_of,
-    sample_prior,
-)
-from trustbo.models.gram import require_forgetting
+from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_choice, require_whole
+from trustbo.journal import Journal
+from trustbo.learning import INITIAL, Learning
+from trustbo.models import PooledTrust, TrustModel, diagnostics, params_of
 from trustbo.models.params import Params
-from trustbo.models.sampling import SAMPLERS, require_sampler
+from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import AwarenessBelief, Plan, Planner, Policy
+from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import greedy, resolve_policy
+from trustbo.result import Result, build_history
 from trustbo.stacking import fill_awareness
 from trustbo.terrain import Workspace
 
-INITIAL = ("prior_draw", "prior_mean")
-UPDATES = ("refit", "moment_matched")
 AWARENESS = ("map", "belief")
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness")
 _N_MAPS = 500  # drawn of the awareness that is believed in
@@ -37,12 +35,20 @@ _N_MAPS = 500  # drawn of the awareness that is believed in
 class Campaign:
     """Learns from missions and proposes the next path.
 
+    With a `directory`, every mission is on disk before anything is learned from it, and everything
+    before the next is asked for: `Campaign.load` goes on where the process ended, and gives what it
+    would have given.
+
     Attributes:
         workspace: Where.
         planner: Finds the paths.
-        missions: All missions told so far.
+        missions: All missions learned from so far, awareness filled in.
         posteriors: The posterior after each of them.
         plans: The plan each of them was asked for with.
+        failures: Missions that were given up without any bound: after how many missions, and why.
+        pending: A mission that was told, but nothing could be learned from it; see `tell`.
+        notes: More for `Result.settings`, such as what the simulator is.
+        stop_reason: Why it ended, for `Result`.
         belief: Parameter draws the next plan is made from: the posterior's, or, before the first
             mission, one from the prior.
         awareness: What is believed of the awareness map, if it is not trusted blindly.
@@ -67,6 +73,7 @@ class Campaign:
         length_weight: float = 0.0,
         awareness: str | AwarenessBelief = "map",
         seed: int = 0,
+        directory: str | PathLike[str] | None = None,
     ) -> None:
         """Set up; nothing is computed yet.
 
@@ -93,13 +100,14 @@ class Campaign:
                 doubt, and corrected by what missions measure; policies draw from what it may be. Or
                 an `AwarenessBelief` of your own.
             seed: Same seed and same missions, same campaign.
+            directory: A folder where the campaign is kept as it goes. Nobody else may use it until
+                `close`, or the end of the process.
 
         Raises:
             TrustboError: Start, goal or a name that does not exist; a sampler that does not suit
                 the model; or a model that cannot be updated so.
             NoPathError: The goal cannot be reached.
         """
-        self.sampler = require_choice("sampler", sampler, SAMPLERS)
         require_choice("initial", initial, INITIAL)
         self._policy = resolve_policy(policy)
         self.planner = Planner(
@@ -114,28 +122,38 @@ class Campaign:
         )
         self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self.model = PooledTrust() if model is None else model
-        _require_model(self.model)
-        require_sampler(self.model, sampler)
-        self.update = require_choice("update", update, UPDATES)
-        self.forgetting = require_forgetting(forgetting)
-        _require_update(self.model, self.update, self.forgetting)
+        self._learning = Learning(self.model, sampler, update, forgetting)
         self.missions: list[Mission] = []
         self.posteriors: list[xr.DataTree] = []
         self.plans: list[Plan] = []
-        self._plan: Plan | None = None
+        self.failures: list[tuple[int, str]] = []
+        self.pending: Mission | None = None
+        self.notes: dict[str, object] = {}
+        self.stop_reason = "interrupted"
         self.awareness = _belief_in(workspace, awareness)
+        self._measured: list[Mission] = []
+        self._rows: list[dict[str, object]] = []
+        self._maps: list[xr.DataArray] = []
+        self._plan: Plan | None = None
         self._believed: Planner | None = None
-        self.belief: Params = self._prior_belief(initial)
+        self._asked = (0.0, 0.0)  # seconds that planning took, and when it was done
+        sizes = workspace.awareness.sizes
+        self.belief: Params = self._learning.prior_belief(
+            initial, sizes["robot"], sizes["feature"], self.seed_of("prior")
+        )
+        own = getattr(policy, "__name__", type(policy).__name__)
         self.settings = {
+            "start": list(self.planner.start),
+            "goal": list(self.planner.goal),
             "model": type(self.model).__name__,
-            "policy": policy if isinstance(policy, str) else getattr(policy, "__name__", "custom"),
+            "policy": policy if isinstance(policy, str) else own,
             "objective": self.planner.objective,
             "sampler": sampler,
             "initial": initial,
             "observation": self.model.observation,
             "response": self.model.response,
             "update": update,
-            "forgetting": self.forgetting,
+            "forgetting": self._learning.forgetting,
             "connectivity": connectivity,
             "team": team,
             "length_weight": length_weight,
@@ -143,40 +161,68 @@ class Campaign:
             "max_bounds": max_bounds if isinstance(max_bounds, str) else self.planner.longest,
             "seed": self.seed,
         }
+        # As it was given: what `load` gives back to this method.
+        self._options = {name: self.settings[name] for name in _OPTIONS} | {
+            "max_bounds": max_bounds,
+            "model": model_to_record(self.model),
+            "own_policy": not isinstance(policy, str),
+            "own_awareness": isinstance(awareness, AwarenessBelief),
+        }
+        self._journal: Journal | None = None
+        if directory is not None:
+            self._open(Journal(directory), overwrite=False)
 
     @property
     def posterior(self) -> xr.DataTree | None:
         """The posterior after the last mission; None before the first."""
         return self.posteriors[-1] if self.posteriors else None
 
+    # --- what is done with it ---
+
     def ask(self) -> Plan:
-        """The next path to run; the same one until `tell`.
+        """The next path to run; the same one until `tell`, `fail` or `suggest`.
 
         Raises:
             TrustboError: The policy returned a path that is broken, or no plan.
         """
         if self._plan is None:
-            key, planner = random.key(self.seed_of("policy")), self._planner_now()
+            started = time.perf_counter()
+            key, planner = random.key(self.seed_of("policy")), self.planner_now()
             plan = self._policy(key, self.belief, planner)
+            name = self.settings["policy"]
             if not isinstance(plan, Plan):
-                raise TrustboError(
-                    f"the policy {self.settings['policy']!r} must return a Plan; got {plan!r}."
-                )
+                raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")
             try:
                 planner.require_path(plan.path)
             except TrustboError as error:
-                raise TrustboError(f"the policy {self.settings['policy']!r}: {error}") from None
-            self._plan = replace(plan, bands=planner.bands(plan.path, self.belief))
+                raise TrustboError(f"the policy {name!r}: {error}") from None
+            self._plan = self._accept(plan, started)
         return self._plan
 
-    def tell(self, mission: Mission) -> xr.DataTree:
+    def suggest(self, path: Sequence[Cell]) -> Plan:
+        """Let the operator choose the next path; `ask` then returns it.
+
+        Args:
+            path: Cells from start to goal.
+
+        Raises:
+            TrustboError: It is broken, or does not lead from start to goal.
+        """
+        started = time.perf_counter()
+        plan = self.planner_now().evaluate(path, self.belief.mean())
+        self._plan = self._accept(plan, started)
+        self._write_state()
+        return self._plan
+
+    def tell(self, mission: Mission, **extra: float) -> xr.DataTree:
         """Learn from a mission.
 
-        Awareness that the mission did not measure (NaN) is taken from the workspace's map. The
+        Awareness that the mission did not measure (NaN) is taken from what is believed of it. The
         mission may have followed another path than the one asked for.
 
         Args:
             mission: What was measured, whether or not the goal was reached.
+            **extra: More for this mission's row of the history, such as its regret.
 
         Returns:
             The posterior given all missions so far.
@@ -184,8 +230,289 @@ class Campaign:
         Raises:
             ShapeError: Robots or features differ from the workspace's.
             TrustboError: The path leaves the grid, or what `fit` refuses.
-            PosteriorError: The posterior's diagnostics are bad; the mission is then not kept.
+            PosteriorError: The posterior's diagnostics are bad. The mission is then not among
+                those learned from, but kept as `pending`, and on disk, until the next is told.
         """
+        self._require_ours(mission)
+        filled = fill_awareness(mission, self.planner_now().mean_awareness)
+        plan, trust_map = self.ask(), self.trust_map()
+        told = time.perf_counter()
+        if self._journal is not None:
+            self._journal.write_measured([*self._measured, mission])
+        missions, last = [*self.missions, filled], self.posterior
+        self.pending = mission
+        posterior = self._learning.posterior(missions, last, self.seed_of("fit"))
+        # Only now, all at once: a failed fit leaves the campaign as it was.
+        before = self.plans[-1] if self.plans else plan
+        self._rows.append(
+            {
+                "objective": plan.value,
+                "path_changed": plan.path != before.path,
+                "contact_rate": float(np.nanmean(mission.contact_rate)),
+                "status": mission.status,
+                **extra,
+                **diagnostics(posterior),
+                "seconds_plan": self._asked[0],
+                "seconds_run": told - self._asked[1],
+                "seconds_fit": time.perf_counter() - told,
+            }
+        )
+        self._maps.append(trust_map)
+        self._learned(filled, mission, plan, posterior)
+        self._write()
+        return posterior
+
+    def fail(self, reason: str, mission: Mission | None = None) -> xr.DataTree | None:
+        """Say that the mission asked for was given up.
+
+        Args:
+            reason: Why, for the record.
+            mission: Its bounds as far as they were run, to learn from; None if there are none.
+
+        Returns:
+            The posterior, if there was something to learn.
+
+        Raises:
+            TrustboError: As `tell`.
+        """
+        posterior = None if mission is None else self.tell(mission)
+        self.failures.append((len(self.missions), str(reason)))
+        self._plan = None
+        self._write_state()
+        return posterior
+
+    def recommend(self) -> Plan:
+        """The best path under the mean of the belief, whatever the policy would try next."""
+        return greedy(random.key(0), self.belief, self.planner_now())
+
+    def trust_map(self) -> xr.DataArray:
+        """The team's trust map under the mean of the belief, dims (row, col)."""
+        return self.planner_now().trust_map(self.belief.mean())
+
+    # --- what it has come to ---
+
+    @property
+    def history(self) -> xr.Dataset:
+        """What `Result.history` holds; empty before the first mission."""
+        return build_history(self._rows, self.plans, self._maps) if self._rows else xr.Dataset()
+
+    def summary(self) -> pd.DataFrame:
+        """One row per mission: what was planned, how it ended, what was learned."""
+        paths = [" ".join(f"{r},{c}" for r, c in plan.path) for plan in self.plans]
+        table = pd.DataFrame(
+            self._rows, index=pd.RangeIndex(1, len(self._rows) + 1, name="mission")
+        )
+        return table.assign(n_bounds=[len(m.bounds) for m in self.missions], path=paths)
+
+    @property
+    def last(self) -> Mapping[str, Any]:
+        """The last mission's row of the history.
+
+        Raises:
+            TrustboError: There is none yet.
+        """
+        if not self._rows:
+            raise TrustboError("the campaign has no mission yet; tell it one first.")
+        return self._rows[-1]
+
+    def result(self) -> Result:
+        """Everything learned so far, as `iterate` returns it.
+
+        Raises:
+            TrustboError: Nothing was learned yet.
+        """
+        if not self.missions:
+            raise TrustboError("the campaign has no mission yet; tell it one first.")
+        best = self.recommend()
+        return Result(
+            self.workspace,
+            list(self.missions),
+            list(self.posteriors),
+            list(best.path),
+            best.trust,
+            best.value,
+            self.trust_map(),
+            self.history,
+            {**self.settings, **self.notes, "trustbo_version": version("trustbo")},
+            self.stop_reason,
+        )
+
+    # --- on disk ---
+
+    def keep(self, directory: str | PathLike[str]) -> None:
+        """Write everything to a folder, replacing what is there, and keep it up to date from now.
+
+        Raises:
+            TrustboError: Another campaign holds the folder, or its name belongs to a file.
+        """
+        self.close()
+        self._open(Journal(directory), overwrite=True)
+
+    def save(self, directory: str | PathLike[str]) -> None:
+        """Write everything to a folder that `Campaign.load` reads.
+
+        What another campaign left there is replaced. To keep a campaign as it goes, give it a
+        `directory` when it is made.
+
+        Raises:
+            TrustboError: Another campaign holds the folder, or its name belongs to a file.
+        """
+        own, self._journal = self._journal, None
+        journal = own if own and own.folder.samefile(directory) else Journal(directory)
+        try:
+            self._open(journal, overwrite=True)
+        finally:
+            self._journal = own
+            if journal is not own:
+                journal.close()
+
+    @classmethod
+    def load(
+        cls,
+        directory: str | PathLike[str],
+        *,
+        model: TrustModel | None = None,
+        policy: Policy | None = None,
+        awareness: AwarenessBelief | None = None,
+    ) -> Self:
+        """Go on with a campaign where it stopped, in the same folder.
+
+        A mission that was told, but not yet learned from, is learned from now.
+
+        Args:
+            directory: The folder of its `directory`, or of `save`.
+            model: Needed again if it has priors of your own, or is your own.
+            policy: Needed again if it is your own.
+            awareness: Needed again if it is your own; as it was before the first mission.
+
+        Raises:
+            TrustboError: There is no campaign; another process is at work on it; or something of
+                your own is missing.
+        """
+        journal = Journal(directory)
+        try:
+            state, measured, result = journal.read()
+            options = state["options"]
+            for name, given in (("policy", policy), ("awareness", awareness)):
+                if options.pop(f"own_{name}") != (given is not None):
+                    raise TrustboError(
+                        f"the campaign's {name} was {'your own; give it' if given is None else ''} "
+                        f"{'again with ' + name + '=' if given is None else 'not your own'}: "
+                        f"{options[name]!r}."
+                    )
+                options[name] = options[name] if given is None else given
+            options["model"] = model_from_record(options["model"], model)
+            start, goal = (tuple(options.pop(name)) for name in ("start", "goal"))
+            campaign = cls(journal.read_workspace(), start, goal, **options)
+        except BaseException:
+            journal.close()
+            raise
+        campaign._recover(state, measured, result)
+        campaign._journal = journal
+        if len(measured) > len(campaign.missions):
+            try:
+                campaign.tell(measured[-1])
+            except PosteriorError as error:
+                warnings.warn(f"the last mission is pending: {error}", stacklevel=2)
+        return campaign
+
+    def stop(self, reason: str) -> Result:
+        """Say why the campaign ends, and what it came to; it may still go on later.
+
+        Args:
+            reason: For `Result.stop_reason`.
+        """
+        self.stop_reason = reason
+        self._write()
+        return self.result()
+
+    def close(self) -> None:
+        """Let go of the folder; the campaign is kept there no longer."""
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _open(self, journal: Journal, *, overwrite: bool) -> None:
+        """Write all of it to a folder, and keep it there from now on."""
+        if journal.is_used and not overwrite:
+            journal.close()
+            raise TrustboError(
+                f"{str(journal.folder)!r} holds a campaign already: go on with it by "
+                "Campaign.load, or choose another folder."
+            )
+        journal.clear()
+        journal.write_workspace(self.workspace)
+        if self._measured:
+            journal.write_measured(self._measured)
+        self._journal = journal
+        self._write(whole=True)
+
+    def _write(self, *, whole: bool = False) -> None:
+        if self._journal is not None:
+            result = self.result() if self.missions else None
+            self._journal.write(self._state(), result, whole=whole)
+
+    def _write_state(self) -> None:
+        if self._journal is not None:
+            self._journal.write(self._state(), None)
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "options": self._options,
+            "n_missions": len(self.missions),
+            "plans": [plan_to_record(plan) for plan in self.plans],
+            "rows": self._rows,
+            "failures": self.failures,
+            "notes": self.notes,
+            "stop_reason": self.stop_reason,
+            "suggested": None if self._plan is None else plan_to_record(self._plan),
+            "versions": {name: version(name) for name in ("trustbo", "numpyro", "jax", "numpy")},
+        }
+
+    def _recover(
+        self, state: dict[str, Any], measured: list[Mission], result: Result | None
+    ) -> None:
+        """Take on what a folder holds."""
+        plans = [plan_from_record(record) for record in state["plans"]]
+        if result is not None:
+            self._maps = [
+                result.history["trust_map"].isel(iteration=i, drop=True) for i in range(len(plans))
+            ]
+            for j, plan in enumerate(plans):
+                self._learned(result.missions[j], measured[j], plan, result.posteriors[j])
+        self._rows, self.notes = state["rows"], state["notes"]
+        self.stop_reason = state["stop_reason"]
+        self.failures = [(n, reason) for n, reason in state["failures"]]
+        self._plan = state["suggested"] and plan_from_record(state["suggested"])
+
+    # --- inside ---
+
+    def _accept(self, plan: Plan, started: float) -> Plan:
+        bands = self.planner_now().bands(plan.path, self.belief)
+        now = time.perf_counter()
+        self._asked = now - started, now
+        return replace(plan, bands=bands)
+
+    def _learned(
+        self, filled: Mission, measured: Mission, plan: Plan, posterior: xr.DataTree
+    ) -> None:
+        self.missions.append(filled)
+        self._measured.append(measured)
+        self.posteriors.append(posterior)
+        self.plans.append(plan)
+        self.belief, self.pending = params_of(posterior), None
+        self._plan = self._believed = None
+        if self.awareness is not None:
+            self.awareness.update(measured)
+
+    def _require_ours(self, mission: Mission) -> None:
+        """Refuse a mission of another team, or somewhere else."""
         awareness = self.workspace.awareness
         if not isinstance(mission, Mission):
             raise TrustboError(f"tell takes a Mission; got {mission!r}.")
@@ -200,29 +527,8 @@ class Campaign:
                     f"the mission's path enters {cell}, outside the grid of {rows} rows and {cols} "
                     "columns."
                 )
-        measured = mission
-        mission = fill_awareness(mission, self._planner_now().mean_awareness)
-        plan = self.ask()
-        missions = [*self.missions, mission]
-        posterior = self._learn(missions)
-        # Only now, all at once: a failed fit leaves the campaign as it was.
-        self.missions = missions
-        self.posteriors.append(posterior)
-        self.plans.append(plan)
-        self.belief, self._plan, self._believed = params_of(posterior), None, None
-        if self.awareness is not None:
-            self.awareness.update(measured)
-        return posterior
 
-    def recommend(self) -> Plan:
-        """The best path under the mean of the belief, whatever the policy would try next."""
-        return greedy(random.key(0), self.belief, self._planner_now())
-
-    def trust_map(self) -> xr.DataArray:
-        """The team's trust map under the mean of the belief, dims (row, col)."""
-        return self._planner_now().trust_map(self.belief.mean())
-
-    def _planner_now(self) -> Planner:
+    def planner_now(self) -> Planner:
         """The planner, going by what is believed of the awareness now."""
         if self.awareness is None:
             return self.planner
@@ -232,40 +538,18 @@ class Campaign:
             self._believed = self.planner.with_awareness(maps, self.awareness.mean())
         return self._believed
 
-    def _learn(self, missions: list[Mission]) -> xr.DataTree:
-        seed = self.seed_of("fit")
-        if self.update == "moment_matched":
-            matched = self.model.priors
-            if self.posteriors:
-                matched = moment_matched(cast(TrustParams, self.belief), self.model.priors)
-            return fit(missions[-1:], replace(self.model, priors=matched), self.sampler, seed=seed)
-        weights = None
-        if self.forgetting < 1.0:
-            weights = self.forgetting ** np.arange(len(missions) - 1, -1, -1)
-        return fit(missions, self.model, self.sampler, weights=weights, seed=seed)
-
-    def _prior_belief(self, initial: str) -> Params:
-        """One draw from the prior, or its mean, as draws with leading axis (draw,) of length 1."""
-        n_robots, n_features = (self.workspace.awareness.sizes[n] for n in ("robot", "feature"))
-        if initial == "prior_mean" and isinstance(self.model, PooledTrust):
-            priors = self.model.priors
-            x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
-            mean = TrustParams(**priors.mean(n_features), **x0)
-        else:
-            # What robots have in common has a mean in no closed form.
-            n_draws, seed = 1 if initial == "prior_draw" else 1000, self.seed_of("prior")
-            mean = sample_prior(self.model, n_features, n_draws, seed, n_robots=n_robots).mean()
-        return type(mean)(*(np.asarray(value, dtype=float)[None] for value in mean))
-
     def seed_of(self, stream: str) -> int:
         """The seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
         entropy = [self.seed, _STREAMS.index(stream), len(self.missions)]
+        if n_failures := sum(n == len(self.missions) for n, _ in self.failures):
+            entropy.append(n_failures)  # another try may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
 
-def _require_model(model: TrustModel) -> None:
-    if not isinstance(model, TrustModel):
-        raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")
+_OPTIONS = (
+    "start", "goal", "policy", "objective", "sampler", "initial", "update", "forgetting",
+    "connectivity", "team", "length_weight", "awareness", "seed",
+)  # fmt: skip
 
 
 def _belief_in(workspace: Workspace, awareness: object) -> AwarenessBelief | None:
@@ -273,21 +557,3 @@ def _belief_in(workspace: Workspace, awareness: object) -> AwarenessBelief | Non
         return awareness
     chosen = require_choice("awareness", awareness, AWARENESS)
     return AwarenessBelief(workspace) if chosen == "belief" else None
-
-
-def _require_update(model: TrustModel, update: str, forgetting: float) -> None:
-    if forgetting < 1.0 and (update != "refit" or model.observation != "gaussian"):
-        raise TrustboError(
-            f'forgetting = {forgetting:g} needs update "refit" and Gaussian observations; got '
-            f'"{update}" and "{model.observation}".'
-        )
-    if update == "moment_matched":
-        if not isinstance(model, PooledTrust):
-            raise TrustboError(
-                f'update="moment_matched" is for PooledTrust; got {type(model).__name__}.'
-            )
-        warnings.warn(
-            'update="moment_matched" is for comparison with the 2023 code: over 20 missions it is '
-            'off by up to 1.15 posterior standard deviations. update="refit" is exact.',
-            stacklevel=3,
-        )

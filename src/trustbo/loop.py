@@ -1,23 +1,25 @@
 """The loop: plan, run, learn, and plan again."""
 
-import inspect
-import time
-from collections.abc import Callable, Sequence
-from importlib.metadata import version
+import logging
+from collections.abc import Callable, Iterator, Sequence
 from os import PathLike
+from typing import Any
 
-import numpy as np
-import xarray as xr
 from tqdm import tqdm
 
 from trustbo.campaign import Campaign
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError, require_whole
-from trustbo.models import TrustModel, diagnostics
+from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.models import TrustModel
 from trustbo.planning import AwarenessBelief, Plan, Policy
-from trustbo.result import Result, require_folder
+from trustbo.replanning import REPLAN, require_bounds, run_replanning, takes
+from trustbo.result import Result
 from trustbo.simulation import KinematicSimulator, Simulator
+from trustbo.stopping import Stop, reason_to_stop, require_stops
 from trustbo.terrain import Workspace
+
+Callback = Callable[[Campaign, Mission], None]
+_log = logging.getLogger(__name__)
 
 
 def iterate(
@@ -39,8 +41,10 @@ def iterate(
     team: str = "mean",
     length_weight: float = 0.0,
     awareness: str | AwarenessBelief = "map",
+    replan: str = "mission",
+    stop: Stop | Sequence[Stop] | None = None,
     checkpoint: str | PathLike[str] | None = None,
-    callbacks: Sequence[Callable[[Campaign, Mission], None]] = (),
+    callbacks: Sequence[Callback] = (),
     seed: int = 0,
     progress: bool = True,
 ) -> Result:
@@ -50,14 +54,15 @@ def iterate(
         workspace: Where.
         start: First cell, (row, col); row 0 is the top.
         goal: Last cell.
-        n_iterations: How many missions.
+        n_iterations: How many missions, at most.
         model: The trust model; by default `PooledTrust()`.
         policy: A name of `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
         objective: `"terminal"` (the paper's), `"mean"`, `"success"`, `"bottleneck"` or
             `"stationary"`; see `Planner`.
         sampler: `"nuts"`, `"exact"` or `"joint"`; see `trustbo.models.fit`.
         simulator: Whatever has `run(path, *, seed) -> Mission`; by default
-            `KinematicSimulator(workspace)`.
+            `KinematicSimulator(workspace)`. If it also has `regret(plan) -> float`, the truth being
+            known, that goes into the history.
         initial: The first plan comes from one random draw of the prior (`"prior_draw"`, as in the
             paper) or from `"prior_mean"`.
         update: `"refit"` from all missions, or `"moment_matched"`; see `Campaign`.
@@ -67,7 +72,12 @@ def iterate(
         team: The team's trust is the `"mean"` or the `"min"` of its robots'.
         length_weight: What a metre of the path costs; see `Planner`.
         awareness: `"map"`, or `"belief"`, which missions correct; see `Campaign`.
-        checkpoint: A folder in which the result so far is saved after each mission.
+        replan: `"mission"`: a path is run as planned. `"bound"`: after each bound the rest is
+            planned again from the trust of now; see `replanning.run_replanning`.
+        stop: When to end before `n_iterations`: a `RegretBound`, `Seconds`, a callable
+            `stop(campaign) -> reason or None`, or several of them.
+        checkpoint: A folder in which everything is kept as it goes, replacing what another campaign
+            left there. If the process dies, `resume` goes on from it.
         callbacks: Each called as `callback(campaign, mission)` after each mission.
         seed: Same seed, same result.
         progress: Whether to show a progress bar.
@@ -99,107 +109,161 @@ def iterate(
         awareness=awareness,
         seed=seed,
     )
-    runner = KinematicSimulator(workspace) if simulator is None else simulator
+    steps = missions(
+        campaign,
+        simulator,
+        n_iterations=n_iterations,
+        replan=replan,
+        stop=stop,
+        callbacks=callbacks,
+        progress=progress,
+    )
+    with campaign:
+        if checkpoint is not None:
+            campaign.keep(checkpoint)
+        for _ in steps:
+            pass
+        return campaign.result()
+
+
+def resume(
+    directory: str | PathLike[str],
+    *,
+    simulator: Simulator | None = None,
+    n_iterations: int | None = None,
+    model: TrustModel | None = None,
+    policy: Policy | None = None,
+    awareness: AwarenessBelief | None = None,
+    stop: Stop | Sequence[Stop] | None = None,
+    callbacks: Sequence[Callback] = (),
+    progress: bool = True,
+) -> Result:
+    """Go on with a campaign that `iterate(checkpoint=directory)` began; the same comes out.
+
+    Args:
+        directory: Its checkpoint.
+        simulator: Needed again unless it was the default.
+        n_iterations: How many missions in all; by default as many as it was begun for.
+        model: See `Campaign.load`.
+        policy: See `Campaign.load`.
+        awareness: See `Campaign.load`.
+        stop: See `iterate`; not kept in the folder.
+        callbacks: See `iterate`; not kept either.
+        progress: Whether to show a progress bar.
+
+    Raises:
+        TrustboError: There is no campaign; another process is at work on it; or something of your
+            own is missing.
+    """
+    with Campaign.load(directory, model=model, policy=policy, awareness=awareness) as campaign:
+        notes: dict[str, Any] = dict(campaign.notes)
+        total = notes.get("n_iterations", 8) if n_iterations is None else n_iterations
+        steps = missions(
+            campaign,
+            simulator,
+            n_iterations=total,
+            replan=notes.get("replan", "mission"),
+            stop=stop,
+            callbacks=callbacks,
+            progress=progress,
+        )
+        _require_same(notes, campaign.notes)
+        for _ in steps:
+            pass
+        return campaign.result()
+
+
+def missions(
+    campaign: Campaign,
+    simulator: Simulator | None = None,
+    *,
+    n_iterations: int = 8,
+    replan: str = "mission",
+    stop: Stop | Sequence[Stop] | None = None,
+    callbacks: Sequence[Callback] = (),
+    progress: bool = False,
+) -> Iterator[tuple[Plan, Mission]]:
+    """Run the missions of a campaign, one for each step of this generator.
+
+    Args:
+        campaign: New, or under way.
+        simulator: See `iterate`.
+        n_iterations: How many missions in all, at most.
+        replan: See `iterate`.
+        stop: See `iterate`.
+        callbacks: See `iterate`.
+        progress: Whether to show a progress bar.
+
+    Yields:
+        Each mission, learned from already, and the plan it was run for.
+
+    Raises:
+        TrustboError: Bad input, before any work starts.
+        PosteriorError: A posterior's diagnostics are bad.
+    """
+    require_whole("n_iterations", n_iterations, 1)
+    runner: Any = KinematicSimulator(campaign.workspace) if simulator is None else simulator
     if not callable(getattr(runner, "run", None)):
         raise TrustboError(f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}.")
-    folder = None if checkpoint is None else require_folder(checkpoint)
+    if require_choice("replan", replan, REPLAN) == "bound":
+        require_bounds(runner)
+    rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
-    settings = {
-        **campaign.settings,
-        **describe(),
-        "trustbo_version": version("trustbo"),
-        "start": list(campaign.planner.start),
-        "goal": list(campaign.planner.goal),
-    }
-    rows: list[dict[str, object]] = []
+    campaign.notes = {**describe(), "replan": replan, "n_iterations": n_iterations}
+    return _missions(campaign, runner, n_iterations, replan, rules, callbacks, progress)
 
-    def keep(reason: str) -> Result:
-        result = _result(campaign, rows, settings, reason)
-        if folder is not None:
-            result.save(folder) if len(rows) == 1 else result.checkpoint(folder)
-        return result
 
-    with tqdm(total=n_iterations, desc="missions", disable=not progress) as bar:
-        for _ in range(n_iterations):
-            rows.append(_iteration(campaign, runner))
-            name, label = ("r_hat", "R-hat") if "r_hat" in rows[-1] else ("k_hat", "k-hat")
-            bar.set_postfix_str(
-                f"objective {rows[-1]['objective']:.3f}, {label} {rows[-1][name]:.3f}"
-            )
+def _missions(
+    campaign: Campaign,
+    runner: Any,
+    n_iterations: int,
+    replan: str,
+    rules: list[Stop],
+    callbacks: Sequence[Callback],
+    progress: bool,
+) -> Iterator[tuple[Plan, Mission]]:
+    done = len(campaign.missions)
+    with tqdm(total=n_iterations, initial=done, desc="missions", disable=not progress) as bar:
+        while len(campaign.missions) < n_iterations:
+            plan = campaign.ask()
+            mission = _run(campaign, runner, plan, replan)
+            oracle = getattr(runner, "regret", None)
+            campaign.tell(mission, **({"regret": oracle(plan)} if oracle else {}))
+            bar.set_postfix_str(_report(campaign))
             bar.update()
+            _log.info("mission %d: %s", len(campaign.missions), _report(campaign))
             for callback in callbacks:
-                callback(campaign, campaign.missions[-1])
-            if folder is not None and len(rows) < n_iterations:
-                keep("interrupted")
-    return keep("n_iterations")
+                callback(campaign, mission)
+            yield plan, mission
+            if reason := reason_to_stop(rules, campaign):
+                campaign.stop(reason)
+                return
+    campaign.stop("n_iterations")
 
 
-def _iteration(campaign: Campaign, simulator: Simulator) -> dict[str, object]:
-    """One mission, from plan to posterior; what the history keeps of it."""
-    clock = time.perf_counter
-    t0 = clock()
-    plan = campaign.ask()
-    trust_map = campaign.trust_map()
-    t1 = clock()
-    mission = simulator.run(
-        plan.path, seed=campaign.seed_of("mission"), **_number(campaign, simulator)
-    )
-    t2 = clock()
-    before = campaign.plans[-1] if campaign.plans else plan
-    posterior = campaign.tell(mission)
-    return {
-        "plan": plan,
-        "trust_map": trust_map,
-        "objective": plan.value,
-        "path_changed": plan.path != before.path,
-        "contact_rate": float(np.nanmean(mission.contact_rate)),
-        "status": mission.status,
-        **diagnostics(posterior),
-        "seconds_plan": t1 - t0,
-        "seconds_run": t2 - t1,
-        "seconds_fit": clock() - t2,
-    }
+def _run(campaign: Campaign, runner: Any, plan: Plan, replan: str) -> Mission:
+    """One mission; simulators of a changing world are told its number."""
+    seed, number = campaign.seed_of("mission"), len(campaign.missions)
+    run = runner.reset if replan == "bound" else runner.run
+    numbered = {"mission": number} if takes(run, "mission") else {}
+    if replan == "bound":
+        return run_replanning(campaign, runner, plan, seed=seed, **numbered)
+    return runner.run(plan.path, seed=seed, **numbered)
 
 
-def _number(campaign: Campaign, simulator: Simulator) -> dict[str, int]:
-    """The mission's number, for simulators of a changing world."""
-    takes_it = "mission" in inspect.signature(simulator.run).parameters
-    return {"mission": len(campaign.missions)} if takes_it else {}
+def _report(campaign: Campaign) -> str:
+    """The last mission in a line."""
+    row = campaign.last
+    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
+    regret = f", regret {row['regret']:.3f}" if "regret" in row else ""
+    return f"objective {row['objective']:.3f}{regret}, {label} {row[name]:.3f}, {row['status']}"
 
 
-def _result(
-    campaign: Campaign, rows: list[dict[str, object]], settings: dict[str, object], reason: str
-) -> Result:
-    recommended = campaign.recommend()
-    plans: list[Plan] = [row["plan"] for row in rows]  # pyright: ignore[reportAssignmentType]
-    steps = np.full((len(rows), max(len(plan.path) for plan in plans), 2), -1)
-    for i, plan in enumerate(plans):
-        steps[i, : len(plan.path)] = plan.path
-    # The exact sampler may have fallen back on NUTS, whose diagnostics are others: NaN then.
-    names = {name: None for row in rows for name in row if name not in _NOT_SCALAR}
-    scalars = {name: [row.get(name, np.nan) for row in rows] for name in names}
-    maps: list[xr.DataArray] = [row["trust_map"] for row in rows]  # pyright: ignore[reportAssignmentType]
-    iteration = xr.DataArray(np.arange(1, len(rows) + 1), dims="iteration", name="iteration")
-    history = xr.Dataset(
-        {
-            **{name: ("iteration", values) for name, values in scalars.items()},
-            "path": (("iteration", "step", "axis"), steps),
-            "trust_map": xr.concat(maps, dim=iteration),
-        },
-        {"iteration": iteration, "axis": ["row", "col"]},
-    )
-    return Result(
-        campaign.workspace,
-        list(campaign.missions),
-        list(campaign.posteriors),
-        list(recommended.path),
-        recommended.trust,
-        recommended.value,
-        campaign.trust_map(),
-        history,
-        settings,
-        reason,
-    )
-
-
-_NOT_SCALAR = ("plan", "trust_map")
+def _require_same(before: dict[str, object], now: dict[str, object]) -> None:
+    """Refuse to go on with another simulator than the one begun with."""
+    for name in now:
+        if name not in ("n_iterations",) and name in before and before[name] != now[name]:
+            raise TrustboError(
+                f"the campaign was begun with {name} = {before[name]!r}, not {now[name]!r}; give "
+                "the same simulator again with simulator=."
+            )

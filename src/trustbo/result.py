@@ -1,6 +1,7 @@
 """What a campaign learned, in memory and on disk."""
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,6 +13,7 @@ from trustbo import archive, records
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
 from trustbo.files import to_json, write_file, write_text
+from trustbo.planning import Plan
 from trustbo.terrain import Workspace
 
 
@@ -109,8 +111,12 @@ class Result:
         write_text(folder / "result.json", to_json(record))
 
 
-def load_result(directory: str | PathLike[str]) -> Result:
+def load_result(directory: str | PathLike[str], n_missions: int | None = None) -> Result:
     """Read a result that `Result.save` wrote.
+
+    Args:
+        directory: The folder.
+        n_missions: Only the first so many missions, and what was learned from them.
 
     Raises:
         TrustboError: The folder holds no result.
@@ -120,7 +126,7 @@ def load_result(directory: str | PathLike[str]) -> Result:
         raise TrustboError(f"{str(folder)!r} holds no result; give a folder written by save().")
     record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
     # A run killed while it saved may have left one mission more than the record knows of.
-    n = record["n_missions"]
+    n = record["n_missions"] if n_missions is None else n_missions
     history = records.read_tree(folder / "history.nc").to_dataset().isel(iteration=slice(n))
     missions = records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n]
     return Result(
@@ -134,6 +140,27 @@ def load_result(directory: str | PathLike[str]) -> Result:
         history.drop_vars("final_trust_map"),
         record["settings"],
         record["stop_reason"],
+    )
+
+
+def build_history(
+    rows: Sequence[Mapping[str, object]], plans: Sequence[Plan], maps: Sequence[xr.DataArray]
+) -> xr.Dataset:
+    """`Result.history`, from one row of numbers, one plan and one trust map per mission."""
+    steps = np.full((len(rows), max(len(plan.path) for plan in plans), 2), -1)
+    for i, plan in enumerate(plans):
+        steps[i, : len(plan.path)] = plan.path
+    # The exact sampler may have fallen back on NUTS, whose diagnostics are others: NaN then.
+    names = {name: None for row in rows for name in row}
+    scalars = {name: [row.get(name, np.nan) for row in rows] for name in names}
+    iteration = xr.DataArray(np.arange(1, len(rows) + 1), dims="iteration", name="iteration")
+    return xr.Dataset(
+        {
+            **{name: ("iteration", values) for name, values in scalars.items()},
+            "path": (("iteration", "step", "axis"), steps),
+            "trust_map": xr.concat(maps, dim=iteration),
+        },
+        {"iteration": iteration, "axis": ["row", "col"]},
     )
 
 

@@ -211,7 +211,12 @@ def params_of(posterior: xr.DataTree) -> Params:
         `TrustParams`, `RobotParams` or `CoupledParams`, according to the model.
     """
     draws = posterior["posterior"].to_dataset().stack(sample=("chain", "draw"))
-    sites = {str(n): draws[n].transpose("sample", ...).values for n in draws.data_vars}
+    # In one layout, whether they were just sampled or read from a file: sums over draws then round
+    # alike, and a campaign that resumes is the campaign it was.
+    sites = {
+        str(n): np.ascontiguousarray(draws[n].transpose("sample", ...).values)
+        for n in draws.data_vars
+    }
     return params_from(sites, {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")})
 
 

@@ -1,6 +1,7 @@
 """A plan: a path and what is expected of it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -45,3 +46,17 @@ class Plan:
     revisits: int
     engine: str
     seconds: float
+
+
+def plan_to_record(plan: Plan) -> dict[str, Any]:
+    """A plan as plain lists and numbers."""
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in vars(plan).items()
+    }
+
+
+def plan_from_record(record: dict[str, Any]) -> Plan:
+    """The plan that `plan_to_record` laid out."""
+    arrays = {name: np.array(record[name]) for name in ("positions", "trust", "bands")}
+    return Plan(**record | arrays | {"path": tuple((r, c) for r, c in record["path"])})

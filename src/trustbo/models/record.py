@@ -1,0 +1,44 @@
+"""A model's settings as a record that JSON can hold, and the model again."""
+
+from dataclasses import fields
+from typing import Any
+
+from trustbo.errors import TrustboError
+from trustbo.models.coupled import CoupledTrust
+from trustbo.models.hierarchical import HierarchicalTrust
+from trustbo.models.model import TrustModel
+from trustbo.models.pooled import PooledTrust
+from trustbo.models.priors import Priors
+
+_MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, CoupledTrust)}
+
+
+def model_to_record(model: TrustModel) -> dict[str, Any]:
+    """Its class, its options, and its priors as text."""
+    options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "priors"}
+    return {"class": type(model).__name__, **options, "priors": model.priors.describe()}
+
+
+def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -> TrustModel:
+    """The model of a record; with priors or a class of your own, give it again.
+
+    Raises:
+        TrustboError: It has to be given and was not, or another was given.
+    """
+    if given is not None:
+        if model_to_record(given) != record:
+            raise TrustboError(
+                f"the campaign's model is {record}; the one given is {model_to_record(given)}."
+            )
+        return given
+    options = {name: value for name, value in record.items() if name not in ("class", "priors")}
+    kind = _MODELS.get(record["class"])
+    if kind is not None:
+        for priors in (None, Priors.zheng2023()):
+            model = kind(priors=priors, **options)  # pyright: ignore[reportArgumentType]
+            if model_to_record(model) == record:
+                return model
+    raise TrustboError(
+        f"the campaign's model {record['class']} has priors of its own, or is your own; give it "
+        f"again with model=. Its priors: {record['priors']}."
+    )
