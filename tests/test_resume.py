@@ -173,7 +173,7 @@ def test_saving_is_a_copy_and_loading_goes_on(workspace, tmp_path):
     campaign.save(tmp_path)
     with tb.Campaign.load(tmp_path) as again:
         assert again.ask().path == operator.path
-        assert again.failures == [(1, "rain")]
+        assert again.log.failures == [(1, "rain")]
         assert again.settings == campaign.settings
         assert (
             again.summary()
@@ -249,4 +249,4 @@ def test_failing_keeps_the_bounds_there_are(workspace):
     posterior = campaign.fail("tipped", replace(part))
     assert posterior is campaign.posterior
     assert len(campaign.missions[0].bounds) == 2
-    assert campaign.failures[-1] == (1, "tipped")
+    assert campaign.log.failures[-1] == (1, "tipped")

@@ -17,13 +17,14 @@ from trustbo.data import Cell, Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_choice, require_whole
 from trustbo.journal import Journal
 from trustbo.learning import INITIAL, Learning
+from trustbo.logbook import Logbook
 from trustbo.models import PooledTrust, TrustModel, diagnostics, params_of
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import AwarenessBelief, Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import greedy, resolve_policy
-from trustbo.result import Result, build_history
+from trustbo.result import Result
 from trustbo.stacking import fill_awareness
 from trustbo.terrain import Workspace
 
@@ -42,13 +43,8 @@ class Campaign:
     Attributes:
         workspace: Where.
         planner: Finds the paths.
-        missions: All missions learned from so far, awareness filled in.
-        posteriors: The posterior after each of them.
-        plans: The plan each of them was asked for with.
-        failures: Missions that were given up without any bound: after how many missions, and why.
+        log: What it has been through (a `Logbook`): missions as measured, plans, history, failures.
         pending: A mission that was told, but nothing could be learned from it; see `tell`.
-        notes: More for `Result.settings`, such as what the simulator is.
-        stop_reason: Why it ended, for `Result`.
         belief: Parameter draws the next plan is made from: the posterior's, or, before the first
             mission, one from the prior.
         awareness: What is believed of the awareness map, if it is not trusted blindly.
@@ -123,17 +119,9 @@ class Campaign:
         self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self.model = PooledTrust() if model is None else model
         self._learning = Learning(self.model, sampler, update, forgetting)
-        self.missions: list[Mission] = []
-        self.posteriors: list[xr.DataTree] = []
-        self.plans: list[Plan] = []
-        self.failures: list[tuple[int, str]] = []
+        self.log = Logbook()
         self.pending: Mission | None = None
-        self.notes: dict[str, object] = {}
-        self.stop_reason = "interrupted"
         self.awareness = _belief_in(workspace, awareness)
-        self._measured: list[Mission] = []
-        self._rows: list[dict[str, object]] = []
-        self._maps: list[xr.DataArray] = []
         self._plan: Plan | None = None
         self._believed: Planner | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and when it was done
@@ -171,6 +159,21 @@ class Campaign:
         self._journal: Journal | None = None
         if directory is not None:
             self._open(Journal(directory), overwrite=False)
+
+    @property
+    def missions(self) -> list[Mission]:
+        """All missions learned from so far, awareness filled in."""
+        return self.log.missions
+
+    @property
+    def posteriors(self) -> list[xr.DataTree]:
+        """The posterior after each of them."""
+        return self.log.posteriors
+
+    @property
+    def plans(self) -> list[Plan]:
+        """The plan each of them was asked for with."""
+        return self.log.plans
 
     @property
     def posterior(self) -> xr.DataTree | None:
@@ -238,27 +241,29 @@ class Campaign:
         plan, trust_map = self.ask(), self.trust_map()
         told = time.perf_counter()
         if self._journal is not None:
-            self._journal.write_measured([*self._measured, mission])
+            self._journal.write_measured([*self.log.measured, mission])
         missions, last = [*self.missions, filled], self.posterior
         self.pending = mission
         posterior = self._learning.posterior(missions, last, self.seed_of("fit"))
         # Only now, all at once: a failed fit leaves the campaign as it was.
         before = self.plans[-1] if self.plans else plan
-        self._rows.append(
-            {
-                "objective": plan.value,
-                "path_changed": plan.path != before.path,
-                "contact_rate": float(np.nanmean(mission.contact_rate)),
-                "status": mission.status,
-                **extra,
-                **diagnostics(posterior),
-                "seconds_plan": self._asked[0],
-                "seconds_run": told - self._asked[1],
-                "seconds_fit": time.perf_counter() - told,
-            }
-        )
-        self._maps.append(trust_map)
-        self._learned(filled, mission, plan, posterior)
+        row = {
+            "objective": plan.value,
+            "path_changed": plan.path != before.path,
+            "contact_rate": float(np.nanmean(mission.contact_rate)),
+            "status": mission.status,
+            **extra,
+            **diagnostics(posterior),
+            "seconds_plan": self._asked[0],
+            "seconds_run": told - self._asked[1],
+            "seconds_fit": time.perf_counter() - told,
+        }
+        log = self.log
+        entries = (filled, mission, plan, trust_map, row, posterior)
+        columns = (log.missions, log.measured, log.plans, log.maps, log.rows, log.posteriors)
+        for column, entry in zip(columns, entries, strict=True):
+            column.append(entry)  # pyright: ignore[reportArgumentType]
+        self._learned(mission)
         self._write()
         return posterior
 
@@ -276,7 +281,7 @@ class Campaign:
             TrustboError: As `tell`.
         """
         posterior = None if mission is None else self.tell(mission)
-        self.failures.append((len(self.missions), str(reason)))
+        self.log.failures.append((len(self.missions), str(reason)))
         self._plan = None
         self._write_state()
         return posterior
@@ -294,15 +299,11 @@ class Campaign:
     @property
     def history(self) -> xr.Dataset:
         """What `Result.history` holds; empty before the first mission."""
-        return build_history(self._rows, self.plans, self._maps) if self._rows else xr.Dataset()
+        return self.log.history()
 
     def summary(self) -> pd.DataFrame:
         """One row per mission: what was planned, how it ended, what was learned."""
-        paths = [" ".join(f"{r},{c}" for r, c in plan.path) for plan in self.plans]
-        table = pd.DataFrame(
-            self._rows, index=pd.RangeIndex(1, len(self._rows) + 1, name="mission")
-        )
-        return table.assign(n_bounds=[len(m.bounds) for m in self.missions], path=paths)
+        return self.log.summary()
 
     @property
     def last(self) -> Mapping[str, Any]:
@@ -311,9 +312,9 @@ class Campaign:
         Raises:
             TrustboError: There is none yet.
         """
-        if not self._rows:
+        if not self.log.rows:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
-        return self._rows[-1]
+        return self.log.rows[-1]
 
     def result(self) -> Result:
         """Everything learned so far, as `iterate` returns it.
@@ -333,8 +334,8 @@ class Campaign:
             best.value,
             self.trust_map(),
             self.history,
-            {**self.settings, **self.notes, "trustbo_version": version("trustbo")},
-            self.stop_reason,
+            {**self.settings, **self.log.notes, "trustbo_version": version("trustbo")},
+            self.log.stop_reason,
         )
 
     # --- on disk ---
@@ -407,7 +408,11 @@ class Campaign:
         except BaseException:
             journal.close()
             raise
-        campaign._recover(state, measured, result)
+        campaign.log = Logbook.from_state(state, measured, result)
+        for mission in campaign.log.measured:
+            campaign._learned(mission)
+        suggested = state["suggested"]
+        campaign._plan = suggested and plan_from_record(suggested)
         campaign._journal = journal
         if len(measured) > len(campaign.missions):
             try:
@@ -422,7 +427,7 @@ class Campaign:
         Args:
             reason: For `Result.stop_reason`.
         """
-        self.stop_reason = reason
+        self.log.stop_reason = reason
         self._write()
         return self.result()
 
@@ -448,8 +453,8 @@ class Campaign:
             )
         journal.clear()
         journal.write_workspace(self.workspace)
-        if self._measured:
-            journal.write_measured(self._measured)
+        if self.log.measured:
+            journal.write_measured(self.log.measured)
         self._journal = journal
         self._write(whole=True)
 
@@ -463,33 +468,8 @@ class Campaign:
             self._journal.write(self._state(), None)
 
     def _state(self) -> dict[str, Any]:
-        return {
-            "options": self._options,
-            "n_missions": len(self.missions),
-            "plans": [plan_to_record(plan) for plan in self.plans],
-            "rows": self._rows,
-            "failures": self.failures,
-            "notes": self.notes,
-            "stop_reason": self.stop_reason,
-            "suggested": None if self._plan is None else plan_to_record(self._plan),
-            "versions": {name: version(name) for name in ("trustbo", "numpyro", "jax", "numpy")},
-        }
-
-    def _recover(
-        self, state: dict[str, Any], measured: list[Mission], result: Result | None
-    ) -> None:
-        """Take on what a folder holds."""
-        plans = [plan_from_record(record) for record in state["plans"]]
-        if result is not None:
-            self._maps = [
-                result.history["trust_map"].isel(iteration=i, drop=True) for i in range(len(plans))
-            ]
-            for j, plan in enumerate(plans):
-                self._learned(result.missions[j], measured[j], plan, result.posteriors[j])
-        self._rows, self.notes = state["rows"], state["notes"]
-        self.stop_reason = state["stop_reason"]
-        self.failures = [(n, reason) for n, reason in state["failures"]]
-        self._plan = state["suggested"] and plan_from_record(state["suggested"])
+        plan = None if self._plan is None else plan_to_record(self._plan)
+        return {"options": self._options, "suggested": plan, **self.log.to_state()}
 
     # --- inside ---
 
@@ -499,17 +479,12 @@ class Campaign:
         self._asked = now - started, now
         return replace(plan, bands=bands)
 
-    def _learned(
-        self, filled: Mission, measured: Mission, plan: Plan, posterior: xr.DataTree
-    ) -> None:
-        self.missions.append(filled)
-        self._measured.append(measured)
-        self.posteriors.append(posterior)
-        self.plans.append(plan)
-        self.belief, self.pending = params_of(posterior), None
+    def _learned(self, mission: Mission) -> None:
+        """Go by what was learned, from a mission as it was told, from now on."""
+        self.belief, self.pending = params_of(self.posteriors[-1]), None
         self._plan = self._believed = None
         if self.awareness is not None:
-            self.awareness.update(measured)
+            self.awareness.update(mission)
 
     def _require_ours(self, mission: Mission) -> None:
         """Refuse a mission of another team, or somewhere else."""
@@ -541,7 +516,7 @@ class Campaign:
     def seed_of(self, stream: str) -> int:
         """The seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
         entropy = [self.seed, _STREAMS.index(stream), len(self.missions)]
-        if n_failures := sum(n == len(self.missions) for n, _ in self.failures):
+        if n_failures := sum(n == len(self.missions) for n, _ in self.log.failures):
             entropy.append(n_failures)  # another try may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 

@@ -156,7 +156,7 @@ def resume(
             own is missing.
     """
     with Campaign.load(directory, model=model, policy=policy, awareness=awareness) as campaign:
-        notes: dict[str, Any] = dict(campaign.notes)
+        notes: dict[str, Any] = dict(campaign.log.notes)
         total = notes.get("n_iterations", 8) if n_iterations is None else n_iterations
         steps = missions(
             campaign,
@@ -167,7 +167,7 @@ def resume(
             callbacks=callbacks,
             progress=progress,
         )
-        _require_same(notes, campaign.notes)
+        _require_same(notes, campaign.log.notes)
         for _ in steps:
             pass
         return campaign.result()
@@ -209,7 +209,7 @@ def missions(
         require_bounds(runner)
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
-    campaign.notes = {**describe(), "replan": replan, "n_iterations": n_iterations}
+    campaign.log.notes = {**describe(), "replan": replan, "n_iterations": n_iterations}
     return _missions(campaign, runner, n_iterations, replan, rules, callbacks, progress)
 
 

@@ -14,6 +14,7 @@ from trustbo.models.params import Params, RobotParams, TrustParams
 from trustbo.stacking import MissionBatch
 
 _CELLS = 1 << 18  # numbers per array and chunk of draws: what the cache holds
+_LEAST_VARIANCE = 1e-300
 
 
 class TrustSummary(NamedTuple):
@@ -189,9 +190,9 @@ def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
 
 def _backward(p: _Draws, lag: float, group: _Group, f: _Filtered, k: int):
     """A, a, V with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V), as in `statespace`."""
-    Q = p.delta_w**2
+    # A far draw's process noise may be so small that its square is 0, where Q would divide.
+    Q, P = np.maximum(p.delta_w**2, _LEAST_VARIANCE), np.maximum(f.var[k], _LEAST_VARIANCE)
     of_rate = np.where(group.seen[k + 1], lag / p.delta_v**2, 0.0)
-    P = f.var[k]
     V = 1.0 / (1.0 / P + p.beta0**2 / Q + lag * of_rate)
     A = V * (p.beta0 / Q + of_rate)
     a = V / P * f.mean[k] - V * p.beta0 / Q * f.drift[k + 1]

@@ -5,11 +5,13 @@ taken to be a Gaussian process over the cells, one for each feature and the same
 what is measured in one cell says something of its neighbours, and little of cells far away.
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import cholesky
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
@@ -78,12 +80,20 @@ class AwarenessBelief:
 
         Raises:
             ShapeError: Robots or features differ from the workspace's.
+            TrustboError: The path leaves the grid.
         """
         if mission.awareness.shape[1:] != (self._map.shape[0], self._map.shape[-1]):
             raise ShapeError(
                 f"the mission measured (robot, feature) {mission.awareness.shape[1:]}, the "
                 f"workspace has {(self._map.shape[0], self._map.shape[-1])}."
             )
+        rows, cols = self._map.shape[1:3]
+        for bound in mission.bounds:
+            if not (0 <= bound.cell[0] < rows and 0 <= bound.cell[1] < cols):
+                raise TrustboError(
+                    f"the mission enters {bound.cell}, outside the grid of {rows} rows and {cols} "
+                    "columns."
+                )
         for bound in mission.bounds:
             error = bound.awareness - self._map[:, *bound.cell]
             for m in range(error.shape[1]):
@@ -132,7 +142,10 @@ class AwarenessBelief:
         regression: Any = GaussianProcessRegressor(
             self._kernel, optimizer="fmin_l_bfgs_b" if learns else cast(Any, None)
         )
-        regression.fit(seen[:, :2], seen[:, 2])
+        with warnings.catch_warnings():
+            # That a scale ends at a limit of ours is no failure.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            regression.fit(seen[:, :2], seen[:, 2])
         if not with_cov:
             return regression.predict(self._cells), np.empty(0)
         mean, covariance = regression.predict(self._cells, return_cov=True)

@@ -1,7 +1,8 @@
 """Policies: from posterior draws to the next plan.
 
 A policy is any callable `policy(key, posterior, planner) -> Plan`; your own may be passed wherever
-a name may. Where the awareness is uncertain, the planner holds a map for each draw, and the i-th
+a name may. Whatever a path was chosen by, what its plan expects is expected under the posterior
+mean. Where the awareness is uncertain, the planner holds a map for each draw, and the i-th
 draw of the parameters goes with the i-th of these.
 """
 
@@ -35,7 +36,8 @@ def greedy(key: Array, posterior: Params, planner: Planner) -> Plan:
 def thompson(key: Array, posterior: Params, planner: Planner) -> Plan:
     """Best path under one posterior draw taken at random (probability matching)."""
     index = int(jax.random.randint(key, (), 0, posterior.leading[0]))
-    return planner.of_draw(index).plan(posterior.draw(index))
+    plan = planner.of_draw(index).plan(posterior.draw(index))
+    return planner.evaluate(plan.path, posterior.mean())
 
 
 def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: float = 0.9) -> Plan:
@@ -90,7 +92,7 @@ def information(key: Array, posterior: Params, planner: Planner, *, n_random: in
     drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=_seed(key))
     rng = np.random.default_rng(_seed(key))
     paths = list(drawn.candidates) + [walks_of(planner.course).draw(rng) for _ in range(n_random)]
-    params, _ = choose(posterior, 1000, _seed(key))
+    params, _ = choose(posterior, N_DRAWS, _seed(key))
     gains = information_gain(params, planner.mean_awareness, paths)
     return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
 

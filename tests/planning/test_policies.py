@@ -1,0 +1,224 @@
+"""The policies, against brute force over all admissible paths."""
+
+import jax
+import numpy as np
+import pytest
+from references import path_values, walks
+
+from trustbo.errors import TrustboError
+from trustbo.models import (
+    CoupledTrust,
+    HierarchicalTrust,
+    PooledTrust,
+    TrustParams,
+    sample_prior,
+)
+from trustbo.planning import POLICIES, AwarenessBelief, Planner, drift, policies
+from trustbo.planning.policies import resolve_policy
+from trustbo.terrain import Workspace
+
+ENDS = ((3, 0), (0, 3))
+N_DRAWS = 60
+
+
+@pytest.fixture
+def workspace():
+    rng = np.random.default_rng(0)
+    passable = np.ones((4, 4), bool)
+    passable[1, 1] = False
+    return Workspace.from_awareness(rng.uniform(size=(2, 4, 4, 2)), passable)
+
+
+@pytest.fixture
+def planner(workspace):
+    return Planner(workspace, *ENDS)
+
+
+def prior_draws(model=None, n_draws=N_DRAWS):
+    return sample_prior(model or PooledTrust(), 2, n_draws, seed=1, n_robots=2)
+
+
+def uncertain(planner, n_maps=20):
+    """The planner, its map in doubt."""
+    return planner.with_awareness(AwarenessBelief(planner.workspace, sd=0.3).draw(n_maps))
+
+
+def brute_force(planner, draws, objective="terminal"):
+    """Every admissible path, and its value under every draw, shape (draw, path)."""
+    passable = planner.workspace.passable.values.tolist()
+    paths = list(walks(passable, *ENDS, planner.longest, u_turns=False))
+    n_cells = np.array([len(path) for path in paths])
+    flat = np.zeros((len(paths), n_cells.max()), int)
+    for i, path in enumerate(paths):
+        flat[i, : len(path)] = [4 * row + col for row, col in path]
+    values = []
+    for d in range(draws.leading[0]):
+        one = draws.draw(d)
+        u = drift(one, planner.awareness).reshape(2, -1)
+        values.append(path_values(objective, flat, n_cells, u, one.beta0 * np.eye(2), one.x0_mean))
+    return paths, np.stack(values)
+
+
+def scores(name, values):
+    if name == "ucb":
+        return values.mean(0) + values.std(0)
+    if name == "cvar":
+        return np.sort(values, axis=0)[:12].mean(0)  # a fifth of 60 draws
+    incumbent = values[:, values.mean(0).argmax()]
+    return np.maximum(values - incumbent[:, None], 0.0).mean(0)
+
+
+@pytest.mark.parametrize("objective", ["terminal", "mean", "success"])
+@pytest.mark.parametrize("name", ["ucb", "ei", "cvar"])
+def test_policies_that_compare_paths_take_the_best_of_those_best_under_a_draw(
+    name, objective, workspace
+):
+    options = {} if objective != "success" else {"max_bounds": "shortest+2"}
+    planner, draws = Planner(workspace, *ENDS, objective, **options), prior_draws()
+    paths, values = brute_force(planner, draws, objective)
+    candidates = np.unique(values.argmax(1))
+    assert len(candidates) > 1
+    score = scores(name, values[:, candidates])
+    plan = POLICIES[name](jax.random.key(0), draws, planner)
+    np.testing.assert_allclose(
+        score[candidates.tolist().index(paths.index(plan.path))], score.max(), rtol=1e-9
+    )
+
+
+def test_ei_takes_the_incumbent_where_nothing_can_be_better(planner):
+    draws = prior_draws(n_draws=1)
+    assert policies.ei(jax.random.key(0), draws, planner).path == planner.plan(draws.draw(0)).path
+
+
+def test_they_weigh_mean_against_spread_as_told(planner):
+    draws, key = prior_draws(), jax.random.key(0)
+    paths, values = brute_force(planner, draws)
+    values = values[:, np.unique(values.argmax(1))]
+    best = values.mean(0).max()
+    calm = policies.ucb(key, draws, planner, kappa=0.0)
+    of = {path: v for path, v in zip(paths, brute_force(planner, draws)[1].T, strict=True)}
+    np.testing.assert_allclose(of[calm.path].mean(), best, rtol=1e-12)
+    everything = policies.cvar(key, draws, planner, alpha=1.0)
+    np.testing.assert_allclose(of[everything.path].mean(), best, rtol=1e-12)
+    worst = policies.cvar(key, draws, planner, alpha=1e-9)
+    np.testing.assert_allclose(of[worst.path].min(), values.min(0).max(), rtol=1e-12)
+    bold = policies.ucb(key, draws, planner, kappa=100.0)
+    assert of[bold.path].std() >= of[calm.path].std()
+
+
+@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust(), CoupledTrust()])
+@pytest.mark.parametrize("name", list(POLICIES))
+def test_every_policy_plans_an_admissible_path_and_repeats_it(name, model, planner):
+    draws = prior_draws(model)
+    for going_by in (planner, uncertain(planner)):
+        plans = [POLICIES[name](jax.random.key(2), draws, going_by) for _ in range(2)]
+        assert planner.require_path(plans[0].path) == plans[0].path
+        assert len(plans[0].path) - 1 <= planner.longest
+        assert plans[0].path == plans[1].path
+        # What it says of the path is under the posterior mean, whatever it was chosen by.
+        mean = going_by.evaluate(plans[0].path, draws.mean())
+        np.testing.assert_allclose(plans[0].trust, mean.trust)
+
+
+def test_greedy_is_the_best_under_the_mean_and_thompson_under_single_draws(planner):
+    draws = prior_draws()
+    paths, values = brute_force(planner, draws)
+    greedy = policies.greedy(jax.random.key(0), draws, planner)
+    assert greedy.path == planner.plan(draws.mean()).path
+    best = {paths[i] for i in values.argmax(1)}
+    drawn = {policies.thompson(jax.random.key(i), draws, planner).path for i in range(40)}
+    assert drawn <= best
+    assert len(drawn) > 3
+
+
+def test_optimistic_is_greedy_at_the_median_of_one_draw_and_bolder_above(planner):
+    one = prior_draws(n_draws=1)
+    plan = policies.optimistic(jax.random.key(0), one, planner, quantile=0.5)
+    assert plan.path == policies.greedy(jax.random.key(0), one, planner).path
+    assert plan.value == planner.plan(one.draw(0)).value
+    # Two draws that differ in the weight alone: above the median, the one with more counts.
+    weights = np.array([[0.0, 0.0], [0.9, 0.0]])
+    half = np.full(2, 0.5)
+    two = TrustParams(half, weights, np.zeros(2), half, half)
+    bold = policies.optimistic(jax.random.key(0), two, planner, quantile=1.0)
+    assert bold.path == planner.plan(two.draw(1)).path
+
+
+def test_optimistic_is_drawn_to_cells_it_knows_nothing_of(workspace):
+    """Corridors alike on average, of which one is uncertain."""
+    z = np.full((1, 3, 5, 1), 0.5)
+    passable = np.ones((3, 5), bool)
+    passable[1, 1:4] = False
+    known = Workspace.from_awareness(z, passable)
+    planner = Planner(known, (1, 0), (1, 4), "mean", connectivity=4)
+    maps = np.repeat(z[None], 50, axis=0)
+    maps[:, 0, 2, 1:4, 0] += np.linspace(-0.4, 0.39, 50)[:, None]
+    one = TrustParams(0.5, np.array([0.5]), 0.0, 0.1, 0.1)
+    draws = TrustParams(*(np.stack([np.asarray(v)] * 50) for v in one[:5]))
+    planner = planner.with_awareness(maps)
+    assert (0, 2) in policies.greedy(jax.random.key(0), draws, planner).path
+    assert (2, 2) in policies.optimistic(jax.random.key(0), draws, planner).path
+
+
+def test_thompson_goes_by_the_map_of_its_draw(planner):
+    draws = prior_draws(n_draws=4)
+    maps = np.random.default_rng(3).uniform(size=(2, 2, 4, 4, 2))
+    one_of = [planner.with_awareness(z) for z in maps]
+    right = {one_of[i % 2].plan(draws.draw(i)).path for i in range(4)}
+    wrong = {one_of[1 - i % 2].plan(draws.draw(i)).path for i in range(4)}
+    assert wrong - right  # so that the test can tell
+    both = planner.with_awareness(maps)
+    drawn = [policies.thompson(jax.random.key(i), draws, both) for i in range(30)]
+    assert {plan.path for plan in drawn} == right
+
+
+def test_information_takes_the_path_that_teaches_most(planner):
+    """Only the first weight is unknown: the path along which that feature is high."""
+    weights = np.stack([np.random.default_rng(4).standard_normal(N_DRAWS), np.zeros(N_DRAWS)], 1)
+    zeros, noise = np.zeros(N_DRAWS), np.full(N_DRAWS, 0.1)
+    draws = TrustParams(zeros, weights, zeros, noise, noise)
+    plan = policies.information(jax.random.key(0), draws, planner, n_random=2000)
+    z = planner.workspace.awareness.values
+    paths, _ = brute_force(planner, draws)
+    teaches = {p: (z[:, *zip(*p[1:], strict=True), 0] ** 2).sum() for p in paths}
+    np.testing.assert_allclose(teaches[plan.path], max(teaches.values()), rtol=1e-12)
+
+
+def test_epsilon_greedy_is_greedy_or_random(planner):
+    draws = prior_draws()
+    greedy = policies.greedy(jax.random.key(0), draws, planner).path
+    never = [
+        policies.epsilon_greedy(jax.random.key(i), draws, planner, epsilon=0) for i in range(9)
+    ]
+    assert {plan.path for plan in never} == {greedy}
+    always = {
+        policies.epsilon_greedy(jax.random.key(i), draws, planner, epsilon=1).path for i in range(9)
+    }
+    assert len(always) > 4
+    some = [
+        policies.epsilon_greedy(jax.random.key(i), draws, planner, epsilon=0.5) for i in range(60)
+    ]
+    explored = np.mean([plan.path != greedy for plan in some])
+    assert 0.3 < explored < 0.7
+
+
+def test_random_ignores_what_was_learned(planner):
+    paths = [
+        [policies.random(jax.random.key(i), draws, planner).path for i in range(5)]
+        for draws in (prior_draws(), prior_draws(n_draws=3))
+    ]
+    assert paths[0] == paths[1]
+    assert len(set(paths[0])) > 1
+
+
+def test_policies_have_names_and_can_be_one_s_own():
+    assert next(iter(POLICIES)) == "greedy"
+    for name, policy in POLICIES.items():
+        assert resolve_policy(name) is policy is getattr(policies, name)
+        assert policy.__doc__
+    own = lambda key, posterior, planner: planner.plan(posterior.mean())  # noqa: E731
+    assert resolve_policy(own) is own
+    with pytest.raises(TrustboError, match="unknown policy 'bold'; choose one of greedy"):
+        resolve_policy("bold")
+    with pytest.raises(TrustboError, match="policy must be a name or a callable; got None"):
+        resolve_policy(None)
