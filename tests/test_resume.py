@@ -161,6 +161,7 @@ def test_a_folder_is_for_one_campaign_at_a_time(workspace, tmp_path):
     tb.Campaign.load(tmp_path).close()
     with pytest.raises(tb.TrustboError, match="holds no campaign"):
         tb.Campaign.load(tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
 
 
 def test_saving_is_a_copy_and_loading_goes_on(workspace, tmp_path):
@@ -171,7 +172,9 @@ def test_saving_is_a_copy_and_loading_goes_on(workspace, tmp_path):
     operator = campaign.suggest([(3, 0), (2, 1), (1, 2), (0, 3)])
     assert campaign.ask().path == operator.path
     campaign.save(tmp_path)
+    campaign.save(tmp_path)  # again, over itself
     with tb.Campaign.load(tmp_path) as again:
+        again.save(tmp_path)  # into the folder it is kept in
         assert again.ask().path == operator.path
         assert again.log.failures == [(1, "rain")]
         assert again.settings == campaign.settings
@@ -195,7 +198,7 @@ def test_what_is_your_own_is_asked_for_again(workspace, tmp_path):
 
     model = PooledTrust(priors=Priors(x0_mean=0.4))
     tb.Campaign(workspace, *ENDS, model=model, policy=straight, directory=tmp_path).close()
-    with pytest.raises(tb.TrustboError, match=r"policy was your own; give it again with policy="):
+    with pytest.raises(tb.TrustboError, match=r"policy was your own .'straight'.; give it again"):
         tb.Campaign.load(tmp_path, model=model)
     with pytest.raises(tb.TrustboError, match="has priors of its own, or is your own; give it"):
         tb.Campaign.load(tmp_path, policy=straight)

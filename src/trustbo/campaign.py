@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from os import PathLike
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -359,7 +360,8 @@ class Campaign:
             TrustboError: Another campaign holds the folder, or its name belongs to a file.
         """
         own, self._journal = self._journal, None
-        journal = own if own and own.folder.samefile(directory) else Journal(directory)
+        here = own is not None and own.folder.resolve() == Path(directory).resolve()
+        journal = own if own is not None and here else Journal(directory)
         try:
             self._open(journal, overwrite=True)
         finally:
@@ -390,18 +392,12 @@ class Campaign:
             TrustboError: There is no campaign; another process is at work on it; or something of
                 your own is missing.
         """
-        journal = Journal(directory)
+        journal = Journal.existing(directory)
         try:
             state, measured, result = journal.read()
             options = state["options"]
             for name, given in (("policy", policy), ("awareness", awareness)):
-                if options.pop(f"own_{name}") != (given is not None):
-                    raise TrustboError(
-                        f"the campaign's {name} was {'your own; give it' if given is None else ''} "
-                        f"{'again with ' + name + '=' if given is None else 'not your own'}: "
-                        f"{options[name]!r}."
-                    )
-                options[name] = options[name] if given is None else given
+                options[name] = _again(name, options[name], given, options.pop(f"own_{name}"))
             options["model"] = model_from_record(options["model"], model)
             start, goal = (tuple(options.pop(name)) for name in ("start", "goal"))
             campaign = cls(journal.read_workspace(), start, goal, **options)
@@ -525,6 +521,17 @@ _OPTIONS = (
     "start", "goal", "policy", "objective", "sampler", "initial", "update", "forgetting",
     "connectivity", "team", "length_weight", "awareness", "seed",
 )  # fmt: skip
+
+
+def _again(name: str, kept: object, given: object, was_own: bool) -> object:
+    """What was kept, or, if it was the user's own, what is given again."""
+    if was_own and given is None:
+        raise TrustboError(
+            f"the campaign's {name} was your own ({kept!r}); give it again with {name}=."
+        )
+    if given is not None and not was_own:
+        raise TrustboError(f"the campaign's {name} is {kept!r}, none of your own; leave {name}=.")
+    return kept if given is None else given
 
 
 def _belief_in(workspace: Workspace, awareness: object) -> AwarenessBelief | None:

@@ -2,7 +2,8 @@
 
 import json
 from os import PathLike
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 from filelock import FileLock, Timeout
 
@@ -44,6 +45,19 @@ class Journal:
                 "another folder."
             ) from None
 
+    @classmethod
+    def existing(cls, directory: str | PathLike[str]) -> Self:
+        """Take hold of a folder that holds a campaign.
+
+        Raises:
+            TrustboError: It holds none, or another campaign is at work in it.
+        """
+        if not (Path(directory) / _STATE).exists():
+            raise TrustboError(
+                f"{str(directory)!r} holds no campaign; give a folder that one was saved to."
+            )
+        return cls(directory)
+
     @property
     def is_used(self) -> bool:
         """Whether the folder holds a campaign already."""
@@ -84,15 +98,7 @@ class Journal:
         write_text(self.folder / _STATE, to_json(state))
 
     def read(self) -> tuple[dict[str, Any], list[Mission], Result | None]:
-        """State, the missions as they were told, and what was learned from all but maybe the last.
-
-        Raises:
-            TrustboError: The folder holds no campaign.
-        """
-        if not self.is_used:
-            raise TrustboError(
-                f"{str(self.folder)!r} holds no campaign; give a folder that one was saved to."
-            )
+        """State, the missions as told, and what was learned from all but maybe the last."""
         state = json.loads((self.folder / _STATE).read_text(encoding="utf-8"))
         measured: list[Mission] = []
         if (self.folder / _MEASURED).exists():

@@ -58,5 +58,8 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 def plan_from_record(record: dict[str, Any]) -> Plan:
     """The plan that `plan_to_record` laid out."""
-    arrays = {name: np.array(record[name]) for name in ("positions", "trust", "bands")}
-    return Plan(**record | arrays | {"path": tuple((r, c) for r, c in record["path"])})
+    values: dict[str, Any] = dict(record)
+    for name in ("positions", "trust", "bands"):
+        values[name] = np.array(record[name])
+    values["path"] = tuple((row, col) for row, col in record["path"])
+    return Plan(**values)
