@@ -1,6 +1,5 @@
 """The planner against every admissible path written out."""
 
-import heapq
 from functools import cache
 
 import numpy as np
@@ -105,33 +104,6 @@ def test_paths_of_two_more_bounds_without_u_turns_are_simple(connectivity):
         except NoPathError:
             continue
         assert planner.plan(make_params(0.95, case)).revisits == 0
-
-
-def test_dijkstra_with_trust_on_arrival_as_label_is_wrong():
-    """What the 2023 code does; kept as a warning. It extends only the most trusting label."""
-    wrong = 0
-    for seed in range(20):
-        case = random_case(seed, n=5)
-        awareness, _, beta, b = case
-        u = (awareness @ beta + b).mean(0)
-        planner = make_planner("success", 8, case)
-        best = planner.plan(make_params(0.7, case)).value
-        queue, done = [(0.0, (4, 0), 0.5, ((4, 0),))], set()
-        while queue:
-            _, cell, x, path = heapq.heappop(queue)
-            if cell in done:
-                continue
-            done.add(cell)
-            if cell == (0, 4):
-                break
-            for other in planner.graph.successors(cell):
-                after = 0.7 * x + u[other]
-                label = 1.0 - 1.0 / (1.0 + np.exp(-after))
-                heapq.heappush(queue, (label, other, after, (*path, other)))
-        naive = planner.evaluate(path, make_params(0.7, case)).value
-        assert naive <= best + 1e-12
-        wrong += naive < best - 1e-9
-    assert wrong >= 5
 
 
 def test_the_trust_map_is_the_best_terminal_trust_of_every_cell():
