@@ -1,10 +1,11 @@
-from . import export, models, planning, plots, simulation, terrain
+from . import export, models, planning, plots, simulation, study, terrain
 from .campaign import Campaign
 from .data import Bound, Mission, Robot, Team
 from .errors import PosteriorError, ShapeError, TerrainError, TrustboError
-from .loop import iterate
+from .loop import iterate, missions, resume
 from .planning import NoPathError
 from .result import Result, load_result
+from .stopping import RegretBound, Seconds
 from .terrain import Workspace
 
 __all__ = [
@@ -13,8 +14,10 @@ __all__ = [
     "Mission",
     "NoPathError",
     "PosteriorError",
+    "RegretBound",
     "Result",
     "Robot",
+    "Seconds",
     "ShapeError",
     "Team",
     "TerrainError",
@@ -23,10 +26,13 @@ __all__ = [
     "export",
     "iterate",
     "load_result",
+    "missions",
     "models",
     "planning",
     "plots",
+    "resume",
     "simulation",
+    "study",
     "terrain",
 ]
 __version__: str

@@ -1,4 +1,4 @@
-"""The command line: `trustbo run` on your own terrain, `trustbo demo` on a made one."""
+"""The command line: `trustbo run` on your own terrain, `demo` on a made one, `study` on many."""
 
 import sys
 import warnings
@@ -16,7 +16,13 @@ app = typer.Typer(
     help="Learn how trustworthy robots are where, and plan the most trustworthy path.",
 )
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results; made if need be.")]
-Policy = Annotated[str, typer.Option(help="How the next path is chosen: greedy, thompson, random.")]
+Policy = Annotated[
+    str,
+    typer.Option(
+        help="How the next path is chosen: greedy, optimistic, thompson, information, ucb, ei, "
+        "epsilon_greedy, cvar, random."
+    ),
+]
 Objective = Annotated[
     str,
     typer.Option(
@@ -147,6 +153,50 @@ def demo(
         quiet=quiet,
         debug=debug,
     )
+
+
+@app.command()
+def study(
+    config: Annotated[Path, typer.Argument(help="The study, in YAML; see docs/studies.md.")],
+    out: Out = Path("out/study"),
+    executor: Annotated[
+        str, typer.Option(help="serial, loky, dask, or a scheduler's address, tcp://host:8786.")
+    ] = "loky",
+    workers: Annotated[
+        int | None, typer.Option(help="Processes of loky or dask; by default one for each core.")
+    ] = None,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Run a study: policies x objectives x models x seeds x terrains, on all cores.
+
+    Example: trustbo study config.yaml --out out/mine
+
+    The folder gets a file for each run, summary.csv (regret, or the plans' value where no truth is
+    known, per policy and mission), and regret.png. Called again, it goes on where it stopped.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from trustbo import plots
+    from trustbo.files import write_file, write_text
+    from trustbo.study import axes_of, run_study, summary
+
+    with _one_line_errors(debug):
+        results = run_study(config, out, executor, n_workers=workers, progress=not quiet)
+        known = bool(results["regret"].notnull().any())
+        table = summary(results, variable="regret" if known else "value")
+        write_text(out / "summary.csv", table.to_csv())
+        if known:
+            others = [name for name in axes_of(results) if name != "policy"]
+            axes = plots.regret_curves(results, panels=others[0] if others else None)
+            write_file(out / "regret.png", lambda file: axes[0].figure.savefig(file, dpi=150))
+        if not quiet:
+            print(f"median {'regret' if known else 'value'} after each mission")
+            print(table["median"].unstack("mission").round(4).to_string())
+        print(f"results are in {out}/; in Python: trustbo.study.load_study({str(out)!r})")
+    if results.attrs["n_failed"]:
+        raise typer.Exit(1)
 
 
 def _campaign(

@@ -102,7 +102,7 @@ def test_cheapest_paths_equal_scipy_s_however_uneven_the_costs(spread):
         passable = rng.uniform(size=(30, 40)) > 0.15
         passable[0, 0] = passable[29, 39] = True
         totals, paths = best_stationary(
-            level, passable, np.zeros(8), np.array(MOVES[8]), 0, 30 * 40 - 1
+            level.__getitem__, 1, passable, np.zeros(8), np.array(MOVES[8]), 0, 30 * 40 - 1
         )
         cost = np.where(passable, np.logaddexp(0.0, -level[0]), np.inf)
         best = dijkstra(grid_matrix(cost), indices=0)[-1]

@@ -8,6 +8,7 @@ cells are looked at again and again, a binary heap takes over.
 """
 
 import heapq
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -18,10 +19,12 @@ _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _MOST_BUCKETS = 1 << 16
 _MOST_LOOKS = 4  # at each cell, on average, before the heap takes over
 _SETTLED = -2
+_CELLS = 1 << 16  # of some draws at once: what the cache holds
 
 
 def best_stationary(
-    level: np.ndarray,
+    level: Callable[[slice], np.ndarray],
+    n_draws: int,
     passable: np.ndarray,
     toll: np.ndarray,
     steps: np.ndarray,
@@ -31,7 +34,8 @@ def best_stationary(
     """The path of every draw with the least sum of softplus(-level) over the cells it enters.
 
     Args:
-        level: The team's trust if it stayed in each cell for ever, shape (draw, row, col).
+        level: Of some draws, the team's trust if it stayed in each cell for ever, (draw, row, col).
+        n_draws: How many there are in all.
         passable: Shape (row, col).
         toll: What each move costs besides, shape (move,).
         steps: Moves, shape (move, 2).
@@ -42,18 +46,21 @@ def best_stationary(
         Costs, shape (draw,); inf where there is no path; and paths, flat indices of cells, shape
         (draw, length), filled with -1.
     """
-    n_draws, rows, cols = level.shape
+    rows, cols = passable.shape
     # One draw may need all cells (a maze); many share a shorter table unless one of them does.
     room = rows * cols if n_draws == 1 else min(rows * cols, 4 * (rows + cols))
     totals, n_cells = np.empty(n_draws), np.zeros(n_draws, np.int64)
     paths = np.full((n_draws, room), -1, np.int32)
 
+    step = max(1, _CELLS // (rows * cols))
+
     def work(first: int, last: int) -> None:
-        cost = _with_margin(level[first:last], passable)
-        part = slice(first, last)
-        _settle_draws(
-            cost, toll, steps, cols, start, goal, totals[part], n_cells[part], paths[part]
-        )
+        for begin in range(first, max(last, first + 1), step):
+            part = slice(begin, min(begin + step, last))
+            cost = _with_margin(level(part), passable)
+            _settle_draws(
+                cost, toll, steps, cols, start, goal, totals[part], n_cells[part], paths[part]
+            )
 
     over_rows(work, n_draws) if n_draws > 1 else work(0, 1)
     longest = int(n_cells.max())

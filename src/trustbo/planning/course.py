@@ -1,5 +1,6 @@
 """Where paths may lead: one start, one goal, and which paths between them are admissible."""
 
+import itertools
 import operator
 from collections.abc import Sequence
 from functools import cached_property
@@ -146,9 +147,10 @@ class Course:
             TrustboError: It is broken, or does not lead from start to goal; the cell is named.
         """
         try:
-            where = np.array([operator.index(i) for cell in path for i in cell]).reshape(-1, 2)
-            cells = tuple(zip(*where.T.tolist(), strict=True))
-        except (TypeError, ValueError):
+            flat = list(map(operator.index, itertools.chain.from_iterable(path)))
+            where = np.array(flat).reshape(len(path), 2)
+            cells = tuple(zip(flat[::2], flat[1::2], strict=True))
+        except (TypeError, ValueError):  # which of them?
             cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
             where = np.array(cells)
         if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:

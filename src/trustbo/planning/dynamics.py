@@ -33,7 +33,11 @@ class Dynamics(NamedTuple):
 
     def draw(self, index: int) -> "Dynamics":
         """One draw, without its leading axis."""
-        return Dynamics(self.transition[index], self.drift[index], self.start[index], self.views)
+        return self.take(index)
+
+    def take(self, which: int | slice | np.ndarray) -> "Dynamics":
+        """Some of the draws."""
+        return Dynamics(self.transition[which], self.drift[which], self.start[which], self.views)
 
     def flat(self) -> "Dynamics":
         """With exactly one leading axis (draw,)."""
@@ -128,7 +132,8 @@ def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
         beta = np.asarray(params.beta, dtype=float)
         u = np.tensordot(beta, z, (-1, -1)) if z.ndim == 4 else np.einsum("dm,dircm->dirc", beta, z)
         b = b[..., None]
-    return u + b[..., None, None]
+    u += b[..., None, None]  # in place: over many draws and cells this is large
+    return u
 
 
 def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:

@@ -69,7 +69,14 @@ def plan_compiled(course: Course, moves: Dynamics, aim: Aim) -> Answer:
     toll = aim.length_weight * course.lengths
     if aim.objective == "stationary":
         ends = course.flat(course.start), course.flat(course.goal)
-        _, paths = best_stationary(moves.settled(), course.passable, toll, course.steps, *ends)
+        _, paths = best_stationary(
+            lambda part: moves.take(part).settled(),
+            len(moves.start),
+            course.passable,
+            toll,
+            course.steps,
+            *ends,
+        )
         return Answer(paths, np.zeros(len(paths)))
     if aim.objective not in LABELLED and len(moves.views) == 1:
         return _additive(course, moves, aim, toll)

@@ -1,5 +1,6 @@
 """The planner a user holds: one workspace, one start and goal, one objective."""
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -116,7 +117,7 @@ class Planner(Setting):
         started = time.perf_counter()
         _require_one_draw(params)
         path, slack, engine = self._find(self.dynamics(params, x0))
-        plan = self.evaluate(path, params, x0=x0)
+        plan = self._evaluate(path, params, x0)
         return replace(
             plan,
             exact=slack <= EXACT,
@@ -210,8 +211,15 @@ class Planner(Setting):
             ShapeError: Parameters of other robots or features.
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
-        cells, grid = self.require_path(path), self.workspace.grid
-        draws, (rows, cols) = draws_of(params), np.array(cells).T
+        return self._evaluate(self.require_path(path), draws_of(params), x0)
+
+    def _evaluate(
+        self, cells: tuple[Cell, ...], draws: Params, x0: ArrayLike | None = None
+    ) -> Plan:
+        """What is expected of a path that is known to be one."""
+        flat, grid = np.fromiter(itertools.chain.from_iterable(cells), int), self.workspace.grid
+        where = flat.reshape(-1, 2)
+        rows, cols = where.T
         z = self.awareness if draws.leading else self.mean_awareness
         along = z[..., rows[1:], cols[1:], :]  # ([draw], robot, bound, feature)
         if along.ndim == 4:
@@ -221,15 +229,16 @@ class Planner(Setting):
         trust = many.mean(0)
         team = trust.mean(1) if self.team == "mean" else trust.min(1)
         if self.objective == "stationary":
-            value = path_value(self.dynamics(draws, x0), self._aim, self.course, cells).mean()
+            value = path_value(self.dynamics(draws, x0), self._aim, self.course, where).mean()
         else:
-            value = self._value(team, cells)
+            toll = self._aim.length_weight * path_length(self.course, where)
+            value = OBJECTIVES[self.objective](PathTrust(team, team, toll))
         return Plan(
             cells,
             np.stack([grid.x[cols], grid.y[rows]], axis=1),
-            path_length(self.course, cells),
+            path_length(self.course, where),
             trust,
-            np.quantile(many, QUANTILES, axis=0),
+            _bands(many),
             float(value),
             float(np.exp(-softplus(-team).sum())),
             self.objective,
@@ -306,10 +315,6 @@ class Planner(Setting):
         answer = plan_compiled(self.course, _stacked(moves), self._aim)
         return self.course.cells(answer.paths[0]), float(answer.slack[0]), engine
 
-    def _value(self, team: np.ndarray, cells: tuple[Cell, ...]) -> float:
-        toll = self._aim.length_weight * path_length(self.course, cells)
-        return float(OBJECTIVES[self.objective](PathTrust(team, team, toll)))
-
     def _bound(self, value: float, slack: float) -> float:
         """The value a plan could have at most, its search having left this much slack."""
         if slack <= 1e-12:
@@ -317,6 +322,13 @@ class Planner(Setting):
         if self.objective == "terminal":
             return float(expit(logit(value) + slack))
         return value * float(np.exp(slack)) if self.objective == "success" else value + slack
+
+
+def _bands(trust: np.ndarray) -> np.ndarray:
+    """Quantiles over draws (draw, bound, robot); one draw is all of its own quantiles."""
+    if len(trust) == 1:
+        return np.repeat(trust, len(QUANTILES), axis=0)
+    return np.quantile(trust, QUANTILES, axis=0)
 
 
 def _require_one_draw(params: Params) -> None:

@@ -51,10 +51,7 @@ class DrawnPaths:
         values, inverse = np.empty(len(self.paths)), self._unique[1]
         for i, path in enumerate(self._unique[0]):
             of = np.flatnonzero(inverse == i)
-            moves = Dynamics(
-                self.moves.transition[of], self.moves.drift[of], self.moves.start[of],
-                self.moves.views,
-            )  # fmt: skip
+            moves = self.moves.take(of)
             values[of] = path_value(moves, self.aim, self.course, self.course.cells(path))
         return values
 

@@ -4,6 +4,7 @@ from trustbo.simulation.bags import Topics, read_bag, write_bag
 from trustbo.simulation.bounding import Simulator
 from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.measure import STATES
+from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.mujoco import MujocoBackend
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.replay import ReplayBackend
@@ -15,6 +16,7 @@ __all__ = [
     "STATES",
     "Degradation",
     "KinematicSimulator",
+    "ModelSimulator",
     "MujocoBackend",
     "ReplayBackend",
     "Sight",

@@ -1,0 +1,125 @@
+"""How soon do policies find the best path? Regret against mission, from many runs."""
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from trustbo.errors import TrustboError, require_choice
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Of the runs: ends of the thin bars and of the thick ones, and the marker between them."""
+_SPREAD = 0.6  # of a mission's width, over which the curves stand side by side
+_MEANING = {
+    "regret": "regret of the path recommended",
+    "regret_followed": "regret of the path followed",
+}
+_MARKERS = "osD^vPX*<>"
+_DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
+
+
+def regret_curves(
+    dataset: xr.Dataset,
+    *,
+    by: str = "policy",
+    panels: str | None = None,
+    variable: str = "regret",
+    relative: bool = False,
+) -> np.ndarray:
+    """Median of a study's regret after each mission, and how it spreads over the runs.
+
+    Thin bars hold 90 % of the runs, thick ones half of them. Curves differ by colour, lightness,
+    dashes and marker at once, so that they can be told apart without colour too.
+
+    Args:
+        dataset: As `study.load_study` gives it: dims (run, mission).
+        by: The coordinate of runs that each curve is for.
+        panels: The coordinate of runs that each panel is for, such as `"terrain"`.
+        variable: What to show, `"regret"` or `"regret_followed"`.
+        relative: As a share of the best path's value.
+
+    Returns:
+        The Axes, shape (panel,).
+
+    Raises:
+        TrustboError: A coordinate there is not, or no regret is known: no simulator of the study
+            knows the truth.
+    """
+    require_choice("variable", variable, _MEANING)
+    for name in (by, panels or by):
+        require_choice(
+            "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]
+        )
+    regret = dataset[variable] / abs(dataset["oracle"]) if relative else dataset[variable]
+    if not np.isfinite(regret).any():
+        raise TrustboError(
+            'no regret is known: the truth is, where a study\'s simulator is of the kind "model".'
+        )
+    names = list(dict.fromkeys(dataset[by].values.tolist()))
+    values = [None] if panels is None else list(dict.fromkeys(dataset[panels].values.tolist()))
+    width = min(1.0 + 0.16 * len(names) * regret.sizes["mission"], 7.5)
+    axes = plt.subplots(
+        1,
+        len(values),
+        figsize=(2.2 + max(width, 2.5) * len(values), 3.6),
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )[1][0]
+    for ax, value in zip(axes, values, strict=True):
+        chosen = regret if value is None else regret[dataset[panels].values == value]
+        _draw(ax, chosen, names, by)
+        n_runs = [int(np.sum(chosen[by].values == name)) for name in names]
+        counted = "-".join(str(n) for n in sorted({min(n_runs), max(n_runs)}))
+        title = "" if value is None else f"{panels} {value}, "
+        ax.set_title(f"{title}{counted} runs each", fontsize=9, loc="left")
+    what = "share of the best value" if relative else "in units of the objective"
+    axes[0].set_ylabel(f"{_MEANING[variable]},\n{what}")
+    axes[0].set_ylim(bottom=-0.03 * axes[0].get_ylim()[1])  # markers at 0 are seen whole
+    # Beside the panels, where it hides nothing.
+    axes[-1].figure.legend(
+        *axes[0].get_legend_handles_labels(),
+        title=f"{by}: median,\n50 % and 90 % of runs",
+        loc="outside right upper",
+        alignment="left",
+        frameon=False,
+    )
+    return axes
+
+
+def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str) -> None:
+    mission = regret["mission"].values
+    shades = colormaps["viridis"](np.linspace(0.0, 0.8, len(names)))
+    # Side by side: shaded bands would hide each other.
+    dodge = np.linspace(-0.5, 0.5, len(names)) * _SPREAD if len(names) > 1 else [0.0]
+    for i, name in enumerate(names):
+        own = regret.values[regret[by].values == name]
+        known = np.isfinite(own).any(0)
+        if not known.any():
+            continue
+        ends = np.nanquantile(own[:, known], QUANTILES, axis=0)
+        place, own_style = mission[known] + dodge[i], {"color": shades[i], "zorder": 3}
+        ax.vlines(place, ends[0], ends[4], linewidth=0.9, **own_style)
+        ax.vlines(place, ends[1], ends[3], linewidth=3.2, **own_style)
+        ax.plot(
+            place,
+            ends[2],
+            linestyle=_DASHES[i % len(_DASHES)],
+            linewidth=1.1,
+            marker=_MARKERS[i % len(_MARKERS)],
+            markersize=6.0,
+            markeredgecolor="white",
+            markeredgewidth=0.6,
+            label=str(name),
+            **own_style,
+        )
+    for k in mission[::2]:
+        ax.axvspan(k - 0.5, k + 0.5, color="0.955", linewidth=0.0, zorder=0)
+    ax.set_xlim(mission[0] - 0.5, mission[-1] + 0.5)
+    ax.set_xlabel("mission")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,147 @@
+"""A study from its table to its results."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from os import PathLike
+from typing import Any
+
+import pandas as pd
+import xarray as xr
+from tqdm import tqdm
+
+from trustbo.errors import TrustboError
+from trustbo.study.configuration import Study, read_study
+from trustbo.study.executors import completed, require_executor
+from trustbo.study.run import Run
+from trustbo.study.store import Store
+from trustbo.study.table import to_dataset
+
+
+def run_study(
+    study: Study | Mapping[str, Any] | str | PathLike[str],
+    directory: str | PathLike[str],
+    executor: Any = None,
+    *,
+    n_workers: int | None = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Run what of a study has not been run yet.
+
+    Args:
+        study: A `Study`, a mapping of its settings, or a YAML file of them.
+        directory: Where results are kept, a file for each run. Called again, a study goes on where
+            it stopped, and runs again what failed.
+        executor: `None` or `"serial"`: here, one after the other. `"loky"` or `"dask"`: in a
+            process for each core, of a local cluster in the case of Dask. The address of a Dask
+            scheduler (`"tcp://..."`), a `distributed.Client`, or any `concurrent.futures.Executor`
+            that does not fork.
+        n_workers: How many processes `"loky"` and `"dask"` start; by default one for each core.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        The results, as `load_study` gives them. Runs that failed are told of in a warning, and
+        listed by `failures`.
+
+    Raises:
+        TrustboError: A study or an executor that cannot be, before any work starts; or every run
+            failed.
+    """
+    if isinstance(study, str | PathLike):
+        study = read_study(study)
+    study = Study.of(study)
+    require_executor(executor)
+    store, runs = Store(directory), study.runs()
+    pending = [run for run in runs if not store.has(run.key)]
+    _rehearse(pending)
+    store.write_study(study, runs)
+    total, done = len(runs), len(runs) - len(pending)
+    failed: list[tuple[Run, str]] = []
+    with tqdm(total=total, initial=done, desc="runs", disable=not progress) as bar:
+        for run, record in completed(pending, executor, n_workers=n_workers):
+            _require_version(record)
+            store.write(run, record)
+            if "error" in record:
+                failed.append((run, record["error"]))
+                bar.set_postfix_str(f"{len(failed)} failed")
+            bar.update()
+    if failed:
+        listed = "; ".join(f"{run}: {error}" for run, error in failed[:3])
+        message = (
+            f"{len(failed)} of {total} runs failed, and are run again at the next call: {listed}"
+            f"{'; ...' if len(failed) > 3 else ''} (tracebacks: {store.folder / 'failed'})"
+        )
+        if len(failed) == total:
+            raise TrustboError(message)
+        warnings.warn(message, stacklevel=2)
+    return load_study(directory)
+
+
+def load_study(directory: str | PathLike[str]) -> xr.Dataset:
+    """The results of a study so far.
+
+    Runs that another study, or another version of trustbo, left in the folder are not among them.
+
+    Returns:
+        Dataset with dims run and mission (1, 2, ...): of each mission `value` (the objective its
+        plan was expected to have), `path` and `recommended` (row and col of each step, -1 after the
+        goal), `regret` (by how much the path recommended after it is worse than the best under the
+        true parameters, in units of the objective), `regret_followed` (of the path it followed),
+        `contact_rate` (mean), `status`, what `models.diagnostics` says of the posterior, and
+        seconds; of each run `oracle` (the best path's true value), `seconds` and `seconds_cpu` (of
+        its process). NaN where there is no truth to know, or no such mission. Coordinates of run:
+        its key, and its place along each axis of the study. Attributes: `n_runs` of the study, and
+        how many of them `n_failed`.
+
+    Raises:
+        TrustboError: The folder holds no study, or no run of it has ended.
+    """
+    store = Store(directory)
+    table = store.table()
+    records = {key: store.read(key) for key in table if store.has(key)}
+    if not records:
+        raise TrustboError(f"no run of the study in {str(store.folder)!r} has ended yet.")
+    dataset = to_dataset(records, table)
+    n_failed = sum(store.failure(key) is not None for key in table)
+    return dataset.assign_attrs(n_runs=len(table), n_failed=n_failed)
+
+
+def failures(directory: str | PathLike[str]) -> pd.DataFrame:
+    """The runs of a study that failed: labels, error and traceback, by key.
+
+    Raises:
+        TrustboError: The folder holds no study.
+    """
+    store = Store(directory)
+    rows = {key: store.failure(key) for key in store.table()}
+    return pd.DataFrame.from_dict(
+        {
+            key: row["labels"] | {"error": row["error"], "traceback": row.get("traceback", "")}
+            for key, row in rows.items()
+            if row is not None
+        },
+        orient="index",
+    )
+
+
+def _require_version(record: dict[str, Any]) -> None:
+    """Make it an error that the worker's trustbo is another: the key says it is ours."""
+    ours, theirs = version("trustbo"), record.get("versions", {}).get("trustbo")
+    if theirs not in (None, ours):
+        record["error"] = f"the worker has trustbo {theirs}, and the study {ours}"
+
+
+def _rehearse(runs: Sequence[Run]) -> None:
+    """Set up a campaign of each kind, so that what cannot be is refused now and not in an hour."""
+    seen = set()
+    for run in runs:
+        kind = repr({name: label for name, label in run.labels.items() if name != "seed"})
+        if kind in seen:
+            continue
+        seen.add(kind)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                run.begin()
+        except (TypeError, ValueError) as error:
+            raise TrustboError(f"the run {run}: {error}") from error

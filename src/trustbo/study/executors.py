@@ -1,0 +1,179 @@
+"""Where runs are run: here, in processes of this machine, or on a Dask cluster."""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import (
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+)
+from contextlib import contextmanager
+from typing import Any
+
+from trustbo.errors import TrustboError, require_choice
+from trustbo.study import workers
+from trustbo.study.run import Run, execute
+from trustbo.terrain.parallel import n_cores
+
+EXECUTORS = ("serial", "loky", "dask")
+_N_POOLS = 3  # in which no run ends, before a study gives up
+_MISSING = '{0!r} is not installed; pip install "trustbo[study]".'
+
+
+def completed(
+    runs: Sequence[Run], executor: object = None, *, n_workers: int | None = None
+) -> Iterator[tuple[Run, dict[str, Any]]]:
+    """Each run with what it left, as they end.
+
+    A run whose worker dies is run again: by Dask on another worker, else in a new pool.
+
+    Args:
+        runs: What to run.
+        executor: See `run_study`.
+        n_workers: Processes started for "loky" and "dask"; by default as many as there are cores.
+
+    Raises:
+        TrustboError: An unknown executor, one that forks, or whose package is not installed.
+    """
+    if not runs:
+        return
+    caller = workers.this_process()
+    if executor is None or executor == "serial":
+        for run in runs:
+            yield run, execute(run, caller)
+        return
+    pending, tries = list(runs), _N_POOLS
+    while pending and tries:
+        lost: list[Run] = []
+        with _pool(executor, min(n_workers or n_cores(), len(pending))) as pool:
+            for run, record in _through(pool, pending, caller):
+                if record is None:
+                    lost.append(run)
+                else:
+                    yield run, record
+        if executor == "loky":  # whose pools do not survive a worker: another one, if it helps
+            tries = tries - 1 if len(lost) == len(pending) else _N_POOLS
+        else:
+            tries = 0
+        pending = lost
+    for run in pending:
+        yield run, {"error": "lost: the workers of its pool died"}
+
+
+def _through(
+    pool: Executor, runs: Sequence[Run], caller: tuple[str, int]
+) -> Iterator[tuple[Run, dict[str, Any] | None]]:
+    """Each run with what it left; None if the pool broke before."""
+    futures: dict[Future[dict[str, Any]], Run] = {}
+    broken: list[Run] = []
+    try:
+        for run in runs:
+            try:
+                futures[pool.submit(execute, run, caller)] = run
+            except BrokenExecutor:
+                broken.append(run)
+        for future in as_completed(list(futures)):
+            try:
+                record = future.result()
+            except BrokenExecutor:
+                record = None
+            except Exception as error:  # the network's, or a worker's that Dask gave up on
+                record = {"error": f"lost: {type(error).__name__}: {error}"}
+            run = futures.pop(future)
+            # While it is held, Dask keeps the result, and makes it anew if the worker dies.
+            del future
+            yield run, record
+        yield from ((run, None) for run in broken)
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def require_executor(executor: object) -> None:
+    """Refuse what runs cannot be given to.
+
+    Raises:
+        TrustboError: An unknown name, or an executor that forks.
+    """
+    if executor is None or hasattr(executor, "get_executor"):
+        return
+    if isinstance(executor, str):
+        if "://" not in executor:
+            require_choice('executor (or give an address, "tcp://...")', executor, EXECUTORS)
+    elif isinstance(executor, ProcessPoolExecutor):
+        context: Any = getattr(executor, "_mp_context", None)
+        if context is not None and context.get_start_method() == "fork":
+            raise TrustboError(
+                "the executor forks, which JAX does not survive: make it with "
+                'ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")), or use '
+                'executor="loky".'
+            )
+    elif not callable(getattr(executor, "submit", None)):
+        raise TrustboError(
+            f"executor must be one of {', '.join(EXECUTORS)}, an address, an Executor, or a "
+            f"distributed.Client; got {executor!r}."
+        )
+
+
+@contextmanager
+def _pool(executor: Any, n_workers: int) -> Iterator[Executor]:
+    """The executor; one that is made here ends here."""
+    if executor == "loky":
+        yield from _loky(n_workers)
+    elif isinstance(executor, str):
+        yield from _dask(executor, n_workers)
+    elif hasattr(executor, "get_executor"):  # a distributed.Client
+        yield _of_client(executor)
+    else:
+        yield executor
+
+
+def _loky(n_workers: int) -> Iterator[Executor]:
+    try:
+        from loky import ProcessPoolExecutor as LokyExecutor
+    except ModuleNotFoundError:
+        raise TrustboError(_MISSING.format("loky")) from None
+    pool = LokyExecutor(n_workers)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=True, kill_workers=True)
+        raise
+    pool.shutdown(wait=True)
+
+
+def _dask(address: str, n_workers: int) -> Iterator[Executor]:
+    try:
+        from dask.config import set as configured
+        from distributed import Client, LocalCluster
+    except ModuleNotFoundError:
+        raise TrustboError(_MISSING.format("distributed")) from None
+    if address != "dask":
+        with Client(address) as client:
+            yield _of_client(client)
+        return
+    with (
+        configured({"distributed.worker.profile.enabled": False}),  # it takes 5 %
+        LocalCluster(
+            n_workers=n_workers,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=0,
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield _of_client(client)
+
+
+def _of_client(client: Any) -> Executor:
+    threads = max(client.nthreads().values(), default=1)
+    if threads > 1:
+        warnings.warn(
+            f"workers of the Dask cluster have up to {threads} threads, and would pin them all to "
+            "one core; start one worker of one thread for each core.",
+            stacklevel=2,
+        )
+    return client.get_executor(pure=False)

@@ -1,0 +1,92 @@
+"""What a study is put together from: terrains, simulators and models, each as plain settings."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from trustbo.errors import TrustboError, require_choice
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """Settings of one thing that runs are made of; JSON can hold them."""
+
+    kind: ClassVar[str]
+    REQUIRED: ClassVar[tuple[str, ...]] = ()
+    """Settings without a default."""
+
+    @classmethod
+    def of(cls, what: str, settings: Mapping[str, Any]) -> Self:
+        """The part with these settings.
+
+        Raises:
+            TrustboError: A setting there is not, or one that is missing or impossible.
+        """
+        known = {f.name: f for f in fields(cls)}
+        for name in settings:
+            require_choice(f"setting of {what} ({cls.kind})", name, known)
+        try:
+            return cls(**{name: _frozen(value) for name, value in settings.items()})
+        except TypeError as error:
+            missing = [name for name in cls.REQUIRED if name not in settings]
+            reason = f"needs {', '.join(missing)}" if missing else str(error)
+            raise TrustboError(f"{what} ({cls.kind}): {reason}; got {dict(settings)}.") from None
+
+    def settings(self) -> dict[str, Any]:
+        """All settings, defaults included."""
+        return {"kind": self.kind, **asdict(self)}
+
+    def identity(self) -> dict[str, Any]:
+        """What the numbers depend on; by default all settings."""
+        return self.settings()
+
+
+def parts_of[P: Part](what: str, given: object, kinds: Iterable[type[P]]) -> dict[str, P]:
+    """Parts by the name the study calls them.
+
+    Args:
+        what: Of which the study has some, e.g. "terrain".
+        given: Names of kinds, or a mapping of names to settings. The setting `kind` may be left
+            out where the name is that of a kind.
+        kinds: The kinds there are.
+
+    Raises:
+        TrustboError: Something else, or a kind or a setting there is not.
+    """
+    by_kind = {kind.kind: kind for kind in kinds}
+    if isinstance(given, str):
+        given = (given,)
+    if not isinstance(given, Mapping):
+        names = given if isinstance(given, list | tuple) else ()
+        given = {name: {} for name in names if isinstance(name, str)}
+        if not given or len(given) != len(names):
+            raise TrustboError(
+                f"{what}s must be distinct names of kinds ({', '.join(by_kind)}), or a mapping of "
+                f"your own names to settings; got {names or given!r}."
+            )
+    if not given:
+        raise TrustboError(f"a study needs at least one {what}; got none.")
+    parts = {}
+    for name, settings in given.items():
+        if isinstance(settings, Part):
+            settings = settings.settings()
+        if not isinstance(settings, Mapping | None):
+            raise TrustboError(f"{what} {name!r} must be a mapping of settings; got {settings!r}.")
+        own = dict(settings or {})
+        kind = by_kind[require_choice(f"kind of {what}", own.pop("kind", str(name)), by_kind)]
+        try:
+            parts[str(name)] = kind.of(f"{what} {name!r}", own)
+        except TrustboError as error:
+            message = str(error)
+            prefix = "" if repr(str(name)) in message else f"{what} {name!r}: "
+            raise TrustboError(prefix + message) from None
+    return parts
+
+
+def _frozen(value: Any) -> Any:
+    """Lists as tuples, so that parts can be hashed."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    return tuple(_frozen(v) for v in value) if isinstance(value, list | tuple) else value

@@ -1,0 +1,151 @@
+"""Where the runs of a study are: terrains as plain settings."""
+
+import hashlib
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from trustbo import terrain
+from trustbo.data import Cell, Team
+from trustbo.errors import TrustboError, require_pair, require_whole
+from trustbo.study.parts import Part
+from trustbo.terrain import Workspace
+
+EACH_RUN = "run"
+"""A terrain with this for a seed is another one in each run, that of the run's seed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Terrain(Part):
+    """Where a run is: a grid, from whose bottom left corner to the top right one it leads."""
+
+    shape: tuple[int, int] = (10, 10)
+    start: Cell | None = None
+    goal: Cell | None = None
+    n_robots: int = 3
+
+    def __post_init__(self) -> None:
+        rows, cols = require_pair("shape", self.shape)
+        for name, corner in (("start", (rows - 1, 0)), ("goal", (0, cols - 1))):
+            cell = corner if getattr(self, name) is None else getattr(self, name)
+            object.__setattr__(self, name, require_pair(name, cell))
+        object.__setattr__(self, "shape", (rows, cols))
+        require_whole("n_robots", self.n_robots, 1)
+
+    @property
+    def ends(self) -> tuple[Cell, Cell]:
+        """Start and goal."""
+        return cast(Cell, self.start), cast(Cell, self.goal)
+
+    def at(self, seed: int) -> "Terrain":
+        """The terrain of the run with this seed."""
+        each = getattr(self, "seed", 0) == EACH_RUN
+        return replace(self, **{"seed": seed}) if each else self
+
+    def workspace(self) -> Workspace:
+        """The workspace; made once per process, for a few terrains."""
+        return _workspace(self)
+
+    def make(self) -> Workspace:
+        """The workspace, made anew."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticTerrain(Terrain):
+    """A made terrain, see `terrain.synthetic_terrain`; `seed` may be `"run"`."""
+
+    kind = "synthetic"
+    size: tuple[float, float] = (500.0, 500.0)
+    resolution: float = 1.0
+    seed: int | str = 0
+    relief: float = 30.0
+    hurst: float = 0.9
+    canopy_cover: float = 0.4
+    canopy_height: float = 6.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_seed(self.seed)
+
+    def make(self) -> Workspace:
+        """The workspace, made anew."""
+        own = asdict(self)
+        for name in ("shape", "start", "goal", "n_robots"):
+            del own[name]
+        ground = terrain.synthetic_terrain(**own)
+        return Workspace.from_terrain(ground, self.shape, Team(n_robots=self.n_robots))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileTerrain(Terrain):
+    """A DEM and a DSM, see `terrain.read_terrain`."""
+
+    kind = "files"
+    REQUIRED = ("dem", "dsm")
+    dem: str
+    dsm: str
+    crs: str | None = None
+    resolution: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("dem", "dsm"):
+            path = Path(getattr(self, name)).absolute()
+            if not path.is_file():
+                raise TrustboError(f"{name}: there is no file {str(path)!r}.")
+            object.__setattr__(self, name, str(path))
+
+    def identity(self) -> dict[str, Any]:
+        """The files' content instead of their names: a study may move to another machine."""
+        return self.settings() | {name: _digest(getattr(self, name)) for name in ("dem", "dsm")}
+
+    def make(self) -> Workspace:
+        """The workspace, made anew."""
+        ground = terrain.read_terrain(self.dem, self.dsm, crs=self.crs, resolution=self.resolution)
+        return Workspace.from_terrain(ground, self.shape, Team(n_robots=self.n_robots))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomAwareness(Terrain):
+    """Awareness drawn uniformly for each cell, the same for every robot; no ground beneath.
+
+    `seed` may be `"run"`.
+    """
+
+    kind = "random"
+    seed: int | str = 0
+    n_features: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_seed(self.seed)
+        require_whole("n_features", self.n_features, 1)
+
+    def make(self) -> Workspace:
+        """The workspace, made anew."""
+        rng = np.random.default_rng(cast(int, self.seed))
+        z = rng.uniform(size=(*self.shape, self.n_features))
+        return Workspace.from_awareness(np.repeat(z[None], self.n_robots, axis=0))
+
+
+TERRAINS = (SyntheticTerrain, FileTerrain, RandomAwareness)
+
+
+@lru_cache(maxsize=4)
+def _workspace(part: Terrain) -> Workspace:
+    return part.make()
+
+
+@lru_cache(maxsize=64)
+def _digest(path: str) -> str:
+    with open(path, "rb") as file:
+        return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _require_seed(seed: object) -> None:
+    if seed != EACH_RUN:
+        require_whole(f'seed (or "{EACH_RUN}")', seed, 0)
