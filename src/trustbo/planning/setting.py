@@ -104,7 +104,8 @@ class Setting:
     def onward(self, done: Sequence[Cell]) -> Self:
         """A planner for the rest of a mission.
 
-        Admissible is what is left of this planner's paths: the bounds already made count.
+        Admissible is what is left of this planner's paths: the bounds already made count. A plan's
+        value is that of the rest alone: for `mean`, the mean over the bounds still to come.
 
         Args:
             done: The cells entered so far, start first; the last is where the team is.
