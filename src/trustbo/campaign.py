@@ -405,8 +405,12 @@ class Campaign:
             journal.close()
             raise
         campaign.log = Logbook.from_state(state, measured, result)
-        for mission in campaign.log.measured:
-            campaign._learned(mission)
+        if campaign.log.measured:
+            *earlier, latest = campaign.log.measured
+            if campaign.awareness is not None:
+                for mission in earlier:
+                    campaign.awareness.update(mission)
+            campaign._learned(latest)
         suggested = state["suggested"]
         campaign._plan = suggested and plan_from_record(suggested)
         campaign._journal = journal
@@ -424,8 +428,10 @@ class Campaign:
             reason: For `Result.stop_reason`.
         """
         self.log.stop_reason = reason
-        self._write()
-        return self.result()
+        result = self.result()
+        if self._journal is not None:
+            self._journal.write(self._state(), result)
+        return result
 
     def close(self) -> None:
         """Let go of the folder; the campaign is kept there no longer."""

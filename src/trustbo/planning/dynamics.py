@@ -39,6 +39,10 @@ class Dynamics(NamedTuple):
         """Some of the draws."""
         return Dynamics(self.transition[which], self.drift[which], self.start[which], self.views)
 
+    def stacked(self) -> "Dynamics":
+        """One draw as many: with a leading axis of length 1."""
+        return Dynamics(self.transition[None], self.drift[None], self.start[None], self.views)
+
     def flat(self) -> "Dynamics":
         """With exactly one leading axis (draw,)."""
 

@@ -312,7 +312,7 @@ class Planner(Setting):
         engine = choose_engine(self.engine, self.course.passable.size, 1)
         if engine == "networkx":
             return plan_networkx(self.course, moves, self._aim, self._backend), 0.0, engine
-        answer = plan_compiled(self.course, _stacked(moves), self._aim)
+        answer = plan_compiled(self.course, moves.stacked(), self._aim)
         return self.course.cells(answer.paths[0]), float(answer.slack[0]), engine
 
     def _bound(self, value: float, slack: float) -> float:
@@ -347,7 +347,3 @@ def _require_length_weight(length_weight: float, objective: str) -> float:
             f"length_weight is for {', '.join(ADDITIVE)}; the objective is {objective!r}."
         )
     return float(length_weight)
-
-
-def _stacked(moves: Dynamics) -> Dynamics:
-    return Dynamics(moves.transition[None], moves.drift[None], moves.start[None], moves.views)

@@ -48,8 +48,7 @@ def plan_networkx(course: Course, moves: Dynamics, aim: Aim, backend: str | None
 
 def _additive(course: Course, moves: Dynamics, aim: Aim, backend: str | None) -> list[Path | None]:
     """The best path of every length."""
-    many = Dynamics(moves.transition[None], moves.drift[None], moves.start[None], moves.views)
-    weights = additive_weights(many, moves.views[0], aim.objective, course.longest)
+    weights = additive_weights(moves.stacked(), moves.views[0], aim.objective, course.longest)
     gains = np.tensordot(weights.per_bound[0], moves.drift, (1, 0))  # (left, row, col)
     paths = []
     for n_bounds in range(course.shortest, course.longest + 1):
