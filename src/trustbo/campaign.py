@@ -32,6 +32,7 @@ from trustbo.terrain import Workspace
 AWARENESS = ("map", "belief")
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness")
 _N_MAPS = 500  # drawn of the awareness that is believed in
+_N_KEPT = 200  # of these, in a result
 
 
 class Campaign:
@@ -147,7 +148,7 @@ class Campaign:
             "team": team,
             "length_weight": length_weight,
             "awareness": "map" if self.awareness is None else "belief",
-            "max_bounds": max_bounds if isinstance(max_bounds, str) else self.planner.longest,
+            "max_bounds": self.planner.max_bounds,
             "seed": self.seed,
         }
         # As it was given: what `load` gives back to this method.
@@ -337,6 +338,7 @@ class Campaign:
             self.history,
             {**self.settings, **self.log.notes, "trustbo_version": version("trustbo")},
             self.log.stop_reason,
+            self._believed_awareness(),
         )
 
     # --- on disk ---
@@ -514,6 +516,15 @@ class Campaign:
             maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
             self._believed = self.planner.with_awareness(maps, self.awareness.mean())
         return self._believed
+
+    def _believed_awareness(self) -> xr.Dataset | None:
+        """`Result.believed`."""
+        if self.awareness is None:
+            return None
+        like, planner = self.workspace.awareness, self.planner_now()
+        maps = planner.awareness[:_N_KEPT]
+        draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
+        return xr.Dataset({"mean": like.copy(data=planner.mean_awareness), "draws": draws})
 
     def seed_of(self, stream: str) -> int:
         """The seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""

@@ -2,9 +2,11 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,8 +15,12 @@ from trustbo import archive, records
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
 from trustbo.files import to_json, write_file, write_text
-from trustbo.planning import Plan
+from trustbo.models import params_of
+from trustbo.planning import Plan, Planner
 from trustbo.terrain import Workspace
+
+_BELIEVED = "believed.nc"
+_PLANNER_OPTIONS = ("objective", "connectivity", "max_bounds", "team", "length_weight")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,8 @@ class Result:
             its posterior, and the seconds spent planning, running and fitting.
         settings: What the campaign was run with.
         stop_reason: Why it ended.
+        believed: Of campaigns with `awareness="belief"`, the awareness believed in at the end: its
+            `mean` (robot, row, col, feature) and `draws` of it (draw, robot, row, col, feature).
     """
 
     workspace: Workspace
@@ -48,11 +56,53 @@ class Result:
     history: xr.Dataset
     settings: dict[str, object]
     stop_reason: str
+    believed: xr.Dataset | None = None
 
     @property
     def posterior(self) -> xr.DataTree:
         """The posterior after the last mission."""
         return self.posteriors[-1]
+
+    @cached_property
+    def planner(self) -> Planner:
+        """A planner as the campaign's, going by the awareness believed in at the end."""
+        options: dict[str, Any] = {name: self.settings[name] for name in _PLANNER_OPTIONS}
+        start, goal = (_cell(self.settings[name]) for name in ("start", "goal"))
+        planner = Planner(self.workspace, start, goal, **options)
+        if self.believed is None:
+            return planner
+        return planner.with_awareness(self.believed["draws"].values, self.believed["mean"].values)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The recommended path as a `Plan`, with bands over the posterior."""
+        mean = params_of(self.posterior).mean()
+        best = self.planner.plan(mean)
+        if list(best.path) != self.path:  # as good, found by another version
+            best = self.planner.evaluate(self.path, mean)
+        return replace(best, bands=self.planner.bands(best.path, self.posterior))
+
+    def maps(self, *, n_draws: int = 1000, seed: int = 0) -> xr.Dataset:
+        """Every map of the planning cells after the last mission, for GIS and figures.
+
+        Args:
+            n_draws: How many draws of the posterior to go over.
+            seed: Same seed, same draws.
+
+        Returns:
+            Dataset over (row, col) with `trust_mean` and `trust_sd` over the posterior, the mean
+            `cost` 1 - sigma(trust), `path_probability` (of a cell to be on the best path), and
+            each feature's awareness, the mean over robots. NaN where no robot can go.
+        """
+        summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
+        maps = summary.rename(mean="trust_mean", sd="trust_sd")
+        share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
+        awareness = self.workspace.awareness if self.believed is None else self.believed["mean"]
+        for name in awareness["feature"].values:
+            values = awareness.sel(feature=name, drop=True).mean("robot")
+            maps[str(name)] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
+        maps["path_probability"] = share
+        return maps.where(self.workspace.passable)
 
     def plot_maps(self) -> np.ndarray:
         """The trust map and path of each iteration, and those after the last; returns the Axes."""
@@ -93,6 +143,9 @@ class Result:
             "missions.nc": records.missions_to_tree(self.missions),
             "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
         }
+        (folder / _BELIEVED).unlink(missing_ok=True)
+        if self.believed is not None:
+            trees[_BELIEVED] = xr.DataTree(self.believed)
         for name, tree in trees.items():
             _write_tree(folder / name, tree)
         scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
@@ -129,17 +182,20 @@ def load_result(directory: str | PathLike[str], n_missions: int | None = None) -
     n = record["n_missions"] if n_missions is None else n_missions
     history = records.read_tree(folder / "history.nc").to_dataset().isel(iteration=slice(n))
     missions = records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n]
+    exists = (folder / _BELIEVED).exists()
+    believed = records.read_tree(folder / _BELIEVED) if exists else None
     return Result(
         archive.workspace_from_tree(records.read_tree(folder / "workspace.nc")),
         missions,
         [records.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n)],
-        [(int(row), int(col)) for row, col in record["path"]],
+        [_cell(cell) for cell in record["path"]],
         np.array(record["trust"]),
         record["value"],
         history["final_trust_map"].rename("trust"),
         history.drop_vars("final_trust_map"),
         record["settings"],
         record["stop_reason"],
+        believed.to_dataset() if believed is not None else None,
     )
 
 
@@ -177,6 +233,11 @@ def require_folder(directory: str | PathLike[str]) -> Path:
                 raise TrustboError(f"cannot write to {str(folder)!r}: {str(part)!r} is a file.")
             break
     return folder
+
+
+def _cell(pair: Any) -> Cell:
+    row, col = pair
+    return int(row), int(col)
 
 
 def _posterior_name(j: int) -> str:

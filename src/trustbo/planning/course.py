@@ -65,6 +65,7 @@ class Course:
         require_way(self.passable, self.bounds_to_goal, self.start, self.goal, connectivity)
         self.shortest = int(self.bounds_to_goal[self.start])
         self.longest = self._most_bounds(max_bounds)
+        self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest
         self.u_turns = not isinstance(max_bounds, str)
         self.revisit = revisit
 

@@ -61,6 +61,11 @@ class Setting:
         return self.course.longest
 
     @property
+    def max_bounds(self) -> int | str:
+        """Which paths are admissible, as it would be given to `Planner`."""
+        return self.course.max_bounds
+
+    @property
     def connectivity(self) -> int:
         """4 or 8."""
         return self.course.connectivity
