@@ -1,16 +1,36 @@
 """Figures: each function takes data and returns Axes; nothing is computed here but the layout."""
 
-from trustbo.plots.maps import cell_map, draw_hillshade, draw_path, draw_scale, trust_maps
+from trustbo.plots.animation import animate_mission
+from trustbo.plots.calibration import calibration
+from trustbo.plots.campaign import campaign_history, parameter_history
+from trustbo.plots.maps import (
+    cell_map,
+    draw_hillshade,
+    draw_path,
+    draw_scale,
+    path_posterior,
+    robot_maps,
+    trust_maps,
+)
+from trustbo.plots.mission import mission_trust, plan_trust
 from trustbo.plots.regret import regret_curves
 from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
+    "animate_mission",
+    "calibration",
+    "campaign_history",
     "cell_map",
     "draw_hillshade",
     "draw_path",
     "draw_scale",
     "loadings",
+    "mission_trust",
+    "parameter_history",
+    "path_posterior",
+    "plan_trust",
     "regret_curves",
+    "robot_maps",
     "terrain_maps",
     "trust_maps",
 ]

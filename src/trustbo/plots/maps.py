@@ -3,16 +3,17 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LightSource, Normalize
+from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from trustbo.data import Cell
+from trustbo.plots.layout import colour_bar, corner_of, extent_of, label_maps, map_panels, tallness
 from trustbo.terrain import Grid, Workspace, pixel_size
 
 if TYPE_CHECKING:
@@ -51,36 +52,69 @@ def trust_maps(result: "Result", *, n_columns: int | None = None) -> np.ndarray:
     learned = everything[1:].copy()
     learned[:, *paths[0][0]] = np.nan
     low, high = np.nanmin(learned), np.nanmax(learned)
-    grid = result.workspace.grid
-    tall = tallness(grid)
-    n_columns = min(n_columns or (3 if tall < 2 else 5), len(maps))
-    n_rows = -(-len(maps) // n_columns)
-    width = 2.6 if tall < 2 else 1.5
-    figure, axes = plt.subplots(
-        n_rows,
-        n_columns,
-        figsize=(width * n_columns + 1.2, width * tall * n_rows + 0.7),
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-        layout="constrained",
-    )
-    panels = axes.ravel()
-    for ax, trust, path, title in zip(panels, maps, paths, titles, strict=False):
-        cell_map(ax, trust, result.workspace, low=low, high=high)
-        draw_path(ax, path, grid)
+    workspace = result.workspace
+    figure, axes, panels = map_panels(workspace.grid, len(maps), n_columns)
+    for ax, trust, path, title in zip(panels, maps, paths, titles, strict=True):
+        cell_map(ax, trust, workspace, low=low, high=high)
+        draw_path(ax, path, workspace.grid)
         ax.set_title(title, fontsize=9)
-    draw_scale(panels[0], grid)
-    for ax in panels[len(maps) :]:
-        ax.set_visible(False)
-    label_outer(axes, grid)
     extend = _extend(np.nanmin(everything) < low, np.nanmax(everything) > high)
-    label = "expected trust"
-    if not result.workspace.passable.all():
-        label += " (grey: impassable)"
-    colours = ScalarMappable(Normalize(low, high), COLOURS)
-    colour_bar(figure, colours, axes, label, extend=extend, aspect=15 * n_rows)
-    return panels[: len(maps)]
+    _finish(figure, axes, workspace, "expected trust", (low, high), extend=extend)
+    return panels
+
+
+def robot_maps(
+    maps: xr.DataArray,
+    workspace: Workspace,
+    path: Sequence[Cell] | None = None,
+    *,
+    label: str = "cost",
+    n_columns: int | None = None,
+) -> np.ndarray:
+    """One map for each robot, in the same colours.
+
+    Args:
+        maps: Dims (robot, row, col), such as `planner.cost_map(params, per_robot=True)`: the
+            paper's cost f = 1 - sigma(trust).
+        workspace: Whose cells they are.
+        path: A path to draw on each.
+        label: What is shown, for the colour bar.
+        n_columns: Panels per row; by default two, or more where the terrain is tall.
+
+    Returns:
+        The Axes, shape (robot,).
+    """
+    names = [str(name) for name in maps["robot"].values]
+    limits = float(maps.min()), float(maps.max())
+    figure, axes, panels = map_panels(workspace.grid, len(names), n_columns or _two(workspace))
+    for ax, name in zip(panels, names, strict=True):
+        cell_map(ax, maps.sel(robot=name), workspace, low=limits[0], high=limits[1])
+        if path is not None:
+            draw_path(ax, path, workspace.grid)
+        ax.set_title(name, fontsize=9)
+    _finish(figure, axes, workspace, label, limits)
+    return panels
+
+
+def path_posterior(
+    share: xr.DataArray, workspace: Workspace, path: Sequence[Cell] | None = None
+) -> Axes:
+    """Where the best path may be: each cell's probability to be on it.
+
+    Args:
+        share: Dims (row, col), in [0, 1], such as `planner.path_posterior(posterior)`.
+        workspace: Whose cells they are.
+        path: A path to draw, such as the recommended one.
+
+    Returns:
+        The Axes.
+    """
+    figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
+    cell_map(ax, share, workspace, low=0.0, high=1.0)
+    if path is not None:
+        draw_path(ax, path, workspace.grid)
+    _finish(figure, axes, workspace, "P(cell on the best path)", (0.0, 1.0))
+    return ax
 
 
 def cell_map(
@@ -139,8 +173,12 @@ def draw_hillshade(ax: Axes, workspace: Workspace, heights: str = "dem") -> None
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """A bar of a round number of metres in the lower right corner."""
-    width = grid.shape[1] * grid.cell_width
+    """A bar of a round number of metres in the lower right corner of a map."""
+    draw_scale_of(ax, grid.shape[1] * grid.cell_width)
+
+
+def draw_scale_of(ax: Axes, width: float) -> None:
+    """As `draw_scale`, on Axes that are so many metres wide."""
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
     outline = [patheffects.Stroke(linewidth=4.0, foreground="white"), patheffects.Normal()]
@@ -166,7 +204,7 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     """Draw a path over a map, from its start (circle) to its goal (star)."""
-    centers = np.array([grid.center(cell) for cell in path]) - _corner(grid)
+    centers = np.array([grid.center(cell) for cell in path]) - corner_of(grid)
     outline = [patheffects.Stroke(linewidth=3.2, foreground="black"), patheffects.Normal()]
     x, y = centers[:, 0], centers[:, 1]
     ax.plot(x, y, color="white", linewidth=1.6, path_effects=outline, solid_joinstyle="round")
@@ -179,55 +217,30 @@ def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     ax.plot(x[-1], y[-1], marker="*", markersize=11, **edge)
 
 
-def colour_bar(figure, image, axes, label: str, **options) -> None:
-    """A colour bar in the figures' sizes."""
-    bar = figure.colorbar(image, ax=axes, pad=0.02, **{"aspect": 18, "shrink": 0.9} | options)
-    bar.set_label(label, fontsize=8)
-    bar.ax.tick_params(labelsize=7)
-
-
 def _cells(path: np.ndarray) -> list[Cell]:
     return [(int(row), int(col)) for row, col in path if row >= 0]
-
-
-def _corner(grid: Grid) -> np.ndarray:
-    """The lower left corner, which maps are drawn relative to: CRS coordinates are long."""
-    return np.array([grid.left, grid.top - grid.shape[0] * grid.cell_height])
-
-
-def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of a map, m from its lower left corner."""
-    return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)
-
-
-def tallness(grid: Grid) -> float:
-    """Height over width, within what fits a page."""
-    ratio = grid.shape[0] * grid.cell_height / (grid.shape[1] * grid.cell_width)
-    return float(np.clip(ratio, 0.25, 5.0))
 
 
 def _extend(below: bool, above: bool) -> str:
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
 
 
-def grid_lines(ax: Axes, grid: Grid) -> None:
-    """The edges of the cells."""
-    for col in range(1, grid.shape[1]):
-        ax.axvline(col * grid.cell_width, color="white", linewidth=0.3, alpha=0.5)
-    for row in range(1, grid.shape[0]):
-        ax.axhline(row * grid.cell_height, color="white", linewidth=0.3, alpha=0.5)
+def _two(workspace: Workspace) -> int | None:
+    return 2 if tallness(workspace.grid) < 2 else None
 
 
-def label_outer(axes: np.ndarray, grid: Grid) -> None:
-    """Axes in metres, labelled where nothing is beside them."""
-    for ax in axes.ravel():
-        ax.set_aspect("equal")
-        ax.tick_params(labelsize=7)
-    visible = [[ax.get_visible() for ax in row] for row in axes]
-    for i, row in enumerate(axes):
-        row[0].set_ylabel("north (m)", fontsize=8)
-        for j, ax in enumerate(row):
-            lowest = i == len(axes) - 1 or not visible[i + 1][j]
-            if lowest:
-                ax.set_xlabel("east (m)", fontsize=8)
-                ax.tick_params(labelbottom=True)
+def _finish(
+    figure: Figure,
+    axes: np.ndarray,
+    workspace: Workspace,
+    label: str,
+    limits: tuple[float, float],
+    extend: str = "neither",
+) -> None:
+    """The scale, metres, and one colour bar for all panels."""
+    draw_scale(axes[0, 0], workspace.grid)
+    label_maps(axes)
+    if not workspace.passable.all():
+        label += " (grey: impassable)"
+    colours = ScalarMappable(Normalize(*limits), COLOURS)
+    colour_bar(figure, colours, axes, label, extend=extend, aspect=15 * len(axes))

@@ -2,35 +2,34 @@
 
 from collections.abc import Mapping
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 
 from trustbo.errors import TrustboError
-from trustbo.plots.maps import (
-    CLOSED,
-    COLOURS,
+from trustbo.plots.layout import (
     colour_bar,
-    draw_hillshade,
-    draw_scale,
     extent_of,
     grid_lines,
-    label_outer,
-    tallness,
+    label_maps,
+    map_panels,
+    plain,
+    small_multiples,
 )
+from trustbo.plots.maps import CLOSED, COLOURS, draw_hillshade, draw_scale
 from trustbo.terrain import CompositeIndex, Workspace
 
 AGREES, OPPOSES = "#0072b2", "#d55e00"
 """Blue and vermilion of Okabe and Ito (2008): safe for the colour-blind."""
 
 
-def terrain_maps(workspace: Workspace) -> np.ndarray:
+def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.ndarray:
     """The paper's Fig. 4: the surface, and traversability, visibility and what else there is.
 
     Args:
         workspace: A workspace made from a terrain in memory.
+        n_columns: Panels per row; by default all in one.
 
     Returns:
         The Axes, shape (1 + feature,).
@@ -45,38 +44,30 @@ def terrain_maps(workspace: Workspace) -> np.ndarray:
             "memory; coarsen a lazily read one first."
         )
     grid, names = workspace.grid, [str(name) for name in workspace.awareness["feature"].values]
-    tall = tallness(grid)
-    width = 3.6 if tall < 2 else 2.0
     n_panels = 1 + len(names)
-    figure, axes = plt.subplots(
-        1,
-        n_panels,
-        figsize=(n_panels * width + 1.8, width * tall + 0.7),
-        sharex=True,
-        sharey=True,
-        layout="constrained",
-    )
+    figure, axes, panels = map_panels(grid, n_panels, n_columns or n_panels, width=3.3)
     extent = extent_of(grid)
     dsm = terrain["dsm"].values
+    surface, *indices = panels
     heights = Normalize(float(np.nanmin(dsm)), float(np.nanmax(dsm)))
-    axes[0].imshow(dsm, cmap="cividis", norm=heights, extent=extent)
-    axes[0].set_title("surface (DSM)", fontsize=9)
-    colour_bar(figure, ScalarMappable(heights, "cividis"), axes[0], "height (m)")
-    for ax, name in zip(axes[1:], names, strict=True):
+    surface.imshow(dsm, cmap="cividis", norm=heights, extent=extent)
+    surface.set_title("surface (DSM)", fontsize=9)
+    colour_bar(figure, ScalarMappable(heights, "cividis"), surface, "height (m)")
+    for ax, name in zip(indices, names, strict=True):
         ax.imshow(pixels[name].values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
         ax.set_title(name, fontsize=9)
     steep = np.isfinite(dsm) & ~pixels["passable"].values
     closed = np.where(steep, 1.0, np.nan)
-    axes[1].imshow(closed, cmap=ListedColormap([CLOSED]), extent=extent, interpolation="nearest")
-    for ax in axes:
+    indices[0].imshow(closed, cmap=ListedColormap([CLOSED]), extent=extent, interpolation="nearest")
+    for ax in panels:
         ax.set_facecolor("white")
-        draw_hillshade(ax, workspace, "dsm" if ax is axes[0] else "dem")
+        draw_hillshade(ax, workspace, "dsm" if ax is surface else "dem")
         grid_lines(ax, grid)
-    draw_scale(axes[0], grid)
+    draw_scale(surface, grid)
     label = "index (0 worst, 1 best; grey: too steep)"
-    colour_bar(figure, ScalarMappable(Normalize(0, 1), COLOURS), axes[1:], label)
-    label_outer(axes[None], grid)
-    return axes
+    colour_bar(figure, ScalarMappable(Normalize(0, 1), COLOURS), indices, label)
+    label_maps(axes)
+    return panels
 
 
 def loadings(composites: Mapping[str, CompositeIndex]) -> np.ndarray:
@@ -94,19 +85,13 @@ def loadings(composites: Mapping[str, CompositeIndex]) -> np.ndarray:
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")
     most = max(len(index.signs) for index in composites.values())
-    _, axes = plt.subplots(
-        1,
-        len(composites),
-        figsize=(3.4 * len(composites), 0.9 + 0.3 * most),
-        sharex=True,
-        squeeze=False,
-        layout="constrained",
-    )
-    for ax, (name, index) in zip(axes[0], composites.items(), strict=True):
+    size = 3.4, 0.9 + 0.3 * most
+    _, _, panels = small_multiples(len(composites), len(composites), size, sharex=True)
+    for ax, (name, index) in zip(panels, composites.items(), strict=True):
         _bars(ax, index)
         share = float(index.explained_variance_ratio_[0])
         ax.set_title(f"{name}: {share:.0%} of the variance", fontsize=9)
-    return axes[0]
+    return panels
 
 
 def _bars(ax: Axes, index: CompositeIndex) -> None:
@@ -117,13 +102,12 @@ def _bars(ax: Axes, index: CompositeIndex) -> None:
         label = "as declared" if colour == AGREES else "against its sign"
         rows = np.flatnonzero(which)
         ax.barh(rows, values[rows], color=colour, hatch=hatch, edgecolor="white", label=label)
-    ax.set_yticks(np.arange(len(names)), names, fontsize=8)
     ax.invert_yaxis()
     ax.axvline(0.0, color="black", linewidth=0.8)
     ax.set_xlim(-1.0, 1.0)
     ax.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
     ax.set_xlabel("loading", fontsize=8)
-    ax.tick_params(axis="x", labelsize=7)
-    ax.spines[["top", "right"]].set_visible(False)
+    plain(ax)
+    ax.set_yticks(np.arange(len(names)), names, fontsize=8)
     if not agrees.all():
         ax.legend(fontsize=7, frameon=False)

@@ -1,0 +1,239 @@
+"""A mission as a film: robots over the hillshade, who sees the lead, and the contact so far."""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter, writers
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from scipy.ndimage import uniform_filter1d
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.files import write_file
+from trustbo.plots.layout import corner_of, extent_of, grid_lines, plain
+from trustbo.plots.maps import draw_hillshade, draw_path, draw_scale, draw_scale_of
+from trustbo.terrain import Workspace
+
+SEEN, UNSEEN = "#009e73", "#d55e00"
+"""Bluish green and vermilion of Okabe and Ito (2008); lines out of sight are dashed, too."""
+SUFFIXES = (".gif", ".mp4")
+_SECONDS = 12.0  # how long a film is, if nothing is said
+_STEADY = 21  # ticks over which the camera's place is averaged
+_GROWN = 0.5  # m above ground from which a pixel counts as vegetation
+_DASHED, _DOTTED = (0, (3, 2)), (0, (1, 2))
+_MARKERS = "osDv^Pp8hH"
+
+
+class Film(NamedTuple):
+    """What is shown at each tick of a mission."""
+
+    time: np.ndarray  # (tick,), s since the mission's start
+    bound: np.ndarray  # (tick,), which bound it is
+    poses: np.ndarray  # (tick, 1 + robot, 2), m from the map's lower left corner, the lead first
+    contact: np.ndarray  # (tick, robot), whether the robot sees the lead
+    rate: np.ndarray  # (tick, robot), contact rate of the bound so far
+
+
+def animate_mission(
+    mission: Mission,
+    workspace: Workspace,
+    path: str | PathLike[str] | None = None,
+    *,
+    speedup: float | None = None,
+    fps: int = 8,
+    dpi: int = 80,
+) -> FuncAnimation:
+    """Show a mission as it went: robots, lines of sight, and the contact rate of the bound so far.
+
+    On the left, the team from near, over the surface's hillshade with vegetation in grey; on the
+    right, where that is. A line from a robot to the lead is green and solid while they have
+    contact, red and dashed while they have not, and so is its bar, filled or hatched. In a
+    notebook, `HTML(animation.to_jshtml())` shows the animation.
+
+    Args:
+        mission: One with the poses and contact of every tick, as simulators and bags give it.
+        workspace: Where it was.
+        path: A `.gif` or `.mp4` file to write. MP4 needs ffmpeg, or the extra `video`.
+        speedup: Seconds of the mission to a second of film; by default such that it lasts 12 s.
+        fps: Frames per second.
+        dpi: Dots per inch of the file.
+
+    Returns:
+        The animation. If it was written to a file, its figure is closed.
+
+    Raises:
+        TrustboError: No poses, another kind of file, a number that is not positive, or no ffmpeg.
+    """
+    target = None if path is None else Path(path)
+    if target is not None:
+        require_choice("suffix", target.suffix.lower(), SUFFIXES)
+    require_positive("fps", fps)
+    ffmpeg = _ffmpeg() if target is not None and target.suffix.lower() == ".mp4" else ""
+    film = _film(mission, workspace)
+    span = float(film.time[-1] - film.time[0])
+    rate = max(1.0, span / _SECONDS) if speedup is None else require_positive("speedup", speedup)
+    shown = np.arange(film.time[0], film.time[-1] + rate / fps, rate / fps)
+    ticks = np.minimum(np.searchsorted(film.time, shown), len(film.time) - 1)
+    figure, draw = _stage(mission, workspace, film)
+    animation = FuncAnimation(figure, draw, frames=ticks.tolist(), interval=1000.0 / fps)
+    if target is not None:
+        try:
+            _save(animation, target, ffmpeg, fps, dpi)
+        finally:
+            plt.close(figure)
+    return animation
+
+
+def _film(mission: Mission, workspace: Workspace) -> Film:
+    parts, corner = [], corner_of(workspace.grid)
+    for k, bound in enumerate(mission.bounds, start=1):
+        if bound.poses is None or bound.contact is None:
+            raise TrustboError(
+                f"bound {k} has no poses or contact of its ticks; simulators and ROS bags record "
+                "them, tables and arrays do not."
+            )
+        n = len(bound.contact)
+        if not n:
+            continue
+        time = bound.t0 + (bound.t1 - bound.t0) * np.arange(1, n + 1) / n
+        rate = np.cumsum(bound.contact, axis=0) / np.arange(1, n + 1)[:, None]
+        place = bound.poses[..., :2] - corner
+        parts.append(Film(time, np.full(n, k), place, np.asarray(bound.contact, bool), rate))
+    if not parts:
+        raise TrustboError("the mission has no tick to show.")
+    return Film(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _stage(mission: Mission, workspace: Workspace, film: Film):
+    """The figure as it is before the first frame, and what draws a tick on it."""
+    figure, axes = plt.subplot_mosaic(
+        [["near", "all"], ["near", "bars"]],
+        figsize=(7.2, 4.8),
+        width_ratios=(4.6, 2.2),
+        height_ratios=(1.3, 1.0),
+        layout="constrained",
+    )
+    near, bars = axes["near"], axes["bars"]
+    for ax in (near, axes["all"]):
+        _draw_ground(ax, mission, workspace)
+    draw_path(axes["all"], mission.path, workspace.grid)
+    draw_scale(axes["all"], workspace.grid)
+    frame = Rectangle((0, 0), 1, 1, fill=False, edgecolor="black", linewidth=1.2, zorder=9)
+    axes["all"].add_patch(frame)
+    cast = _Cast(near, mission.robots)
+    heights = bars.barh(
+        mission.robots, np.zeros(len(mission.robots)), height=0.6, edgecolor="black", linewidth=0.6
+    )
+    bars.invert_yaxis()
+    bars.set_xlim(0.0, 1.0)
+    bars.set_xlabel("contact rate so far", fontsize=8)
+    plain(bars)
+    center, half = _window(film, workspace)
+    draw_scale_of(near, 2.0 * half)
+    # Laid out once: doing so for each frame would take most of the time.
+    figure.canvas.draw()
+    figure.set_layout_engine("none")
+
+    def draw(tick: int):
+        cast.place(film.poses[tick], film.contact[tick])
+        for bar, rate, seen in zip(heights, film.rate[tick], film.contact[tick], strict=True):
+            bar.set_width(rate)
+            bar.set(facecolor=SEEN if seen else UNSEEN, hatch="" if seen else "////")
+        (x, y), k = center[tick], int(film.bound[tick])
+        near.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+        frame.set(x=x - half, y=y - half, width=2 * half, height=2 * half)
+        clock = f"{film.time[tick]:.0f} s, bound {k} of {len(mission.path) - 1}"
+        ended = tick == len(film.time) - 1
+        near.set_title(clock + (f": {mission.status}" if ended else ""), fontsize=9)
+        return []
+
+    return figure, draw
+
+
+class _Cast:
+    """The robots, and the line from each to the lead."""
+
+    def __init__(self, ax: Axes, names: Sequence[str]) -> None:
+        style = {"markeredgecolor": "black", "linestyle": "none", "zorder": 5, "color": "white"}
+        self.sight = [ax.plot([], [], linewidth=1.8, zorder=4)[0] for _ in names]
+        self.robots = [
+            ax.plot([], [], marker=_MARKERS[i % len(_MARKERS)], markersize=8, label=name, **style)[
+                0
+            ]
+            for i, name in enumerate(names)
+        ]
+        lead = style | {"color": "black", "markeredgecolor": "white", "zorder": 6}
+        (self.lead,) = ax.plot([], [], marker="*", markersize=15, label="lead", **lead)
+        own, _ = ax.get_legend_handles_labels()
+        lines = [
+            Line2D([], [], color=SEEN, label="in contact"),
+            Line2D([], [], color=UNSEEN, linestyle=_DASHED, label="no contact"),
+            Line2D([], [], color="0.3", linestyle=_DOTTED, linewidth=1.0, label="planned path"),
+            Patch(facecolor="0.78", label="vegetation"),
+        ]
+        ax.legend(handles=[*own, *lines], loc="upper left", fontsize=7, framealpha=0.85)
+
+    def place(self, poses: np.ndarray, contact: np.ndarray) -> None:
+        """Put them where they are at a tick; the lead's pose comes first."""
+        (x, y), *others = poses
+        for line, robot, pose, seen in zip(self.sight, self.robots, others, contact, strict=True):
+            line.set_data([x, pose[0]], [y, pose[1]])
+            line.set(color=SEEN if seen else UNSEEN, linestyle="-" if seen else _DASHED)
+            robot.set_data([pose[0]], [pose[1]])
+        self.lead.set_data([x], [y])
+
+
+def _window(film: Film, workspace: Workspace) -> tuple[np.ndarray, float]:
+    """What is seen near the team: its centre at each tick, shape (tick, 2), and half its width."""
+    middle = (film.poses.min(1) + film.poses.max(1)) / 2.0
+    # The camera does not jump where robots start or stop.
+    center = uniform_filter1d(middle, min(_STEADY, len(middle)), axis=0, mode="nearest")
+    reach = float(np.abs(film.poses - center[:, None]).max())
+    left, right, bottom, top = extent_of(workspace.grid)
+    return center, min(1.15 * reach + 3.0, max(right - left, top - bottom) / 2.0)
+
+
+def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
+    left, right, bottom, top = extent = extent_of(workspace.grid)
+    terrain = workspace.terrain
+    if terrain is None or workspace.pixels is None:
+        ax.set_facecolor("0.92")
+        grid_lines(ax, workspace.grid)
+    else:
+        grown = (terrain["dsm"] - terrain["dem"]).values > _GROWN
+        ax.imshow(grown, cmap="Greys", vmin=0.0, vmax=3.0, extent=extent, interpolation="nearest")
+        draw_hillshade(ax, workspace, "dsm")
+    cells = np.array([workspace.grid.center(cell) for cell in mission.path])
+    ax.plot(*(cells - corner_of(workspace.grid)).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+
+
+def _save(animation: FuncAnimation, path: Path, ffmpeg: str, fps: int, dpi: int) -> None:
+    if path.suffix.lower() == ".gif":
+        write_file(path, lambda file: animation.save(file, PillowWriter(fps=fps), dpi=dpi))
+        return
+    with mpl.rc_context({"animation.ffmpeg_path": ffmpeg}):
+        # Even numbers of pixels, and a pixel format that every player knows.
+        even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+        film = FFMpegWriter(fps=fps, extra_args=even)
+        write_file(path, lambda file: animation.save(file, film, dpi=dpi))
+
+
+def _ffmpeg() -> str:
+    """Where ffmpeg is: on the PATH, or in the package of the extra `video`."""
+    if writers.is_available("ffmpeg"):
+        return str(mpl.rcParams["animation.ffmpeg_path"])
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+    except ImportError:
+        raise TrustboError(
+            'an .mp4 needs ffmpeg: install it, or pip install "trustbo[video]"; a .gif does not.'
+        ) from None
+    return get_ffmpeg_exe()

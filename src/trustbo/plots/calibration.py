@@ -1,0 +1,71 @@
+"""Are posteriors calibrated? Ranks and coverage of simulation-based calibration."""
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.lines import Line2D
+from scipy import stats
+
+from trustbo.plots.layout import plain, small_multiples
+
+_DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
+_MARKERS = "osD^vPX*<>"
+_PROBABILITY = 0.95
+
+
+def calibration(ranks: xr.Dataset) -> np.ndarray:
+    """Do ranks of the truth among posterior draws look uniform, and do intervals hold the truth?
+
+    On the left, how far each parameter's empirical distribution of ranks lies from uniform. In a
+    band of the Kolmogorov-Smirnov statistic, grey, a whole curve stays with a probability of 95 %
+    if its parameter is calibrated. On the right, the share of truths in central intervals, and in
+    grey where 95 % of such shares should lie (binomial).
+
+    Args:
+        ranks: What `models.sbc` returned.
+
+    Returns:
+        The Axes, shape (2,).
+    """
+    figure, _, panels = small_multiples(2, 2, (3.4, 2.9), room=1.2)
+    curves, cover = panels
+    n, names = ranks.sizes["dataset"], [str(name) for name in ranks["parameter"].values]
+    shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(names)))
+    widths, keys = ranks["interval"].values, []
+    dodge = 0.025 * (np.linspace(-1.0, 1.0, len(names)) if len(names) > 1 else np.zeros(1))
+    far = float(stats.kstwo.ppf(_PROBABILITY, n))
+    curves.axhspan(-far, far, color="0.9", linewidth=0.0)
+    for i, name in enumerate(names):
+        pit = np.sort(ranks["pit"].sel(parameter=name).values)
+        # A step at each rank: from how far below it is to how far above.
+        x = np.concatenate([[0.0], np.repeat(pit, 2), [1.0]])
+        above = np.concatenate([[0.0, 0.0], np.repeat(np.arange(1, n + 1) / n, 2)])
+        style = {"color": shades[i], "linestyle": _DASHES[i % len(_DASHES)], "linewidth": 1.1}
+        curves.plot(x, above - x, **style)
+        marker = {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 4.0}
+        cover.plot(
+            widths + dodge[i], ranks["coverage"].sel(parameter=name).values,
+            **style | marker | {"linestyle": "none"},
+        )  # fmt: skip
+        keys.append(Line2D([], [], label=name, **style | marker))
+    curves.set(xlim=(0.0, 1.0))
+    curves.set_xlabel("rank of the truth among the draws, as a share", fontsize=8)
+    curves.set_ylabel("share of ranks below, less uniform", fontsize=8)
+    expected = np.array([stats.binom.ppf((0.025, 0.975), n, width) / n for width in widths])
+    cover.vlines(widths, *expected.T, color="0.87", linewidth=16.0, zorder=0)
+    cover.plot([0.0, 1.0], [0.0, 1.0], color="0.5", linewidth=0.8)
+    cover.set(xlim=(0.0, 1.04), ylim=(0.0, 1.04))
+    cover.set_xlabel("probability of the interval", fontsize=8)
+    cover.set_ylabel("share of truths in it", fontsize=8)
+    for ax in panels:
+        plain(ax)
+    title = f"{n} data sets,\n{ranks.attrs.get('sampler', 'unknown')} sampler"
+    figure.legend(
+        handles=keys,
+        loc="outside right upper",
+        title=title,
+        fontsize=7,
+        title_fontsize=8,
+        frameon=False,
+    )
+    return panels

@@ -1,0 +1,154 @@
+"""A campaign mission by mission: what was learned of the parameters, and how missions went."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from trustbo.errors import TrustboError, require_choice
+from trustbo.planning import QUANTILES
+from trustbo.plots.layout import lowest, plain, small_multiples
+from trustbo.plots.mission import INNER, LINE
+
+MOST_PANELS = 64
+_PRIOR = "0.6"
+
+
+def parameter_history(
+    posteriors: Sequence[xr.DataTree],
+    *,
+    names: Sequence[str] | None = None,
+    truth: Mapping[str, float] | None = None,
+    n_columns: int | None = None,
+) -> np.ndarray:
+    """The posterior of each parameter after each mission, the prior before the first.
+
+    Thin bars hold 90 % of the draws, thick ones 50 %, dots are medians. Panels are scaled to the
+    posteriors: a wide prior, in grey, may reach beyond.
+
+    Args:
+        posteriors: One for each mission, such as `Result.posteriors`.
+        names: Which parameters, such as `["beta0", "beta"]`; by default all.
+        truth: True values by label, such as `{"beta[visibility]": 0.4}`, where they are known.
+        n_columns: Panels per row; by default three.
+
+    Returns:
+        The Axes, shape (parameter,), titled by labels such as "beta[visibility]".
+
+    Raises:
+        TrustboError: No posteriors, a parameter or label that there is not, or so many that none
+            could be read.
+    """
+    if not posteriors:
+        raise TrustboError("there are no posteriors; give one for each mission.")
+    known = [str(name) for name in posteriors[-1]["posterior"].data_vars]
+    chosen = known if names is None else [require_choice("parameter", n, known) for n in names]
+    last = _scalars(posteriors[-1], "posterior", chosen)
+    if len(last) > MOST_PANELS:
+        raise TrustboError(
+            f"{len(last)} parameters need as many panels; choose at most {MOST_PANELS} by names=, "
+            f"of {', '.join(known)}."
+        )
+    for label in truth or {}:
+        require_choice("label in truth", label, last)
+    prior = _scalars(posteriors[-1], "prior", chosen)
+    after = [_scalars(posterior, "posterior", chosen) for posterior in posteriors]
+    _, axes, panels = small_multiples(len(last), n_columns, (2.5, 1.7), sharex=True)
+    for ax, label in zip(panels, last, strict=True):
+        _draw_parameter(ax, prior.get(label), [draws[label] for draws in after])
+        if truth is not None and label in truth:
+            ax.axhline(truth[label], color="black", linewidth=0.9, linestyle=(0, (4, 2)))
+        ax.set_title(label, fontsize=8)
+        ax.set_xlim(-0.6, len(after) + 0.6)
+        ax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        plain(ax)
+    for ax in lowest(axes):
+        ax.set_xlabel("missions learned from", fontsize=8)
+        ax.tick_params(labelbottom=True)
+    return panels
+
+
+def campaign_history(history: xr.Dataset) -> np.ndarray:
+    """What each plan promised, and the contact that its mission kept.
+
+    A filled dot marks a path other than the mission's before; a cross, with its status, a mission
+    that did not reach the goal.
+
+    Args:
+        history: `Result.history` or `Campaign.history`.
+
+    Returns:
+        The Axes, shape (2,): the plans' objective, the missions' mean contact rate.
+
+    Raises:
+        TrustboError: No mission yet.
+    """
+    if not history.sizes.get("iteration"):
+        raise TrustboError("the history has no mission yet; tell the campaign one first.")
+    _, axes, panels = small_multiples(2, 1, (4.6, 1.6), sharex=True)
+    mission, changed = history["iteration"].values, history["path_changed"].values.astype(bool)
+    changed[0] |= mission[0] == 1  # there was none before
+    status = [str(s) for s in history["status"].values]
+    failed = np.array([s != "ok" for s in status])
+    for ax, name, label in (
+        (panels[0], "objective", "objective\nwhen planned"),
+        (panels[1], "contact_rate", "contact rate\nmeasured"),
+    ):
+        values = history[name].values
+        dots = {"linestyle": "none", "marker": "o", "markersize": 5.5, "markeredgecolor": LINE}
+        ax.plot(mission, values, color=INNER, linewidth=1.0, zorder=1)
+        for which, fill, text in ((changed, LINE, "a new path"), (~changed, "white", "the same")):
+            ax.plot(mission[which], values[which], color=fill, label=text, **dots)
+        ax.set_ylabel(label, fontsize=8)
+        plain(ax)
+    crosses = {"linestyle": "none", "marker": "x", "markersize": 9, "color": "black"}
+    rate = history["contact_rate"].values
+    if failed.any():
+        panels[1].plot(mission[failed], rate[failed], label="not at the goal", **crosses)
+    for j in np.flatnonzero(failed):
+        panels[1].annotate(
+            status[j], (mission[j], rate[j]), (5, 5), textcoords="offset points", fontsize=7
+        )
+    axes[-1, 0].set_xlabel("mission", fontsize=8)
+    axes[-1, 0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    keys = panels[1].get_legend_handles_labels()
+    panels[0].figure.legend(*keys, loc="outside upper right", ncols=3, fontsize=7, frameon=False)
+    return panels
+
+
+def _draw_parameter(ax: Axes, prior: np.ndarray | None, after: Sequence[np.ndarray]) -> None:
+    ends = np.stack([np.quantile(draws, (*QUANTILES, 0.5)) for draws in after], axis=1)
+    bars = [(1.0 + np.arange(len(after)), ends, LINE)]
+    if prior is not None:
+        own = np.quantile(prior, (*QUANTILES, 0.5))[:, None]
+        bars.append((np.zeros(1), own, _PRIOR))
+    for x, (low, lower, upper, high, middle), colour in bars:
+        ax.vlines(x, low, high, color=colour, linewidth=1.0)
+        ax.vlines(x, lower, upper, color=colour, linewidth=3.0)
+        ax.plot(
+            x, middle, "o", color=colour, markersize=4.5, markeredgecolor="white",
+            markeredgewidth=0.6,
+        )  # fmt: skip
+    # The first mission or two may say little: what later ones say sets the scale.
+    settled = ends[:, len(after) // 4 :]
+    low, high = float(settled.min()), float(settled.max())
+    margin = 0.15 * max(high - low, 1e-6 * max(abs(high), 1.0))
+    ax.set_ylim(low - margin, high + margin)
+
+
+def _scalars(posterior: xr.DataTree, group: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Draws (draw,) by label; nothing where there is no such group."""
+    if group not in posterior:
+        return {}
+    draws = posterior[group].to_dataset()
+    labelled = {}
+    for name in names:
+        own = draws[name].stack(all_draws=("chain", "draw"))
+        dims = [str(dim) for dim in own.dims if dim != "all_draws"]
+        own = own.transpose(*dims, "all_draws")
+        for index in np.ndindex(*(own.sizes[dim] for dim in dims)):
+            where = ", ".join(str(own[d].values[i]) for d, i in zip(dims, index, strict=True))
+            labelled[f"{name}[{where}]" if dims else name] = own.values[index]
+    return labelled

@@ -1,0 +1,118 @@
+"""How figures are laid out: small multiples, maps in metres, colour bars."""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from trustbo.errors import require_whole
+from trustbo.terrain import Grid
+
+
+def small_multiples(
+    n: int, n_columns: int | None, size: tuple[float, float], room: float = 0.0, **shared: Any
+) -> tuple[Figure, np.ndarray, np.ndarray]:
+    """A figure of equal panels, row by row.
+
+    Args:
+        n: How many.
+        n_columns: Panels per row, at most; None for three, or two of four.
+        size: Of one panel, width and height, inches.
+        room: Beside them, inches.
+        shared: `sharex`, `sharey`.
+
+    Returns:
+        The figure, all its Axes (row, column), and those to be used, shape (n,); the others are
+        made invisible.
+
+    Raises:
+        TrustboError: A number of columns that is none.
+    """
+    usual = 2 if n == 4 else 3
+    columns = min(usual if n_columns is None else require_whole("n_columns", n_columns, 1), n)
+    rows = -(-n // columns)
+    figure, axes = plt.subplots(
+        rows,
+        columns,
+        figsize=(size[0] * columns + room, size[1] * rows),
+        squeeze=False,
+        layout="constrained",
+        **shared,
+    )
+    panels = axes.ravel()
+    for ax in panels[n:]:
+        ax.set_visible(False)
+    return figure, axes, panels[:n]
+
+
+def map_panels(
+    grid: Grid, n: int, n_columns: int | None, width: float = 2.6
+) -> tuple[Figure, np.ndarray, np.ndarray]:
+    """As `small_multiples`, for maps; more of them in a row where the terrain is tall."""
+    tall = tallness(grid)
+    if tall >= 2:
+        width, n_columns = 0.6 * width, n_columns or 5
+    size = width, width * tall + 0.35
+    return small_multiples(n, n_columns, size, room=1.2, sharex=True, sharey=True)
+
+
+def colour_bar(figure, image, axes, label: str, **options) -> None:
+    """A colour bar in the figures' sizes."""
+    bar = figure.colorbar(image, ax=axes, pad=0.02, **{"aspect": 18, "shrink": 0.9} | options)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
+def corner_of(grid: Grid) -> np.ndarray:
+    """The lower left corner, which maps are drawn relative to: CRS coordinates are long."""
+    return np.array([grid.left, grid.top - grid.shape[0] * grid.cell_height])
+
+
+def extent_of(grid: Grid) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of a map, m from its lower left corner."""
+    return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)
+
+
+def tallness(grid: Grid) -> float:
+    """Height over width, within what fits a page."""
+    ratio = grid.shape[0] * grid.cell_height / (grid.shape[1] * grid.cell_width)
+    return float(np.clip(ratio, 0.25, 5.0))
+
+
+def grid_lines(ax: Axes, grid: Grid) -> None:
+    """The edges of the cells."""
+    for col in range(1, grid.shape[1]):
+        ax.axvline(col * grid.cell_width, color="white", linewidth=0.3, alpha=0.5)
+    for row in range(1, grid.shape[0]):
+        ax.axhline(row * grid.cell_height, color="white", linewidth=0.3, alpha=0.5)
+
+
+def label_maps(axes: np.ndarray) -> None:
+    """Axes (row, column) of maps in metres, labelled where nothing is beside them."""
+    for ax in axes.ravel():
+        ax.set_aspect("equal")
+        ax.tick_params(labelsize=7)
+    for row in axes:
+        row[0].set_ylabel("north (m)", fontsize=8)
+    for ax in lowest(axes):
+        ax.set_xlabel("east (m)", fontsize=8)
+        ax.tick_params(labelbottom=True)
+
+
+def lowest(axes: np.ndarray) -> list[Axes]:
+    """The Axes (row, column) with no visible ones below them."""
+    last = len(axes) - 1
+    return [
+        ax
+        for i, row in enumerate(axes)
+        for j, ax in enumerate(row)
+        if ax.get_visible() and (i == last or not axes[i + 1, j].get_visible())
+    ]
+
+
+def plain(ax: Axes) -> None:
+    """No frame above and on the right, small numbers."""
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.tick_params(labelsize=7)

@@ -1,0 +1,148 @@
+"""Trust of each robot along a mission: what was expected, what was learned, what was measured."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.planning import QUANTILES, Plan
+from trustbo.plots.layout import lowest, plain, small_multiples
+
+OUTER, INNER, LINE = "#c6dcec", "#7fb2d6", "#003f66"
+"""Three lightnesses of one blue: the 90 % band, the 50 % band, and what lies in their middle."""
+_SIZE = 2.7, 2.0
+
+
+def mission_trust(
+    posterior: xr.DataTree, mission: int = -1, *, n_columns: int | None = None
+) -> np.ndarray:
+    """Latent trust of each robot along a mission, and the contact rates it was learned from.
+
+    Bands hold 50 % and 90 % of the posterior, the line is its median, over the draws of trust in
+    the group `latent`. Dots are contact rates; bounds that were not measured have none.
+
+    Args:
+        posterior: What `fit` returned, or `Result.posterior`.
+        mission: Which one, counted from 0, or from the last by negative numbers.
+        n_columns: Panels per row; by default three.
+
+    Returns:
+        The Axes, shape (robot,).
+
+    Raises:
+        TrustboError: No such mission.
+    """
+    latent = posterior["latent"].to_dataset()
+    n_missions = latent.sizes["mission"]
+    if not -n_missions <= mission < n_missions:
+        raise TrustboError(
+            f"mission must be one of {n_missions}, from {-n_missions} to {n_missions - 1}; "
+            f"got {mission!r}."
+        )
+    trust = latent["trust"].isel(mission=mission).stack(all_draws=("chain", "draw"))
+    trust = trust.dropna("bound", how="all").transpose("all_draws", "bound", "robot")
+    rates = posterior["observed_data"]["contact_rate"].isel(mission=mission)
+    rates = rates.sel(bound=trust["bound"]).transpose("bound", "robot").values
+    middle, bands = np.median(trust.values, 0), np.quantile(trust.values, QUANTILES, axis=0)
+    robots = [str(name) for name in trust["robot"].values]
+    named = "trust", "median"
+    return _panels(robots, trust["bound"].values, middle, bands, rates, named, n_columns)
+
+
+def plan_trust(
+    plan: Plan,
+    robots: Sequence[str],
+    contact_rate: np.ndarray | None = None,
+    *,
+    n_columns: int | None = None,
+) -> np.ndarray:
+    """Trust of each robot that a plan expects along its path, with bands over the parameters.
+
+    Args:
+        plan: A plan over a posterior, such as `campaign.ask()` or `Result.plan`.
+        robots: The robots' names, such as `workspace.team.names`.
+        contact_rate: What was measured when it was run, shape (bound, robot), if it was.
+        n_columns: Panels per row; by default three.
+
+    Returns:
+        The Axes, shape (robot,).
+
+    Raises:
+        ShapeError: Another number of robots or bounds than the plan's.
+    """
+    n_bounds, n_robots = plan.trust.shape
+    if len(robots) != n_robots:
+        raise ShapeError(f"the plan is of {n_robots} robots; got the names {tuple(robots)}.")
+    rates = np.full(plan.trust.shape, np.nan)
+    if contact_rate is not None:
+        measured = np.asarray(contact_rate, dtype=float)
+        if measured.ndim != 2 or measured.shape[1] != n_robots or len(measured) > n_bounds:
+            raise ShapeError(
+                f"contact_rate must be ({n_bounds}, {n_robots}) or of fewer bounds; "
+                f"got shape {measured.shape}."
+            )
+        rates[: len(measured)] = measured
+    bounds = np.arange(1, n_bounds + 1)
+    names, named = [str(robot) for robot in robots], ("expected trust", "mean")
+    return _panels(names, bounds, plan.trust, plan.bands, rates, named, n_columns)
+
+
+def _panels(
+    robots: Sequence[str],
+    bounds: np.ndarray,
+    middle: np.ndarray,
+    bands: np.ndarray,
+    rates: np.ndarray,
+    named: tuple[str, str],
+    n_columns: int | None,
+) -> np.ndarray:
+    figure, axes, panels = small_multiples(
+        len(robots), n_columns, _SIZE, room=0.3, sharex=True, sharey=True
+    )
+    for i, (ax, name) in enumerate(zip(panels, robots, strict=True)):
+        _draw(ax, bounds, middle[:, i], bands[:, :, i], rates[:, i], named)
+        ax.set_title(name, fontsize=9)
+    for ax in lowest(axes):
+        ax.set_xlabel("bound", fontsize=8)
+        ax.tick_params(labelbottom=True)
+    for row in axes:
+        row[0].set_ylabel("trust, contact rate", fontsize=8)
+    keys = panels[0].get_legend_handles_labels()
+    figure.legend(*keys, loc="outside upper center", ncols=2, fontsize=7, frameon=False)
+    return panels
+
+
+def _draw(
+    ax: Axes,
+    bounds: np.ndarray,
+    middle: np.ndarray,
+    bands: np.ndarray,
+    rates: np.ndarray,
+    named: tuple[str, str],
+) -> None:
+    what, centre = named
+    x, (low, lower, upper, high) = bounds, bands
+    if len(bounds) == 1:  # a band of one bound would not be seen
+        x = np.array([bounds[0] - 0.3, bounds[0] + 0.3])
+        middle, low, lower, upper, high = (
+            np.repeat(values, 2) for values in (middle, low, lower, upper, high)
+        )
+    ax.fill_between(x, low, high, color=OUTER, linewidth=0.0, label=f"90 % of {what}")
+    ax.fill_between(x, lower, upper, color=INNER, linewidth=0.0, label=f"50 % of {what}")
+    ax.plot(x, middle, color=LINE, linewidth=1.2, label=f"{centre} of {what}")
+    ax.plot(
+        bounds,
+        rates,
+        linestyle="none",
+        marker="o",
+        markersize=3.8,
+        color="black",
+        markeredgecolor="white",
+        markeredgewidth=0.5,
+        label="contact rate measured" if np.isfinite(rates).any() else "_",
+    )
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    plain(ax)

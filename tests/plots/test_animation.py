@@ -1,0 +1,85 @@
+"""A mission's film: frames are the mission's ticks."""
+
+import sys
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from matplotlib.animation import writers
+from PIL import Image
+
+import trustbo as tb
+
+
+@pytest.fixture(scope="module")
+def mission(result):
+    return result.missions[0]
+
+
+def test_a_frame_shows_where_robots_are_and_who_sees_the_lead(result, mission):
+    animation = tb.plots.animate_mission(mission, result.workspace, speedup=10.0)
+    near, overview, bars = animation._fig.axes
+    animation._func(0)
+    bound, grid = mission.bounds[0], result.workspace.grid
+    corner = np.array([grid.left, grid.top - 90.0])
+    shown = {line.get_label(): np.ravel(line.get_data()) for line in near.lines}
+    for name, pose in zip(("lead", "r1", "r2", "r3"), bound.poses[0], strict=True):
+        np.testing.assert_allclose(shown[name], pose[:2] - corner)
+    sight = [line for line in near.lines if len(line.get_xdata()) == 2][:3]
+    for line, seen in zip(sight, bound.contact[0], strict=True):
+        assert line.get_linestyle() == ("-" if seen else "--")
+    animation._func(len(bound.contact) - 1)  # the bound's last tick
+    widths = [bar.get_width() for bar in bars.patches]
+    np.testing.assert_allclose(widths, bound.contact_rate)
+    n_ticks = sum(len(b.contact) for b in mission.bounds)
+    animation._func(n_ticks - 1)
+    assert near.get_title().endswith(f"bound {len(mission.bounds)} of {len(mission.path) - 1}: ok")
+    assert overview.images
+    animation._draw_was_started = True  # nobody will: matplotlib would warn
+
+
+def test_all_robots_stay_in_sight_of_the_camera(result, mission):
+    animation = tb.plots.animate_mission(mission, result.workspace)
+    near = animation._fig.axes[0]
+    corner = np.array([result.workspace.grid.left, result.workspace.grid.top - 90.0])
+    poses = np.concatenate([bound.poses[..., :2] for bound in mission.bounds]) - corner
+    for tick in range(0, len(poses), 7):
+        animation._func(tick)
+        low, high = np.transpose([near.get_xlim(), near.get_ylim()])
+        assert ((poses[tick] > low) & (poses[tick] < high)).all()
+    animation._draw_was_started = True
+
+
+def test_a_gif_has_a_frame_for_each_step_of_the_film(result, mission, tmp_path):
+    path = tmp_path / "mission.gif"
+    span = mission.bounds[-1].t1
+    tb.plots.animate_mission(mission, result.workspace, path, speedup=span, fps=4, dpi=40)
+    with Image.open(path) as film:
+        assert film.n_frames == 5  # four in the one second it lasts, and the end
+        assert film.info["duration"] == 250
+    assert [file.name for file in tmp_path.iterdir()] == ["mission.gif"]
+
+
+def test_an_mp4_can_be_played(result, mission, tmp_path):
+    path = tmp_path / "mission.mp4"
+    span = mission.bounds[-1].t1
+    tb.plots.animate_mission(mission, result.workspace, path, speedup=span, fps=4, dpi=41)
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(path)
+    assert frames == 5
+
+
+def test_without_poses_there_is_nothing_to_show(result, tmp_path):
+    mission = tb.Mission.from_arrays([(0, 0), (0, 1)], np.full((1, 3, 2), 0.5), [[0.5] * 3])
+    with pytest.raises(tb.TrustboError, match="bound 1 has no poses or contact of its ticks"):
+        tb.plots.animate_mission(mission, result.workspace, tmp_path / "mission.gif")
+    with pytest.raises(tb.TrustboError, match=r"unknown suffix '.avi'; choose one of .gif, .mp4"):
+        tb.plots.animate_mission(mission, result.workspace, tmp_path / "mission.avi")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_mp4_without_ffmpeg_says_what_to_do(result, mission, tmp_path, monkeypatch):
+    monkeypatch.setattr(writers, "is_available", lambda name: False)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(tb.TrustboError, match=r"an \.mp4 needs ffmpeg"):
+        tb.plots.animate_mission(mission, result.workspace, tmp_path / "mission.mp4")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,42 @@
+"""Cost per robot, and where the best path may be."""
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+
+
+def test_each_robot_has_its_map_in_the_same_colours(result):
+    mean = tb.models.params_of(result.posterior).mean()
+    cost = result.planner.cost_map(mean, per_robot=True)
+    axes = tb.plots.robot_maps(cost, result.workspace, result.path, label="cost 1 - sigma(trust)")
+    assert [ax.get_title() for ax in axes] == ["r1", "r2", "r3"]
+    for ax, own in zip(axes, cost, strict=True):
+        np.testing.assert_array_equal(ax.images[0].get_array(), own)
+        assert ax.images[0].get_clim() == (float(cost.min()), float(cost.max()))
+        assert ax.lines[0].get_xdata().size == len(result.path)
+    (bar,) = [ax for ax in axes[0].figure.axes if ax.get_label() == "<colorbar>"]
+    assert bar.get_ylabel().startswith("cost 1 - sigma(trust)")
+
+
+def test_probabilities_of_cells_go_from_0_to_1(result):
+    share = result.planner.path_posterior(result.posterior, n_draws=200)
+    ax = tb.plots.path_posterior(share, result.workspace, result.path)
+    np.testing.assert_array_equal(ax.images[0].get_array(), share)
+    assert ax.images[0].get_clim() == (0.0, 1.0)
+
+
+def test_columns_can_be_chosen_and_are_whole_numbers(result):
+    axes = tb.plots.trust_maps(result, n_columns=1)
+    assert len({ax.get_position().x0 for ax in axes}) == 1
+    assert [ax.get_xlabel() for ax in axes] == ["", "", "east (m)"]
+    with pytest.raises(tb.TrustboError, match="n_columns must be a whole number from 1 on; got 0"):
+        tb.plots.trust_maps(result, n_columns=0)
+
+
+def test_figures_are_vectors_but_for_the_maps(result, tmp_path):
+    axes = tb.plots.trust_maps(result)
+    axes[0].figure.savefig(tmp_path / "maps.svg")
+    text = (tmp_path / "maps.svg").read_text()
+    assert text.count("<path") > 20  # lines and letters
+    assert text.count("<image") <= 2 * len(axes) + 1  # colours and shadows of each, the bar

@@ -1,0 +1,72 @@
+"""A result's own planner, plan and maps are the campaign's."""
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+import trustbo as tb
+
+AWARENESS = np.random.default_rng(3).uniform(size=(2, 4, 4, 2))
+PASSABLE = np.ones((4, 4), bool)
+PASSABLE[1, 1] = False
+
+
+@pytest.fixture(
+    scope="module",
+    params=[("terminal", "map"), ("success", "map"), ("mean", "belief")],
+    ids=lambda p: "-".join(p),
+)
+def result(request):
+    objective, awareness = request.param
+    workspace = tb.Workspace.from_awareness(AWARENESS, PASSABLE)
+    truth = tb.models.TrustParams(0.4, np.array([0.5, 0.2]), 0.1, 0.05, 0.05)
+    return tb.iterate(
+        workspace,
+        (3, 0),
+        (0, 3),
+        n_iterations=2,
+        objective=objective,
+        awareness=awareness,
+        sampler="exact",
+        simulator=tb.simulation.ModelSimulator(workspace, truth),
+        progress=False,
+    )
+
+
+def test_its_plan_is_the_recommended_path(result):
+    plan = result.plan
+    assert list(plan.path) == result.path
+    assert plan.exact
+    np.testing.assert_allclose(plan.value, result.value, rtol=1e-12)
+    np.testing.assert_allclose(plan.trust, result.trust, rtol=1e-12)
+    assert (plan.bands[0] < plan.bands[-1]).all()
+
+
+def test_its_planner_gives_its_trust_map(result):
+    mean = tb.models.params_of(result.posterior).mean()
+    np.testing.assert_allclose(result.planner.trust_map(mean), result.trust_map, rtol=1e-12)
+
+
+def test_its_maps_are_over_the_posterior(result):
+    maps = result.maps(n_draws=300)
+    assert list(maps) == [
+        "trust_mean", "trust_sd", "cost", "traversability", "visibility", "path_probability",
+    ]  # fmt: skip
+    assert all(np.isnan(maps[name][1, 1]) for name in maps)
+    share = maps["path_probability"]
+    assert share[3, 0] == share[0, 3] == 1.0
+    # The mean cost and the cost of the mean differ by little, as sigma bends little.
+    np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=5e-3)
+    assert result.maps(n_draws=300).identical(maps)
+    believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
+    expected = np.where(PASSABLE, believed.sel(feature="visibility").mean("robot"), np.nan)
+    np.testing.assert_allclose(maps["visibility"], expected)
+
+
+def test_a_loaded_result_plans_alike(result, tmp_path):
+    result.save(tmp_path)
+    loaded = tb.load_result(tmp_path)
+    assert (loaded.believed is None) == (result.believed is None)
+    assert loaded.plan.path == result.plan.path
+    np.testing.assert_array_equal(loaded.plan.bands, result.plan.bands)
+    assert loaded.maps(n_draws=50).equals(result.maps(n_draws=50))
