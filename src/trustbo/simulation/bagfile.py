@@ -1,5 +1,6 @@
 """ROS bags as files: their messages, read and written by rosbags."""
 
+import importlib.util
 import os
 import re
 import tempfile
@@ -129,8 +130,34 @@ def opened(path: Path) -> Iterator[Bag]:
         reader.close()
 
 
+def require_new_bag(path: Path, version: int | None) -> int:
+    """The version of ROS that a new bag's path says, .bag for 1.
+
+    Raises:
+        TrustboError: No rosbags; another version is wanted; the path exists.
+    """
+    if importlib.util.find_spec("rosbags") is None:
+        raise TrustboError(_NO_ROSBAGS)
+    of_path = 1 if path.suffix == ".bag" else 2
+    if version not in (None, of_path):
+        raise TrustboError(
+            f"version must be 1 with a path that ends in .bag, 2 with another; got {version!r} and "
+            f"{str(path)!r}."
+        )
+    if path.exists():
+        raise TrustboError(
+            f"{str(path)!r} exists; bags are not overwritten: remove it, or give another path."
+        )
+    return of_path
+
+
 def write_messages(
-    path: Path, version: int, storage: str, records: Callable[[Messages], Iterable[Record]]
+    path: Path,
+    version: int,
+    storage: str,
+    records: Callable[[Messages], Iterable[Record]],
+    *,
+    latched: bool = False,
 ) -> None:
     """Write a bag whole or not at all.
 
@@ -139,6 +166,7 @@ def write_messages(
         version: Of ROS, 1 or 2.
         storage: Of ROS 2, one of `STORAGES`.
         records: Gives the messages in order of time, made by what it is called with.
+        latched: Whether who subscribes while the bag is played gets what was played before.
 
     Raises:
         TrustboError: No rosbags.
@@ -158,13 +186,40 @@ def write_messages(
         else:
             plugin = rosbag2.StoragePlugin[storage.upper()]
             writer = rosbag2.Writer(file, version=8, storage_plugin=plugin)
+        options = _latch(version) if latched else {}
         connections: dict[str, Any] = {}
         with writer:
             for time, topic, kind, message in records(Messages(store.types)):
                 if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
+                    connections[topic] = writer.add_connection(
+                        topic, kind, typestore=store, **options
+                    )
                 writer.write(connections[topic], time, serialize(message, kind))
         os.replace(file, path)
+
+
+def _latch(version: int) -> dict[str, Any]:
+    """What makes rosbags' writer offer a topic to late subscribers."""
+    from rosbags import interfaces as ros
+
+    if version == 1:
+        return {"latching": 1}
+    ever = ros.QosTime(9_223_372_036, 854_775_807)  # how ROS 2 writes "no limit"
+    return {
+        "offered_qos_profiles": [
+            ros.Qos(
+                history=ros.QosHistory.KEEP_LAST,
+                depth=1,
+                reliability=ros.QosReliability.RELIABLE,
+                durability=ros.QosDurability.TRANSIENT_LOCAL,
+                deadline=ever,
+                lifespan=ever,
+                liveliness=ros.QosLiveliness.AUTOMATIC,
+                liveliness_lease_duration=ever,
+                avoid_ros_namespace_conventions=False,
+            )
+        ]
+    }
 
 
 def _as_array(values: Sequence[Any], types: tuple[str, ...]) -> np.ndarray:

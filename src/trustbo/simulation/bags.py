@@ -50,7 +50,7 @@ import numpy as np
 from trustbo.data import FEATURES, Mission, default_features
 from trustbo.errors import TrustboError, require_choice
 from trustbo.records import STATES
-from trustbo.simulation.bagfile import STORAGES, Record, opened, write_messages
+from trustbo.simulation.bagfile import STORAGES, Record, opened, require_new_bag, write_messages
 from trustbo.simulation.messages import (
     AWARENESS_TYPES,
     CONTACT_TYPES,
@@ -158,14 +158,7 @@ def write_bag(
     require_same_team(missions)
     require_choice("storage", storage, STORAGES)
     target, names = Path(path), Topics() if topics is None else topics
-    of_path = 1 if target.suffix == ".bag" else 2
-    if version not in (None, of_path):
-        raise TrustboError(
-            f"version must be 1 with a path that ends in .bag, 2 with another; got {version!r} and "
-            f"{str(target)!r}."
-        )
-    if target.exists():
-        raise TrustboError(f"{str(target)!r} exists; bags are not overwritten.")
+    of_path = require_new_bag(target, version)
     _require_names(missions[0], names.lead)
     for j, mission in enumerate(missions):
         _require_ticks(f"mission {j}", mission)

@@ -14,6 +14,8 @@ TEXT = "std_msgs/msg/String"
 FLAG = "std_msgs/msg/Bool"
 NUMBERS = "std_msgs/msg/Float64MultiArray"
 POSE = "geometry_msgs/msg/PoseStamped"
+GRID = "nav_msgs/msg/OccupancyGrid"
+PATH = "nav_msgs/msg/Path"
 
 MARKER_TYPES = (TEXT, "std_msgs/msg/Int32MultiArray")
 STATUS_TYPES = (TEXT,)
@@ -85,19 +87,50 @@ class Messages:
 
     def pose(self, time: int, pose: np.ndarray) -> Any:
         """A pose (x, y, heading) at a time in ns, in the frame `map`."""
-        x, y, heading = (float(value) for value in pose)
-        stamp = self._types["builtin_interfaces/msg/Time"](
+        return self._types[POSE](header=self._header(time), pose=self._pose(pose))
+
+    def path(self, time: int, poses: np.ndarray) -> Any:
+        """A path through poses, shape (pose, 3), in the frame `map`."""
+        stamped = [self.pose(time, pose) for pose in poses]
+        return self._types[PATH](header=self._header(time), poses=stamped)
+
+    def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
+        """A map in the frame `map`.
+
+        Args:
+            time: ns.
+            values: Shape (row, col), int8, the southern row first.
+            resolution: Side of a pixel, m.
+            corner: Pose of the lower left one's corner.
+        """
+        height, width = values.shape
+        info = self._types["nav_msgs/msg/MapMetaData"](
+            map_load_time=self._stamp(time),
+            resolution=resolution,
+            width=width,
+            height=height,
+            origin=self._pose(corner),
+        )
+        data = np.ascontiguousarray(values, dtype=np.int8).ravel()
+        return self._types[GRID](header=self._header(time), info=info, data=data)
+
+    def _stamp(self, time: int) -> Any:
+        return self._types["builtin_interfaces/msg/Time"](
             sec=time // 1_000_000_000, nanosec=time % 1_000_000_000
         )
+
+    def _header(self, time: int) -> Any:
         head = self._types["std_msgs/msg/Header"]
         number = {"seq": 0} if "seq" in head.__dataclass_fields__ else {}  # of ROS 1 alone
-        header = head(stamp=stamp, frame_id="map", **number)
+        return head(stamp=self._stamp(time), frame_id="map", **number)
+
+    def _pose(self, pose: np.ndarray) -> Any:
+        x, y, heading = (float(value) for value in pose)
         turn = self._types["geometry_msgs/msg/Quaternion"](
             x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0)
         )
         place = self._types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0)
-        both = self._types["geometry_msgs/msg/Pose"](position=place, orientation=turn)
-        return self._types[POSE](header=header, pose=both)
+        return self._types["geometry_msgs/msg/Pose"](position=place, orientation=turn)
 
 
 def read_marker(message: Any) -> dict[str, Any]:

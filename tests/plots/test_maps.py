@@ -1,12 +1,8 @@
-"""Figures and files of a result."""
-
-import json
+"""Figures of a result."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-import rasterio
-from rasterio.warp import transform
 
 import trustbo as tb
 
@@ -108,37 +104,3 @@ def test_impassable_cells_are_grey():
     image = tb.plots.cell_map(ax, trust, workspace)
     assert np.ma.getmaskarray(image.get_array()).tolist() == (~passable).tolist()
     assert ax.get_facecolor() == (0.75, 0.75, 0.75, 1.0)
-
-
-def test_the_trust_map_is_a_geotiff_in_the_terrain_s_crs(result, tmp_path):
-    path = tmp_path / "trust.tif"
-    tb.export.write_cell_map(path, result.trust_map, result.workspace)
-    with rasterio.open(path) as source:
-        assert source.crs.to_epsg() == 32616
-        assert source.bounds == pytest.approx(result.workspace.terrain.rio.bounds())
-        assert source.descriptions == ("trust",)
-        assert np.isnan(source.nodata)
-        np.testing.assert_allclose(source.read(1), result.trust_map.values, rtol=1e-6)
-
-
-def test_the_path_is_geojson_in_degrees_on_the_right_place(result, tmp_path):
-    path = tmp_path / "path.geojson"
-    tb.export.write_path(path, result)
-    features = json.loads(path.read_text())["features"]
-    line, *points = features
-    assert line["geometry"]["type"] == "LineString"
-    assert len(line["geometry"]["coordinates"]) == len(points) == len(result.path)
-    for (lon, lat), cell in zip(line["geometry"]["coordinates"], result.path, strict=True):
-        x, y = transform("EPSG:4326", "EPSG:32616", [lon], [lat])
-        # 1e-8 degree is 1 mm.
-        np.testing.assert_allclose([x[0], y[0]], result.workspace.grid.center(cell), atol=2e-3)
-    assert points[1]["properties"]["trust_r1"] == pytest.approx(result.trust[0, 0])
-    assert "trust_r1" not in points[0]["properties"]
-
-
-def test_without_a_terrain_there_is_no_place_on_earth(tmp_path):
-    workspace = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
-    trust = workspace.awareness.isel(robot=0, feature=0)
-    with pytest.raises(tb.TrustboError, match="has a place on Earth"):
-        tb.export.write_cell_map(tmp_path / "map.tif", trust, workspace)
-    assert list(tmp_path.iterdir()) == []

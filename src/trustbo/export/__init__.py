@@ -1,0 +1,23 @@
+"""Results as files that other programs open: GIS, GPS, robots, tables."""
+
+from trustbo.export.everything import FORMATS, export_result
+from trustbo.export.netcdf import write_netcdf
+from trustbo.export.paths import path_frame, write_path
+from trustbo.export.rasters import write_geotiff
+from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
+from trustbo.export.style import write_style
+from trustbo.export.tables import write_csv
+
+__all__ = [
+    "FORMATS",
+    "export_result",
+    "occupancy",
+    "path_frame",
+    "write_csv",
+    "write_geotiff",
+    "write_netcdf",
+    "write_path",
+    "write_ros_bag",
+    "write_ros_map",
+    "write_style",
+]

@@ -1,0 +1,149 @@
+"""A result in several formats at once, in one folder."""
+
+from collections.abc import Callable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import xarray as xr
+
+from trustbo.errors import require_choice
+from trustbo.export.checks import require_crs, require_file
+from trustbo.export.netcdf import write_netcdf
+from trustbo.export.paths import write_path
+from trustbo.export.rasters import write_geotiff
+from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
+from trustbo.export.style import write_style
+from trustbo.export.tables import write_csv
+from trustbo.result import Result, require_folder
+from trustbo.simulation.bagfile import require_new_bag
+
+
+class _Content(NamedTuple):
+    """What is to be written."""
+
+    result: Result
+    maps: xr.Dataset
+    resolution: float | None
+
+
+class _Format(NamedTuple):
+    text: str
+    files: tuple[str, ...]
+    write: Callable[[_Content, Path], None]
+    """Called with the first of the files."""
+    on_earth: bool = False
+    """Whether it needs a CRS."""
+
+
+def export_result(
+    result: Result,
+    folder: str | PathLike[str],
+    formats: Sequence[str] = ("geotiff", "geojson"),
+    *,
+    resolution: float | None = None,
+) -> list[Path]:
+    """Write a result's maps and its recommended path to a folder.
+
+    Args:
+        result: What a campaign learned.
+        folder: Made if need be. Files in it are replaced, but bags are not.
+        formats: Which of `FORMATS`.
+        resolution: Side of a pixel of the maps for ROS, m; by default that of a cell.
+
+    Returns:
+        The files written; of a ROS 2 bag, its folder.
+
+    Raises:
+        TrustboError: Before anything is written: an unknown format; one that needs a place on
+            Earth, of a result without a terrain; a bag that exists, or no rosbags; what `occupancy`
+            refuses; or files that cannot be.
+    """
+    names = [formats] if isinstance(formats, str) else dict.fromkeys(formats)
+    chosen = {name: _FORMATS[require_choice("format", name, _FORMATS)] for name in names}
+    target = require_folder(folder)
+    if any(kind.on_earth for kind in chosen.values()):
+        require_crs(result.workspace)
+    for name, kind in chosen.items():
+        for file in kind.files:
+            if name in _BAGS:
+                require_new_bag(target / file, None)
+            else:
+                require_file(target / file)
+    content = _Content(result, result.maps(), resolution)
+    if not chosen.keys().isdisjoint(_ROS):
+        occupancy(content.maps["cost"], result.workspace, resolution=resolution)
+    for kind in chosen.values():
+        kind.write(content, target / kind.files[0])
+    return [target / file for kind in chosen.values() for file in kind.files]
+
+
+def _write_maps(content: _Content, file: Path) -> None:
+    maps = content.maps
+    write_geotiff(file, maps, content.result.workspace, style=False)
+    row, col = content.result.path[0]
+    # The start's trust is assumed: it must not stretch the colours of what was learned.
+    learned = maps.where((maps["row"] != row) | (maps["col"] != col))
+    write_style(file.with_suffix(".qml"), learned)
+
+
+def _write_cog(content: _Content, file: Path) -> None:
+    write_geotiff(file, content.maps, content.result.workspace, cog=True, style=False)
+
+
+def _write_tables(content: _Content, file: Path) -> None:
+    write_csv(file, content.result)
+    write_path(file.with_name("path.csv"), content.result)
+
+
+def _write_map(content: _Content, file: Path) -> None:
+    workspace, cost = content.result.workspace, content.maps["cost"]
+    write_ros_map(file, cost, workspace, resolution=content.resolution)
+
+
+def _write_bag(content: _Content, file: Path) -> None:
+    workspace, cost = content.result.workspace, content.maps["cost"]
+    write_ros_bag(file, content.result, cost, workspace, resolution=content.resolution)
+
+
+def _write_path(content: _Content, file: Path) -> None:
+    write_path(file, content.result)
+
+
+_BAGS = ("ros1_bag", "ros2_bag")
+_ROS = ("ros_map", *_BAGS)
+_FORMATS = {
+    "geotiff": _Format(
+        "all maps as bands of a GeoTIFF, with a style for QGIS",
+        ("maps.tif", "maps.qml"),
+        _write_maps,
+        on_earth=True,
+    ),
+    "cog": _Format(
+        "all maps as a Cloud Optimized GeoTIFF", ("maps_cog.tif",), _write_cog, on_earth=True
+    ),
+    "netcdf": _Format(
+        "all maps as netCDF by the CF conventions",
+        ("maps.nc",),
+        lambda content, file: write_netcdf(file, content.maps, content.result.workspace),
+    ),
+    "geojson": _Format(
+        "the path in longitude and latitude", ("path.geojson",), _write_path, on_earth=True
+    ),
+    "gpx": _Format(
+        "the path as a route for GPS receivers", ("path.gpx",), _write_path, on_earth=True
+    ),
+    "geopackage": _Format(
+        "the path and its cells as layers for GIS", ("path.gpkg",), _write_path, on_earth=True
+    ),
+    "csv": _Format(
+        "tables of all bounds and of the path", ("bounds.csv", "path.csv"), _write_tables
+    ),
+    "ros_map": _Format(
+        "the cost map for map_server and Nav2", ("cost_map.yaml", "cost_map.pgm"), _write_map
+    ),
+    "ros1_bag": _Format("cost map and path as a bag of ROS 1", ("path.bag",), _write_bag),
+    "ros2_bag": _Format("cost map and path as a bag of ROS 2 (mcap)", ("path_ros2",), _write_bag),
+}
+FORMATS = {name: kind.text for name, kind in _FORMATS.items()}
+"""What `export_result` writes, by name."""

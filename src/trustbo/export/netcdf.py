@@ -1,0 +1,48 @@
+"""Maps as netCDF, by the CF conventions."""
+
+from os import PathLike
+
+import numpy as np
+from rasterio.transform import from_origin
+
+from trustbo.export.checks import Maps, find_crs, require_file, require_maps
+from trustbo.files import write_file
+from trustbo.terrain import Workspace
+
+
+def write_netcdf(path: str | PathLike[str], maps: Maps, workspace: Workspace) -> None:
+    """Write maps of the planning cells as netCDF-4 by CF-1.8, dims (y, x), north first.
+
+    Args:
+        path: The file; a complete one replaces it, or nothing.
+        maps: Dims (row, col), e.g. `Result.maps()`.
+        workspace: Whose cells they are. Without a terrain there is no CRS, and x and y are metres
+            from the grid's lower left corner.
+
+    Raises:
+        ShapeError: Other dims, or another number of cells.
+        TrustboError: The path is no file to be.
+    """
+    bands, target = require_maps(maps, workspace), require_file(path)
+    grid, crs = workspace.grid, find_crs(workspace)
+    data = bands.rename(row="y", col="x").assign_coords(y=grid.y, x=grid.x)
+    for name, values in data.data_vars.items():
+        values.attrs = {"long_name": name, "units": "1"} | values.attrs
+        values.encoding = {"zlib": True, "_FillValue": np.nan}
+    for axis, way in (("x", "east"), ("y", "north")):
+        attrs = {"axis": axis.upper(), "units": "m"}
+        attrs["long_name"] = f"distance {way} of the grid's lower left corner"
+        if crs is not None:
+            attrs["long_name"] = f"{axis} coordinate of projection"
+            attrs["standard_name"] = f"projection_{axis}_coordinate"
+        data[axis].attrs = attrs
+        data[axis].encoding = {"_FillValue": None}  # CF: coordinates miss nothing
+    if crs is not None:
+        transform = from_origin(grid.left, grid.top, grid.cell_width, grid.cell_height)
+        data = data.rio.write_crs(crs).rio.write_transform(transform)
+    data.attrs = {
+        "Conventions": "CF-1.8",
+        "title": "Maps of trust after a campaign of bounding overwatch",
+        "source": "trustbo",
+    }
+    write_file(target, lambda file: data.to_netcdf(file, engine="netcdf4"))

@@ -1,0 +1,126 @@
+"""Colours of a raster in QGIS, as a layer style (.qml)."""
+
+import math
+from os import PathLike
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from trustbo.errors import require_choice
+from trustbo.export.checks import Maps, as_dataset, require_file
+from trustbo.files import write_text
+
+_VIRIDIS = (
+    (68, 1, 84),
+    (72, 36, 117),
+    (65, 68, 135),
+    (53, 95, 141),
+    (42, 120, 142),
+    (33, 145, 140),
+    (34, 168, 132),
+    (68, 191, 112),
+    (122, 209, 81),
+    (189, 223, 38),
+    (253, 231, 37),
+)
+"""Stops at tenths; straight lines between them are within 14 of 255 of matplotlib's."""
+_HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+
+
+def write_style(path: str | PathLike[str], maps: Maps, *, band: str | None = None) -> None:
+    """Write how QGIS is to colour a raster of `write_geotiff`: viridis over a band's values.
+
+    QGIS takes it up by itself when it is named as the raster, but .qml.
+
+    Args:
+        path: The file, .qml.
+        maps: As `write_geotiff` wrote them; what is NaN in these does not count.
+        band: Which of them to show; by default the first.
+
+    Raises:
+        ShapeError: There are no maps.
+        TrustboError: An unknown band, or a path that is no such file.
+    """
+    target = require_file(path, ".qml")
+    bands = as_dataset(maps)
+    names = [str(name) for name in bands.data_vars]
+    shown = names[0] if band is None else require_choice("band", band, names)
+    low, high = _limits(bands[shown].values)
+    root = ET.Element("qgis", version="3.28.0-Firenze", styleCategories="Symbology")
+    pipe = ET.SubElement(root, "pipe")
+    nearest = {f"zoomed{way}ResamplingMethod": "nearestNeighbour" for way in ("In", "Out")}
+    provider = ET.SubElement(pipe, "provider")
+    ET.SubElement(provider, "resampling", nearest, enabled="false", maxOversampling="2")
+    limits = {"classificationMin": repr(low), "classificationMax": repr(high)}
+    of_band = {"band": str(names.index(shown) + 1), "alphaBand": "-1", "opacity": "1"}
+    kind = {"type": "singlebandpseudocolor", "nodataColor": ""}
+    renderer = ET.SubElement(pipe, "rasterrenderer", kind | of_band | limits)
+    ET.SubElement(renderer, "rasterTransparency")
+    origin = ET.SubElement(renderer, "minMaxOrigin")
+    # "None": the limits are as given here, not taken anew from what is on the screen.
+    for tag, text in {"limits": "None", "extent": "WholeRaster", "statAccuracy": "Exact"}.items():
+        ET.SubElement(origin, tag).text = text
+    renderer.append(_shader(low, high))
+    ET.SubElement(pipe, "brightnesscontrast", brightness="0", contrast="0", gamma="1")
+    ET.SubElement(pipe, "huesaturation", saturation="0", grayscaleMode="0", colorizeOn="0")
+    ET.SubElement(pipe, "rasterresampler", maxOversampling="2")
+    ET.SubElement(root, "blendMode").text = "0"
+    ET.indent(root)
+    write_text(target, _HEAD + ET.tostring(root, encoding="unicode") + "\n")
+
+
+def _shader(low: float, high: float) -> ET.Element:
+    """Colours by value, and the ramp that QGIS shows for editing."""
+    shader = ET.Element("rastershader")
+    ramp = ET.SubElement(
+        shader,
+        "colorrampshader",
+        colorRampType="INTERPOLATED",
+        classificationMode="2",  # stops at equal intervals
+        clip="0",
+        labelPrecision=str(_decimals(low, high)),
+        minimumValue=repr(low),
+        maximumValue=repr(high),
+    )
+    source = ET.SubElement(ramp, "colorramp", type="gradient", name="[source]")
+    options = ET.SubElement(source, "Option", type="Map")
+    steps, values = (np.linspace(*ends, len(_VIRIDIS)).tolist() for ends in ((0, 1), (low, high)))
+    stops = [f"{step:g};{_rgba(c)}" for step, c in zip(steps, _VIRIDIS, strict=True)]
+    for name, value in {
+        "color1": _rgba(_VIRIDIS[0]),
+        "color2": _rgba(_VIRIDIS[-1]),
+        "discrete": "0",
+        "rampType": "gradient",
+        "stops": ":".join(stops[1:-1]),
+    }.items():
+        ET.SubElement(options, "Option", name=name, type="QString", value=value)
+    for value, (red, green, blue) in zip(values, _VIRIDIS, strict=True):
+        ET.SubElement(
+            ramp,
+            "item",
+            value=repr(value),
+            color=f"#{red:02x}{green:02x}{blue:02x}",
+            label=f"{value:.{_decimals(low, high)}f}",
+            alpha="255",
+        )
+    # A continuous legend would show the labels of the two ends alone.
+    ET.SubElement(ramp, "rampLegendSettings", useContinuousLegend="0", direction="0")
+    return shader
+
+
+def _limits(values: np.ndarray) -> tuple[float, float]:
+    """Least and largest finite value, held apart where there is only one, or none."""
+    finite = values[np.isfinite(values)].astype(float)
+    if not finite.size:
+        return 0.0, 1.0
+    low, high = float(finite.min()), float(finite.max())
+    return (low, high) if low < high else (low - 0.5, high + 0.5)
+
+
+def _decimals(low: float, high: float) -> int:
+    """Decimals with which the labels of neighbouring stops differ."""
+    return max(0, 2 - math.floor(math.log10(high - low)))
+
+
+def _rgba(color: tuple[int, int, int]) -> str:
+    return ",".join(map(str, (*color, 255)))

@@ -1,0 +1,102 @@
+"""All formats at once."""
+
+import dataclasses
+import sys
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.errors import TrustboError
+from trustbo.export import FORMATS, export_result
+
+FILES = {
+    "geotiff": ["maps.tif", "maps.qml"],
+    "cog": ["maps_cog.tif"],
+    "netcdf": ["maps.nc"],
+    "geojson": ["path.geojson"],
+    "gpx": ["path.gpx"],
+    "geopackage": ["path.gpkg"],
+    "csv": ["bounds.csv", "path.csv"],
+    "ros_map": ["cost_map.yaml", "cost_map.pgm"],
+    "ros1_bag": ["path.bag"],
+    "ros2_bag": ["path_ros2"],
+}
+NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "gpx", "geopackage")
+
+
+def test_every_format_is_written_under_its_name(result, tmp_path):
+    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+    assert list(FORMATS) == list(FILES)
+    written = export_result(result, tmp_path / "out", FORMATS)
+    assert written == [tmp_path / "out" / name for names in FILES.values() for name in names]
+    assert set((tmp_path / "out").iterdir()) == set(written)
+    assert all(file.is_dir() or file.stat().st_size for file in written)
+
+
+def test_by_default_it_is_what_a_gis_takes_and_a_second_time_replaces_it(result, tmp_path):
+    for _ in range(2):
+        written = export_result(result, tmp_path)
+        assert [file.name for file in written] == ["maps.tif", "maps.qml", "path.geojson"]
+    assert len(list(tmp_path.iterdir())) == 3
+    assert export_result(result, tmp_path, "gpx") == [tmp_path / "path.gpx"]
+
+
+def test_the_assumed_trust_of_the_start_does_not_stretch_the_colours(result, tmp_path):
+    export_result(result, tmp_path, ["geotiff"])
+    stops = [float(i.get("value")) for i in ET.parse(tmp_path / "maps.qml").iter("item")]
+    learned = result.maps()["trust_mean"].values
+    assert learned[result.path[0]] == pytest.approx(0.5, abs=0.1)
+    learned[result.path[0]] = np.nan
+    assert (stops[0], stops[-1]) == (np.nanmin(learned), np.nanmax(learned))
+
+
+def test_a_result_read_from_disk_is_exported_alike(result, tmp_path):
+    result.save(tmp_path / "result")
+    again = tb.load_result(tmp_path / "result")
+    formats = ("geotiff", "geojson", "csv")
+    for one, folder in ((result, "a"), (again, "b")):
+        export_result(one, tmp_path / folder, formats)
+    for name in (name for kind in formats for name in FILES[kind]):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_without_a_terrain_there_are_tables_netcdf_and_ros(nowhere, tmp_path):
+    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+    for name in NEEDS_A_PLACE:
+        with pytest.raises(TrustboError, match="only a workspace made from a terrain has a place"):
+            export_result(nowhere, tmp_path / "out", ["csv", name])
+    assert list(tmp_path.iterdir()) == []
+    rest = [name for name in FORMATS if name not in NEEDS_A_PLACE]
+    written = export_result(nowhere, tmp_path, rest)
+    assert set(tmp_path.iterdir()) == set(written)
+
+
+def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, monkeypatch):
+    with pytest.raises(TrustboError, match="unknown format 'kml'; choose one of geotiff, cog, net"):
+        export_result(result, tmp_path, ["csv", "kml"])
+    with pytest.raises(TrustboError, match=r"resolution must be positive and finite; got 0"):
+        export_result(result, tmp_path, ["csv", "ros_map"], resolution=0)
+    grid = dataclasses.replace(result.workspace.grid, cell_width=40.0)
+    workspace = dataclasses.replace(result.workspace, grid=grid)
+    oblong = dataclasses.replace(result, workspace=workspace)
+    with pytest.raises(TrustboError, match="cells of 40 x 30 m are not square"):
+        export_result(oblong, tmp_path, ["csv", "ros2_bag"])
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(TrustboError, match=r'pip install "trustbo\[ros\]"'):
+        export_result(result, tmp_path, ["csv", "ros1_bag"])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_in_the_way_is_named_before_anything_is_written(result, tmp_path):
+    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+    (tmp_path / "path.csv").mkdir()
+    (tmp_path / "path.bag").touch()
+    with pytest.raises(TrustboError, match=r"path\.csv': it is a folder"):
+        export_result(result, tmp_path, ["geojson", "csv"])
+    with pytest.raises(TrustboError, match=r"path\.bag' exists; bags are not overwritten"):
+        export_result(result, tmp_path, ["geojson", "ros1_bag"])
+    with pytest.raises(TrustboError, match=r"cannot write to '.*path\.bag': .* is a file"):
+        export_result(result, tmp_path / "path.bag")
+    assert {file.name for file in tmp_path.iterdir()} == {"path.csv", "path.bag"}

@@ -1,0 +1,206 @@
+"""Paths, each format read back by a reader that is not the writer."""
+
+import csv
+import json
+import sqlite3
+import struct
+from dataclasses import replace
+
+import gpxpy
+import numpy as np
+import pytest
+import shapely
+from pyproj import Transformer
+
+import trustbo as tb
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.export import path_frame, write_path
+
+ROBOTS = ("r1", "r2", "r3")
+TO_DEGREES = Transformer.from_crs(32616, 4326, always_xy=True)
+
+
+@pytest.fixture(scope="module")
+def centers(result):
+    """Metres in the terrain's CRS: 30 m cells from the corner (380000, 5225000)."""
+    return np.array([(380015.0 + 30.0 * c, 5224985.0 - 30.0 * r) for r, c in result.path])
+
+
+def trust_of(plan, k, robot):
+    """Expected trust after bound k with its 5 % and 95 % quantiles."""
+    i = ROBOTS.index(robot)
+    return [plan.trust[k - 1, i], plan.bands[0, k - 1, i], plan.bands[3, k - 1, i]]
+
+
+def test_a_frame_has_a_point_per_cell(result, centers):
+    frame = path_frame(result)
+    assert frame.crs.to_epsg() == 4326
+    assert frame["bound"].tolist() == list(range(len(result.path)))
+    assert list(zip(frame["row"], frame["col"], strict=True)) == result.path
+    np.testing.assert_array_equal(frame[["x", "y"]], centers)
+    degrees = np.transpose(TO_DEGREES.transform(*centers.T))
+    found = np.column_stack([frame.geometry.x, frame.geometry.y])
+    np.testing.assert_allclose(found, degrees, rtol=0.0, atol=1e-10)
+    for robot in ROBOTS:
+        names = [f"trust_{robot}{end}" for end in ("", "_low", "_high")]
+        assert frame.loc[0, names].isna().all()
+        for k in range(1, len(frame)):
+            np.testing.assert_array_equal(frame.loc[k, names], trust_of(result.plan, k, robot))
+
+
+def test_a_frame_may_be_in_another_crs_or_in_none(result, nowhere, centers):
+    own = path_frame(result.plan, result.workspace, crs=None)
+    assert own.crs.to_epsg() == 32616
+    np.testing.assert_array_equal(own.get_coordinates(), centers)
+    assert path_frame(result, crs=32617).crs.to_epsg() == 32617
+    bare = path_frame(result.plan, nowhere.workspace, crs=None)
+    assert bare.crs is None
+    np.testing.assert_array_equal(bare.get_coordinates(), centers)
+    with pytest.raises(TrustboError, match=r"unknown crs 'EPSG:0'; give e\.g\. 'EPSG:4326'"):
+        path_frame(result, crs="EPSG:0")
+    with pytest.raises(TrustboError, match="only a workspace made from a terrain has a place"):
+        path_frame(nowhere)
+
+
+def test_geojson_is_in_degrees_on_the_right_place(result, centers, tmp_path):
+    write_path(tmp_path / "path.geojson", result)
+    collection = json.loads((tmp_path / "path.geojson").read_text())
+    assert set(collection) == {"type", "features"}  # RFC 7946 knows no "crs"
+    line, *points = collection["features"]
+    assert line["geometry"]["type"] == "LineString"
+    assert {point["geometry"]["type"] for point in points} == {"Point"}
+    positions = line["geometry"]["coordinates"]
+    assert [point["geometry"]["coordinates"] for point in points] == positions
+    back = Transformer.from_crs(4326, 32616, always_xy=True).transform(*np.transpose(positions))
+    np.testing.assert_allclose(np.transpose(back), centers, atol=2e-3)  # 1e-8 degree is 1 mm
+    facts = line["properties"]
+    assert (facts["name"], facts["bounds"]) == ("most trustworthy path", len(points) - 1)
+    assert facts["value"] == pytest.approx(result.value)
+    length = np.hypot(*np.diff(centers, axis=0).T).sum()
+    assert facts["length_m"] == pytest.approx(length)
+    assert points[0]["properties"] == {"bound": 0, "cell": [2, 0]}
+    for k, (point, cell) in enumerate(zip(points, result.path, strict=True)):
+        said = point["properties"]
+        assert (said["bound"], said["cell"]) == (k, list(cell))
+        for robot in ROBOTS if k else ():
+            found = [said[f"trust_{robot}{end}"] for end in ("", "_low", "_high")]
+            assert found == trust_of(result.plan, k, robot)
+
+
+def test_gpx_is_a_route_over_the_ground(result, centers, tmp_path):
+    write_path(tmp_path / "path.gpx", result.plan, result.workspace)
+    gpx = gpxpy.parse((tmp_path / "path.gpx").read_text(), version="1.1")
+    assert gpx.version == "1.1"
+    (route,) = gpx.routes
+    assert route.name == "most trustworthy path"
+    assert [point.name for point in route.points] == [str(k) for k in range(len(centers))]
+    lon, lat = TO_DEGREES.transform(*centers.T)
+    np.testing.assert_allclose([p.longitude for p in route.points], lon, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose([p.latitude for p in route.points], lat, rtol=0.0, atol=1e-8)
+    dem = result.workspace.terrain["dem"].values  # 1 m pixels, the centre is a corner of four
+    for point, (row, col) in zip(route.points, result.path, strict=True):
+        corner = dem[30 * row + 14 : 30 * row + 16, 30 * col + 14 : 30 * col + 16]
+        assert corner.min() - 0.01 <= point.elevation <= corner.max() + 0.01
+    trust, low, high = trust_of(result.plan, 1, "r1")
+    said = f"r1 {trust:.2f} ({low:.2f} to {high:.2f}), r2 "
+    assert route.points[1].description.startswith(said)
+    assert route.points[0].description == "start"
+
+
+def test_gpx_says_no_elevation_where_the_ground_is_not_known(result, nowhere, tmp_path):
+    lost = result.workspace.terrain.copy()
+    lost["dem"] = lost["dem"].where(lost["x"] > 380030.0)  # the first column of cells
+    write_path(tmp_path / "path.gpx", result.plan, replace(result.workspace, terrain=lost))
+    (route,) = gpxpy.parse((tmp_path / "path.gpx").read_text()).routes
+    known = [point.elevation is not None for point in route.points]
+    assert known == [col > 0 for _, col in result.path]
+    placed = replace(nowhere.workspace, grid=result.workspace.grid)
+    write_path(tmp_path / "path.gpx", result.plan, placed)
+    assert "<ele>" not in (tmp_path / "path.gpx").read_text()
+
+
+def geometry(blob):
+    """A GeoPackage's geometry: a header, by whose flags an envelope follows, then WKB."""
+    magic, version, flags, srs = struct.unpack("<2sBBi", blob[:8])
+    assert (magic, version, flags & 1) == (b"GP", 0, 1)
+    doubles = {0: 0, 1: 4, 2: 6, 3: 6, 4: 8}[flags >> 1 & 7]
+    return srs, shapely.from_wkb(blob[8 + 8 * doubles :])
+
+
+def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, centers, tmp_path):
+    write_path(tmp_path / "path.gpkg", result)
+    assert [file.name for file in tmp_path.iterdir()] == ["path.gpkg"]
+    base = sqlite3.connect(tmp_path / "path.gpkg")
+    base.row_factory = sqlite3.Row
+    layers = base.execute("SELECT table_name, data_type FROM gpkg_contents").fetchall()
+    assert {tuple(layer) for layer in layers} == {("path", "features"), ("bounds", "features")}
+    kinds = base.execute("SELECT table_name, geometry_type_name FROM gpkg_geometry_columns")
+    assert {tuple(k) for k in kinds} == {("path", "LINESTRING"), ("bounds", "POINT")}
+    (line,) = base.execute("SELECT * FROM path").fetchall()
+    srs, way = geometry(line["geom"])
+    place = base.execute(
+        "SELECT organization_coordsys_id AS code FROM gpkg_spatial_ref_sys WHERE srs_id = ?", [srs]
+    ).fetchone()
+    assert place["code"] == 32616
+    np.testing.assert_array_equal(way.coords, centers)
+    assert line["bounds"] == len(centers) - 1
+    assert line["value"] == pytest.approx(result.value)
+    points = base.execute("SELECT * FROM bounds ORDER BY bound").fetchall()
+    base.close()
+    for k, (point, center, cell) in enumerate(zip(points, centers, result.path, strict=True)):
+        np.testing.assert_array_equal(geometry(point["geom"])[1].coords, [center])
+        assert (point["bound"], point["row"], point["col"]) == (k, *cell)
+        found = [point[f"trust_r2{end}"] for end in ("", "_low", "_high")]
+        assert found == (trust_of(result.plan, k, "r2") if k else [None] * 3)
+
+
+def test_a_table_has_degrees_where_there_are_any(result, nowhere, centers, tmp_path):
+    write_path(tmp_path / "path.csv", result)
+    write_path(tmp_path / "bare.csv", result.plan, nowhere.workspace)
+    tables = {}
+    for name in ("path", "bare"):
+        with (tmp_path / f"{name}.csv").open(newline="") as stream:
+            tables[name] = list(csv.DictReader(stream))
+    lon, lat = TO_DEGREES.transform(*centers.T)
+    for k, row in enumerate(tables["path"]):
+        place = float(row.pop("longitude")), float(row.pop("latitude"))
+        np.testing.assert_allclose(place, (lon[k], lat[k]), rtol=0.0, atol=1e-10)
+        assert (float(row["x"]), float(row["y"])) == tuple(centers[k])
+        found = [row[f"trust_r3{end}"] for end in ("", "_low", "_high")]
+        if k:
+            assert [float(f) for f in found] == trust_of(result.plan, k, "r3")
+        else:
+            assert found == ["", "", ""]
+    assert tables["bare"] == tables["path"]
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, tmp_path):
+    plan, workspace = result.plan, result.workspace
+    choices = r"choose one of \.geojson, \.gpx, \.gpkg, \.csv"
+    for name, suffix in (("path.kml", r"\.kml"), ("path", "")):
+        with pytest.raises(TrustboError, match=f"unknown suffix '{suffix}'; {choices}"):
+            write_path(tmp_path / name, result)
+    for name in ("path.geojson", "path.gpx", "path.gpkg"):
+        with pytest.raises(TrustboError, match=r"has a place on Earth; use Workspace\.from_t"):
+            write_path(tmp_path / name, nowhere)
+    with pytest.raises(TrustboError, match="a plan does not say where it is; give the workspace"):
+        write_path(tmp_path / "path.csv", plan)
+    alone = tb.Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5))
+    with pytest.raises(ShapeError, match=r"the plan has 3 robots, the workspace \('r1',\)"):
+        write_path(tmp_path / "path.csv", plan, alone)
+    small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
+    with pytest.raises(TrustboError, match=r"path\[0\] \(2, 0\) is outside the grid of 2 rows"):
+        write_path(tmp_path / "path.csv", plan, small)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "path.gpkg").mkdir()
+    with pytest.raises(TrustboError, match=r"cannot write '.*path\.gpkg': it is a folder"):
+        write_path(tmp_path / "path.gpkg", plan, workspace)
+
+
+def test_a_file_is_replaced_whole(result, tmp_path):
+    for suffix in ("geojson", "gpx", "gpkg", "csv"):
+        file = tmp_path / f"path.{suffix.upper()}"
+        file.write_text("an older file " * 100_000)
+        write_path(file, result)
+        assert b"an older file" not in file.read_bytes()
+    assert len(list(tmp_path.iterdir())) == 4

@@ -1,0 +1,148 @@
+"""GeoTIFF, read back by tifffile and by GDAL."""
+
+import dataclasses
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+import rasterio
+import tifffile
+import xarray as xr
+
+import trustbo as tb
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.export import write_geotiff
+
+
+def geokey(page, number):
+    """A key of the GeoTIFF directory, whose entries are (key, place, count, value)."""
+    directory = np.reshape(page.tags["GeoKeyDirectoryTag"].value, (-1, 4))
+    return int(directory[directory[:, 0] == number, 3][0])
+
+
+def test_each_map_is_a_band_where_it_belongs(result, maps, tmp_path):
+    path = tmp_path / "maps.tif"
+    write_geotiff(path, maps, result.workspace, style=False)
+    assert [file.name for file in tmp_path.iterdir()] == ["maps.tif"]
+    with tifffile.TiffFile(path) as tiff:
+        page = tiff.pages[0]
+        values = page.asarray()
+        assert values.dtype == np.float32
+        np.testing.assert_array_equal(values, maps.to_dataarray().values.astype(np.float32))
+        assert np.isnan(values[:, 0, 0]).all()
+        assert np.isfinite(values[:, 2, 3]).all()
+        assert page.tags["ModelPixelScaleTag"].value == (30.0, 30.0, 0.0)
+        # Pixel (0, 0) begins at the north-western corner.
+        assert page.tags["ModelTiepointTag"].value == (0.0, 0.0, 0.0, 380000.0, 5225000.0, 0.0)
+        assert page.tags["GDAL_NODATA"].value == "nan"
+        assert geokey(page, 3072) == 32616  # ProjectedCRS: UTM zone 16N
+        assert geokey(page, 1025) == 1  # RasterPixelIsArea
+        items = ET.fromstring(page.tags["GDAL_METADATA"].value).findall("Item")
+    names = [item.text for item in items if item.get("role") == "description"]
+    assert names == list(maps.data_vars)
+    texts = {int(i.get("sample")): i.text for i in items if i.get("name") == "long_name"}
+    assert texts[0] == "mean expected trust"
+    assert texts[3] == "traversability, 0 worst, 1 best"
+
+
+def test_gdal_finds_the_terrain_s_place(result, maps, tmp_path):
+    write_geotiff(tmp_path / "maps.tif", maps, result.workspace)
+    with rasterio.open(tmp_path / "maps.tif") as source:
+        assert source.crs.to_epsg() == 32616
+        assert source.bounds == pytest.approx(result.workspace.terrain.rio.bounds())
+        assert source.descriptions == tuple(maps.data_vars)
+        assert np.isnan(source.nodata)
+        row, col = result.path[-1]
+        ((value, *_),) = source.sample([result.workspace.grid.center((row, col))])
+        assert value == np.float32(maps["trust_mean"].values[row, col])
+
+
+def test_one_map_is_one_band_however_its_dims_are_ordered(result, tmp_path):
+    path = tmp_path / "new" / "trust.TIF"
+    write_geotiff(path, result.trust_map.transpose("col", "row"), result.workspace)
+    np.testing.assert_array_equal(tifffile.imread(path), result.trust_map.astype(np.float32))
+    write_geotiff(path, result.workspace.passable.rename(None), result.workspace)
+    with rasterio.open(path) as source:
+        assert source.descriptions == ("map",)
+        assert source.read(1).sum() == 11.0
+    assert {file.name for file in path.parent.iterdir()} == {"trust.TIF", "trust.qml"}
+
+
+def test_a_small_cloud_optimized_geotiff_holds_the_same(result, maps, tmp_path):
+    write_geotiff(tmp_path / "maps.tif", maps, result.workspace, cog=True)
+    assert {file.name for file in tmp_path.iterdir()} == {"maps.tif", "maps.qml"}
+    with rasterio.open(tmp_path / "maps.tif") as source:
+        assert source.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert source.descriptions == tuple(maps.data_vars)
+        assert source.tags(1)["long_name"] == "mean expected trust"
+        np.testing.assert_array_equal(source.read(), maps.to_dataarray().astype(np.float32))
+        assert source.bounds == pytest.approx(result.workspace.terrain.rio.bounds())
+
+
+def test_a_large_one_is_laid_out_for_the_cloud(result, tmp_path):
+    rng, shape = np.random.default_rng(0), (600, 1100)
+    grid = dataclasses.replace(result.workspace.grid, shape=shape, cell_width=3.0, cell_height=2.0)
+    workspace = dataclasses.replace(result.workspace, grid=grid)
+    cost = xr.DataArray(rng.random(shape), dims=("row", "col"), name="cost")
+    write_geotiff(tmp_path / "cost.tif", cost, workspace, cog=True, style=False)
+    assert b"LAYOUT=IFDS_BEFORE_DATA" in (tmp_path / "cost.tif").read_bytes()[:300]
+    with tifffile.TiffFile(tmp_path / "cost.tif") as tiff:
+        full, *overviews = tiff.pages
+        assert full.is_tiled
+        assert full.tags["ModelPixelScaleTag"].value == (3.0, 2.0, 0.0)
+        assert full.shape == shape
+        assert [page.shape for page in overviews] == [(300, 550), (150, 275)]
+        assert all(page.is_tiled and page.is_reduced for page in overviews)
+        # Directories first, full size first; then the data, coarse to fine.
+        offsets = [page.offset for page in tiff.pages]
+        assert offsets == sorted(offsets)
+        first = [min(page.dataoffsets) for page in tiff.pages]
+        assert first == sorted(first, reverse=True)
+        assert max(offsets) < min(first)
+        np.testing.assert_array_equal(full.asarray(), cost.astype(np.float32))
+        means = cost.values.reshape(300, 2, 550, 2).mean((1, 3))
+        np.testing.assert_allclose(overviews[0].asarray(), means, rtol=1e-6)
+
+
+def test_what_is_no_map_of_the_cells_is_refused(result, maps, nowhere, tmp_path):
+    workspace, path = result.workspace, tmp_path / "maps.tif"
+    with pytest.raises(TrustboError, match="only a workspace made from a terrain has a place on"):
+        write_geotiff(path, maps, nowhere.workspace)
+    with pytest.raises(ShapeError, match=r"map 'awareness' has dims \('robot', .*\(row, col\)"):
+        write_geotiff(path, workspace.awareness, workspace)
+    with pytest.raises(ShapeError, match=r"map 'trust_mean' has \(3, 3\) cells, .* \(3, 4\)"):
+        write_geotiff(path, maps.isel(col=slice(3)), workspace)
+    with pytest.raises(ShapeError, match="there are no maps"):
+        write_geotiff(path, xr.Dataset(), workspace)
+    with pytest.raises(TrustboError, match="map 'trust' must hold numbers; got <U"):
+        write_geotiff(path, result.trust_map.astype(str), workspace)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_is_refused_before_anything_is_written(result, maps, tmp_path):
+    (tmp_path / "folder.tif").mkdir()
+    (tmp_path / "styled.qml").mkdir()
+    (tmp_path / "text").write_text("")
+    for name, message in (
+        ("folder.tif", r"cannot write '.*folder\.tif': it is a folder; name a file in it"),
+        ("styled.tif", r"cannot write '.*styled\.qml': it is a folder"),
+        ("text/maps.tif", r"'.*text' is a file"),
+        ("maps.png", r"maps\.png' must end in \.tif or \.tiff"),
+    ):
+        with pytest.raises(TrustboError, match=message):
+            write_geotiff(tmp_path / name, maps, result.workspace)
+    names = {"folder.tif", "styled.qml", "text"}
+    assert {file.name for file in tmp_path.iterdir()} == names
+    write_geotiff(tmp_path / "styled.tif", maps, result.workspace, style=False)
+
+
+def test_a_workspace_of_a_lazy_terrain_keeps_its_place_when_saved(result, tmp_path):
+    """Then the grid alone knows it; and the terrain alone in files of older versions."""
+    lazy = dataclasses.replace(result.workspace, terrain=None, pixels=None)
+    old = dataclasses.replace(
+        result.workspace, grid=dataclasses.replace(result.workspace.grid, crs=None)
+    )
+    for workspace in (lazy, old):
+        tb.export.write_geotiff(tmp_path / "trust.tif", result.trust_map, workspace)
+        with rasterio.open(tmp_path / "trust.tif") as source:
+            assert source.crs.to_epsg() == 32616
