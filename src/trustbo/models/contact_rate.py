@@ -43,7 +43,20 @@ class ContactRate(dist.Distribution):
         lag: float = 0.0,
         shared: bool = False,
     ) -> None:
-        """Args as in `TrustModel.__call__`; `noise` and `pilot` are (bound, mission, robot)."""
+        """The distribution for given parameters and awareness.
+
+        Args:
+            params: Parameters without leading axes.
+            awareness: Shape (mission, bound, robot, feature).
+            exposure: Ticks, shape (mission, bound, robot); the beta-binomial family needs them.
+            noise: What latent trust is made of where it cannot be integrated out, standard normal,
+                shape (bound, mission, robot).
+            weight: Of each mission's log density, shape (mission,).
+            pilot: See `observation.Observed`; of the shape of `noise`.
+            observation: `"gaussian"`, `"censored"` or `"beta_binomial"`.
+            lag: 0 where rates measure trust, 1 where they measure its change.
+            shared: No rate is missing before the last of a mission.
+        """
         self.params, self.awareness, self.exposure = params, awareness, exposure
         self.noise, self.weight, self.pilot = noise, weight, pilot
         self.observation, self.lag, self.shared = observation, lag, shared
@@ -61,7 +74,7 @@ class ContactRate(dist.Distribution):
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
-        """Contact rates, shape (*sample_shape, mission, bound, robot)."""
+        """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
         keys = jax.random.split(key, sample_shape)
 
         def one(key: Array) -> Array:

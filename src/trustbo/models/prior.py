@@ -77,7 +77,15 @@ def prior_predictive(
 def sample_prior(
     model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
 ) -> Params:
-    """Draws of the parameters from the prior, leading axis (draw,)."""
+    """Draws of the parameters from the prior, leading axis (draw,).
+
+    Args:
+        model: The trust model.
+        n_features: How many features the awareness has.
+        n_draws: How many draws.
+        seed: Same seed, same draws.
+        n_robots: How many robots, of models whose robots have parameters of their own.
+    """
     return params_from(draw_sites(model, (n_robots, n_features), n_draws, seed), model.x0)
 
 

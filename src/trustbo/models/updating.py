@@ -64,6 +64,10 @@ def moment_matched(params: TrustParams, priors: Priors) -> Priors:
 
     Each parameter keeps its own moments only; what the posterior knew of how they go together, and
     its skewness, is lost, and so is exactness: off by up to 1.15 posterior sd over 20 missions.
+
+    Args:
+        params: Draws of the last posterior, leading axis (draw,).
+        priors: The priors it came from, for what is not learned.
     """
     flat = params.flat()
     with jax.enable_x64(True):

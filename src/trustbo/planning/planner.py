@@ -262,9 +262,19 @@ class Planner(Setting):
         per_robot: bool = False,
         x0: ArrayLike | None = None,
     ) -> xr.DataArray:
-        """Largest expected trust with which each cell can be reached, dims (row, col).
+        """Largest expected trust with which each cell can be reached; see `maps.trust_map`.
 
-        See `maps.trust_map`.
+        Args:
+            params: Parameters of any model; of draws, or a posterior, every draw's map.
+            per_robot: One map per robot instead of the team's.
+            x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
+
+        Returns:
+            DataArray (row, col), or (robot, row, col), with a leading (draw,) for draws; NaN where
+            no robot can go.
+
+        Raises:
+            ShapeError: Parameters of other robots or features.
         """
         return maps.trust_map(self, params, per_robot=per_robot, x0=x0)
 
@@ -275,7 +285,7 @@ class Planner(Setting):
         per_robot: bool = False,
         x0: ArrayLike | None = None,
     ) -> xr.DataArray:
-        """The paper's cost f = 1 - sigma(trust) of reaching each cell; as `trust_map`."""
+        """The cost f = 1 - sigma(trust) of reaching each cell, equation (6); as `trust_map`."""
         return maps.cost_map(self, params, per_robot=per_robot, x0=x0)
 
     def trust_summary(
@@ -286,7 +296,14 @@ class Planner(Setting):
         n_draws: int = 200,
         seed: int = 0,
     ) -> xr.Dataset:
-        """Mean and sd over draws of the trust map, and the mean cost; see `maps.trust_summary`."""
+        """Dataset of `mean` and `sd` of the trust map, and the mean `cost`, over draws.
+
+        Args:
+            posterior: What `fit` returned, or draws with leading axis (draw,).
+            per_robot: One map per robot instead of the team's: (robot, row, col), not (row, col).
+            n_draws: How many draws, taken at random without replacement.
+            seed: Same seed, same draws.
+        """
         return maps.trust_summary(self, posterior, per_robot=per_robot, n_draws=n_draws, seed=seed)
 
     def path_posterior(

@@ -1,0 +1,88 @@
+"""How Sphinx builds the site (`make docs`); neither it nor a reader needs the network."""
+
+import shutil
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE / "extensions"))
+
+project = "trustbo"
+author = "The trustbo developers"
+project_copyright = f"2026, {author}"
+version = release = installed_version("trustbo")
+
+extensions = [
+    "mathml",
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_copybutton",
+]
+exclude_patterns = ["_build", "extensions"]
+
+# Pages are Markdown; notebooks are kept executed, and `make test` runs them again.
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+nb_execution_mode = "off"
+nb_merge_streams = True
+suppress_warnings = ["mystnb.unknown_mime_type"]  # widgets, which have a plain form beside
+
+# Docstrings are Google's. `Attributes:` as a list, lest a field be described twice.
+napoleon_numpy_docstring = False
+napoleon_custom_sections = [("Attributes", "params_style")]
+napoleon_use_rtype = False
+default_role = "code"  # docstrings quote names in single backticks
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+autoclass_content = "both"  # what a class takes is often said by its `__init__`
+add_module_names = False
+python_maximum_signature_line_length = 120
+python_display_short_literal_types = True
+
+html_theme = "furo"
+html_title = f"trustbo {version}"
+html_math_renderer = "mathml"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sphinx = False
+pygments_style = "friendly"
+pygments_dark_style = "github-dark"
+copybutton_prompt_text = r"\$ "
+copybutton_prompt_is_regexp = True
+
+
+def copy_notebooks(app: Sphinx) -> None:
+    """Put the notebooks where Sphinx finds them: it reads nothing outside its folder."""
+    target = HERE / "notebooks"
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    for notebook in sorted((HERE.parent / "notebooks").glob("*.ipynb")):
+        shutil.copy2(notebook, target)
+
+
+def point_to_copies(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Links to notebooks hold in the repository; on the site, they lead to its copies."""
+    source[0] = source[0].replace("../notebooks/", "notebooks/").replace("../docs/", "../")
+
+
+def drop_words_of_python(
+    app: Sphinx, kind: str, name: str, value: object, options: Any, lines: list[str]
+) -> None:
+    """Leave out what Python itself says of a constant's type, and of making a named tuple."""
+    if kind == "data":
+        lines.clear()
+    lines[:] = [line for line in lines if not line.startswith("Create new instance of")]
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the above."""
+    app.connect("builder-inited", copy_notebooks)
+    app.connect("source-read", point_to_copies)
+    app.connect("autodoc-process-docstring", drop_words_of_python)
