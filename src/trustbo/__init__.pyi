@@ -1,4 +1,4 @@
-from . import export, models, planning, plots, simulation, study, terrain
+from . import export, models, planning, plots, report, simulation, study, terrain
 from .campaign import Campaign
 from .data import Bound, Mission, Robot, Team
 from .errors import PosteriorError, ShapeError, TerrainError, TrustboError
@@ -30,6 +30,7 @@ __all__ = [
     "models",
     "planning",
     "plots",
+    "report",
     "resume",
     "simulation",
     "study",

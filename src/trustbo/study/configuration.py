@@ -9,6 +9,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
+import yaml
+
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.loop import iterate
 from trustbo.models.sampling import SAMPLERS, require_sampler
@@ -148,10 +150,6 @@ def read_study(path: str | PathLike[str]) -> Study:
     Raises:
         TrustboError: No such file, no YAML, or what `Study` refuses.
     """
-    try:
-        import yaml
-    except ModuleNotFoundError:
-        raise TrustboError('studies in YAML need PyYAML: pip install "trustbo[study]".') from None
     file = Path(path)
     try:
         configuration = yaml.safe_load(file.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""The command line: what it writes, what it refuses, and in which words."""
+"""`trustbo run` and `demo`: what they write, what they refuse, and in which words."""
 
 import json
 
@@ -7,56 +7,33 @@ import pandas as pd
 import pytest
 import rasterio
 import xarray as xr
-from typer.testing import CliRunner
-
-from trustbo.cli import app
-from trustbo.terrain import synthetic_terrain
 
 
-def invoke(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
-
-
-@pytest.fixture(scope="module")
-def rasters(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rasters")
-    terrain = synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
-    for name in ("dem", "dsm"):
-        terrain[name].astype("float32").rio.to_raster(folder / f"{name}.tif")
-    return "--dem", folder / "dem.tif", "--dsm", folder / "dsm.tif"
-
-
-RUN = ("--start", "2,0", "--goal", "0,2", "--shape", "3,3")
-
-
-@pytest.fixture(scope="module")
-def run_folder(rasters, tmp_path_factory):
-    out = tmp_path_factory.mktemp("runs") / "mine"
-    done = invoke("run", *rasters, *RUN, "--iterations", 2, "--seed", 1, "--out", out)
-    assert done.exit_code == 0, done.output
-    return out, done
-
-
-def test_run_writes_every_file_and_says_where(run_folder):
-    out, done = run_folder
+def test_run_writes_every_file_and_says_where(finished):
+    out, done = finished
     names = {path.name for path in out.iterdir()}
     assert names >= {
         "posterior.nc",
         "history.csv",
         "maps.png",
         "terrain.png",
-        "trust_map.tif",
+        "report.html",
+        "maps.tif",
+        "maps.qml",
         "path.geojson",
         "result.json",
+        "campaign.json",
     }
-    assert f"results are in {out}/" in done.output
-    assert "mission  status  contact  objective  R-hat  path" in done.output
+    assert "trust_map.tif" not in names
+    assert f"results are in {out}/: report.html, maps.png, terrain.png, maps.tif" in done.output
+    assert "mission  status  contact  objective  k-hat  path" in done.output
+    assert "stopped: n_iterations" in done.output
     assert "recommended: 2,0 " in done.output
     assert (out / "maps.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_run_s_files_say_the_same(run_folder):
-    out, _ = run_folder
+def test_run_s_files_say_the_same(finished):
+    out, _ = finished
     history = pd.read_csv(out / "history.csv")
     assert list(history["iteration"]) == [1, 2]
     record = json.loads((out / "result.json").read_text())
@@ -66,6 +43,26 @@ def test_run_s_files_say_the_same(run_folder):
     posterior.close()
     line = json.loads((out / "path.geojson").read_text())["features"][0]
     assert len(line["geometry"]["coordinates"]) == len(record["path"])
+    assert "after 2 missions" in (out / "report.html").read_text()
+
+
+def test_run_passes_every_choice_on(invoke, flags, tmp_path):
+    done = invoke(
+        *("run", *flags, "--iterations", 9, "--awareness", "belief", "--replan", "bound"),
+        *("--max-bounds", "shortest", "--objective", "mean", "--stop-regret", 0.9, "--quiet"),
+        *("--out", tmp_path),
+    )
+    assert done.exit_code == 0, done.output
+    record = json.loads((tmp_path / "result.json").read_text())
+    chosen = {
+        "awareness": "belief",
+        "replan": "bound",
+        "max_bounds": "shortest",
+        "objective": "mean",
+    }
+    assert {name: record["settings"][name] for name in chosen} == chosen
+    assert record["stop_reason"].startswith("regret_bound: P(regret <= 0.9)")
+    assert record["n_missions"] == 3  # the fewest that the rule asks for
 
 
 @pytest.mark.parametrize(
@@ -76,27 +73,30 @@ def test_run_s_files_say_the_same(run_folder):
         ("bcts", 3005, "20,4", ("19,0", "0,3"), (-127.63, 50.67)),
     ],
 )
-def test_run_on_real_terrain(name, epsg, shape, ends, place, real_terrain, tmp_path):
+def test_run_on_real_terrain(name, epsg, shape, ends, place, invoke, real_terrain, tmp_path):
     dem, dsm = real_terrain(name)
     done = invoke(
         *("run", "--dem", dem, "--dsm", dsm, "--shape", shape, "--start", ends[0]),
-        *("--goal", ends[1], "--iterations", 1, "--out", tmp_path, "--quiet"),
+        *("--goal", ends[1], "--iterations", 1, "--sampler", "exact", "--out", tmp_path),
+        "--quiet",
     )
     assert done.exit_code == 0, done.output
-    with rasterio.open(tmp_path / "trust_map.tif") as source:
+    with rasterio.open(tmp_path / "maps.tif") as source:
         assert source.crs.to_epsg() == epsg
         assert f"{source.height},{source.width}" == shape
         assert np.isfinite(source.read(1)).any()
     line = json.loads((tmp_path / "path.geojson").read_text())["features"][0]
     coordinates = np.array(line["geometry"]["coordinates"])
     np.testing.assert_allclose(coordinates.mean(0), place, atol=0.02)
+    assert (tmp_path / "report.html").stat().st_size < 3e6
 
 
-def test_demo_runs_on_the_rasters_it_writes(tmp_path):
-    done = invoke("demo", "--iterations", 1, "--out", tmp_path / "demo", "--quiet")
+def test_demo_runs_on_the_rasters_it_writes(invoke, tmp_path):
+    out = tmp_path / "demo"
+    done = invoke("demo", "--iterations", 1, "--sampler", "exact", "--out", out, "--quiet")
     assert done.exit_code == 0, done.output
-    assert (tmp_path / "demo" / "dem.tif").exists()
-    assert (tmp_path / "demo" / "maps.png").exists()
+    assert {"dem.tif", "dsm.tif", "maps.png", "report.html"} <= {p.name for p in out.iterdir()}
+    assert "mission  status" not in done.output
 
 
 @pytest.mark.parametrize(
@@ -107,6 +107,14 @@ def test_demo_runs_on_the_rasters_it_writes(tmp_path):
         (("--start", "2;0"), "--start must be two whole numbers as 9,0; got '2;0'"),
         (("--policy", "bold"), "unknown policy 'bold'; choose one of greedy, optimistic, thompson"),
         (("--objective", "best"), "unknown objective 'best'; choose one of terminal, mean"),
+        (("--model", "own"), "unknown model 'own'; choose one of pooled, hierarchical, coupled"),
+        (("--sampler", "gibbs"), "unknown sampler 'gibbs'; choose one of nuts, exact, joint"),
+        (("--observation", "odd"), "unknown observation 'odd'; choose one of gaussian, censored"),
+        (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
+        (("--replan", "tick"), "unknown replan 'tick'; choose one of mission, bound"),
+        (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
+        (("--stop-regret", "2"), "RegretBound.eps must be in (0, 1); got 2.0"),
+        (("--model", "hierarchical"), 'sampler "exact" needs Gaussian observations, and Pooled'),
         (("--iterations", "0"), "n_iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),
         (("--seed", "-1"), "seed must be a whole number from 0 on; got -1"),
@@ -118,9 +126,11 @@ def test_demo_runs_on_the_rasters_it_writes(tmp_path):
         (("--shape", "100,100"), "needs at least 2 x 2 pixels per cell"),
     ],
 )
-def test_bad_input_is_one_line_exit_2_and_nothing_written(arguments, message, rasters, tmp_path):
+def test_bad_input_is_one_line_exit_2_and_nothing_written(
+    arguments, message, invoke, flags, tmp_path
+):
     out = tmp_path / "never"
-    done = invoke("run", *rasters, *RUN, "--out", out, *arguments)
+    done = invoke("run", *flags, "--out", out, *arguments)
     assert done.exit_code == 2
     assert done.stderr.startswith("error: ")
     assert message in done.stderr
@@ -128,18 +138,12 @@ def test_bad_input_is_one_line_exit_2_and_nothing_written(arguments, message, ra
     assert not out.exists()
 
 
-def test_demo_writes_nothing_on_bad_input(tmp_path):
+def test_demo_writes_nothing_on_bad_input(invoke, tmp_path):
     done = invoke("demo", "--policy", "bold", "--out", tmp_path / "never")
     assert done.exit_code == 2
     assert not (tmp_path / "never").exists()
 
 
-def test_debug_shows_the_traceback(rasters, tmp_path):
-    done = invoke("run", *rasters, *RUN, "--policy", "bold", "--out", tmp_path, "--debug")
+def test_debug_shows_the_traceback(invoke, flags, tmp_path):
+    done = invoke("run", *flags, "--policy", "bold", "--out", tmp_path, "--debug")
     assert isinstance(done.exception, ValueError)
-
-
-def test_help_teaches():
-    assert "trustbo run --dem dem.tif" in invoke("run", "--help").output
-    for command in ("run", "demo"):
-        assert command in invoke("--help").output

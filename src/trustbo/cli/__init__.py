@@ -1,0 +1,5 @@
+"""The command line: `trustbo demo`, `run`, `resume`, `report`, `export` and `study`."""
+
+from trustbo.cli.program import app, main
+
+__all__ = ["app", "main"]

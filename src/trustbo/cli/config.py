@@ -1,0 +1,91 @@
+"""`--config`: flags from a YAML file."""
+
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from trustbo.cli.errors import fail
+from trustbo.errors import TrustboError
+
+_FILES = ("dem", "dsm")
+"""Paths that are relative to the file, not to where the program is run."""
+_NOT_IN_FILE = ("config",)
+
+
+def read_config(context: typer.Context, path: Path | None) -> Path | None:
+    """Make what a file says the command's defaults, before its other flags are looked at."""
+    if path is not None:
+        known = [str(p.name) for p in context.command.params if p.name not in _NOT_IN_FILE]
+        try:
+            context.default_map = flags_of(path, known)
+        except TrustboError as error:
+            fail(error, 2)
+    return path
+
+
+def flags_of(path: Path, known: Iterable[str]) -> dict[str, str]:
+    """Flags by name, as they would be typed.
+
+    Args:
+        path: A YAML file, a mapping of long flags (with dashes or underscores) to values.
+        known: The flags there are, with underscores.
+
+    Raises:
+        TrustboError: No such file, no YAML, a flag there is not, or a value that is no value.
+    """
+    flags: dict[str, str] = {}
+    for key, value in _read(path).items():
+        name = str(key).replace("-", "_")
+        _require_known(path, name, list(known))
+        if name in flags:
+            raise TrustboError(f"{path}: {_flag(name)} is given twice; leave one out.")
+        text = _typed(path, name, value)
+        if text is not None:
+            flags[name] = str(path.parent / text) if name in _FILES else text
+    return flags
+
+
+def _read(path: Path) -> Mapping[Any, Any]:
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise TrustboError(f"cannot read {str(path)!r}: {error.strerror}.") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise TrustboError(f"{str(path)!r} is no YAML: {' '.join(str(error).split())}") from None
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise TrustboError(
+            f"{path} must hold flags and their values, e.g. seed: 1; got {content!r}."
+        )
+    return content
+
+
+def _require_known(path: Path, name: str, known: list[str]) -> None:
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+        choices = [_flag(choice) for choice in near or known]
+        raise TrustboError(
+            f"{path}: unknown flag {_flag(name)!r}; {'did you mean' if near else 'choose one of'} "
+            f"{', '.join(choices)}?"
+        )
+
+
+def _typed(path: Path, name: str, value: object) -> str | None:
+    """A value as it would be typed; None leaves the flag at its default."""
+    if isinstance(value, list | tuple) and all(type(item) is int for item in value):
+        return ",".join(str(item) for item in value)  # a cell as YAML writes pairs
+    if value is None or isinstance(value, str | int | float):  # bool is an int
+        return None if value is None else str(value)
+    raise TrustboError(
+        f"{path}: {_flag(name)} must be a number, a name or a pair [row, col]; got {value!r}."
+    )
+
+
+def _flag(name: str) -> str:
+    return name.replace("_", "-")

@@ -1,0 +1,73 @@
+"""What a campaign's folder gets when it is done, for people and for GIS."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from trustbo.result import Result
+
+
+def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
+    """Write figures, report and maps beside a result, and say where they are.
+
+    Args:
+        result: The result, kept in `out` already.
+        out: The folder.
+        table: Whether to print a row per mission, too.
+
+    Raises:
+        TrustboError: The folder's name belongs to a file.
+    """
+    use_no_screen()
+    from trustbo import plots
+    from trustbo.report import write_report
+
+    written = ["report.html", "maps.png"]
+    write_figure(out / "maps.png", plots.trust_maps(result))
+    on_terrain = result.workspace.terrain is not None
+    if on_terrain and result.workspace.pixels is not None:
+        write_figure(out / "terrain.png", plots.terrain_maps(result.workspace))
+        written.append("terrain.png")
+    if on_terrain:  # else there is no place on earth to export to
+        from trustbo.export import export_result
+
+        written += [file.name for file in export_result(result, out, ("geotiff", "geojson"))]
+    write_report(out / "report.html", result)
+    if table:
+        _print_table(result)
+    print(f"results are in {out}/: {', '.join(written)},")
+    print(f"posterior.nc, history.csv; in Python: trustbo.load_result({str(out)!r})")
+
+
+def use_no_screen() -> None:
+    """Draw into files, whether or not there is a display."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+
+
+def write_figure(path: Path, axes) -> None:
+    """Write the figure that holds these Axes, and let go of it."""
+    import matplotlib.pyplot as plt
+
+    from trustbo.files import write_file
+
+    figure = axes[0].figure
+    write_file(path, lambda file: figure.savefig(file, dpi=150))
+    plt.close(figure)
+
+
+def _print_table(result: "Result") -> None:
+    """One line per mission, and what was learned."""
+    name, label = ("r_hat", "R-hat") if "r_hat" in result.history else ("k_hat", "k-hat")
+    print(f"mission  status  contact  objective  {label}  path")
+    for i in result.history["iteration"].values:
+        row = result.history.sel(iteration=i)
+        change = "first" if i == 1 else "changed" if row["path_changed"] else "same"
+        print(
+            f"{i:7d}  {row['status'].item():6s}  {row['contact_rate'].item():7.3f}  "
+            f"{row['objective'].item():9.3f}  {row[name].item():5.3f}  {change}"
+        )
+    print(f"stopped: {result.stop_reason}")
+    print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")
+    print(f"objective {result.value:.3f} ({result.settings['objective']})")

@@ -1,0 +1,32 @@
+"""`trustbo report`: a result as one page to read."""
+
+from pathlib import Path
+
+from trustbo.cli import options
+from trustbo.cli.errors import one_line_errors
+from trustbo.cli.outputs import use_no_screen
+
+
+def report(
+    folder: options.Folder,
+    out: options.OutFile = None,
+    title: options.Title = None,
+    debug: options.Debug = False,
+) -> None:
+    """Write a result as one HTML page, with all its figures and tables.
+
+    Example: trustbo report out/demo --out demo.html
+
+    The page needs no network and no other file. Of a campaign that was
+    interrupted it shows what was learned until then.
+    """
+    with one_line_errors(debug):
+        from trustbo.result import load_result
+
+        result = load_result(folder)
+        use_no_screen()
+        from trustbo.report import write_report
+
+        file = folder / "report.html" if out is None else Path(out)
+        write_report(file, result, title=title)
+        print(f"the report is {file}")

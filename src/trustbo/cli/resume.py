@@ -1,0 +1,77 @@
+"""`trustbo resume`: on with a campaign that was interrupted, or is to be longer."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trustbo.cli import options
+from trustbo.cli.errors import one_line_errors
+from trustbo.cli.outputs import write_outputs
+from trustbo.errors import TrustboError, require_whole
+
+if TYPE_CHECKING:
+    from trustbo.simulation import KinematicSimulator
+
+
+def resume(
+    folder: options.Folder,
+    iterations: options.Total = None,
+    stop_regret: options.StopRegret = None,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Go on with a campaign that was interrupted, or with more missions.
+
+    Example: trustbo resume out/demo
+    More missions, 12 in all: trustbo resume out/demo --iterations 12
+
+    What comes out is what would have come out without the interruption. All
+    flags are as the campaign was begun with; only a rule to stop is not kept
+    in the folder, so give --stop-regret again.
+    """
+    with one_line_errors(debug, campaign=folder):
+        if iterations is not None:
+            require_whole("n_iterations", iterations, 1)
+        state = _state(folder)
+        from trustbo.loop import resume as go_on
+        from trustbo.stopping import RegretBound
+
+        stop = None if stop_regret is None else RegretBound(eps=stop_regret)
+        total = iterations or state["notes"]["n_iterations"]
+        if state["n_missions"] >= total and not quiet:
+            print(f"all {state['n_missions']} missions are done; for more, give --iterations.")
+        result = go_on(
+            folder,
+            simulator=_simulator(folder, state["notes"]),
+            n_iterations=total,
+            stop=stop,
+            progress=not quiet,
+        )
+        write_outputs(result, folder, table=not quiet)
+
+
+def _state(folder: Path) -> dict[str, Any]:
+    """What the campaign's folder says of it."""
+    file = folder / "campaign.json"
+    if not file.exists():
+        raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
+    state = json.loads(file.read_text(encoding="utf-8"))
+    name = state["notes"].get("simulator")
+    if name != "KinematicSimulator":
+        raise TrustboError(
+            f"the campaign in {str(folder)!r} was run by {name or 'robots of your own'}, not by "
+            "trustbo run; go on with it in Python: trustbo.resume(folder, simulator=...)."
+        )
+    return state
+
+
+def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
+    """The simulator the campaign was begun with."""
+    from trustbo import archive, records
+    from trustbo.simulation import KinematicSimulator, Sight
+
+    workspace = archive.workspace_from_tree(records.read_tree(folder / "workspace.nc"))
+    sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
+    return KinematicSimulator(
+        workspace, sight=sight, tick=notes["tick"], bounding=notes["bounding"]
+    )

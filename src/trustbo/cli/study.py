@@ -1,0 +1,47 @@
+"""`trustbo study`: many campaigns, on all cores."""
+
+from pathlib import Path
+
+import typer
+
+from trustbo.cli import options
+from trustbo.cli.errors import FAILED, one_line_errors
+from trustbo.cli.outputs import use_no_screen, write_figure
+
+
+def study(
+    config: options.StudyConfig,
+    out: options.Out = Path("out/study"),
+    executor: options.Executor = "loky",
+    workers: options.Workers = None,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Run a study: policies x objectives x models x seeds x terrains, on all cores.
+
+    Example: trustbo study config.yaml --out out/mine
+
+    The folder gets a file for each run, summary.csv (regret, or the plans' value
+    where no truth is known, per policy and mission), and regret.png. Called
+    again, it goes on where it stopped.
+    """
+    use_no_screen()
+    with one_line_errors(debug):
+        from trustbo import plots
+        from trustbo.files import write_text
+        from trustbo.study import axes_of, run_study, summary
+
+        results = run_study(config, out, executor, n_workers=workers, progress=not quiet)
+        known = bool(results["regret"].notnull().any())
+        table = summary(results, variable="regret" if known else "value")
+        write_text(out / "summary.csv", table.to_csv())
+        if known:
+            others = [name for name in axes_of(results) if name != "policy"]
+            axes = plots.regret_curves(results, panels=others[0] if others else None)
+            write_figure(out / "regret.png", axes)
+        if not quiet:
+            print(f"median {'regret' if known else 'value'} after each mission")
+            print(table["median"].unstack("mission").round(4).to_string())
+        print(f"results are in {out}/; in Python: trustbo.study.load_study({str(out)!r})")
+    if results.attrs["n_failed"]:
+        raise typer.Exit(FAILED)

@@ -1,0 +1,77 @@
+"""Figures as images that a page carries in itself."""
+
+import base64
+import io
+import re
+from collections.abc import Callable
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from PIL import Image as Raster
+from PIL import features
+
+from trustbo.report.blocks import Image, Picture
+
+PHONE = 3.55
+"""Width of figures for phones, inches: at 96 CSS pixels each, a little under the screen's."""
+_PIXELS = 96
+_DOTS, _QUALITY = 160, 85
+"""Of what is raster in them, such as hillshades: dots per inch, and how well WebP keeps them."""
+_PNG = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
+_STYLE: dict[Any, Any] = {
+    "svg.fonttype": "path",
+    "svg.hashsalt": "trustbo",
+    "figure.facecolor": "white",
+}
+"""Fonts as outlines, the same on every machine; names of elements the same on every run."""
+
+Draw = Callable[[int | None], Axes | np.ndarray]
+"""Draws with so many panels in a row, or as many as it likes."""
+
+
+def picture(
+    draw: Draw, alt: str, caption: str, *, phone_columns: int = 1, shrink: bool = False
+) -> Picture:
+    """Draw a figure twice, for pages and for phones.
+
+    Args:
+        draw: Draws it, with so many panels in a row.
+        alt: What is seen.
+        caption: What it shows.
+        phone_columns: Panels in a row on phones.
+        shrink: Whether panels get lower as they get narrower on phones, as maps do.
+    """
+    with plt.rc_context(_STYLE):
+        wide, narrow = _figure(draw(None)), _figure(draw(phone_columns))
+        width, height = narrow.get_size_inches()
+        narrow.set_size_inches(PHONE, height * PHONE / width if shrink else height)
+        return Picture(alt, caption, _image(wide), _image(narrow))
+
+
+def _figure(axes: Axes | np.ndarray) -> Figure:
+    first = axes if isinstance(axes, Axes) else axes.ravel()[0]
+    figure = first.get_figure(root=True)
+    return figure  # pyright: ignore[reportReturnType]
+
+
+def _image(figure: Figure) -> Image:
+    file = io.BytesIO()
+    figure.savefig(file, format="svg", dpi=_DOTS, metadata={"Date": None})
+    plt.close(figure)
+    width, height = (round(_PIXELS * inches) for inches in figure.get_size_inches())
+    svg = _PNG.sub(_smaller, file.getvalue().decode("utf-8"))
+    text = base64.b64encode(svg.encode("utf-8")).decode("ascii")
+    return Image(f"data:image/svg+xml;base64,{text}", width, height)
+
+
+def _smaller(png: re.Match[str]) -> str:
+    """The raster in WebP, which every browser reads: a hillshade is a tenth of its PNG."""
+    if not features.check("webp"):
+        return png[0]
+    file = io.BytesIO()
+    with Raster.open(io.BytesIO(base64.b64decode(png[1]))) as raster:
+        raster.save(file, "WEBP", quality=_QUALITY, method=6)
+    return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -1,0 +1,164 @@
+"""The figures of a page, each with what it shows in words."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from trustbo import plots
+from trustbo.models import params_of
+from trustbo.report.blocks import Picture
+from trustbo.report.drawing import picture
+from trustbo.report.numbers import counted, joined, number
+from trustbo.report.tables import labelled_draws
+from trustbo.result import Result
+
+MOST_MAPS = 11
+"""Missions whose maps are shown; of longer campaigns, the first, the last, and some between."""
+MOST_PARAMETERS = 30
+
+
+def trust_maps(result: Result) -> Picture:
+    """The trust map after each mission, and the paths."""
+    n = result.history.sizes["iteration"]
+    shown = np.unique(np.linspace(0, n - 1, min(n, MOST_MAPS)).round().astype(int))
+    some = replace(result, history=result.history.isel(iteration=shown))
+
+    def draw(n_columns: int | None):
+        axes = plots.trust_maps(some, n_columns=n_columns)
+        axes[-1].set_title(f"after {counted(n, 'mission')}", fontsize=9)
+        if n_columns is not None:  # a phone has no room for more
+            axes[0].set_title("mission 1 (prior)", fontsize=9)
+        return axes
+
+    low, high = _ends(result.trust_map)
+    n_changes = int(result.history["path_changed"].sum())
+    caption = (
+        "Expected trust with which each cell can be reached, as each mission's path (white, from "
+        "circle to star) was planned, and after the last. The first map comes from the prior."
+    )
+    if len(shown) < n:
+        caption += f" {len(shown)} of the {n} missions are shown."
+    return picture(
+        draw,
+        f"{len(shown) + 1} maps of expected trust. After the last mission trust goes from {low} to "
+        f"{high}. Over {counted(n, 'mission')} the path changed {counted(n_changes, 'time')}.",
+        caption,
+        phone_columns=2,
+        shrink=True,
+    )
+
+
+def path_posterior(result: Result) -> Picture:
+    """Where the best path may be."""
+    share = result.planner.path_posterior(result.posterior)
+    values = share.values
+    sure = int((values >= 0.95).sum())
+    likely = int(((values >= 0.05) & (values < 0.95)).sum())
+    return picture(
+        lambda _: plots.path_posterior(share, result.workspace, path=result.path),
+        f"Map of the probability of each cell to be on the best path: {counted(sure, 'cell')} with "
+        f"at least 95 %, {counted(likely, 'more cell')} with 5 % to 95 %.",
+        "The share of posterior draws whose best path enters a cell; white, the recommended path. "
+        "Where cells beside the path are likely, too, more missions may change it.",
+        shrink=True,
+    )
+
+
+def robot_costs(result: Result) -> Picture:
+    """What each cell costs each robot."""
+    cost = result.planner.cost_map(params_of(result.posterior).mean(), per_robot=True)
+    alike = bool(np.allclose(cost.values, cost.values[:1], equal_nan=True))
+    shown = cost.isel(robot=slice(1)) if alike else cost
+
+    def draw(n_columns: int | None):
+        axes = plots.robot_maps(
+            shown, result.workspace, path=result.path, label="cost", n_columns=n_columns
+        )
+        if alike:
+            axes[0].set_title("every robot", fontsize=9)
+        return axes
+
+    low, high = _ends(shown)
+    names = joined([str(name) for name in cost["robot"].values])
+    same = " It is the same for all of them: they share parameters and awareness." if alike else ""
+    return picture(
+        draw,
+        f"Maps of the cost of reaching each cell, for {names}: from {low} to {high}.{same}",
+        "The paper's cost 1 \N{MINUS SIGN} \N{GREEK SMALL LETTER SIGMA}(trust) of reaching each "
+        f"cell, for {names}; white, the recommended path.{same}",
+        phone_columns=1 if alike else 2,
+        shrink=True,
+    )
+
+
+def terrain(result: Result) -> Picture:
+    """The ground, and what is made of it."""
+    features = joined([str(name) for name in result.workspace.awareness["feature"].values])
+    closed = int((~result.workspace.passable).sum())
+    return picture(
+        lambda n_columns: plots.terrain_maps(result.workspace, n_columns=n_columns),
+        f"Maps of the surface's height, and of {features}. {counted(closed, 'cell')} of the "
+        "planning grid cannot be entered.",
+        f"The surface (DSM), and what planning makes of it per pixel: {features}, 0 worst, 1 best. "
+        "Lines are the planning grid.",
+        shrink=True,
+    )
+
+
+def parameters(result: Result) -> Picture:
+    """What was learned of the parameters, mission by mission."""
+    sites = result.posterior["posterior"].to_dataset()
+    sizes: dict[str, int] = {}
+    for _, name, _, _ in labelled_draws(sites):
+        sizes[name] = sizes.get(name, 0) + 1
+    shown, total = [], 0
+    for name, size in sizes.items():
+        if not shown or total + size <= MOST_PARAMETERS:
+            shown.append(name)
+            total += size
+    rest = [name for name in sizes if name not in shown]
+    caption = (
+        "Each parameter after each mission: thick bars hold 50 % of the posterior, thin ones 90 %; "
+        "grey at 0, the prior."
+    )
+    if rest:
+        caption += f" Of {joined(rest)}, see the table."
+    return picture(
+        lambda n_columns: plots.parameter_history(
+            result.posteriors, names=shown, n_columns=n_columns
+        ),
+        f"{counted(total, 'panel')}, one for each parameter: how its posterior narrows over "
+        f"{counted(len(result.posteriors), 'mission')}. The table has the numbers.",
+        caption,
+        phone_columns=2,
+    )
+
+
+def last_mission(result: Result) -> Picture:
+    """Trust along the last mission."""
+    mission = result.missions[-1]
+    low, high = (number(float(f(mission.contact_rate)), 2) for f in (np.nanmin, np.nanmax))
+    return picture(
+        lambda n_columns: plots.mission_trust(result.posterior, n_columns=n_columns),
+        f"{counted(len(mission.robots), 'panel')}, one for each robot: latent trust over the "
+        f"{counted(len(mission.bounds), 'bound')} of the last mission. Contact rates measured go "
+        f"from {low} to {high}.",
+        "Latent trust of each robot along the last mission, given all missions: bands of 50 % and "
+        "90 %. Dots are the contact rates measured.",
+    )
+
+
+def history(result: Result) -> Picture:
+    """Objective and contact rate over the campaign."""
+    first, last = (number(float(v)) for v in result.history["objective"].values[[0, -1]])
+    return picture(
+        lambda _: plots.campaign_history(result.history),
+        f"Two curves over {counted(len(result.missions), 'mission')}: the objective when planned, "
+        f"from {first} to {last}, and the contact rate measured.",
+        "What each plan promised, and the contact its mission kept. The first plan comes from the "
+        "prior, and may promise anything.",
+    )
+
+
+def _ends(values) -> tuple[str, str]:
+    return number(float(np.nanmin(values))), number(float(np.nanmax(values)))

@@ -1,0 +1,45 @@
+"""Numbers as people read them: no more digits than they are sure of."""
+
+import math
+from collections.abc import Sequence
+
+MINUS, NONE = "\N{MINUS SIGN}", "\N{EN DASH}"
+
+
+def number(value: float, decimals: int | None = None) -> str:
+    """A number with so many decimals; by default, to about three significant digits.
+
+    NaN is a dash; the minus is a minus sign, not a hyphen.
+    """
+    if not math.isfinite(value):
+        return NONE if math.isnan(value) else f"{'' if value > 0 else MINUS}\N{INFINITY}"
+    if decimals is None:
+        if value != 0.0 and abs(value) < 1e-3:
+            return f"{value:.1e}".replace("-", MINUS)
+        decimals = (
+            3 if abs(value) < 1.0 else 2 if abs(value) < 10.0 else 1 if abs(value) < 100 else 0
+        )
+    text = f"{value:.{decimals}f}"
+    return text.replace("-", MINUS) if float(text) else text.lstrip("-")
+
+
+def decimals_for(spread: float) -> int:
+    """As many decimals as show the spread (such as an sd) to two digits; from 0 to 6."""
+    if not math.isfinite(spread) or spread <= 0.0:
+        return 3
+    return min(max(1 - math.floor(math.log10(spread)), 0), 6)
+
+
+def cell_text(cell: Sequence[int]) -> str:
+    """A cell, as on the command line: "9,0"."""
+    return f"{cell[0]},{cell[1]}"
+
+
+def joined(names: Sequence[str]) -> str:
+    """Names in a sentence: "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def counted(n: int, noun: str) -> str:
+    """So many of them: "1 mission", "2 missions"."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"

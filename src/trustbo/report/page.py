@@ -1,0 +1,93 @@
+"""The page: one HTML file that needs no other."""
+
+from collections.abc import Iterator
+from importlib.metadata import version
+from os import PathLike
+
+import jinja2
+
+from trustbo.errors import TrustboError
+from trustbo.files import write_text
+from trustbo.report import figures, tables
+from trustbo.report.blocks import Section
+from trustbo.report.numbers import counted
+from trustbo.report.summary import facts_of
+from trustbo.result import Result
+
+
+def write_report(path: str | PathLike[str], result: Result, *, title: str | None = None) -> None:
+    """Write a result as one HTML page, figures and all; the same result gives the same bytes.
+
+    Args:
+        path: The file, e.g. "report.html"; a complete one replaces it, or nothing.
+        result: What `iterate` returned, or `load_result`.
+        title: Of the page; by default it says how many missions there were.
+
+    Raises:
+        TrustboError: The result has no mission.
+    """
+    if not result.missions:
+        raise TrustboError("the result has no mission; run one first.")
+    name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("trustbo.report", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("page.html").render(
+        title=name,
+        facts=facts_of(result),
+        sections=list(_sections(result)),
+        version=result.settings.get("trustbo_version", version("trustbo")),
+    )
+    write_text(path, page)
+
+
+def _sections(result: Result) -> Iterator[Section]:
+    """All parts of the page, in the order of what a reader wants to know."""
+    yield Section("maps", "Trust maps", "", [figures.trust_maps(result)])
+    yield Section("path", "The recommended path", "", [tables.bounds_table(result)])
+    yield Section(
+        "where",
+        "Where the best path may be",
+        "The recommended path is the best under the posterior mean; under single draws of the "
+        "posterior, others may be.",
+        [figures.path_posterior(result)],
+    )
+    yield Section("cost", "Cost per robot", "", [figures.robot_costs(result)])
+    if result.workspace.terrain is not None and result.workspace.pixels is not None:
+        yield Section("terrain", "Terrain", "", [figures.terrain(result)])
+    yield Section(
+        "learned",
+        "What was learned",
+        _what_parameters_mean(result),
+        [figures.parameters(result), tables.parameter_table(result)],
+    )
+    yield Section(
+        "last",
+        "Trust along the last mission",
+        _how_it_ended(result),
+        [figures.last_mission(result)],
+    )
+    yield Section(
+        "history", "The campaign", "", [figures.history(result), tables.history_table(result)]
+    )
+    yield Section("settings", "Settings", "", [tables.settings_table(result)])
+
+
+def _what_parameters_mean(result: Result) -> str:
+    itself, awareness = ("B0", "B") if "B0" in result.posterior["posterior"] else ("beta0", "beta")
+    return (
+        f"The parameters of the model, {result.settings['model']}: trust follows itself by "
+        f"{itself}, and the awareness of the cell entered by {awareness}."
+    )
+
+
+def _how_it_ended(result: Result) -> str:
+    mission = result.missions[-1]
+    n, status = len(mission.bounds), mission.status
+    if status == "ok":
+        return f"It reached the goal in {counted(n, 'bound')}."
+    return f"It ended as {status.replace('_', ' ')!r} in bound {n}, short of the goal."

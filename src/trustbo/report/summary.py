@@ -1,0 +1,126 @@
+"""What a result comes to, in sentences."""
+
+import numpy as np
+from scipy.special import expit
+
+from trustbo.planning import Plan
+from trustbo.report.blocks import Fact
+from trustbo.report.numbers import cell_text, counted, joined, number
+from trustbo.result import Result
+
+MAX_RHAT, MIN_ESS, MAX_KHAT = 1.01, 400, 0.7
+"""What `models.fit` asks of a posterior, and how even the exact sampler's weights must be."""
+_MEANS = {
+    "terminal": "the chance \N{GREEK SMALL LETTER SIGMA}(trust) at the goal, 1 minus the paper's "
+    "cost (6)",
+    "mean": "the mean of expected trust over the bounds",
+    "success": "the probability that every bound succeeds",
+    "bottleneck": "the least expected trust on the way",
+    "stationary": "the probability that every bound succeeds, trust taken as settled in each cell",
+}
+_ENDS = {
+    "n_iterations": "All missions asked for were run.",
+    "interrupted": "It was interrupted, or is still under way: trustbo resume goes on.",
+}
+
+
+def facts_of(result: Result) -> list[Fact]:
+    """Where it was, what is recommended, and how sure that is."""
+    plan = result.plan
+    return [
+        Fact("The campaign", f"{_where(result)} {_missions(result)}"),
+        Fact("Recommended", _path(result, plan)),
+        Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
+        Fact("Success", _success(plan)),
+        _soundness(result),
+        Fact("Why it ended", _ENDS.get(result.stop_reason, f"{_sentence(result.stop_reason)}")),
+    ]
+
+
+def _where(result: Result) -> str:
+    grid, team = result.workspace.grid, result.workspace.team
+    rows, cols = grid.shape
+    size = f"{number(cols * grid.cell_width, 0)} m \N{MULTIPLICATION SIGN} "
+    size += f"{number(rows * grid.cell_height, 0)} m"
+    cells = f"{rows} \N{MULTIPLICATION SIGN} {cols} cells"
+    return (
+        f"{counted(len(result.missions), 'mission')} on {cells}, {size}, with a lead and "
+        f"{counted(len(team.names), 'robot')} ({joined(list(team.names))}) in overwatch."
+    )
+
+
+def _missions(result: Result) -> str:
+    status = [str(s) for s in result.history["status"].values if s != "ok"]
+    if not status:
+        return "All reached the goal."
+    kinds = joined(sorted(set(status)))
+    return f"{len(status)} of them did not reach the goal ({kinds.replace('_', ' ')})."
+
+
+def _path(result: Result, plan: Plan) -> str:
+    revisits = f", entering {counted(plan.revisits, 'cell')} again" if plan.revisits else ""
+    return (
+        f"From cell {cell_text(plan.path[0])} (row, column) to {cell_text(plan.path[-1])} in "
+        f"{counted(len(plan.path) - 1, 'bound')}, {number(plan.length, 0)} m{revisits}: "
+        f"{' \N{RIGHTWARDS ARROW} '.join(cell_text(cell) for cell in plan.path)}."
+    )
+
+
+def _value(result: Result) -> str:
+    name = str(result.settings["objective"])
+    meaning = _MEANS[name]
+    if result.settings.get("length_weight"):
+        meaning += ", less the toll on its length"
+    return f"{number(result.value)}, {meaning} (objective {name})."
+
+
+def _exactness(plan: Plan) -> str:
+    if plan.exact:
+        return "It is exact: under the posterior mean, no admissible path is better."
+    if np.isfinite(plan.bound):
+        return f"It is not proven best: a path may be worth up to {number(plan.bound)}."
+    return "Whether a path is better was not looked into."
+
+
+def _success(plan: Plan) -> str:
+    n, sigma = len(plan.path) - 1, "\N{GREEK SMALL LETTER SIGMA}"
+    return (
+        f"All {counted(n, 'bound')} of it succeed with probability {number(plan.success)}, the "
+        f"product of {sigma}(trust) over them. That compares paths rather than predicts: as "
+        f"{sigma}(1) is 0.73, even {counted(n, 'bound')} of full contact come to "
+        f"{number(expit(1.0) ** n)}."
+    )
+
+
+def _soundness(result: Result) -> Fact:
+    """The worst diagnostics over the posteriors of all missions."""
+    history, said, good = result.history, [], True
+    if "r_hat" in history:
+        rhat = float(np.nanmax(history["r_hat"]))
+        ess = float(np.nanmin(history["ess_bulk"]))
+        divergences = int(np.nansum(history["divergences"]))
+        good = rhat <= MAX_RHAT and ess >= MIN_ESS and divergences == 0
+        said.append(
+            f"R-hat is {number(rhat, 3)} at worst (good: at most {MAX_RHAT}), bulk ESS "
+            f"{number(ess, 0)} at least (good: {MIN_ESS} or more), with "
+            f"{counted(divergences, 'divergence')} (good: 0)"
+        )
+    if "k_hat" in history:
+        khat, kish = (float(f(history[n])) for f, n in ((np.nanmax, "k_hat"), (np.nanmin, "kish")))
+        good = good and khat <= MAX_KHAT
+        said.append(
+            f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below 0.5; usable: "
+            f"up to {MAX_KHAT}), its effective points {number(kish, 0)} at least"
+        )
+    verdict = "They can be relied on" if good else "Do not rely on them"
+    return Fact("Posteriors", f"{verdict}: {'; '.join(said)}.", good)
+
+
+def _sentence(text: str) -> str:
+    """A rule's own reason as a sentence."""
+    name, _, rest = text.partition(":")
+    known = {
+        "regret_bound": "The recommended path is good enough:",
+        "seconds": "The time was up, in seconds:",
+    }
+    return f"{known[name]}{rest}." if name in known else f"A rule to stop said: {text}."

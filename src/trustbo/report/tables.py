@@ -1,0 +1,124 @@
+"""The tables of a page."""
+
+from collections.abc import Iterator
+
+import arviz as az
+import numpy as np
+import xarray as xr
+
+from trustbo.files import to_json
+from trustbo.report.blocks import Table
+from trustbo.report.numbers import NONE, cell_text, decimals_for, number
+from trustbo.result import Result
+
+
+def bounds_table(result: Result) -> Table:
+    """The recommended path bound by bound: each robot's expected trust, and its 90 % band."""
+    plan, names = result.plan, result.workspace.team.names
+    low, high = plan.bands[0], plan.bands[-1]
+    places = max(decimals_for(float(np.median(high - low)) / 3.3), 2)  # 90 % is +- 1.65 sd
+
+    def trust(k: int, i: int) -> str:
+        ends = f"{number(low[k, i], places)} to {number(high[k, i], places)}"
+        return f"{number(plan.trust[k, i], places)} ({ends})"
+
+    rows = [
+        (str(k + 1), cell_text(cell), *(trust(k, i) for i in range(len(names))))
+        for k, cell in enumerate(plan.path[1:])
+    ]
+    return Table(
+        "Expected trust after each bound of the recommended path, from cell "
+        f"{cell_text(plan.path[0])} on; in brackets the 90 % band over the posterior.",
+        ("bound", "cell", *names),
+        rows,
+    )
+
+
+def parameter_table(result: Result) -> Table:
+    """Each parameter's posterior after the last mission."""
+    posterior = result.posterior
+    # The exact sampler's draws are nearly independent: k-hat speaks for them, not R-hat.
+    diagnosed = posterior.attrs["sampler"] != "exact"
+    sites = posterior["posterior"].to_dataset()
+    with np.errstate(invalid="ignore"):
+        rhat = az.rhat(sites) if diagnosed else None
+        ess = az.ess(sites, method="bulk") if diagnosed else None
+    rows = []
+    for label, name, where, draws in labelled_draws(sites):
+        sd = float(draws.std())
+        places = decimals_for(sd)
+        low, high = np.quantile(draws, (0.05, 0.95))
+        row = [label, *(number(float(v), places) for v in (draws.mean(), sd, low, high))]
+        if rhat is not None and ess is not None:
+            moves = bool(np.ptp(draws) > 0.0)  # what does not is a constant of the model
+            row.append(number(float(ess[name][where]), 0) if moves else NONE)
+            row.append(number(float(rhat[name][where]), 3) if moves else NONE)
+        rows.append(row)
+    head = ["parameter", "mean", "sd", "5 %", "95 %"]
+    caption = "The posterior of each parameter after the last mission"
+    if diagnosed:
+        head += ["bulk ESS", "R-hat"]
+        caption += ", and how well it was sampled"
+    return Table(f"{caption}.", head, rows)
+
+
+def history_table(result: Result) -> Table:
+    """One row for each mission."""
+    history = result.history
+    columns = {
+        "status": lambda row: str(row["status"].item()).replace("_", " "),
+        "contact rate": lambda row: number(row["contact_rate"].item(), 2),
+        "objective": lambda row: number(row["objective"].item(), 3),
+        "path": _change,
+    }
+    for name, label, places in (
+        ("regret", "regret", 3), ("r_hat", "R-hat", 3), ("ess_bulk", "bulk ESS", 0),
+        ("divergences", "divergences", 0), ("k_hat", "k-hat", 2), ("kish", "Kish size", 0),
+    ):  # fmt: skip
+        if name in history:
+            columns[label] = lambda row, n=name, p=places: number(float(row[n].item()), p)
+    columns["seconds"] = lambda row: number(
+        sum(float(row[f"seconds_{what}"].item()) for what in ("plan", "run", "fit")), 1
+    )
+    rows = []
+    for i in history["iteration"].values:
+        row = history.sel(iteration=i)
+        rows.append([str(i), *(text(row) for text in columns.values())])
+    return Table(
+        "Each mission: how it ended, the mean contact rate measured, the objective when it was "
+        "planned, the posterior's diagnostics, and the seconds for all of it.",
+        ("mission", *columns),
+        rows,
+        text_columns=(1, 4),
+    )
+
+
+def settings_table(result: Result) -> Table:
+    """What the campaign was run with."""
+    rows = [(name.replace("_", " "), _plain(value)) for name, value in result.settings.items()]
+    return Table("What the campaign was run with.", ("setting", "value"), rows, text_columns=(1,))
+
+
+def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:
+    """Label such as "beta[visibility]", name, index and draws (draw,) of every parameter."""
+    for name, array in sites.data_vars.items():
+        draws = array.transpose("chain", "draw", ...)
+        dims, values = draws.dims[2:], draws.values.reshape(-1, *draws.shape[2:])
+        for where in np.ndindex(*draws.shape[2:]):
+            places = [str(draws[d].values[i]) for d, i in zip(dims, where, strict=True)]
+            label = f"{name}[{', '.join(places)}]" if places else str(name)
+            yield label, str(name), where, values[:, *where]
+
+
+def _change(row: xr.Dataset) -> str:
+    if int(row["iteration"]) == 1:
+        return "first"
+    return "new" if bool(row["path_changed"]) else "same"
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, str | int | float | bool):
+        return str(value)
+    if isinstance(value, list | tuple) and not any(isinstance(v, list | dict) for v in value):
+        return ", ".join(str(v) for v in value) or "none"
+    return " ".join(to_json(value).split())

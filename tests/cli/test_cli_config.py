@@ -1,0 +1,86 @@
+"""`--config`: a file says what flags would, and flags win."""
+
+import json
+
+import pytest
+
+from trustbo.cli.config import flags_of
+from trustbo.errors import TrustboError
+
+
+def test_a_file_gives_every_flag_and_flags_win(invoke, rasters, tmp_path, monkeypatch):
+    (rasters / "mission.yaml").write_text(
+        "dem: dem.tif\ndsm: dsm.tif\nstart: [2, 0]\ngoal: 0,2\nshape: 3,3\nsampler: exact\n"
+        "iterations: 5\nmax-slope: 40\nlidar_range: 80\nquiet: true\nseed: 3\n"
+    )
+    monkeypatch.chdir(tmp_path)  # rasters are found beside the file
+    config = rasters / "mission.yaml"
+    done = invoke("run", "--seed", 4, "--config", config, "--iterations", 1, "--out", "here")
+    assert done.exit_code == 0, done.output
+    record = json.loads((tmp_path / "here" / "result.json").read_text())
+    assert record["n_missions"] == 1
+    assert record["settings"]["seed"] == 4
+    assert record["path"][0] == [2, 0]
+    state = (tmp_path / "here" / "report.html").read_text()
+    assert "after 1 mission" in state
+    assert "mission  status" not in done.output
+
+
+KNOWN = ("dem", "dsm", "start", "max_slope", "max_bounds", "crs", "quiet", "policy")
+
+
+def test_values_are_as_they_would_be_typed(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text("dem: maps/a.tif\nstart: [9, 0]\nmax-slope: 30\ncrs: null\nquiet: yes\n")
+    assert flags_of(file, KNOWN) == {
+        "dem": str(tmp_path / "maps" / "a.tif"),
+        "start": "9,0",
+        "max_slope": "30",
+        "quiet": "True",
+    }
+    file.write_text("dem: /maps/a.tif\n")
+    assert flags_of(file, KNOWN) == {"dem": "/maps/a.tif"}
+    file.write_text("")
+    assert flags_of(file, KNOWN) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("max-slop: 3", r"a.yaml: unknown flag 'max-slop'; did you mean max-slope"),
+        ("zzzz: 3", r"unknown flag 'zzzz'; choose one of dem, dsm, start, max-slope"),
+        ("config: b.yaml", r"unknown flag 'config'"),
+        ("max-slope: 3\nmax_slope: 4", r"max-slope is given twice; leave one out"),
+        ("start: {row: 1}", r"start must be a number, a name or a pair .* got {'row': 1}"),
+        ("start: [1.5, 2]", r"start must be a number, a name or a pair .* got \[1.5, 2\]"),
+        ("- dem", r"must hold flags and their values, e.g. seed: 1; got \['dem'\]"),
+        ("dem: [", r"is no YAML: while parsing"),
+    ],
+)
+def test_what_no_flag_could_be_is_refused(text, message, tmp_path):
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(TrustboError, match=message) as refused:
+        flags_of(tmp_path / "a.yaml", KNOWN)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_program_says_so_in_one_line(invoke, tmp_path):
+    (tmp_path / "a.yaml").write_text("polcy: greedy")
+    for name, message in (
+        ("a.yaml", "unknown flag 'polcy'; did you mean policy"),
+        ("b", "No such"),
+    ):
+        done = invoke("demo", "--config", tmp_path / name, "--out", tmp_path / "never")
+        assert done.exit_code == 2
+        assert done.stderr.startswith("error: ")
+        assert message in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "never").exists()
+
+
+def test_a_number_that_is_none_is_refused(invoke, tmp_path):
+    (tmp_path / "a.yaml").write_text("iterations: 1.5")
+    done = invoke("demo", "--config", tmp_path / "a.yaml", "--out", tmp_path / "never")
+    assert done.exit_code == 2
+    assert "--iterations" in done.stderr
+    assert not (tmp_path / "never").exists()

@@ -1,0 +1,74 @@
+"""`trustbo report` and `export`, the help of all commands, and how fast it comes."""
+
+import subprocess
+import sys
+
+import pytest
+
+from trustbo.export import FORMATS
+
+COMMANDS = ("demo", "run", "resume", "report", "export", "study")
+
+
+def test_report_writes_one_page(invoke, finished, tmp_path):
+    folder, _ = finished
+    page = tmp_path / "mine.html"
+    done = invoke("report", folder, "--out", page, "--title", "Two missions")
+    assert done.exit_code == 0, done.output
+    assert done.output == f"the report is {page}\n"
+    assert "<h1>Two missions</h1>" in page.read_text()
+
+
+def test_export_writes_what_is_asked_for(invoke, finished, tmp_path):
+    folder, _ = finished
+    formats = ("--format", "gpx", "--format", "csv", "--format", "gpx")
+    done = invoke("export", folder, *formats, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    names = ["path.gpx", "bounds.csv", "path.csv"]
+    assert done.output.splitlines() == [str(tmp_path / name) for name in names]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
+
+
+def test_export_writes_all_there_is(invoke, finished, tmp_path):
+    folder, _ = finished
+    done = invoke("export", folder, "--format", "all", "--resolution", 10, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert len(done.output.splitlines()) >= len(FORMATS)
+
+
+def test_an_unknown_format_lists_the_choices(invoke, finished, tmp_path):
+    folder, _ = finished
+    done = invoke("export", folder, "--format", "dwg", "--out", tmp_path / "never")
+    assert done.exit_code == 2
+    assert done.stderr == f"error: unknown format 'dwg'; choose one of {', '.join(FORMATS)}, all.\n"
+    assert not (tmp_path / "never").exists()
+
+
+@pytest.mark.parametrize("command", [("report",), ("export", "--format", "csv")])
+def test_a_folder_without_a_result_is_refused(command, invoke, tmp_path):
+    done = invoke(*command, tmp_path)
+    assert done.exit_code == 2
+    assert "holds no result" in done.stderr
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches_by_example(command, invoke):
+    shown = invoke(command, "--help").output
+    assert f"Example: trustbo {command} " in shown
+    assert "Exit codes: 0 done;" in shown
+    assert max(len(line) for line in shown.splitlines()) <= 80
+
+
+def test_the_program_names_its_commands_and_its_version(invoke):
+    shown = invoke("--help").output
+    assert all(f" {command} " in shown for command in COMMANDS)
+    assert invoke("--version").output.startswith("trustbo 0.")
+
+
+def test_help_imports_nothing_heavy():
+    loaded = "import sys, trustbo.cli; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", loaded], capture_output=True, text=True, check=True
+    )
+    heavy = {"numpy", "jax", "xarray", "matplotlib", "scipy", "jinja2", "pandas"}
+    assert heavy.isdisjoint(done.stdout.split())

@@ -1,0 +1,87 @@
+"""`trustbo resume`: after Ctrl-C, for more missions, and when a posterior was refused."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import typer
+
+import trustbo as tb
+from trustbo.cli.errors import one_line_errors
+
+# Shells start background jobs with SIGINT ignored, which children inherit.
+PROGRAM = (
+    "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from trustbo.cli import main; main(sys.argv[1:])"
+)
+
+
+def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(invoke, flags, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["run", *flags, "--iterations", 500, "--seed", 2, "--out", out, "--quiet"]
+    command = [sys.executable, "-c", PROGRAM, *(str(a) for a in arguments)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not (out / "result.json").exists() and time.monotonic() < deadline:
+            assert process.poll() is None, process.communicate()[1]
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, said
+    assert f"all missions so far are kept: trustbo resume {out} goes on" in said
+    assert "Traceback" not in said
+    n = json.loads((out / "campaign.json").read_text())["n_missions"]
+    assert 1 <= n < 500
+    done = invoke("resume", out, "--iterations", n + 1, "--quiet")
+    assert done.exit_code == 0, done.output
+    again = tb.load_result(out)
+    assert len(again.missions) == n + 1
+    assert again.stop_reason == "n_iterations"
+    assert (out / "report.html").exists()
+
+
+def test_resume_of_what_is_done_says_so_and_changes_nothing(invoke, finished, tmp_path):
+    whole, folder = tb.load_result(finished[0]), tmp_path / "copy"
+    shutil.copytree(finished[0], folder)
+    (folder / "report.html").unlink()
+    done = invoke("resume", folder)
+    assert done.exit_code == 0, done.output
+    assert "all 2 missions are done; for more, give --iterations." in done.output
+    again = tb.load_result(folder)
+    assert again.path == whole.path
+    np.testing.assert_array_equal(again.trust_map, whole.trust_map)
+    assert (folder / "report.html").exists()
+
+
+def test_resume_says_what_it_cannot_do(invoke, tmp_path):
+    done = invoke("resume", tmp_path)
+    assert done.exit_code == 2
+    assert "holds no campaign; give the --out of trustbo run" in done.stderr
+    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 2), 0.5))
+    tb.Campaign(workspace, (2, 0), (0, 2), directory=tmp_path).close()
+    done = invoke("resume", tmp_path)
+    assert done.exit_code == 2
+    assert "was run by robots of your own, not by trustbo run" in done.stderr
+
+
+def test_a_refused_posterior_is_exit_3_and_says_what_is_kept(tmp_path, capsys):
+    with pytest.raises(typer.Exit) as ended, one_line_errors(debug=False, campaign=tmp_path):
+        raise tb.PosteriorError("posterior refused after a longer retry: 7 divergences.")
+    assert ended.value.exit_code == 3
+    error, hint = capsys.readouterr().err.splitlines()
+    assert error == "error: posterior refused after a longer retry: 7 divergences."
+    assert hint.startswith(f"hint: what was measured is kept in {tmp_path}/measured.nc. Run again")
+    with pytest.raises(tb.PosteriorError), one_line_errors(debug=True):
+        raise tb.PosteriorError("posterior refused.")
+
+
+def test_an_interruption_before_anything_was_begun_says_so(tmp_path, capsys):
+    with pytest.raises(typer.Exit) as ended, one_line_errors(debug=False, campaign=tmp_path):
+        raise KeyboardInterrupt
+    assert ended.value.exit_code == 130
+    assert "interrupted; nothing was begun yet." in capsys.readouterr().err

@@ -1,0 +1,128 @@
+"""The report page in a real browser, at the widths of a desk and of a phone."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.report import write_report
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None or DRIVER is None, reason="no chromium and chromedriver on the path"
+)
+WIDTHS = {"wide": (1280, 900, False), "phone": (390, 844, True)}
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A report with long names and a table wider than a phone."""
+    team = tb.Team(names=("the-first-robot", "the-second-robot"), n_robots=2)
+    awareness = np.random.default_rng(0).uniform(size=(2, 4, 4, 2))
+    workspace = tb.Workspace.from_awareness(awareness, team=team)
+    truth = tb.models.TrustParams(0.4, np.array([0.5, 0.2]), 0.1, 0.05, 0.05)
+    result = tb.iterate(
+        workspace,
+        (3, 0),
+        (0, 3),
+        n_iterations=3,
+        sampler="exact",
+        simulator=tb.simulation.ModelSimulator(workspace, truth),
+        progress=False,
+    )
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(path, result)
+    return path.as_uri()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture(params=WIDTHS.values(), ids=list(WIDTHS))
+def seen(request, chromium, page):
+    """The page as it is seen at a width."""
+    width, height, mobile = request.param
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": mobile}
+    chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    chromium.get(page)
+    return chromium
+
+
+def test_everything_is_shown_without_complaint(seen):
+    assert seen.get_log("browser") == []
+    loaded = seen.execute_script(
+        "return [...document.images].map(i => i.complete && i.naturalWidth > 0)"
+    )
+    assert loaded == [True] * 6
+
+
+def test_nothing_overflows_the_page_and_text_can_be_read(seen):
+    assert seen.execute_script("return document.scrollingElement.scrollWidth <= window.innerWidth")
+    sizes = seen.execute_script(
+        "return [...document.querySelectorAll('p, dd, dt, li, td, th, caption, figcaption')]"
+        ".map(e => parseFloat(getComputedStyle(e).fontSize))"
+    )
+    assert min(sizes) >= 14.0
+    outside = seen.execute_script(
+        "return [...document.querySelectorAll('p, dl, h1, h2, nav, figure, img, .scroll')]"
+        ".filter(e => e.getBoundingClientRect().right > window.innerWidth + 0.5)"
+        ".map(e => e.outerHTML.slice(0, 80))"
+    )
+    assert outside == []
+
+
+def test_figures_are_drawn_for_the_width_they_are_seen_at(seen):
+    """Text of 7 points, the smallest in figures, is 9.3 pixels high unless they are shrunk."""
+    scales = seen.execute_script(
+        "return [...document.images].map(i => i.getBoundingClientRect().width / i.naturalWidth)"
+    )
+    assert min(scales) * 7 * 96 / 72 >= 9.0
+
+
+def test_wide_tables_scroll_on_their_own(seen):
+    overflow = seen.execute_script(
+        "return [...document.querySelectorAll('.scroll')].map(e => getComputedStyle(e).overflowX)"
+    )
+    assert set(overflow) == {"auto"}
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_stands_out_in_light_and_dark_and_figures_stay_on_white(scheme, chromium, page):
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    chromium.get(page)
+
+    def style(selector, name):
+        return chromium.execute_script(
+            "return getComputedStyle(document.querySelector(arguments[0]))[arguments[1]]",
+            selector,
+            name,
+        )
+
+    ground = luminance(style("body", "backgroundColor"))
+    assert (ground > 0.5) == (scheme == "light")
+    for selector in ("body", "a", "figcaption", "caption", ".kind", ".good", "footer"):
+        text = luminance(style(selector, "color"))
+        high, low = max(text, ground) + 0.05, min(text, ground) + 0.05
+        assert high / low >= 4.5, selector  # WCAG 2, level AA
+    assert luminance(style("figure img", "backgroundColor")) == 1.0
+
+
+def luminance(colour):
+    """Relative luminance of a CSS colour such as "rgb(1, 2, 3)"."""
+    channels = [int(c) / 255 for c in colour[colour.index("(") + 1 : -1].split(",")[:3]]
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
+    return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
