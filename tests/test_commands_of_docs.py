@@ -41,7 +41,7 @@ _, STUDY = next(steps_of(ROOT / "docs" / "howto" / "run-a-study.md"))
 
 @pytest.fixture(scope="module")
 def terrain():
-    return tb.terrain.synthetic_terrain((60.0, 60.0), seed=5)
+    return tb.terrain.synthetic_terrain((100.0, 100.0), seed=3, relief=5.0)
 
 
 @pytest.fixture(scope="module")

@@ -183,7 +183,7 @@ def test_doubtful_posteriors_are_called_so(rhat, ess, divergences, good, result)
         if fact.name == "Posteriors"
     ]
     assert fact.good is good
-    assert fact.text.startswith("They can be relied on" if good else "Do not rely on them")
+    assert fact.text.startswith("They are well sampled" if good else "Do not rely on them")
 
 
 def test_reasons_to_end_are_sentences(result):

@@ -73,5 +73,5 @@ def _smaller(png: re.Match[str]) -> str:
         return png[0]
     file = io.BytesIO()
     with Raster.open(io.BytesIO(base64.b64decode(png[1]))) as raster:
-        raster.save(file, "WEBP", quality=_QUALITY, method=6)
+        raster.save(file, "WEBP", quality=_QUALITY)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

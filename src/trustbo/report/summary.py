@@ -112,7 +112,7 @@ def _soundness(result: Result) -> Fact:
             f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below 0.5; usable: "
             f"up to {MAX_KHAT}), its effective points {number(kish, 0)} at least"
         )
-    verdict = "They can be relied on" if good else "Do not rely on them"
+    verdict = "They are well sampled" if good else "Do not rely on them"
     return Fact("Posteriors", f"{verdict}: {'; '.join(said)}.", good)
 
 
