@@ -1,10 +1,12 @@
 """`trustbo report` and `export`, the help of all commands, and how fast it comes."""
 
+import re
 import subprocess
 import sys
 
 import pytest
 
+from trustbo.cli import main
 from trustbo.export import FORMATS
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
@@ -63,6 +65,31 @@ def test_the_program_names_its_commands_and_its_version(invoke):
     shown = invoke("--help").output
     assert all(f" {command} " in shown for command in COMMANDS)
     assert invoke("--version").output.startswith("trustbo 0.")
+
+
+def test_help_of_export_names_every_format(invoke):
+    shown = invoke("export", "--help").output
+    assert all(re.search(rf"\b{name}\b", shown) for name in FORMATS)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["run", "--dem", "x.tif"], 2, "error: Missing option '--dsm'.\nhint: trustbo run --help "),
+        (["run", "--robots", "two"], 2, "error: Invalid value for '--robots': "),
+        (["fly"], 2, "error: No such command 'fly'.\nhint: trustbo --help "),
+        (["report", "nowhere"], 2, "error: 'nowhere' holds no result;"),
+        (["--version"], 0, ""),
+        ([], 0, ""),
+    ],
+)
+def test_misuse_is_a_line_and_a_hint(words, code, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == code
+    error = capsys.readouterr().err
+    assert error.startswith(said)
+    assert len(error.splitlines()) <= 2
 
 
 def test_help_imports_nothing_heavy():

@@ -46,11 +46,16 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
 
 
 def fail(error: Exception, code: int, hint: str = "") -> NoReturn:
-    """End with an error in one line, and maybe a hint in another."""
+    """End a command with an error in one line, and maybe a hint in another."""
+    complain(str(error), hint)
+    raise typer.Exit(code)
+
+
+def complain(error: str, hint: str = "") -> None:
+    """Say what is wrong in one line, and in another what may help."""
     print(f"error: {error}", file=sys.stderr)
     if hint:
         print(f"hint: {hint}", file=sys.stderr)
-    raise typer.Exit(code)
 
 
 def _way_on(campaign: Path | None) -> str:

@@ -157,7 +157,12 @@ OutFile = Annotated[
 Title = Annotated[str | None, _option(PROGRAM, "Title of the page.", metavar="TEXT")]
 Formats = Annotated[
     list[str],
-    typer.Option("--format", help="Which; may be given often. all: every one.", metavar="NAME"),
+    typer.Option(
+        "--format",
+        help="geotiff, cog, netcdf (maps); geojson, gpx, geopackage (the path); csv (path and "
+        "missions); ros_map, ros1_bag, ros2_bag (cost and path); or all. Give it once for each.",
+        metavar="NAME",
+    ),
 ]
 OutFolder = Annotated[
     Path | None,

@@ -1,11 +1,13 @@
 """The program `trustbo` and its commands; importing it imports nothing heavy."""
 
+import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from trustbo.cli.demo import demo
+from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.export import export
 from trustbo.cli.report import report
 from trustbo.cli.resume import resume
@@ -16,6 +18,7 @@ EPILOG = """
 Exit codes: 0 done; 1 done, but some of a study's runs failed; 2 bad input;
 3 a posterior was refused, what was measured is kept; 130 interrupted.
 """
+_UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
 _PANELS = (
     ("A campaign", (demo, run, resume)),
     ("What it came to", (report, export)),
@@ -51,16 +54,24 @@ def _program(
 ) -> None:
     """Learn how far robots can be trusted where, and plan the most trustworthy path.
 
-    See it work:      trustbo demo
-    On your terrain:  trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
-    How that works:   trustbo run --help
+    See it work:   trustbo demo
+    On your own:   trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
+    How it works:  trustbo run --help
     """
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the program.
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the program, and leave with its exit code; misuse, too, is one line.
 
     Args:
         arguments: What would follow `trustbo` in a shell; by default what does.
     """
-    app(arguments)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        code = app(given or ["--help"], prog_name="trustbo", standalone_mode=False)
+    except _UsageError as error:
+        where = getattr(error, "ctx", None)
+        name = where.command_path if where else "trustbo"
+        complain(str(error.format_message()), f"{name} --help says what there is.")
+        sys.exit(BAD_INPUT)
+    sys.exit(code or 0)
