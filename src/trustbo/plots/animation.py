@@ -209,7 +209,7 @@ def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
     else:
         grown = (terrain["dsm"] - terrain["dem"]).values > _GROWN
         ax.imshow(grown, cmap="Greys", vmin=0.0, vmax=3.0, extent=extent, interpolation="nearest")
-        draw_hillshade(ax, workspace, "dsm")
+        draw_hillshade(ax, workspace, "dsm", exaggerate=3.0)
     cells = np.array([workspace.grid.center(cell) for cell in mission.path])
     ax.plot(*(cells - corner_of(workspace.grid)).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])

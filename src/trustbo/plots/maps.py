@@ -147,13 +147,16 @@ def cell_map(
     return image
 
 
-def draw_hillshade(ax: Axes, workspace: Workspace, heights: str = "dem") -> None:
+def draw_hillshade(
+    ax: Axes, workspace: Workspace, heights: str = "dem", *, exaggerate: float = 1.0
+) -> None:
     """Shadows over what is drawn already, if there is a terrain in memory.
 
     Args:
         ax: Where to draw.
         workspace: Whose terrain.
         heights: `"dem"` for the ground's, `"dsm"` for the surface's.
+        exaggerate: How many times steeper than it is the ground is to look.
     """
     terrain = workspace.terrain
     if terrain is None or workspace.pixels is None:
@@ -164,7 +167,9 @@ def draw_hillshade(ax: Axes, workspace: Workspace, heights: str = "dem") -> None
     height, width = pixel_size(terrain)
     known = np.isfinite(dem)
     ground = np.where(known, dem, np.nanmean(dem))
-    light = LightSource(azdeg=315, altdeg=45).hillshade(ground, dx=width * step, dy=height * step)
+    light = LightSource(azdeg=315, altdeg=45).hillshade(
+        ground, exaggerate, dx=width * step, dy=height * step
+    )
     shadow = np.zeros((*dem.shape, 4))
     # Level ground, lit at 45 degrees, keeps its colour: that of the colour bar.
     level = np.sin(np.deg2rad(45.0))
