@@ -1,7 +1,12 @@
-"""The pages' examples run as printed, every public name has an entry and one, links lead on."""
+"""The pages' examples run and print what is shown, every public name has one, links lead on."""
 
+import ast
+import io
 import re
+from contextlib import redirect_stdout
+from decimal import Decimal
 from importlib import import_module
+from itertools import zip_longest
 from pathlib import Path
 from types import ModuleType
 
@@ -33,7 +38,11 @@ NAMESPACES = (
     "trustbo.export",
     "trustbo.report",
 )
-BLOCK = re.compile(r"^```python\n(.*?)^```", flags=re.S | re.M)
+BLOCK = re.compile(r"^```python\n(.*?)^```(?:\n+```text\n(.*?)^```)?", flags=re.S | re.M)
+"""An example, and what the page says that it prints, if it does."""
+TOKEN = re.compile(r"[^\W\d]\w*|[+-]?\d+\.?\d*(?:e[+-]?\d+)?|\S|\n")
+"""A word, a number, a sign of layout such as a bracket, or the end of a line."""
+NUMBER, WHOLE = re.compile(r"[+-]?\d"), re.compile(r"[+-]?\d+")
 
 
 def name_of(page):
@@ -45,26 +54,90 @@ def page_of(namespace):
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name_of)
-def test_the_examples_of_a_page_run_from_top_to_bottom(page, tmp_path, monkeypatch):
+def test_the_examples_of_a_page_run_and_print_what_it_says(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     text, namespace = page.read_text(), {}
     with plt.rc_context():
         for block in BLOCK.finditer(text):
             line = text.count("\n", 0, block.start(1))  # so that an error names the page's line
-            exec(compile("\n" * line + block[1], name_of(page), "exec"), namespace)
+            with redirect_stdout(io.StringIO()) as printed:
+                exec(compile("\n" * line + block[1], name_of(page), "exec"), namespace)
+            if block[2] is not None:
+                at = f"{name_of(page)}:{text.count('\n', 0, block.start(2)) + 1}"
+                found = differences(block[2], printed.getvalue())
+                assert found == [], f"{at} is stale: {found}; printed was\n{printed.getvalue()}"
     plt.close("all")
+
+
+def differences(shown, printed):
+    """Pairs of tokens that differ, of what a page shows and of what was printed.
+
+    How wide the blanks are does not matter. Whole numbers are cells and counts, and must be equal;
+    others may differ by one in the last digit.
+    """
+    tokens = (TOKEN.findall(text.strip()) for text in (shown, printed))
+    return [(a, b) for a, b in zip_longest(*tokens, fillvalue="") if not alike(a, b)]
+
+
+def alike(a, b):
+    if not (NUMBER.match(a) and NUMBER.match(b)) or (WHOLE.fullmatch(a) and WHOLE.fullmatch(b)):
+        return a == b
+    one, other = Decimal(a), Decimal(b)
+    last = min(one.as_tuple().exponent, other.as_tuple().exponent)  # numpy leaves out zeros: "0.8 "
+    return abs(one - other) <= Decimal(1).scaleb(last)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "found"),
+    [
+        ("[[0.8  0.12]]", "[[ 0.79 0.13]]", []),
+        ("x  -0.1\n", "x 0.0", []),
+        ("2.5e-4 nan", "2.6e-4 nan", []),
+        ("[0.8 ]", "[0.82]", [("0.8", "0.82")]),
+        ("-0.22", "0.22", [("-0.22", "0.22")]),
+        ("(-3, 4)", "(-4, 5)", [("-3", "-4"), ("4", "5")]),
+        ("r1 0.5", "r2 0.5", [("r1", "r2")]),
+        ("0.1 0.2", "0.1\n0.2", [("0.2", "\n"), ("", "0.2")]),
+        ("0.1", "[0.1]", [("0.1", "["), ("", "0.1"), ("", "]")]),
+    ],
+)
+def test_a_page_is_stale_if_more_than_the_last_digit_differs(shown, printed, found):
+    assert differences(shown, printed) == found
 
 
 @pytest.mark.parametrize("namespace", NAMESPACES)
 def test_every_public_name_has_an_entry_and_an_example(namespace):
     module, text = import_module(namespace), page_of(namespace).read_text()
     entries = set(re.findall(r"^\.\. auto\w+:: ([\w.]+)$", text, flags=re.M))
-    code = "\n".join(BLOCK.findall(text))
+    used = names_used("\n".join(block[1] for block in BLOCK.finditer(text)))
     parts = {name for name in module.__all__ if isinstance(getattr(module, name), ModuleType)}
     parts = {name for name in parts if f"{namespace}.{name}" in NAMESPACES}  # on their own pages
     for name in module.__all__:
         assert name in parts or f"{namespace}.{name}" in entries, f"{name} has no entry"
-        assert re.search(rf"\b{name}\b", code), f"{name} has no example"
+        assert f"{namespace}.{name}" in used, f"{name} has no example"
+
+
+def names_used(code):
+    """Full names of what code uses; to import a thing, or to write of it, is not to use it."""
+    tree, imported = ast.parse(code), {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imported |= {alias.asname: alias.name for alias in node.names if alias.asname}
+        elif isinstance(node, ast.ImportFrom):
+            imported |= {a.asname or a.name: f"{node.module}.{a.name}" for a in node.names}
+    loaded = [
+        node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Load)
+    ]
+    roots = (ast.unparse(node).partition(".") for node in loaded)
+    return {f"{imported.get(root, root)}{dot}{rest}" for root, dot, rest in roots}
+
+
+def test_a_name_in_a_comment_an_import_or_of_something_else_is_not_used():
+    code = "import trustbo as tb\nfrom trustbo import a, b\nb.c(d=1)  # tb.e\nmine.f = tb.g.h"
+    used = {"b", "b.c", "g", "g.h"}
+    assert names_used(code) == {"mine", "trustbo", *(f"trustbo.{name}" for name in used)}
 
 
 def test_every_entry_is_public():

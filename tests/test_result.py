@@ -1,5 +1,7 @@
 """A result's own planner, plan and maps are the campaign's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import expit
@@ -70,3 +72,40 @@ def test_a_loaded_result_plans_alike(result, tmp_path):
     assert loaded.plan.path == result.plan.path
     np.testing.assert_array_equal(loaded.plan.bands, result.plan.bands)
     assert loaded.maps(n_draws=50).equals(result.maps(n_draws=50))
+
+
+def test_features_that_are_called_as_maps_are_told_apart(tmp_path):
+    workspace = tb.Workspace.from_awareness(AWARENESS, features=("cost", "x"))
+    truth = tb.models.TrustParams(0.4, np.array([0.5, 0.2]), 0.1, 0.05, 0.05)
+    result = tb.iterate(
+        workspace,
+        (3, 0),
+        (0, 3),
+        n_iterations=1,
+        sampler="exact",
+        simulator=tb.simulation.ModelSimulator(workspace, truth),
+        progress=False,
+    )
+    maps = result.maps(n_draws=20)
+    np.testing.assert_allclose(maps["awareness_cost"], AWARENESS[..., 0].mean(0))
+    np.testing.assert_allclose(maps["awareness_x"], AWARENESS[..., 1].mean(0))
+    np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=5e-2)
+
+
+def test_a_damaged_result_is_refused(result, tmp_path):
+    result.save(tmp_path)
+    whole = (tmp_path / "result.json").read_text()
+    (tmp_path / "result.json").write_text(whole[:40])
+    with pytest.raises(tb.TrustboError, match=r"result\.json' is damaged"):
+        tb.load_result(tmp_path)
+    if result.believed is not None:
+        (tmp_path / "result.json").write_text(whole)
+        (tmp_path / "believed.nc").unlink()
+        with pytest.raises(tb.TrustboError, match=r"believed\.nc' is missing"):
+            tb.load_result(tmp_path)
+
+
+def test_settings_that_lack_something_are_named(result):
+    some = {name: value for name, value in result.settings.items() if name != "team"}
+    with pytest.raises(tb.TrustboError, match="the result's settings lack team"):
+        _ = replace(result, settings=some).planner

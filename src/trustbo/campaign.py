@@ -396,7 +396,7 @@ class Campaign:
         """
         journal = Journal.existing(directory)
         try:
-            state, measured, result = journal.read()
+            state, measured, learned = journal.read()
             options = state["options"]
             for name, given in (("policy", policy), ("awareness", awareness)):
                 options[name] = _again(name, options[name], given, options.pop(f"own_{name}"))
@@ -406,7 +406,7 @@ class Campaign:
         except BaseException:
             journal.close()
             raise
-        campaign.log = Logbook.from_state(state, measured, result)
+        campaign.log = Logbook.from_state(state, measured, learned)
         if campaign.log.measured:
             *earlier, latest = campaign.log.measured
             if campaign.awareness is not None:
@@ -522,7 +522,8 @@ class Campaign:
         if self.awareness is None:
             return None
         like, planner = self.workspace.awareness, self.planner_now()
-        maps = planner.awareness[:_N_KEPT]
+        # Single precision: they are written after every mission.
+        maps = planner.awareness[:_N_KEPT].astype(np.float32)
         draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
         return xr.Dataset({"mean": like.copy(data=planner.mean_awareness), "draws": draws})
 

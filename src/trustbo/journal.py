@@ -11,7 +11,7 @@ from trustbo import archive, records
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.files import to_json, write_file, write_text
-from trustbo.result import Result, load_result, require_folder
+from trustbo.result import Learned, Result, read_learned, require_folder
 from trustbo.terrain import Workspace
 
 _STATE, _MEASURED, _WORKSPACE = "campaign.json", "measured.nc", "workspace.nc"
@@ -97,11 +97,11 @@ class Journal:
             result.save(self.folder) if whole else result.checkpoint(self.folder)
         write_text(self.folder / _STATE, to_json(state))
 
-    def read(self) -> tuple[dict[str, Any], list[Mission], Result | None]:
+    def read(self) -> tuple[dict[str, Any], list[Mission], Learned | None]:
         """State, the missions as told, and what was learned from all but maybe the last."""
         state = json.loads((self.folder / _STATE).read_text(encoding="utf-8"))
         measured: list[Mission] = []
         if (self.folder / _MEASURED).exists():
             measured = records.missions_from_tree(records.read_tree(self.folder / _MEASURED))
         n = state["n_missions"]
-        return state, measured, load_result(self.folder, n) if n else None
+        return state, measured, read_learned(self.folder, n) if n else None

@@ -10,7 +10,7 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
-from trustbo.result import Result, build_history
+from trustbo.result import Learned, build_history
 
 
 @dataclass(eq=False)
@@ -64,14 +64,14 @@ class Logbook:
 
     @classmethod
     def from_state(
-        cls, state: dict[str, Any], measured: list[Mission], result: Result | None
+        cls, state: dict[str, Any], measured: list[Mission], learned: Learned | None
     ) -> Self:
         """The logbook again, of missions as they were told and of what was learned from them."""
         n = state["n_missions"]
         maps, missions, posteriors = [], [], []
-        if result is not None:
-            missions, posteriors = result.missions, result.posteriors
-            maps = [result.history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
+        if learned is not None:
+            missions, posteriors, history = learned
+            maps = [history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
         return cls(
             list(missions),
             measured[:n],

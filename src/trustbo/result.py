@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -66,6 +66,12 @@ class Result:
     @cached_property
     def planner(self) -> Planner:
         """A planner as the campaign's, going by the awareness believed in at the end."""
+        missing = [n for n in (*_PLANNER_OPTIONS, "start", "goal") if n not in self.settings]
+        if missing:
+            raise TrustboError(
+                f"the result's settings lack {', '.join(missing)}: it was made by another version "
+                "or by hand; plan with a Planner of your own."
+            )
         options: dict[str, Any] = {name: self.settings[name] for name in _PLANNER_OPTIONS}
         start, goal = (_cell(self.settings[name]) for name in ("start", "goal"))
         planner = Planner(self.workspace, start, goal, **options)
@@ -82,25 +88,32 @@ class Result:
             best = self.planner.evaluate(self.path, mean)
         return replace(best, bands=self.planner.bands(best.path, self.posterior))
 
-    def maps(self, *, n_draws: int = 1000, seed: int = 0) -> xr.Dataset:
+    def maps(self, *, n_draws: int | None = None, seed: int = 0) -> xr.Dataset:
         """Every map of the planning cells after the last mission, for GIS and figures.
 
         Args:
-            n_draws: How many draws of the posterior to go over.
+            n_draws: How many draws of the posterior to go over; by default 1000, or 100 where each
+                cell needs a search of its own: `team="min"`, or robots that influence each other.
             seed: Same seed, same draws.
 
         Returns:
             Dataset over (row, col) with `trust_mean` and `trust_sd` over the posterior, the mean
             `cost` 1 - sigma(trust), `path_probability` (of a cell to be on the best path), and
-            each feature's awareness, the mean over robots. NaN where no robot can go.
+            each feature's awareness, the mean over robots, by its name (with "awareness_" before it
+            if that is another map's or a dim's). NaN where no robot can go.
         """
+        if n_draws is None:
+            mean = params_of(self.posterior).mean()
+            n_draws = 1000 if self.planner.dynamics(mean).is_scalar else 100
         summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
         share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
         awareness = self.workspace.awareness if self.believed is None else self.believed["mean"]
-        for name in awareness["feature"].values:
+        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref"}
+        for name in [str(feature) for feature in awareness["feature"].values]:
             values = awareness.sel(feature=name, drop=True).mean("robot")
-            maps[str(name)] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
+            own = f"awareness_{name}" if name in taken else name
+            maps[own] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
         maps["path_probability"] = share
         return maps.where(self.workspace.passable)
 
@@ -143,8 +156,9 @@ class Result:
             "missions.nc": records.missions_to_tree(self.missions),
             "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
         }
-        (folder / _BELIEVED).unlink(missing_ok=True)
-        if self.believed is not None:
+        if self.believed is None:
+            (folder / _BELIEVED).unlink(missing_ok=True)
+        else:
             trees[_BELIEVED] = xr.DataTree(self.believed)
         for name, tree in trees.items():
             _write_tree(folder / name, tree)
@@ -164,38 +178,60 @@ class Result:
         write_text(folder / "result.json", to_json(record))
 
 
-def load_result(directory: str | PathLike[str], n_missions: int | None = None) -> Result:
+def load_result(directory: str | PathLike[str]) -> Result:
     """Read a result that `Result.save` wrote.
 
     Args:
         directory: The folder.
-        n_missions: Only the first so many missions, and what was learned from them.
 
     Raises:
-        TrustboError: The folder holds no result.
+        TrustboError: The folder holds no result, or a damaged one.
     """
     folder = Path(directory)
     if not (folder / "result.json").exists():
         raise TrustboError(f"{str(folder)!r} holds no result; give a folder written by save().")
-    record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    try:
+        record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        n, settings = record["n_missions"], record["settings"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise TrustboError(f"{str(folder / 'result.json')!r} is damaged: {error!r}.") from None
     # A run killed while it saved may have left one mission more than the record knows of.
-    n = record["n_missions"] if n_missions is None else n_missions
-    history = records.read_tree(folder / "history.nc").to_dataset().isel(iteration=slice(n))
-    missions = records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n]
-    exists = (folder / _BELIEVED).exists()
-    believed = records.read_tree(folder / _BELIEVED) if exists else None
+    missions, posteriors, history = read_learned(folder, n)
+    believed = None
+    if settings.get("awareness") == "belief":
+        if not (folder / _BELIEVED).exists():
+            raise TrustboError(f"{str(folder / _BELIEVED)!r} is missing: the result is damaged.")
+        believed = records.read_tree(folder / _BELIEVED).to_dataset()
     return Result(
         archive.workspace_from_tree(records.read_tree(folder / "workspace.nc")),
         missions,
-        [records.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n)],
+        posteriors,
         [_cell(cell) for cell in record["path"]],
         np.array(record["trust"]),
         record["value"],
         history["final_trust_map"].rename("trust"),
         history.drop_vars("final_trust_map"),
-        record["settings"],
+        settings,
         record["stop_reason"],
-        believed.to_dataset() if believed is not None else None,
+        believed,
+    )
+
+
+class Learned(NamedTuple):
+    """Missions of a saved result, the posterior after each, and the history."""
+
+    missions: list[Mission]
+    posteriors: list[xr.DataTree]
+    history: xr.Dataset
+
+
+def read_learned(folder: Path, n_missions: int) -> Learned:
+    """The first missions of a saved result, and what was learned from each."""
+    history = records.read_tree(folder / "history.nc").to_dataset()
+    return Learned(
+        records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n_missions],
+        [records.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n_missions)],
+        history.isel(iteration=slice(n_missions)),
     )
 
 

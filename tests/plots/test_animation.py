@@ -6,9 +6,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from matplotlib.animation import writers
+from matplotlib.colors import to_hex
 from PIL import Image
 
 import trustbo as tb
+from trustbo.plots.animation import SEEN, UNSEEN
 
 
 @pytest.fixture(scope="module")
@@ -19,23 +21,40 @@ def mission(result):
 def test_a_frame_shows_where_robots_are_and_who_sees_the_lead(result, mission):
     animation = tb.plots.animate_mission(mission, result.workspace, speedup=10.0)
     near, overview, bars = animation._fig.axes
-    animation._func(0)
     bound, grid = mission.bounds[0], result.workspace.grid
     corner = np.array([grid.left, grid.top - 90.0])
-    shown = {line.get_label(): np.ravel(line.get_data()) for line in near.lines}
-    for name, pose in zip(("lead", "r1", "r2", "r3"), bound.poses[0], strict=True):
-        np.testing.assert_allclose(shown[name], pose[:2] - corner)
-    sight = [line for line in near.lines if len(line.get_xdata()) == 2][:3]
-    for line, seen in zip(sight, bound.contact[0], strict=True):
-        assert line.get_linestyle() == ("-" if seen else "--")
+    seen_by, ticks = np.unique(bound.contact, axis=0, return_index=True)
+    assert len(ticks) >= 4  # who sees the lead changes, so that robots cannot be mixed up
+    np.testing.assert_array_equal([seen_by.any(0), seen_by.all(0)], [[True] * 3, [False] * 3])
+    for tick, contact in zip(ticks, seen_by, strict=True):
+        animation._func(int(tick))
+        lead, *robots = bound.poses[tick, :, :2] - corner
+        shown = {line.get_label(): np.ravel(line.get_data()) for line in near.lines}
+        for name, place in zip(("lead", "r1", "r2", "r3"), (lead, *robots), strict=True):
+            np.testing.assert_allclose(shown[name], place)
+        assert [text.get_text() for text in bars.get_yticklabels()] == ["r1", "r2", "r3"]
+        rates = bound.contact[: tick + 1].mean(0)
+        for i, (place, seen) in enumerate(zip(robots, contact, strict=True)):
+            color = SEEN if seen else UNSEEN
+            (sight,) = [line for line in near.lines if is_between(line, lead, place)]
+            assert (sight.get_color(), sight.get_linestyle()) == (color, "-" if seen else "--")
+            (bar,) = [b for b in bars.patches if b.get_y() < i < b.get_y() + b.get_height()]
+            assert bar.get_width() == pytest.approx(rates[i])
+            assert to_hex(bar.get_facecolor()) == color
+            assert bar.get_hatch() == ("" if seen else "////")
     animation._func(len(bound.contact) - 1)  # the bound's last tick
-    widths = [bar.get_width() for bar in bars.patches]
-    np.testing.assert_allclose(widths, bound.contact_rate)
+    np.testing.assert_allclose([bar.get_width() for bar in bars.patches], bound.contact_rate)
     n_ticks = sum(len(b.contact) for b in mission.bounds)
     animation._func(n_ticks - 1)
     assert near.get_title().endswith(f"bound {len(mission.bounds)} of {len(mission.path) - 1}: ok")
     assert overview.images
     animation._draw_was_started = True  # nobody will: matplotlib would warn
+
+
+def is_between(line, one, other):
+    """Whether a line joins two points."""
+    ends = np.transpose(line.get_data())
+    return ends.shape == (2, 2) and np.allclose(ends, [one, other])
 
 
 def test_all_robots_stay_in_sight_of_the_camera(result, mission):

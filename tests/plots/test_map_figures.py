@@ -1,7 +1,9 @@
 """Cost per robot, and where the best path may be."""
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 import trustbo as tb
 
@@ -11,7 +13,8 @@ def test_each_robot_has_its_map_in_the_same_colours(result):
     cost = result.planner.cost_map(mean, per_robot=True)
     axes = tb.plots.robot_maps(cost, result.workspace, result.path, label="cost 1 - sigma(trust)")
     assert [ax.get_title() for ax in axes] == ["r1", "r2", "r3"]
-    for ax, own in zip(axes, cost, strict=True):
+    for ax in axes:
+        own = cost.sel(robot=ax.get_title())
         np.testing.assert_array_equal(ax.images[0].get_array(), own)
         assert ax.images[0].get_clim() == (float(cost.min()), float(cost.max()))
         assert ax.lines[0].get_xdata().size == len(result.path)
@@ -32,6 +35,20 @@ def test_columns_can_be_chosen_and_are_whole_numbers(result):
     assert [ax.get_xlabel() for ax in axes] == ["", "", "east (m)"]
     with pytest.raises(tb.TrustboError, match="n_columns must be a whole number from 1 on; got 0"):
         tb.plots.trust_maps(result, n_columns=0)
+
+
+def test_fonts_are_the_user_s_and_sizes_the_figure_s(result):
+    theirs = {"font.family": "serif", "font.size": 20, "figure.figsize": (9, 9)}
+    sizes = []
+    for settings in ({}, theirs):
+        with plt.rc_context(settings):
+            figure = tb.plots.trust_maps(result)[0].figure
+            figure.canvas.draw()
+        texts = [text for text in figure.findobj(Text) if text.get_text()]
+        sizes.append(([text.get_fontsize() for text in texts], *figure.get_size_inches()))
+    assert sizes[0] == sizes[1]
+    assert {7.0, 8.0, 9.0} == set(sizes[0][0])
+    assert {text.get_fontfamily()[0] for text in texts} == {"serif"}
 
 
 def test_figures_are_vectors_but_for_the_maps(result, tmp_path):

@@ -1,24 +1,13 @@
 """Figures of a result."""
 
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import xarray as xr
 
 import trustbo as tb
-
-
-@pytest.fixture(scope="module")
-def result():
-    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
-    return tb.iterate(
-        tb.Workspace.from_terrain(terrain, (3, 4)), (2, 0), (0, 3), n_iterations=2, progress=False
-    )
-
-
-@pytest.fixture(autouse=True)
-def close_figures():
-    yield
-    plt.close("all")
 
 
 def test_one_panel_per_iteration_and_one_for_the_end(result):
@@ -104,3 +93,23 @@ def test_impassable_cells_are_grey():
     image = tb.plots.cell_map(ax, trust, workspace)
     assert np.ma.getmaskarray(image.get_array()).tolist() == (~passable).tolist()
     assert ax.get_facecolor() == (0.75, 0.75, 0.75, 1.0)
+
+
+def test_level_ground_keeps_its_colour_whatever_lies_beside_it():
+    height = np.zeros((40, 40))
+    height[:, 20:] = np.arange(20) * 0.2  # a bank that faces the west, towards the sun
+    height[20:, :20] -= np.arange(20)[:, None] * 0.3  # and one that faces the south
+    y, x = np.arange(40.0)[::-1] + 0.5, np.arange(40.0) + 0.5
+    dem = xr.DataArray(height, {"y": y, "x": x}, ("y", "x"))
+    terrain = tb.terrain.assemble_terrain(dem.rio.write_crs("EPSG:32633"), dem)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # such ground makes for odd indices
+        workspace = tb.Workspace.from_terrain(terrain, (2, 2))
+    _, ax = plt.subplots()
+    tb.plots.draw_hillshade(ax, workspace, exaggerate=1.0)
+    shadow = ax.images[0].get_array()[..., 3]
+    np.testing.assert_allclose(shadow[2:18, 2:18], 0.0, atol=1e-12)  # level
+    np.testing.assert_allclose(shadow[2:18, 23:38], 0.0, atol=1e-12)  # lit
+    # Lambert's law on the bank to the south: n = (0, -0.3, 1), sun (-1, 1, sqrt 2) / 2, over level.
+    light = (1.0 - 0.3 / np.sqrt(2.0)) / np.sqrt(1.0 + 0.3**2)
+    np.testing.assert_allclose(shadow[23:38, 2:18], 0.55 * (1.0 - light), rtol=1e-9)

@@ -10,6 +10,7 @@ def test_bands_and_rates_are_those_of_the_posterior(result):
     axes = tb.plots.mission_trust(result.posterior, 0)
     drawn = result.posterior["latent"]["trust"].isel(mission=0)
     measured = result.missions[0].contact_rate
+    assert [ax.get_title() for ax in axes] == ["r1", "r2", "r3"]
     for i, ax in enumerate(axes):
         n = len(measured)
         own = drawn.isel(robot=i, bound=slice(n)).values.reshape(-1, n)
@@ -26,9 +27,9 @@ def test_bands_and_rates_are_those_of_the_posterior(result):
 
 def test_the_last_mission_is_shown_unless_another_is_asked_for(result):
     for mission in (-1, 1):
-        ax = tb.plots.mission_trust(result.posterior, mission)[0]
-        rates = ax.lines[1].get_ydata()
-        np.testing.assert_array_equal(rates, result.missions[1].contact_rate[:, 0])
+        axes = tb.plots.mission_trust(result.posterior, mission)
+        rates = np.transpose([ax.lines[1].get_ydata() for ax in axes])
+        np.testing.assert_array_equal(rates, result.missions[1].contact_rate)
     with pytest.raises(tb.TrustboError, match="mission must be one of 2, from -2 to 1; got 2"):
         tb.plots.mission_trust(result.posterior, 2)
 
@@ -53,11 +54,13 @@ def test_a_plan_s_bands_are_its_own(result):
     assert [ax.get_title() for ax in axes] == list(names)
     for i, ax in enumerate(axes):
         np.testing.assert_allclose(ax.lines[0].get_ydata(), plan.trust[:, i])
-        outer = ax.collections[0].get_paths()[0].vertices[:, 1]
-        assert set(np.round(plan.bands[[0, 3], :, i].ravel(), 9)) <= set(np.round(outer, 9))
-    rates = np.full((1, 3), 0.5)  # the mission ended after one bound
-    ax = tb.plots.plan_trust(plan, names, rates)[0]
-    assert np.isfinite(ax.lines[1].get_ydata()).sum() == 1
+        outer, inner = (band.get_paths()[0].vertices[:, 1] for band in ax.collections)
+        for ends, drawn in (([0, 3], outer), ([1, 2], inner)):
+            assert set(np.round(plan.bands[ends, :, i].ravel(), 9)) <= set(np.round(drawn, 9))
+    rates = np.array([[0.5, 0.6, 0.7]])  # the mission ended after one bound
+    for ax, rate in zip(tb.plots.plan_trust(plan, names, rates), rates[0], strict=True):
+        drawn = ax.lines[1].get_ydata()
+        np.testing.assert_array_equal(drawn[np.isfinite(drawn)], [rate])
 
 
 def test_a_plan_of_other_robots_is_refused(result):

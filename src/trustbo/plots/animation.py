@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.files import write_file
-from trustbo.plots.layout import corner_of, extent_of, grid_lines, plain
+from trustbo.plots.layout import as_text, corner_of, extent_of, grid_lines, plain
 from trustbo.plots.maps import draw_hillshade, draw_path, draw_scale, draw_scale_of
 from trustbo.terrain import Workspace
 
@@ -75,6 +75,7 @@ def animate_mission(
     if target is not None:
         require_choice("suffix", target.suffix.lower(), SUFFIXES)
     require_positive("fps", fps)
+    require_positive("dpi", dpi)
     ffmpeg = _ffmpeg() if target is not None and target.suffix.lower() == ".mp4" else ""
     film = _film(mission, workspace)
     span = float(film.time[-1] - film.time[0])
@@ -102,6 +103,8 @@ def _film(mission: Mission, workspace: Workspace) -> Film:
         n = len(bound.contact)
         if not n:
             continue
+        if not np.isfinite(bound.poses[..., :2]).all():
+            raise TrustboError(f"bound {k} has a pose that is not known (NaN); fill it first.")
         time = bound.t0 + (bound.t1 - bound.t0) * np.arange(1, n + 1) / n
         rate = np.cumsum(bound.contact, axis=0) / np.arange(1, n + 1)[:, None]
         place = bound.poses[..., :2] - corner
@@ -129,7 +132,11 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
     axes["all"].add_patch(frame)
     cast = _Cast(near, mission.robots)
     heights = bars.barh(
-        mission.robots, np.zeros(len(mission.robots)), height=0.6, edgecolor="black", linewidth=0.6
+        [as_text(name) for name in mission.robots],
+        np.zeros(len(mission.robots)),
+        height=0.6,
+        edgecolor="black",
+        linewidth=0.6,
     )
     bars.invert_yaxis()
     bars.set_xlim(0.0, 1.0)

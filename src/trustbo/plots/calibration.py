@@ -6,7 +6,7 @@ from matplotlib import colormaps
 from matplotlib.lines import Line2D
 from scipy import stats
 
-from trustbo.plots.layout import plain, small_multiples
+from trustbo.plots.layout import as_text, plain, small_multiples
 
 _DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
 _MARKERS = "osD^vPX*<>"
@@ -47,7 +47,7 @@ def calibration(ranks: xr.Dataset) -> np.ndarray:
             widths + dodge[i], ranks["coverage"].sel(parameter=name).values,
             **style | marker | {"linestyle": "none"},
         )  # fmt: skip
-        keys.append(Line2D([], [], label=name, **style | marker))
+        keys.append(Line2D([], [], label=as_text(name), **style | marker))
     curves.set(xlim=(0.0, 1.0))
     curves.set_xlabel("rank of the truth among the draws, as a share", fontsize=8)
     curves.set_ylabel("share of ranks below, less uniform", fontsize=8)

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.planning import QUANTILES
-from trustbo.plots.layout import lowest, plain, small_multiples
+from trustbo.plots.layout import as_text, lowest, plain, small_multiples
 from trustbo.plots.mission import INNER, LINE
 
 MOST_PANELS = 64
@@ -60,7 +60,7 @@ def parameter_history(
         _draw_parameter(ax, prior.get(label), [draws[label] for draws in after])
         if truth is not None and label in truth:
             ax.axhline(truth[label], color="black", linewidth=0.9, linestyle=(0, (4, 2)))
-        ax.set_title(label, fontsize=8)
+        ax.set_title(as_text(label), fontsize=8)
         ax.set_xlim(-0.6, len(after) + 0.6)
         ax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
         plain(ax)

@@ -53,7 +53,7 @@ def map_panels(
     """As `small_multiples`, for maps; more of them in a row where the terrain is tall."""
     tall = tallness(grid)
     if tall >= 2:
-        width, n_columns = 0.6 * width, n_columns or 5
+        width, n_columns = 0.6 * width, 5 if n_columns is None else n_columns
     size = width, width * tall + 0.35
     return small_multiples(n, n_columns, size, room=1.2, sharex=True, sharey=True)
 
@@ -110,6 +110,11 @@ def lowest(axes: np.ndarray) -> list[Axes]:
         for j, ax in enumerate(row)
         if ax.get_visible() and (i == last or not axes[i + 1, j].get_visible())
     ]
+
+
+def as_text(name: str) -> str:
+    """A user's name as it is: matplotlib would take dollar signs for formulas."""
+    return name.replace("$", r"\$")
 
 
 def plain(ax: Axes) -> None:

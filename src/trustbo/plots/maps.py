@@ -8,12 +8,20 @@ import xarray as xr
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LightSource, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from trustbo.data import Cell
-from trustbo.plots.layout import colour_bar, corner_of, extent_of, label_maps, map_panels, tallness
+from trustbo.plots.layout import (
+    as_text,
+    colour_bar,
+    corner_of,
+    extent_of,
+    label_maps,
+    map_panels,
+    tallness,
+)
 from trustbo.terrain import Grid, Workspace, pixel_size
 
 if TYPE_CHECKING:
@@ -84,14 +92,16 @@ def robot_maps(
     Returns:
         The Axes, shape (robot,).
     """
+    maps = maps.transpose("robot", "row", "col")
     names = [str(name) for name in maps["robot"].values]
     limits = float(maps.min()), float(maps.max())
-    figure, axes, panels = map_panels(workspace.grid, len(names), n_columns or _two(workspace))
-    for ax, name in zip(panels, names, strict=True):
-        cell_map(ax, maps.sel(robot=name), workspace, low=limits[0], high=limits[1])
+    n_columns = _two(workspace) if n_columns is None else n_columns
+    figure, axes, panels = map_panels(workspace.grid, len(names), n_columns)
+    for ax, name, own in zip(panels, names, maps, strict=True):
+        cell_map(ax, own, workspace, low=limits[0], high=limits[1])
         if path is not None:
             draw_path(ax, path, workspace.grid)
-        ax.set_title(name, fontsize=9)
+        ax.set_title(as_text(name), fontsize=9)
     _finish(figure, axes, workspace, label, limits)
     return panels
 
@@ -148,7 +158,7 @@ def cell_map(
 
 
 def draw_hillshade(
-    ax: Axes, workspace: Workspace, heights: str = "dem", *, exaggerate: float = 1.0
+    ax: Axes, workspace: Workspace, heights: str = "dem", *, exaggerate: float = 2.0
 ) -> None:
     """Shadows over what is drawn already, if there is a terrain in memory.
 
@@ -167,13 +177,12 @@ def draw_hillshade(
     height, width = pixel_size(terrain)
     known = np.isfinite(dem)
     ground = np.where(known, dem, np.nanmean(dem))
-    light = LightSource(azdeg=315, altdeg=45).hillshade(
-        ground, exaggerate, dx=width * step, dy=height * step
-    )
+    south, east = np.gradient(exaggerate * ground, height * step, width * step)
+    # Level ground has a light of 1, and so keeps its colour: that of the colour bar. The sun is in
+    # the north-west at 45 degrees; not matplotlib's shading, which stretches light to its extremes.
+    light = (1.0 + (east + south) / np.sqrt(2.0)) / np.sqrt(1.0 + east**2 + south**2)
     shadow = np.zeros((*dem.shape, 4))
-    # Level ground, lit at 45 degrees, keeps its colour: that of the colour bar.
-    level = np.sin(np.deg2rad(45.0))
-    shadow[..., 3] = np.where(known, SHADOW * np.clip(1.0 - light / level, 0.0, 1.0), 0.0)
+    shadow[..., 3] = np.where(known, SHADOW * np.clip(1.0 - light, 0.0, 1.0), 0.0)
     ax.imshow(shadow, extent=extent_of(workspace.grid), interpolation="bilinear")
 
 

@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.planning import QUANTILES, Plan
-from trustbo.plots.layout import lowest, plain, small_multiples
+from trustbo.plots.layout import as_text, lowest, plain, small_multiples
 
 OUTER, INNER, LINE = "#c6dcec", "#7fb2d6", "#003f66"
 """Three lightnesses of one blue: the 90 % band, the 50 % band, and what lies in their middle."""
@@ -37,7 +37,7 @@ def mission_trust(
     """
     latent = posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
-    if not -n_missions <= mission < n_missions:
+    if not isinstance(mission, int | np.integer) or not -n_missions <= mission < n_missions:
         raise TrustboError(
             f"mission must be one of {n_missions}, from {-n_missions} to {n_missions - 1}; "
             f"got {mission!r}."
@@ -104,7 +104,7 @@ def _panels(
     )
     for i, (ax, name) in enumerate(zip(panels, robots, strict=True)):
         _draw(ax, bounds, middle[:, i], bands[:, :, i], rates[:, i], named)
-        ax.set_title(name, fontsize=9)
+        ax.set_title(as_text(name), fontsize=9)
     for ax in lowest(axes):
         ax.set_xlabel("bound", fontsize=8)
         ax.tick_params(labelbottom=True)

@@ -9,6 +9,7 @@ from matplotlib.colors import ListedColormap, Normalize
 
 from trustbo.errors import TrustboError
 from trustbo.plots.layout import (
+    as_text,
     colour_bar,
     extent_of,
     grid_lines,
@@ -45,7 +46,9 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
         )
     grid, names = workspace.grid, [str(name) for name in workspace.awareness["feature"].values]
     n_panels = 1 + len(names)
-    figure, axes, panels = map_panels(grid, n_panels, n_columns or n_panels, width=3.3)
+    figure, axes, panels = map_panels(
+        grid, n_panels, n_panels if n_columns is None else n_columns, width=3.3
+    )
     extent = extent_of(grid)
     dsm = terrain["dsm"].values
     surface, *indices = panels
@@ -55,7 +58,7 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
     colour_bar(figure, ScalarMappable(heights, "cividis"), surface, "height (m)")
     for ax, name in zip(indices, names, strict=True):
         ax.imshow(pixels[name].values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
-        ax.set_title(name, fontsize=9)
+        ax.set_title(as_text(name), fontsize=9)
     steep = np.isfinite(dsm) & ~pixels["passable"].values
     closed = np.where(steep, 1.0, np.nan)
     indices[0].imshow(closed, cmap=ListedColormap([CLOSED]), extent=extent, interpolation="nearest")
@@ -90,14 +93,14 @@ def loadings(composites: Mapping[str, CompositeIndex]) -> np.ndarray:
     for ax, (name, index) in zip(panels, composites.items(), strict=True):
         _bars(ax, index)
         share = float(index.explained_variance_ratio_[0])
-        ax.set_title(f"{name}: {share:.0%} of the variance", fontsize=9)
+        ax.set_title(f"{as_text(name)}: {share:.0%} of the variance", fontsize=9)
     return panels
 
 
 def _bars(ax: Axes, index: CompositeIndex) -> None:
     values, signs = index.loadings_.values, np.array(list(index.signs.values()))
     agrees = values * signs >= 0.0
-    names = [name.replace("_", " ") for name in index.signs]
+    names = [as_text(name.replace("_", " ")) for name in index.signs]
     for which, colour, hatch in ((agrees, AGREES, ""), (~agrees, OPPOSES, "///")):
         label = "as declared" if colour == AGREES else "against its sign"
         rows = np.flatnonzero(which)
