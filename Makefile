@@ -12,7 +12,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 .PHONY: demo test lint docs bench clean
 
 demo: $(VENV)/.installed
-	$(BIN)/trustbo demo --out out/demo
+	$(BIN)/trustbo demo --out out/demo --overwrite
 
 test: $(VENV)/.installed-dev
 	TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --nbmake tests notebooks

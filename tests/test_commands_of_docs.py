@@ -41,7 +41,8 @@ _, STUDY = next(steps_of(ROOT / "docs" / "howto" / "run-a-study.md"))
 
 @pytest.fixture(scope="module")
 def terrain():
-    return tb.terrain.synthetic_terrain((100.0, 100.0), seed=3, relief=5.0)
+    """A rectangle, as most people's is."""
+    return tb.terrain.synthetic_terrain((100.0, 120.0), seed=3, relief=5.0)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,8 @@ def test_the_commands_of_a_page_run_from_top_to_bottom(
     monkeypatch.chdir(tmp_path)
     for name in ("dem", "dsm"):
         terrain[name].astype("float32").rio.to_raster(f"{name}.tif")
-    for name in ("mine", "demo"):
+    commands = [words for words, content in PAGES[page] if content is None]
+    for name in () if commands[0][1] in ("run", "demo") else ("mine", "demo"):
         shutil.copytree(campaign, Path("out") / name, ignore=shutil.ignore_patterns(".lock"))
     Path("config.yaml").write_text(STUDY)
     for words, content in PAGES[page]:

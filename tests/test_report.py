@@ -198,6 +198,16 @@ def test_reasons_to_end_are_sentences(result):
         assert end.text.startswith(sentence)
 
 
+@pytest.mark.parametrize("simulator", [None, "ModelSimulator"])
+def test_what_the_program_cannot_resume_goes_on_in_python(simulator, result):
+    settings = {**result.settings, "simulator": simulator}
+    if simulator is None:  # as of a campaign that was asked and told
+        del settings["simulator"]
+    under_way = dataclasses.replace(result, settings=settings, stop_reason="interrupted")
+    end = facts_of(under_way)[-1]
+    assert end.text == "It is under way, or was interrupted: Campaign.load(folder) goes on."
+
+
 def test_names_cannot_break_the_page_and_a_result_needs_no_terrain(hostile, tmp_path):
     text = write(hostile, tmp_path, title="<script>alert(1)</script>")
     page = Page(text)
@@ -236,6 +246,18 @@ def test_a_result_without_missions_is_refused(result, tmp_path):
     with pytest.raises(tb.TrustboError, match="the result has no mission; run one first"):
         write(dataclasses.replace(result, missions=[]), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_it_is_drawn(result, tmp_path):
+    (tmp_path / "file").touch()
+    broken = dataclasses.replace(result, posteriors=[])  # of which nothing could be drawn
+    for path, message in (
+        (tmp_path, r"cannot write '.*': it is a folder; name a file in it"),
+        (tmp_path / "file" / "report.html", r"cannot write to '.*file': .*file' is a file"),
+    ):
+        with pytest.raises(tb.TrustboError, match=message):
+            write_report(path, broken)
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
 
 
 def test_numbers_have_the_digits_they_are_sure_of():

@@ -1,5 +1,6 @@
 """`trustbo report` and `export`, the help of all commands, and how fast it comes."""
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -31,11 +32,50 @@ def test_export_writes_what_is_asked_for(invoke, finished, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
 
 
-def test_export_writes_all_there_is(invoke, finished, tmp_path):
+@pytest.mark.parametrize("target", [".", "folder", "file/report.html"])
+def test_report_says_at_once_where_it_cannot_write(target, invoke, finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    done = invoke("report", finished[0], "--out", target)
+    assert done.exit_code == 2
+    assert done.stderr.startswith("error: cannot write ")
+    assert done.stderr.count("\n") == 1
+    assert {file.name for file in tmp_path.rglob("*")} == {"file", "folder"}
+
+
+def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished, tmp_path):
     folder, _ = finished
-    done = invoke("export", folder, "--format", "all", "--resolution", 10, "--out", tmp_path)
-    assert done.exit_code == 0, done.output
-    assert len(done.output.splitlines()) >= len(FORMATS)
+    ask = ("export", folder, "--format", "all", "--resolution", 10)
+    once, again = (invoke(*ask, "--out", tmp_path) for _ in range(2))
+    assert (once.exit_code, again.exit_code) == (0, 0), once.output + again.output
+    there_are_bags = importlib.util.find_spec("rosbags") is not None
+    for done in (once, again):
+        absent = [line.split(":")[0].removeprefix("left out ") for line in done.stderr.splitlines()]
+        bags = ["ros1_bag", "ros2_bag"]
+        assert absent == ([] if done is once and there_are_bags else bags)
+        assert len(done.stdout.splitlines()) >= len(FORMATS) - len(absent)
+    if there_are_bags:
+        assert f"left out ros1_bag: '{tmp_path / 'path.bag'}' exists; bags are not" in again.stderr
+    strict = invoke(*ask, "--format", "ros1_bag", "--out", tmp_path)
+    assert strict.exit_code == 2
+    assert strict.stderr.startswith("error: ")
+    assert strict.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (("gpx", "--resolution", 5), "resolution=5 is of maps for ROS; leave it out, or ask for"),
+        (("ros_map", "--resolution", 0), "resolution must be positive and finite; got 0.0"),
+    ],
+)
+def test_a_resolution_that_cannot_be_is_refused(ask, message, invoke, finished, tmp_path):
+    done = invoke("export", finished[0], "--out", tmp_path / "never", "--format", *ask)
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "never").exists()
 
 
 def test_an_unknown_format_lists_the_choices(invoke, finished, tmp_path):
@@ -58,6 +98,7 @@ def test_help_teaches_by_example(command, invoke):
     shown = invoke(command, "--help").output
     assert f"Example: trustbo {command} " in shown
     assert "Exit codes: 0 done;" in shown
+    assert "unforeseen" in shown
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 

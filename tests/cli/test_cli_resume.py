@@ -26,12 +26,15 @@ def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(invoke, flags, tmp_path):
     arguments = ["run", *flags, "--iterations", 500, "--seed", 2, "--out", out, "--quiet"]
     command = [sys.executable, "-c", PROGRAM, *(str(a) for a in arguments)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 120
-        while not (out / "result.json").exists() and time.monotonic() < deadline:
-            assert process.poll() is None, process.communicate()[1]
-            time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=60)[1]
+        try:
+            deadline = time.monotonic() + 120
+            while not (out / "result.json").exists() and time.monotonic() < deadline:
+                assert process.poll() is None, process.communicate()[1]
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            said = process.communicate(timeout=60)[1]
+        finally:
+            process.kill()  # or a test that fails would wait for it
     assert process.returncode == 130, said
     assert f"all missions so far are kept: trustbo resume {out} goes on" in said
     assert "Traceback" not in said

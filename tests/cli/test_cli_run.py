@@ -1,6 +1,7 @@
 """`trustbo run` and `demo`: what they write, what they refuse, and in which words."""
 
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -142,6 +143,48 @@ def test_demo_writes_nothing_on_bad_input(invoke, tmp_path):
     done = invoke("demo", "--policy", "bold", "--out", tmp_path / "never")
     assert done.exit_code == 2
     assert not (tmp_path / "never").exists()
+
+
+def kept_in(folder):
+    """The bytes of all that a campaign left, the files that a run may touch among them."""
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
+
+
+def test_a_campaign_is_not_erased_unless_asked_for(invoke, flags, finished, tmp_path):
+    out = tmp_path / "mine"
+    shutil.copytree(finished[0], out)
+    before = kept_in(out)
+    for command in (("run", *flags), ("demo",)):
+        done = invoke(*command, "--out", out)
+        assert done.exit_code == 2
+        assert done.stderr == (
+            f"error: '{out}' holds a campaign: trustbo resume {out} goes on with it; give another "
+            "--out, or --overwrite to replace it.\n"
+        )
+        assert kept_in(out) == before  # no dem.tif either
+    again = ("run", *flags, "--iterations", 1, "--seed", 8, "--out", out, "--overwrite", "--quiet")
+    done = invoke(*again)
+    assert done.exit_code == 0, done.output
+    record = json.loads((out / "result.json").read_text())
+    assert (record["n_missions"], record["settings"]["seed"]) == (1, 8)
+
+
+def test_a_result_saved_in_python_is_not_erased_either(invoke, flags, tmp_path):
+    (tmp_path / "result.json").write_text("{}")
+    done = invoke("run", *flags, "--out", tmp_path)
+    assert done.exit_code == 2
+    assert "holds a result; give another --out, or --overwrite to replace it" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["report.html", "maps.png", "path.geojson", "dem.tif"])
+def test_a_folder_in_place_of_a_file_is_named_before_any_work(name, invoke, tmp_path):
+    (tmp_path / name).mkdir()
+    done = invoke("demo", "--out", tmp_path)
+    assert done.exit_code == 2
+    assert done.stderr == (
+        f"error: cannot write '{tmp_path / name}': it is a folder; name a file in it.\n"
+    )
+    assert [file.name for file in tmp_path.iterdir()] == [name]
 
 
 def test_debug_shows_the_traceback(invoke, flags, tmp_path):

@@ -10,6 +10,7 @@ import pytest
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.export import FORMATS, export_result
+from trustbo.export.everything import left_out
 
 FILES = {
     "geotiff": ["maps.tif", "maps.qml"],
@@ -62,6 +63,35 @@ def test_a_result_read_from_disk_is_exported_alike(result, tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
+    made = []
+
+    class Watched(tb.Result):
+        def maps(self, **options):
+            made.append(options)
+            return super().maps(**options)
+
+    fields = {f.name: getattr(result, f.name) for f in dataclasses.fields(result)}
+    watched = Watched(**fields)
+    export_result(watched, tmp_path, ["geojson", "gpx", "geopackage", "csv"])
+    assert made == []
+    export_result(watched, tmp_path, ["geotiff", "cog", "netcdf", "ros_map"])
+    assert made == [{}]
+
+
+def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    absent = left_out(nowhere, tmp_path)
+    assert list(absent) == [*NEEDS_A_PLACE, "ros1_bag", "ros2_bag"]
+    assert "only a workspace made from a terrain has a place on Earth" in absent["gpx"]
+    assert 'pip install "trustbo[ros]"' in absent["ros2_bag"]
+    (tmp_path / "path.csv").mkdir()
+    assert list(left_out(result, tmp_path)) == ["csv", "ros1_bag", "ros2_bag"]
+    (tmp_path / "file").touch()
+    with pytest.raises(TrustboError, match=r"cannot write to '.*file': .* is a file"):
+        left_out(result, tmp_path / "file")
+
+
 def test_without_a_terrain_there_are_tables_netcdf_and_ros(nowhere, tmp_path):
     pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
     for name in NEEDS_A_PLACE:
@@ -78,11 +108,8 @@ def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, 
         export_result(result, tmp_path, ["csv", "kml"])
     with pytest.raises(TrustboError, match=r"resolution must be positive and finite; got 0"):
         export_result(result, tmp_path, ["csv", "ros_map"], resolution=0)
-    grid = dataclasses.replace(result.workspace.grid, cell_width=40.0)
-    workspace = dataclasses.replace(result.workspace, grid=grid)
-    oblong = dataclasses.replace(result, workspace=workspace)
-    with pytest.raises(TrustboError, match="cells of 40 x 30 m are not square"):
-        export_result(oblong, tmp_path, ["csv", "ros2_bag"])
+    with pytest.raises(TrustboError, match=r"resolution=5 is of maps for ROS; leave it out, or"):
+        export_result(result, tmp_path, ["csv", "gpx"], resolution=5)
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(TrustboError, match=r'pip install "trustbo\[ros\]"'):
         export_result(result, tmp_path, ["csv", "ros1_bag"])

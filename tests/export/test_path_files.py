@@ -91,9 +91,9 @@ def test_gpx_is_a_route_over_the_ground(result, centers, tmp_path):
     write_path(tmp_path / "path.gpx", result.plan, result.workspace)
     gpx = gpxpy.parse((tmp_path / "path.gpx").read_text(), version="1.1")
     assert gpx.version == "1.1"
-    (route,) = gpx.routes
+    (route,), n = gpx.routes, len(centers)
     assert route.name == "most trustworthy path"
-    assert [point.name for point in route.points] == [str(k) for k in range(len(centers))]
+    assert [point.name for point in route.points] == [str(k) for k in range(n)]
     lon, lat = TO_DEGREES.transform(*centers.T)
     np.testing.assert_allclose([p.longitude for p in route.points], lon, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose([p.latitude for p in route.points], lat, rtol=0.0, atol=1e-8)
@@ -101,10 +101,9 @@ def test_gpx_is_a_route_over_the_ground(result, centers, tmp_path):
     for point, (row, col) in zip(route.points, result.path, strict=True):
         corner = dem[30 * row + 14 : 30 * row + 16, 30 * col + 14 : 30 * col + 16]
         assert corner.min() - 0.01 <= point.elevation <= corner.max() + 0.01
-    trust, low, high = trust_of(result.plan, 1, "r1")
-    said = f"r1 {trust:.2f} ({low:.2f} to {high:.2f}), r2 "
-    assert route.points[1].description.startswith(said)
-    assert route.points[0].description == "start"
+    said = [[(robot, *trust_of(result.plan, k, robot)) for robot in ROBOTS] for k in range(1, n)]
+    texts = [", ".join(f"{r} {t:.2f} ({a:.2f} to {b:.2f})" for r, t, a, b in one) for one in said]
+    assert [point.description for point in route.points] == ["start", *texts]
 
 
 def test_gpx_says_no_elevation_where_the_ground_is_not_known(result, nowhere, tmp_path):
@@ -150,8 +149,9 @@ def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, cent
     for k, (point, center, cell) in enumerate(zip(points, centers, result.path, strict=True)):
         np.testing.assert_array_equal(geometry(point["geom"])[1].coords, [center])
         assert (point["bound"], point["row"], point["col"]) == (k, *cell)
-        found = [point[f"trust_r2{end}"] for end in ("", "_low", "_high")]
-        assert found == (trust_of(result.plan, k, "r2") if k else [None] * 3)
+        for robot in ROBOTS:
+            found = [point[f"trust_{robot}{end}"] for end in ("", "_low", "_high")]
+            assert found == (trust_of(result.plan, k, robot) if k else [None] * 3)
 
 
 def test_a_table_has_degrees_where_there_are_any(result, nowhere, centers, tmp_path):
@@ -166,11 +166,12 @@ def test_a_table_has_degrees_where_there_are_any(result, nowhere, centers, tmp_p
         place = float(row.pop("longitude")), float(row.pop("latitude"))
         np.testing.assert_allclose(place, (lon[k], lat[k]), rtol=0.0, atol=1e-10)
         assert (float(row["x"]), float(row["y"])) == tuple(centers[k])
-        found = [row[f"trust_r3{end}"] for end in ("", "_low", "_high")]
-        if k:
-            assert [float(f) for f in found] == trust_of(result.plan, k, "r3")
-        else:
-            assert found == ["", "", ""]
+        for robot in ROBOTS:
+            found = [row[f"trust_{robot}{end}"] for end in ("", "_low", "_high")]
+            if k:
+                assert [float(f) for f in found] == trust_of(result.plan, k, robot)
+            else:
+                assert found == ["", "", ""]
     assert tables["bare"] == tables["path"]
 
 

@@ -102,16 +102,16 @@ def test_each_place_has_its_value_in_both_loaders(result, maps, resolution, orig
     assert len(np.unique(values)) > 3
 
 
-def test_cells_that_are_not_square_need_a_resolution(result, tmp_path):
-    oblong = tb.Workspace.from_terrain(result.workspace.terrain, (3, 3))
+def test_cells_that_are_not_square_are_of_ten_pixels_on_their_shorter_side(result, tmp_path):
+    oblong = tb.Workspace.from_terrain(result.workspace.terrain, (3, 3))  # cells of 40 x 30 m
     cost = oblong.awareness.isel(robot=0, feature=0)
-    message = r"cells of 40 x 30 m are not square, .*; give a resolution, e\.g\. resolution=3\."
-    with pytest.raises(TrustboError, match=message):
-        occupancy(cost, oblong)
-    with pytest.raises(TrustboError, match=message):
-        write_ros_map(tmp_path / "map.yaml", cost, oblong)
-    assert list(tmp_path.iterdir()) == []
     cells = np.clip(np.rint(100 * cost.values[::-1]), 0, 98)
+    write_ros_map(tmp_path / "map.yaml", cost, oblong)
+    values, record = load(tmp_path / "map.yaml")
+    assert record["resolution"] == 3.0
+    # Of 40 pixels to three cells, the centres at 40.5 and 79.5 m are just beyond and within.
+    widths = np.repeat([0, 1, 2], [13, 14, 13])
+    np.testing.assert_array_equal(values, np.repeat(cells, 10, axis=0)[:, widths])
     np.testing.assert_array_equal(
         occupancy(cost, oblong, resolution=10.0), np.kron(cells, np.ones((3, 4)))
     )

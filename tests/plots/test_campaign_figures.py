@@ -48,9 +48,13 @@ def test_robots_of_their_own_have_panels_of_their_own():
     ]
     model = tb.models.CoupledTrust(inter_robot="none")
     posterior = tb.models.fit(missions, model, sampler="exact")
-    titles = [ax.get_title() for ax in tb.plots.parameter_history([posterior], names=["beta", "b"])]
+    axes = tb.plots.parameter_history([posterior], names=["beta", "b"])
+    titles = [ax.get_title() for ax in axes]
     features = "traversability", "visibility"
     assert titles == [*(f"beta[{r}, {f}]" for r in "ab" for f in features), "b[a]", "b[b]"]
+    for ax, robot in zip(axes[-2:], "ab", strict=True):
+        draws = posterior["posterior"]["b"].sel(robot=robot).values
+        np.testing.assert_allclose(bars(ax)[0][0], [1, *np.quantile(draws, [0.05, 0.95])])
 
 
 def test_dots_are_missions_and_crosses_those_that_failed(result):

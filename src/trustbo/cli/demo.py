@@ -4,6 +4,7 @@ from pathlib import Path
 
 from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
+from trustbo.cli.outputs import require_outputs
 from trustbo.cli.run import require_names, run
 
 
@@ -16,12 +17,13 @@ def demo(
     seed: options.Seed = 0,
     config: options.Config = None,
     out: options.Out = Path("out/demo"),
+    overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
     """Run a campaign on a made terrain of 500 m x 500 m, whose DEM and DSM are written out too.
 
-    Example: trustbo demo --iterations 4 --out out/demo
+    Example: trustbo demo --sampler exact --iterations 4 --out out/demo
 
     Then open out/demo/report.html. The objective is the mean trust on the way,
     which makes for a telling picture; that of the paper, the default of run, is
@@ -29,11 +31,10 @@ def demo(
     """
     from trustbo import terrain
     from trustbo.files import write_file
-    from trustbo.result import require_folder
 
-    with one_line_errors(debug):
+    with one_line_errors(debug, campaign=out):
         require_names(policy, objective, model, sampler, iterations=iterations, seed=seed)
-        require_folder(out)
+        require_outputs(out, "dem.tif", "dsm.tif", overwrite=overwrite)
         ground = terrain.synthetic_terrain(seed=seed)
         for name in ("dem", "dsm"):
             raster = ground[name].astype("float32")
@@ -50,6 +51,7 @@ def demo(
         iterations=iterations,
         seed=seed,
         out=out,
+        overwrite=overwrite,
         quiet=quiet,
         debug=debug,
     )

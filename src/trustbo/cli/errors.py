@@ -70,5 +70,5 @@ def _after_refusal(campaign: Path | None) -> str:
     kept = "" if campaign is None else f"what was measured is kept in {campaign / 'measured.nc'}. "
     return (
         f"{kept}Run again with a model that asks less of so few data (--model pooled), longer "
-        "paths (more cells: --shape), or another --seed."
+        "paths (more cells: --shape), or another --seed, and another --out or --overwrite."
     )

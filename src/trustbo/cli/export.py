@@ -1,5 +1,7 @@
 """`trustbo export`: a result as files for other programs."""
 
+import sys
+
 from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
 from trustbo.errors import require_choice
@@ -16,15 +18,25 @@ def export(
 
     Example: trustbo export out/demo --format geotiff --format gpx
     Everything there is: trustbo export out/demo --format all --out for-the-field
+
+    Of all, what cannot be written (a place on Earth without a terrain, a bag that
+    is there already) is left out, which is said; what is asked for by name must be.
     """
     with one_line_errors(debug):
         from trustbo.export import FORMATS, export_result
+        from trustbo.export.everything import left_out
+        from trustbo.result import load_result
 
         for name in formats:
             require_choice("format", name, (*FORMATS, "all"))
-        chosen = tuple(FORMATS) if "all" in formats else tuple(dict.fromkeys(formats))
-        from trustbo.result import load_result
-
-        result = load_result(folder)
-        for file in export_result(result, out or folder, chosen, resolution=resolution):
+        result, target = load_result(folder), out or folder
+        chosen, absent = formats, {}
+        if "all" in formats:
+            reasons = left_out(result, target)
+            absent = {name: why for name, why in reasons.items() if name not in formats}
+            chosen = [name for name in FORMATS if name not in absent]
+        files = export_result(result, target, chosen, resolution=resolution)
+        for name, why in absent.items():
+            print(f"left out {name}: {why}", file=sys.stderr)
+        for file in files:
             print(file)

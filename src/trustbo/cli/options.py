@@ -138,7 +138,15 @@ Config = Annotated[
     ),
 ]
 Out = Annotated[
-    Path, _option(PROGRAM, "Folder for the results; made if need be.", metavar="FOLDER")
+    Path,
+    _option(
+        PROGRAM,
+        "Folder for the results, made if need be; not one that holds a campaign.",
+        metavar="FOLDER",
+    ),
+]
+Overwrite = Annotated[
+    bool, _option(PROGRAM, "Replace the campaign that the folder holds.", "--overwrite")
 ]
 Quiet = Annotated[bool, _option(PROGRAM, "No progress bar, no table.", "--quiet", "-q")]
 Debug = Annotated[bool, _option(PROGRAM, "Show the whole traceback of an error.", "--debug")]
@@ -160,7 +168,8 @@ Formats = Annotated[
     typer.Option(
         "--format",
         help="geotiff, cog, netcdf (maps); geojson, gpx, geopackage (the path); csv (path and "
-        "missions); ros_map, ros1_bag, ros2_bag (cost and path); or all. Give it once for each.",
+        "missions); ros_map, ros1_bag, ros2_bag (cost and path); or all that can be written. Give "
+        "it once for each.",
         metavar="NAME",
     ),
 ]
@@ -172,12 +181,20 @@ OutFolder = Annotated[
 ]  # fmt: skip
 ExportResolution = Annotated[
     float | None,
-    typer.Option("--resolution", help="Pixel size of rasters; by default a cell.", metavar="M"),
+    typer.Option(
+        "--resolution",
+        help="Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side where "
+        "cells are not square.",
+        metavar="M",
+    ),
 ]
 
 # --- of a study ---
 StudyConfig = Annotated[
     Path, typer.Argument(help="The study, in YAML; see docs/studies.md.", metavar="CONFIG")
+]
+StudyOut = Annotated[
+    Path, _option(PROGRAM, "Folder for the results; made if need be.", "--out", metavar="FOLDER")
 ]
 Executor = Annotated[
     str,

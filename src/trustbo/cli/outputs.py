@@ -3,8 +3,39 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from trustbo.errors import TrustboError
+
 if TYPE_CHECKING:
     from trustbo.result import Result
+
+_FILES = ("report.html", "maps.png", "terrain.png", "maps.tif", "maps.qml", "path.geojson")
+
+
+def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
+    """Refuse a folder that cannot take the results, before any work.
+
+    Args:
+        out: The folder, which need not exist yet.
+        *others: Files that it is to get, beside those of `write_outputs`.
+        overwrite: Whether a campaign may be there already.
+
+    Raises:
+        TrustboError: It holds a campaign or a result; its name belongs to a file, or that of a
+            file to a folder.
+    """
+    from trustbo.export.checks import require_file
+
+    if not overwrite and (out / "campaign.json").exists():
+        raise TrustboError(
+            f"{str(out)!r} holds a campaign: trustbo resume {out} goes on with it; give another "
+            "--out, or --overwrite to replace it."
+        )
+    if not overwrite and (out / "result.json").exists():
+        raise TrustboError(
+            f"{str(out)!r} holds a result; give another --out, or --overwrite to replace it."
+        )
+    for name in (*_FILES, *others):
+        require_file(out / name)
 
 
 def write_outputs(result: "Result", out: Path, *, table: bool) -> None:

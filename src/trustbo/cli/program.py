@@ -15,8 +15,9 @@ from trustbo.cli.run import run
 from trustbo.cli.study import study
 
 EPILOG = """
-Exit codes: 0 done; 1 done, but some of a study's runs failed; 2 bad input;
-3 a posterior was refused, what was measured is kept; 130 interrupted.
+Exit codes: 0 done; 1 done, but some of a study's runs failed, or an
+unforeseen error (with a traceback); 2 bad input; 3 a posterior was refused,
+what was measured is kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
 _PANELS = (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
-from trustbo.cli.outputs import write_outputs
+from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.errors import TrustboError, require_whole
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ def resume(
         if iterations is not None:
             require_whole("n_iterations", iterations, 1)
         state = _state(folder)
+        require_outputs(folder, overwrite=True)
         from trustbo.loop import resume as go_on
         from trustbo.stopping import RegretBound
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
-from trustbo.cli.outputs import write_outputs
+from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
@@ -40,24 +40,27 @@ def run(
     seed: options.Seed = 0,
     config: options.Config = None,
     out: options.Out = Path("out"),
+    overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
     """Run a campaign on your own terrain: plan, simulate, learn, and plan again.
 
     Example: trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
-    The same, with flags in a file: trustbo run --config mission.yaml --seed 2
+    The same, with flags in a file: trustbo run --config mission.yaml --seed 2 --out out/second
 
     The folder gets report.html (read this first), maps.png, terrain.png, maps.tif
     with its style maps.qml and path.geojson (for QGIS), posterior.nc (for ArviZ),
     history.csv, and the rest of the result for trustbo.load_result in Python.
-    Interrupted by Ctrl-C or a power cut, it goes on by trustbo resume.
+    Interrupted by Ctrl-C or a power cut, it goes on by trustbo resume. A campaign
+    that the folder holds already is kept: give another --out, or --overwrite.
     """
     with one_line_errors(debug, campaign=out):
         require_names(
             policy, objective, model, sampler, sight, awareness, team, replan,
             iterations=iterations, seed=seed,
         )  # fmt: skip
+        require_outputs(out, overwrite=overwrite)
         trust_model, who = _model(model, observation), _team(robots, max_slope, lidar_range)
         cells = _pair("start", start), _pair("goal", goal)
         rows_cols = _pair("shape", shape)

@@ -11,7 +11,7 @@ from trustbo.cli.outputs import use_no_screen, write_figure
 
 def study(
     config: options.StudyConfig,
-    out: options.Out = Path("out/study"),
+    out: options.StudyOut = Path("out/study"),
     executor: options.Executor = "loky",
     workers: options.Workers = None,
     quiet: options.Quiet = False,
@@ -19,7 +19,7 @@ def study(
 ) -> None:
     """Run a study: policies x objectives x models x seeds x terrains, on all cores.
 
-    Example: trustbo study config.yaml --out out/mine
+    Example: trustbo study config.yaml --out out/study
 
     The folder gets a file for each run, summary.csv (regret, or the plans' value
     where no truth is known, per policy and mission), and regret.png. Called
@@ -28,9 +28,12 @@ def study(
     use_no_screen()
     with one_line_errors(debug):
         from trustbo import plots
+        from trustbo.export.checks import require_file
         from trustbo.files import write_text
         from trustbo.study import axes_of, run_study, summary
 
+        for name in ("summary.csv", "regret.png"):
+            require_file(out / name)
         results = run_study(config, out, executor, n_workers=workers, progress=not quiet)
         known = bool(results["regret"].notnull().any())
         table = summary(results, variable="regret" if known else "value")

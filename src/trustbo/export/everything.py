@@ -1,13 +1,15 @@
 """A result in several formats at once, in one folder."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 import xarray as xr
 
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import require_crs, require_file
 from trustbo.export.netcdf import write_netcdf
 from trustbo.export.paths import write_path
@@ -19,12 +21,17 @@ from trustbo.result import Result, require_folder
 from trustbo.simulation.bagfile import require_new_bag
 
 
-class _Content(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class _Content:
     """What is to be written."""
 
     result: Result
-    maps: xr.Dataset
     resolution: float | None
+
+    @cached_property
+    def maps(self) -> xr.Dataset:
+        """The maps, made once and only if a format asks for them: they may take long."""
+        return self.result.maps()
 
 
 class _Format(NamedTuple):
@@ -49,33 +56,68 @@ def export_result(
         result: What a campaign learned.
         folder: Made if need be. Files in it are replaced, but bags are not.
         formats: Which of `FORMATS`.
-        resolution: Side of a pixel of the maps for ROS, m; by default that of a cell.
+        resolution: Side of a pixel of the maps for ROS, m; by default that of a cell, or a tenth of
+            its shorter side where cells are not square.
 
     Returns:
         The files written; of a ROS 2 bag, its folder.
 
     Raises:
         TrustboError: Before anything is written: an unknown format; one that needs a place on
-            Earth, of a result without a terrain; a bag that exists, or no rosbags; what `occupancy`
-            refuses; or files that cannot be.
+            Earth, of a result without a terrain; a bag that exists, or no rosbags; a resolution
+            that is not positive, or without a format for ROS; what `occupancy` refuses; or files
+            that cannot be.
     """
     names = [formats] if isinstance(formats, str) else dict.fromkeys(formats)
     chosen = {name: _FORMATS[require_choice("format", name, _FORMATS)] for name in names}
-    target = require_folder(folder)
-    if any(kind.on_earth for kind in chosen.values()):
-        require_crs(result.workspace)
-    for name, kind in chosen.items():
-        for file in kind.files:
-            if name in _BAGS:
-                require_new_bag(target / file, None)
-            else:
-                require_file(target / file)
-    content = _Content(result, result.maps(), resolution)
-    if not chosen.keys().isdisjoint(_ROS):
+    target, for_ros = require_folder(folder), not chosen.keys().isdisjoint(_ROS)
+    if resolution is not None:
+        require_positive("resolution", resolution)
+        if not for_ros:
+            raise TrustboError(
+                f"resolution={resolution:g} is of maps for ROS; leave it out, or ask for one of "
+                f"{', '.join(_ROS)}."
+            )
+    for name in chosen:
+        _require_possible(name, result, target)
+    content = _Content(result, resolution)
+    if for_ros:
         occupancy(content.maps["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
     return [target / file for kind in chosen.values() for file in kind.files]
+
+
+def left_out(result: Result, folder: str | PathLike[str]) -> dict[str, str]:
+    """The formats that this result, folder and machine cannot give, each with the reason.
+
+    Raises:
+        TrustboError: The folder's name belongs to a file.
+    """
+    target, reasons = require_folder(folder), {}
+    for name in _FORMATS:
+        try:
+            _require_possible(name, result, target)
+        except TrustboError as error:
+            reasons[name] = str(error)
+    return reasons
+
+
+def _require_possible(name: str, result: Result, target: Path) -> None:
+    """Refuse a format that cannot be written.
+
+    Raises:
+        TrustboError: It needs a place on Earth, and there is no terrain; it is a bag that exists,
+            or there is no rosbags; or a folder is in the way.
+    """
+    kind = _FORMATS[name]
+    if kind.on_earth:
+        require_crs(result.workspace)
+    for file in kind.files:
+        if name in _BAGS:
+            require_new_bag(target / file, None)
+        else:
+            require_file(target / file)
 
 
 def _write_maps(content: _Content, file: Path) -> None:

@@ -5,6 +5,7 @@ from os import PathLike
 import numpy as np
 from rasterio.transform import from_origin
 
+from trustbo.errors import TrustboError
 from trustbo.export.checks import Maps, find_crs, require_file, require_maps
 from trustbo.files import write_file
 from trustbo.terrain import Workspace
@@ -21,13 +22,17 @@ def write_netcdf(path: str | PathLike[str], maps: Maps, workspace: Workspace) ->
 
     Raises:
         ShapeError: Other dims, or another number of cells.
-        TrustboError: The path is no file to be.
+        TrustboError: The path is no file to be, or a map's name is none that netCDF takes.
     """
     bands, target = require_maps(maps, workspace), require_file(path)
+    for name in map(str, bands.data_vars):
+        if "/" in name or name in ("x", "y", "spatial_ref"):
+            raise TrustboError(f"a map in netCDF cannot be called {name!r}; rename it.")
     grid, crs = workspace.grid, find_crs(workspace)
     data = bands.rename(row="y", col="x").assign_coords(y=grid.y, x=grid.x)
     for name, values in data.data_vars.items():
-        values.attrs = {"long_name": name, "units": "1"} | values.attrs
+        texts = {key: str(value) for key, value in values.attrs.items()}
+        values.attrs = {"long_name": str(name), "units": "1"} | texts
         values.encoding = {"zlib": True, "_FillValue": np.nan}
     for axis, way in (("x", "east"), ("y", "north")):
         attrs = {"axis": axis.upper(), "units": "m"}

@@ -157,6 +157,12 @@ def _write_gpx(file: Path, plan: Plan, workspace: Workspace) -> None:
 def _write_geopackage(file: Path, plan: Plan, workspace: Workspace) -> None:
     require_crs(workspace)
     points = path_frame(plan, workspace, crs=None)
+    names = [str(name).lower() for name in points.columns]  # as SQL has them
+    if len(set(names)) < len(names):
+        raise TrustboError(
+            f"a GeoPackage does not tell capitals from small letters, as the names of these robots "
+            f"do: {workspace.team.names}; write GeoJSON instead."
+        )
     way = LineString(np.column_stack([points["x"], points["y"]]))
     line = gpd.GeoDataFrame([_facts(plan)], geometry=[way], crs=points.crs)
 

@@ -48,7 +48,8 @@ def occupancy(
     Args:
         cost: Dims (row, col), in [0, 1]; NaN where it is not known, e.g. `Result.maps()["cost"]`.
         workspace: Whose cells they are.
-        resolution: Side of a pixel, m, each as the cell at its centre; by default that of a cell.
+        resolution: Side of a pixel, m, each as the cell at its centre; by default that of a cell,
+            or a tenth of its shorter side where cells are not square.
 
     Returns:
         Shape (height, width), int8, the southern row first: 100 times the cost, but at most 98,
@@ -57,8 +58,7 @@ def occupancy(
 
     Raises:
         ShapeError: Other dims, or another number of cells.
-        TrustboError: A cost outside [0, 1]; cells that are not square, without a resolution; or a
-            resolution that is not positive, or far too fine.
+        TrustboError: A cost outside [0, 1]; or a resolution that is not positive, or far too fine.
     """
     (values,) = require_maps(cost.rename("cost"), workspace).data_vars.values()
     known = values.values
@@ -197,12 +197,8 @@ def _resolution(workspace: Workspace, resolution: float | None) -> float:
     if resolution is not None:
         return require_positive("resolution", resolution)
     height, width = workspace.grid.cell_height, workspace.grid.cell_width
-    if not math.isclose(height, width, rel_tol=1e-6):
-        raise TrustboError(
-            f"cells of {width:g} x {height:g} m are not square, as pixels of ROS are; give a "
-            f"resolution, e.g. resolution={min(height, width) / 10.0:g}."
-        )
-    return width
+    # Pixels of ROS are square; with ten to a cell, its edges are off by a twentieth at most.
+    return width if math.isclose(height, width, rel_tol=1e-6) else min(height, width) / 10.0
 
 
 def _position(origin: tuple[float, float]) -> np.ndarray:

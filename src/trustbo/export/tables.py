@@ -10,6 +10,8 @@ from trustbo.files import write_text
 from trustbo.result import Result
 from trustbo.simulation.rows import column_of
 
+_TRUST = ("trust_mean", "trust_sd")
+
 
 def write_csv(path: str | PathLike[str], result: Result) -> None:
     """Write a table with one row per mission (from 0), bound that was run (from 1), and robot.
@@ -28,7 +30,7 @@ def write_csv(path: str | PathLike[str], result: Result) -> None:
     """
     target = require_file(path)
     latent = result.posterior["latent"].to_dataset()
-    trust = {name: latent[name].values for name in ("trust_mean", "trust_sd")}
+    trust = {name: latent[name].values for name in _TRUST}
     # With update="moment_matched" a posterior is of its last mission alone.
     first = len(result.missions) - latent.sizes["mission"]
     rows = []
@@ -49,7 +51,12 @@ def write_csv(path: str | PathLike[str], result: Result) -> None:
                         "status": bound.status,
                         "mission_status": mission.status,
                     }
-                    | dict(zip(map(column_of, mission.features), bound.awareness[i], strict=True))
+                    | dict(zip(map(_column, mission.features), bound.awareness[i], strict=True))
                     | {n: a[j - first, k, i] if j >= first else np.nan for n, a in trust.items()}
                 )
     write_text(target, pd.DataFrame(rows).to_csv(index=False, lineterminator="\n"))
+
+
+def _column(feature: str) -> str:
+    """As in `simulation.write_table`, and apart from the columns of latent trust."""
+    return f"awareness_{feature}" if feature in _TRUST else column_of(feature)

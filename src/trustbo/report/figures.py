@@ -105,17 +105,19 @@ def terrain(result: Result) -> Picture:
     )
 
 
-def parameters(result: Result) -> Picture:
-    """What was learned of the parameters, mission by mission."""
+def parameters(result: Result) -> Picture | None:
+    """What was learned of the parameters, mission by mission; None if they are too many."""
     sites = result.posterior["posterior"].to_dataset()
     sizes: dict[str, int] = {}
     for _, name, _, _ in labelled_draws(sites):
         sizes[name] = sizes.get(name, 0) + 1
     shown, total = [], 0
     for name, size in sizes.items():
-        if not shown or total + size <= MOST_PARAMETERS:
+        if total + size <= MOST_PARAMETERS:
             shown.append(name)
             total += size
+    if not shown:
+        return None
     rest = [name for name in sizes if name not in shown]
     caption = (
         "Each parameter after each mission: thick bars hold 50 % of the posterior, thin ones 90 %; "

@@ -7,9 +7,10 @@ from os import PathLike
 import jinja2
 
 from trustbo.errors import TrustboError
+from trustbo.export.checks import require_file
 from trustbo.files import write_text
 from trustbo.report import figures, tables
-from trustbo.report.blocks import Section
+from trustbo.report.blocks import Picture, Section, Table
 from trustbo.report.numbers import counted
 from trustbo.report.summary import facts_of
 from trustbo.result import Result
@@ -24,8 +25,9 @@ def write_report(path: str | PathLike[str], result: Result, *, title: str | None
         title: Of the page; by default it says how many missions there were.
 
     Raises:
-        TrustboError: The result has no mission.
+        TrustboError: The result has no mission, or the path is no file to be.
     """
+    target = require_file(path)
     if not result.missions:
         raise TrustboError("the result has no mission; run one first.")
     name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
@@ -42,7 +44,7 @@ def write_report(path: str | PathLike[str], result: Result, *, title: str | None
         sections=list(_sections(result)),
         version=result.settings.get("trustbo_version", version("trustbo")),
     )
-    write_text(path, page)
+    write_text(target, page)
 
 
 def _sections(result: Result) -> Iterator[Section]:
@@ -63,7 +65,7 @@ def _sections(result: Result) -> Iterator[Section]:
         "learned",
         "What was learned",
         _what_parameters_mean(result),
-        [figures.parameters(result), tables.parameter_table(result)],
+        [block for block in _learned(result) if block is not None],
     )
     yield Section(
         "last",
@@ -75,6 +77,10 @@ def _sections(result: Result) -> Iterator[Section]:
         "history", "The campaign", "", [figures.history(result), tables.history_table(result)]
     )
     yield Section("settings", "Settings", "", [tables.settings_table(result)])
+
+
+def _learned(result: Result) -> tuple[Picture | None, Table]:
+    return figures.parameters(result), tables.parameter_table(result)
 
 
 def _what_parameters_mean(result: Result) -> str:

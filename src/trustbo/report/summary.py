@@ -18,10 +18,6 @@ _MEANS = {
     "bottleneck": "the least expected trust on the way",
     "stationary": "the probability that every bound succeeds, trust taken as settled in each cell",
 }
-_ENDS = {
-    "n_iterations": "All missions asked for were run.",
-    "interrupted": "It was interrupted, or is still under way: trustbo resume goes on.",
-}
 
 
 def facts_of(result: Result) -> list[Fact]:
@@ -33,7 +29,7 @@ def facts_of(result: Result) -> list[Fact]:
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
         Fact("Success", _success(plan)),
         _soundness(result),
-        Fact("Why it ended", _ENDS.get(result.stop_reason, f"{_sentence(result.stop_reason)}")),
+        Fact("Why it ended", _end(result)),
     ]
 
 
@@ -116,8 +112,15 @@ def _soundness(result: Result) -> Fact:
     return Fact("Posteriors", f"{verdict}: {'; '.join(said)}.", good)
 
 
-def _sentence(text: str) -> str:
-    """A rule's own reason as a sentence."""
+def _end(result: Result) -> str:
+    """Why it ended, or how it goes on."""
+    text = result.stop_reason
+    if text == "n_iterations":
+        return "All missions asked for were run."
+    if text == "interrupted":
+        if result.settings.get("simulator") == "KinematicSimulator":  # as `trustbo run` has it
+            return "It was interrupted, or is still under way: trustbo resume goes on."
+        return "It is under way, or was interrupted: Campaign.load(folder) goes on."
     name, _, rest = text.partition(":")
     known = {
         "regret_bound": "The recommended path is good enough:",
