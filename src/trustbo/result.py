@@ -99,8 +99,8 @@ class Result:
         Returns:
             Dataset over (row, col) with `trust_mean` and `trust_sd` over the posterior, the mean
             `cost` 1 - sigma(trust), `path_probability` (of a cell to be on the best path), and
-            each feature's awareness, the mean over robots, by its name (with "awareness_" before it
-            if that is another map's or a dim's). NaN where no robot can go.
+            each feature's awareness, the mean over robots, by its name, or as `awareness_<name>`
+            where that is another map's or a dim's. NaN where no robot can go.
         """
         if n_draws is None:
             mean = params_of(self.posterior).mean()
