@@ -127,3 +127,17 @@ def test_what_is_in_the_way_is_named_before_anything_is_written(result, tmp_path
     with pytest.raises(TrustboError, match=r"cannot write to '.*path\.bag': .* is a file"):
         export_result(result, tmp_path / "path.bag")
     assert {file.name for file in tmp_path.iterdir()} == {"path.csv", "path.bag"}
+
+
+def test_names_that_a_format_cannot_hold_are_refused_before_anything_is_written(result, tmp_path):
+    workspace = result.workspace
+    team = tb.Team(3, names=("R1", "r1", "r2"))
+    awareness = workspace.awareness.assign_coords(robot=list(team.names), feature=["a/b", "x"])
+    odd = dataclasses.replace(workspace, team=team, awareness=awareness)
+    odd = dataclasses.replace(result, workspace=odd)
+    with pytest.raises(TrustboError, match=r"does not tell capitals .* \('R1', 'r1', 'r2'\)"):
+        export_result(odd, tmp_path, ["geojson", "geopackage"])
+    with pytest.raises(TrustboError, match="a map in netCDF cannot be called 'a/b'"):
+        export_result(odd, tmp_path, ["geojson", "netcdf"])
+    assert list(tmp_path.iterdir()) == []
+    assert {"geopackage", "netcdf"} <= set(left_out(odd, tmp_path))

@@ -1,5 +1,6 @@
 """What exports refuse before they write anything."""
 
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -89,3 +90,27 @@ def require_maps(maps: Maps, workspace: Workspace) -> xr.Dataset:
             raise TrustboError(f"map {name!r} must hold numbers; got {values.dtype}.")
         bands[str(name)] = (("row", "col"), values.values.astype(np.float64), values.attrs)
     return xr.Dataset(bands)
+
+
+def require_names_for_netcdf(names: Iterable[str]) -> None:
+    """Refuse names that a map in netCDF cannot have.
+
+    Raises:
+        TrustboError: One of them, named.
+    """
+    for name in names:
+        if "/" in name or name in ("x", "y", "spatial_ref"):
+            raise TrustboError(f"a map in netCDF cannot be called {name!r}; rename it.")
+
+
+def require_names_for_sql(robots: Sequence[str]) -> None:
+    """Refuse names of robots that a GeoPackage could not tell apart.
+
+    Raises:
+        TrustboError: They differ by capitals alone.
+    """
+    if len({name.lower() for name in robots}) < len(robots):
+        raise TrustboError(
+            "a GeoPackage does not tell capitals from small letters, as the names of these robots "
+            f"do: {tuple(robots)}; write GeoJSON instead."
+        )

@@ -10,7 +10,12 @@ from typing import NamedTuple
 import xarray as xr
 
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.export.checks import require_crs, require_file
+from trustbo.export.checks import (
+    require_crs,
+    require_file,
+    require_names_for_netcdf,
+    require_names_for_sql,
+)
 from trustbo.export.netcdf import write_netcdf
 from trustbo.export.paths import write_path
 from trustbo.export.rasters import write_geotiff
@@ -41,6 +46,8 @@ class _Format(NamedTuple):
     """Called with the first of the files."""
     on_earth: bool = False
     """Whether it needs a CRS."""
+    require: Callable[[Result], None] | None = None
+    """Refuses a result that it cannot hold."""
 
 
 def export_result(
@@ -108,11 +115,13 @@ def _require_possible(name: str, result: Result, target: Path) -> None:
 
     Raises:
         TrustboError: It needs a place on Earth, and there is no terrain; it is a bag that exists,
-            or there is no rosbags; or a folder is in the way.
+            or there is no rosbags; a name that it cannot hold; or a folder is in the way.
     """
     kind = _FORMATS[name]
     if kind.on_earth:
         require_crs(result.workspace)
+    if kind.require is not None:
+        kind.require(result)
     for file in kind.files:
         if name in _BAGS:
             require_new_bag(target / file, None)
@@ -152,6 +161,12 @@ def _write_path(content: _Content, file: Path) -> None:
     write_path(file, content.result)
 
 
+def _require_netcdf(result: Result) -> None:
+    features = result.workspace.awareness["feature"].values
+    # Result.maps gives those that are called as a coordinate another name.
+    require_names_for_netcdf(str(name) for name in features if "/" in str(name))
+
+
 _BAGS = ("ros1_bag", "ros2_bag")
 _ROS = ("ros_map", *_BAGS)
 _FORMATS = {
@@ -168,6 +183,7 @@ _FORMATS = {
         "all maps as netCDF by the CF conventions",
         ("maps.nc",),
         lambda content, file: write_netcdf(file, content.maps, content.result.workspace),
+        require=_require_netcdf,
     ),
     "geojson": _Format(
         "the path in longitude and latitude", ("path.geojson",), _write_path, on_earth=True
@@ -176,7 +192,11 @@ _FORMATS = {
         "the path as a route for GPS receivers", ("path.gpx",), _write_path, on_earth=True
     ),
     "geopackage": _Format(
-        "the path and its cells as layers for GIS", ("path.gpkg",), _write_path, on_earth=True
+        "the path and its cells as layers for GIS",
+        ("path.gpkg",),
+        _write_path,
+        on_earth=True,
+        require=lambda result: require_names_for_sql(result.workspace.team.names),
     ),
     "csv": _Format(
         "tables of all bounds and of the path", ("bounds.csv", "path.csv"), _write_tables

@@ -5,8 +5,13 @@ from os import PathLike
 import numpy as np
 from rasterio.transform import from_origin
 
-from trustbo.errors import TrustboError
-from trustbo.export.checks import Maps, find_crs, require_file, require_maps
+from trustbo.export.checks import (
+    Maps,
+    find_crs,
+    require_file,
+    require_maps,
+    require_names_for_netcdf,
+)
 from trustbo.files import write_file
 from trustbo.terrain import Workspace
 
@@ -25,9 +30,7 @@ def write_netcdf(path: str | PathLike[str], maps: Maps, workspace: Workspace) ->
         TrustboError: The path is no file to be, or a map's name is none that netCDF takes.
     """
     bands, target = require_maps(maps, workspace), require_file(path)
-    for name in map(str, bands.data_vars):
-        if "/" in name or name in ("x", "y", "spatial_ref"):
-            raise TrustboError(f"a map in netCDF cannot be called {name!r}; rename it.")
+    require_names_for_netcdf(map(str, bands.data_vars))
     grid, crs = workspace.grid, find_crs(workspace)
     data = bands.rename(row="y", col="x").assign_coords(y=grid.y, x=grid.x)
     for name, values in data.data_vars.items():

@@ -12,7 +12,7 @@ from pyproj.exceptions import CRSError
 from shapely import LineString
 
 from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.export.checks import find_crs, require_crs, require_file
+from trustbo.export.checks import find_crs, require_crs, require_file, require_names_for_sql
 from trustbo.export.gpx import gpx_route
 from trustbo.files import to_json, write_file, write_text
 from trustbo.planning import Plan
@@ -156,13 +156,8 @@ def _write_gpx(file: Path, plan: Plan, workspace: Workspace) -> None:
 
 def _write_geopackage(file: Path, plan: Plan, workspace: Workspace) -> None:
     require_crs(workspace)
+    require_names_for_sql(workspace.team.names)
     points = path_frame(plan, workspace, crs=None)
-    names = [str(name).lower() for name in points.columns]  # as SQL has them
-    if len(set(names)) < len(names):
-        raise TrustboError(
-            f"a GeoPackage does not tell capitals from small letters, as the names of these robots "
-            f"do: {workspace.team.names}; write GeoJSON instead."
-        )
     way = LineString(np.column_stack([points["x"], points["y"]]))
     line = gpd.GeoDataFrame([_facts(plan)], geometry=[way], crs=points.crs)
 
