@@ -230,11 +230,18 @@ def test_alternate_bounding_leads_by_turns(wooded):
 
 def test_iterate_tells_the_simulator_which_mission_it_is(flat):
     jam = Threat("jam", flat.grid.center((1, 1)), 60.0, first_mission=1, strength=0.9)
-    simulator = KinematicSimulator(flat, sight="bare", threats=[jam])
-    model = tb.models.PooledTrust(observation="censored")
+    # Rates that are all 1 would be refused.
+    worn = Degradation("r1", 0.8)
+    simulator = KinematicSimulator(flat, sight="bare", threats=[jam], degradations=[worn])
     result = tb.iterate(
-        flat, (2, 0), (0, 2), n_iterations=2, simulator=simulator, model=model, progress=False
+        flat,
+        (2, 0),
+        (0, 2),
+        n_iterations=2,
+        sampler="exact",
+        simulator=simulator,
+        progress=False,
     )
-    first, second = (m.contact_rate.mean() for m in result.missions)
+    first, second = (m.contact_rate[:, 1:].mean() for m in result.missions)
     assert first == 1.0
     assert second < 0.5
