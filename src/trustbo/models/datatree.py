@@ -1,6 +1,6 @@
 """How a posterior is laid out for ArviZ: named axes, no padding, the data beside it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -85,3 +85,14 @@ def _data_groups(
         own | {"feature": coords["feature"]},
     )
     return rates, constant
+
+
+def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:
+    """Label such as "beta[visibility]", name, index and draws (draw,) of every parameter."""
+    for name, array in sites.data_vars.items():
+        draws = array.transpose("chain", "draw", ...)
+        dims, values = draws.dims[2:], draws.values.reshape(-1, *draws.shape[2:])
+        for where in np.ndindex(*draws.shape[2:]):
+            places = [str(draws[d].values[i]) for d, i in zip(dims, where, strict=True)]
+            label = f"{name}[{', '.join(places)}]" if places else str(name)
+            yield label, str(name), where, values[:, *where]

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
+from trustbo.models.datatree import labelled_draws
 from trustbo.planning import QUANTILES
 from trustbo.plots.layout import as_text, lowest, plain, small_multiples
 from trustbo.plots.mission import INNER, LINE
@@ -142,13 +143,5 @@ def _scalars(posterior: xr.DataTree, group: str, names: Sequence[str]) -> dict[s
     """Draws (draw,) by label; nothing where there is no such group."""
     if group not in posterior:
         return {}
-    draws = posterior[group].to_dataset()
-    labelled = {}
-    for name in names:
-        own = draws[name].stack(all_draws=("chain", "draw"))
-        dims = [str(dim) for dim in own.dims if dim != "all_draws"]
-        own = own.transpose(*dims, "all_draws")
-        for index in np.ndindex(*(own.sizes[dim] for dim in dims)):
-            where = ", ".join(str(own[d].values[i]) for d, i in zip(dims, index, strict=True))
-            labelled[f"{name}[{where}]" if dims else name] = own.values[index]
-    return labelled
+    chosen = posterior[group].to_dataset()[list(names)]
+    return {label: draws for label, _, _, draws in labelled_draws(chosen)}

@@ -6,10 +6,10 @@ import numpy as np
 
 from trustbo import plots
 from trustbo.models import params_of
+from trustbo.models.datatree import labelled_draws
 from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
 from trustbo.report.numbers import counted, joined, number
-from trustbo.report.tables import labelled_draws
 from trustbo.result import Result
 
 MOST_MAPS = 11

@@ -1,12 +1,11 @@
 """The tables of a page."""
 
-from collections.abc import Iterator
-
 import arviz as az
 import numpy as np
 import xarray as xr
 
 from trustbo.files import to_json
+from trustbo.models.datatree import labelled_draws
 from trustbo.report.blocks import Table
 from trustbo.report.numbers import NONE, cell_text, decimals_for, number
 from trustbo.result import Result
@@ -97,17 +96,6 @@ def settings_table(result: Result) -> Table:
     """What the campaign was run with."""
     rows = [(name.replace("_", " "), _plain(value)) for name, value in result.settings.items()]
     return Table("What the campaign was run with.", ("setting", "value"), rows, text_columns=(1,))
-
-
-def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:
-    """Label such as "beta[visibility]", name, index and draws (draw,) of every parameter."""
-    for name, array in sites.data_vars.items():
-        draws = array.transpose("chain", "draw", ...)
-        dims, values = draws.dims[2:], draws.values.reshape(-1, *draws.shape[2:])
-        for where in np.ndindex(*draws.shape[2:]):
-            places = [str(draws[d].values[i]) for d, i in zip(dims, where, strict=True)]
-            label = f"{name}[{', '.join(places)}]" if places else str(name)
-            yield label, str(name), where, values[:, *where]
 
 
 def _change(row: xr.Dataset) -> str:
