@@ -49,14 +49,9 @@ def flags_of(path: Path, known: Iterable[str]) -> dict[str, str]:
 
 
 def _read(path: Path) -> Mapping[Any, Any]:
-    import yaml
+    from trustbo.study.configuration import read_yaml
 
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TrustboError(f"cannot read {str(path)!r}: {error.strerror}.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise TrustboError(f"{str(path)!r} is no YAML: {' '.join(str(error).split())}") from None
+    content = read_yaml(path)
     if content is None:
         return {}
     if not isinstance(content, Mapping):

@@ -185,7 +185,7 @@ def _raster(
     origin: tuple[float, float] | None,
 ) -> _Raster:
     grid = workspace.grid
-    own = np.array([grid.left, grid.top - grid.shape[0] * grid.cell_height])
+    own = np.array(grid.corner)
     corner = own if origin is None else _position(origin)
     values = occupancy(cost, workspace, resolution=resolution)
     x, y = corner.tolist()

@@ -17,7 +17,7 @@ from scipy.ndimage import uniform_filter1d
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.files import write_file
-from trustbo.plots.layout import as_text, corner_of, extent_of, grid_lines, plain
+from trustbo.plots.layout import as_text, extent_of, grid_lines, plain
 from trustbo.plots.maps import draw_hillshade, draw_path, draw_scale, draw_scale_of
 from trustbo.terrain import Workspace
 
@@ -93,7 +93,7 @@ def animate_mission(
 
 
 def _film(mission: Mission, workspace: Workspace) -> Film:
-    parts, corner = [], corner_of(workspace.grid)
+    parts, corner = [], workspace.grid.corner
     for k, bound in enumerate(mission.bounds, start=1):
         if bound.poses is None or bound.contact is None:
             raise TrustboError(
@@ -218,7 +218,7 @@ def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
         ax.imshow(grown, cmap="Greys", vmin=0.0, vmax=3.0, extent=extent, interpolation="nearest")
         draw_hillshade(ax, workspace, "dsm", exaggerate=3.0)
     cells = np.array([workspace.grid.center(cell) for cell in mission.path])
-    ax.plot(*(cells - corner_of(workspace.grid)).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
+    ax.plot(*(cells - workspace.grid.corner).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 
 

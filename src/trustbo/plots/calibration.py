@@ -6,10 +6,8 @@ from matplotlib import colormaps
 from matplotlib.lines import Line2D
 from scipy import stats
 
-from trustbo.plots.layout import as_text, plain, small_multiples
+from trustbo.plots.layout import DASHES, MARKERS, as_text, plain, small_multiples
 
-_DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)))
-_MARKERS = "osD^vPX*<>"
 _PROBABILITY = 0.95
 
 
@@ -40,9 +38,9 @@ def calibration(ranks: xr.Dataset) -> np.ndarray:
         # A step at each rank: from how far below it is to how far above.
         x = np.concatenate([[0.0], np.repeat(pit, 2), [1.0]])
         above = np.concatenate([[0.0, 0.0], np.repeat(np.arange(1, n + 1) / n, 2)])
-        style = {"color": shades[i], "linestyle": _DASHES[i % len(_DASHES)], "linewidth": 1.1}
+        style = {"color": shades[i], "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.1}
         curves.plot(x, above - x, **style)
-        marker = {"marker": _MARKERS[i % len(_MARKERS)], "markersize": 4.0}
+        marker = {"marker": MARKERS[i % len(MARKERS)], "markersize": 4.0}
         cover.plot(
             widths + dodge[i], ranks["coverage"].sel(parameter=name).values,
             **style | marker | {"linestyle": "none"},

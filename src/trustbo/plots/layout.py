@@ -10,6 +10,10 @@ from matplotlib.figure import Figure
 from trustbo.errors import require_whole
 from trustbo.terrain import Grid
 
+MARKERS = "osD^vPX*<>"
+DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
+"""Of curves beside each other, in order, so that they can be told apart without colour."""
+
 
 def small_multiples(
     n: int, n_columns: int | None, size: tuple[float, float], room: float = 0.0, **shared: Any
@@ -65,13 +69,8 @@ def colour_bar(figure, image, axes, label: str, **options) -> None:
     bar.ax.tick_params(labelsize=7)
 
 
-def corner_of(grid: Grid) -> np.ndarray:
-    """The lower left corner, which maps are drawn relative to: CRS coordinates are long."""
-    return np.array([grid.left, grid.top - grid.shape[0] * grid.cell_height])
-
-
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of a map, m from its lower left corner."""
+    """Left, right, bottom and top of a map, m from its lower left corner: CRS metres are long."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)
 
 

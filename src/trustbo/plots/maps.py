@@ -16,7 +16,6 @@ from trustbo.data import Cell
 from trustbo.plots.layout import (
     as_text,
     colour_bar,
-    corner_of,
     extent_of,
     label_maps,
     map_panels,
@@ -218,7 +217,7 @@ def draw_scale_of(ax: Axes, width: float) -> None:
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     """Draw a path over a map, from its start (circle) to its goal (star)."""
-    centers = np.array([grid.center(cell) for cell in path]) - corner_of(grid)
+    centers = np.array([grid.center(cell) for cell in path]) - grid.corner
     outline = [patheffects.Stroke(linewidth=3.2, foreground="black"), patheffects.Normal()]
     x, y = centers[:, 0], centers[:, 1]
     ax.plot(x, y, color="white", linewidth=1.6, path_effects=outline, solid_joinstyle="round")

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
+from trustbo.plots.layout import DASHES, MARKERS
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Of the runs: ends of the thin bars and of the thick ones, and the marker between them."""
@@ -18,8 +19,6 @@ _MEANING = {
     "regret": "regret of the path recommended",
     "regret_followed": "regret of the path followed",
 }
-_MARKERS = "osD^vPX*<>"
-_DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
 
 
 def regret_curves(
@@ -108,9 +107,9 @@ def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str) -> N
         ax.plot(
             place,
             ends[2],
-            linestyle=_DASHES[i % len(_DASHES)],
+            linestyle=DASHES[i % len(DASHES)],
             linewidth=1.1,
-            marker=_MARKERS[i % len(_MARKERS)],
+            marker=MARKERS[i % len(MARKERS)],
             markersize=6.0,
             markeredgecolor="white",
             markeredgewidth=0.6,

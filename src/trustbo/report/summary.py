@@ -3,13 +3,14 @@
 import numpy as np
 from scipy.special import expit
 
+from trustbo.models.sampling import MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import cell_text, counted, joined, number
 from trustbo.result import Result
 
-MAX_RHAT, MIN_ESS, MAX_KHAT = 1.01, 400, 0.7
-"""What `models.fit` asks of a posterior, and how even the exact sampler's weights must be."""
+MAX_KHAT = 0.7
+"""How even the exact sampler's weights must be; of NUTS, what `models.fit` asks."""
 _MEANS = {
     "terminal": "the chance \N{GREEK SMALL LETTER SIGMA}(trust) at the goal, 1 minus the paper's "
     "cost (6)",
@@ -98,7 +99,7 @@ def _soundness(result: Result) -> Fact:
         good = rhat <= MAX_RHAT and ess >= MIN_ESS and divergences == 0
         said.append(
             f"R-hat is {number(rhat, 3)} at worst (good: at most {MAX_RHAT}), bulk ESS "
-            f"{number(ess, 0)} at least (good: {MIN_ESS} or more), with "
+            f"{number(ess, 0)} at least (good: {MIN_ESS:.0f} or more), with "
             f"{counted(divergences, 'divergence')} (good: 0)"
         )
     if "k_hat" in history:

@@ -151,18 +151,27 @@ def read_study(path: str | PathLike[str]) -> Study:
         TrustboError: No such file, no YAML, or what `Study` refuses.
     """
     file = Path(path)
-    try:
-        configuration = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TrustboError(f"cannot read {str(file)!r}: {error.strerror}.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise TrustboError(f"{str(file)!r} is no YAML: {error}") from None
+    configuration = read_yaml(file)
     try:
         if isinstance(configuration, Mapping):
             configuration = _with_paths_from(file.parent, dict(configuration))
         return Study.of(configuration)
     except TrustboError as error:
         raise TrustboError(f"{file}: {error}") from None
+
+
+def read_yaml(file: Path) -> Any:
+    """What a YAML file holds.
+
+    Raises:
+        TrustboError: No such file, or no YAML.
+    """
+    try:
+        return yaml.safe_load(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise TrustboError(f"cannot read {str(file)!r}: {error.strerror}.") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise TrustboError(f"{str(file)!r} is no YAML: {' '.join(str(error).split())}") from None
 
 
 def _with_paths_from(folder: Path, configuration: dict[str, Any]) -> dict[str, Any]:

@@ -73,6 +73,11 @@ class Grid:
         return x, self.top - (row + 0.5) * self.cell_height
 
     @property
+    def corner(self) -> tuple[float, float]:
+        """X and y of the lower left corner, CRS metres."""
+        return self.left, self.top - self.shape[0] * self.cell_height
+
+    @property
     def x(self) -> np.ndarray:
         """X of the columns' centres, CRS metres, shape (col,)."""
         return self.left + (np.arange(self.shape[1]) + 0.5) * self.cell_width
