@@ -1,21 +1,31 @@
-# make demo   install into .venv and run the main job on a made terrain
-# make test   install what the tests need too, and run them
-# make lint   format, style, types and the direction of imports
-# make docs   build the documentation site, and say where to open it
-# make bench  install the peers, and print the figures we claim beside theirs
-# make clean  remove everything that make made
+# make demo       install into .venv and run the main job on a made terrain
+# make test       install what the tests need too, and run them
+# make notebooks  run the notebooks, with fewer missions than they show
+# make slow       run the long tests of calibration and NUTS that make test leaves out
+# make lint       format, style, types and the direction of imports
+# make docs       build the documentation site, and say where to open it
+# make bench      install the peers, and print the figures we claim beside theirs
+# make peers      ask pip whether the peers can be installed, and install nothing
+# make clean      remove everything that make made
 
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+PYTEST := TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
-.PHONY: demo test lint docs bench clean
+.PHONY: demo test notebooks slow lint docs bench peers clean
 
 demo: $(VENV)/.installed
 	$(BIN)/trustbo demo --out out/demo --overwrite
 
 test: $(VENV)/.installed-dev
-	TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile --nbmake tests notebooks
+	$(PYTEST) -m "not slow" tests
+
+notebooks: $(VENV)/.installed-dev
+	$(PYTEST) --nbmake notebooks
+
+slow: $(VENV)/.installed-dev
+	$(PYTEST) -m slow tests
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
@@ -30,8 +40,11 @@ docs: $(VENV)/.installed-docs
 bench: $(VENV)/.installed-bench
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
+peers: $(VENV)/.installed
+	$(PIP) --dry-run --editable ".[bench]"
+
 clean:
-	rm -rf $(VENV) out build dist .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf $(VENV) .cache out build dist .pytest_cache .ruff_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:

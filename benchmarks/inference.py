@@ -37,11 +37,11 @@ from trustbo.models import (
     sample_prior,
     sample_statistics,
 )
-from trustbo.models.exact import _matched, _start, _target
-from trustbo.models.geometry import round_target
-from trustbo.models.laplace import laplace
-from trustbo.models.nuts import NutsSettings
-from trustbo.models.sampling import draw_posterior, nuts_data
+from trustbo.models.samplers.exact import _matched, _start, _target
+from trustbo.models.samplers.laplace import laplace
+from trustbo.models.samplers.nuts import NutsSettings
+from trustbo.models.samplers.reparam import reparametrise
+from trustbo.models.samplers.run import draw_posterior, nuts_data
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -384,7 +384,7 @@ def gradient_row(model, data, quick):
 
     @jax.jit
     def run(missions):
-        target = round_target(model, missions, shared=True, joint=False)
+        target = reparametrise(model, missions, complete=True)
         potential = jax.value_and_grad(lambda theta: target.potential({"theta": theta}))
 
         def step(_, carry):

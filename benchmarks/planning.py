@@ -19,10 +19,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from trustbo.models import PooledTrust, TrustParams, sample_prior
 from trustbo.planning import Planner
-from trustbo.planning.buckets import best_stationary
-from trustbo.planning.course import Course
+from trustbo.planning.engines.buckets import best_stationary
+from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.values import entry_cost
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 QUICK = "quick" in sys.argv
 
@@ -58,9 +58,9 @@ def workspace_of(n, kind="open", seed=0):
     return Workspace.from_awareness(z[None], passable)
 
 
-def csr_of(course):
+def csr_of(admissible):
     """Edges by their targets, in CSR order: weights are then one fancy index away."""
-    neighbours = course.neighbours
+    neighbours = admissible.neighbours
     rows, moves = np.nonzero(neighbours >= 0)
     cols = neighbours[rows, moves]
     n = len(neighbours)
@@ -84,23 +84,23 @@ def many_draws(n, n_networkx):
     drawn = planner.plan_draws(draws)
     line("trustbo, stationary (a history-free cost)", ours)
 
-    moves = planner.dynamics(draws)
-    level, toll = moves.settled(), np.zeros(8)
-    start, goal = planner.course.flat(planner.start), planner.course.flat(planner.goal)
+    dynamics = planner.dynamics(draws)
+    steady_state, length_cost = dynamics.steady_state(), np.zeros(8)
+    start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
     search = seconds(
         lambda: best_stationary(
-            level.__getitem__,
+            steady_state.__getitem__,
             1000,
-            planner.course.passable,
-            toll,
-            planner.course.steps,
+            planner.paths.passable,
+            length_cost,
+            planner.paths.steps,
             start,
             goal,
         )
     )
     line("the same without computing u from the draws", search)
-    costs = entry_cost(planner.course.passable, moves)
-    matrix = csr_of(planner.course)
+    costs = entry_cost(planner.paths.passable, dynamics)
+    matrix = csr_of(planner.paths)
 
     def scipy_loop():
         totals = np.empty(len(costs))
@@ -165,12 +165,12 @@ def large(n, kind):
     ours, plan = seconds(trustbo_plan), trustbo_plan()
     line("trustbo, stationary, Planner and plan", ours, None, f"{len(plan.path)} cells")
     planner = Planner(*ends, "stationary")
-    cost = entry_cost(planner.course.passable, planner.dynamics(params))
-    start, goal = planner.course.flat(planner.start), planner.course.flat(planner.goal)
+    cost = entry_cost(planner.paths.passable, planner.dynamics(params))
+    start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
 
     def scipy_plan():
-        course = Course(workspace, (0, 0), (n - 1, n - 1), 8, "shortest+2", True)
-        matrix = csr_of(course)
+        admissible = AdmissiblePaths(workspace, (0, 0), (n - 1, n - 1), 8, "shortest+2", True)
+        matrix = csr_of(admissible)
         matrix.data = cost.ravel()[matrix.indices]
         total, before = dijkstra(matrix, indices=start, return_predecessors=True)
         return total[goal], path_of(before, start, goal, n)

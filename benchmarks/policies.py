@@ -35,12 +35,12 @@ from scipy.stats import binomtest, rankdata
 
 from trustbo.data import Mission
 from trustbo.models import PooledTrust, sample_prior
-from trustbo.models.nuts import NutsSettings
-from trustbo.models.params import params_from
-from trustbo.models.sampling import draw_posterior
-from trustbo.planning import POLICIES, AwarenessBelief, Planner
+from trustbo.models.params import assemble_params
+from trustbo.models.samplers.nuts import NutsSettings
+from trustbo.models.samplers.run import draw_posterior
+from trustbo.planning import POLICIES, Planner
 from trustbo.stacking import stack_missions
-from trustbo.terrain import Workspace
+from trustbo.workspace import AwarenessBelief, Workspace
 
 SHAPE, N_ROBOTS, N_MISSIONS = (10, 10), 3, 15
 START, GOAL = (9, 0), (0, 9)
@@ -112,7 +112,7 @@ def learn(missions, seed):
     with warnings.catch_warnings(action="ignore"):  # NUTS instead, where weights are uneven
         draws, _ = draw_posterior(MODEL, "exact", settings, seed, batch, weight, check=False)
     sites = {name: v.reshape(-1, *v.shape[2:]) for name, v in draws.params.items()}
-    return params_from(sites, MODEL.x0)
+    return assemble_params(sites, MODEL.x0)
 
 
 def run(name, policy, objective, seed):

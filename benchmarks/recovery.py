@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from trustbo import Mission
-from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
+from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit, params_of
 
 N_MISSIONS, N_BOUNDS, N_ROBOTS = 8, 11, 3
 
@@ -46,7 +46,7 @@ def main(n_campaigns=20):
         found = diagnostics(posterior)
         worst["r_hat"] = max(worst["r_hat"], found["r_hat"])
         worst["ess_bulk"] = min(worst["ess_bulk"], found["ess_bulk"])
-        draws = TrustParams.from_posterior(posterior)
+        draws = params_of(posterior)
         pairs = {
             "beta0": (draws.beta0, truth.beta0),
             "beta[0]": (draws.beta[:, 0], truth.beta[0]),

@@ -23,8 +23,8 @@ import numpy as np
 import xarray as xr
 
 import trustbo as tb
-from trustbo.simulation.sight import Sight, chance
 from trustbo.simulation.world import Worlds
+from trustbo.workspace.sight import Sight, detection_probability
 
 N_PAIRS, N_SIDE, REACH, EYE = 100_000, 1000, 100.0, 1.0
 OPTICS = np.array([EYE, EYE, np.inf, 1.0])
@@ -77,7 +77,7 @@ def ours(surface, a, b, mode):
     def place(p):
         return np.stack([surface.origin[0] + p[:, 0], surface.origin[1] - p[:, 1]], axis=1)
 
-    return chance(surface, Sight(mode), place(a), place(b), OPTICS)
+    return detection_probability(surface, Sight(mode), place(a), place(b), OPTICS)
 
 
 def heights(ground, p):

@@ -1,4 +1,4 @@
-"""Speed and memory of the terrain's features beside GDAL, xdem and xarray-spatial.
+"""Speed and memory of the terrain's features beside GDAL and xarray-spatial.
 
 Run: python benchmarks/terrain.py [attributes] [awareness] [visibility] [huge] [quick]
 
@@ -63,16 +63,16 @@ def trustbo_files(dem, out):
     """Four attributes, file to file, as gdaldem does it."""
     import rioxarray
 
-    from trustbo import terrain
+    from trustbo.terrain import features
 
-    warm_up(terrain, dem)
+    warm_up(dem)
     started = time.perf_counter()
     with rioxarray.open_rasterio(dem) as opened:
         ground = opened.isel(band=0, drop=True).load().to_dataset(name="dem")
     with rasterio.open(dem) as source:
         profile = source.profile | {"tiled": False}
     for name in ATTRIBUTES:
-        values = getattr(terrain, name)(ground)
+        values = getattr(features, name)(ground)
         with rasterio.open(Path(out) / f"trustbo_{name}.tif", "w", **profile) as sink:
             sink.write(values.values, 1)
     return time.perf_counter() - started
@@ -80,23 +80,25 @@ def trustbo_files(dem, out):
 
 def trustbo_memory(dem, out):
     """Four attributes, in memory."""
-    from trustbo import terrain
+    from trustbo.terrain import features
 
-    warm_up(terrain, dem)
+    warm_up(dem)
     ground = in_memory(dem)
     started = time.perf_counter()
     for name in ATTRIBUTES:
-        getattr(terrain, name)(ground)
+        getattr(features, name)(ground)
     return time.perf_counter() - started
 
 
-def warm_up(terrain, dem):
+def warm_up(dem):
     """Compiled code is loaded at its first call."""
+    from trustbo.terrain import features
+
     small = in_memory(dem).isel(y=slice(50), x=slice(50))
     for name in ATTRIBUTES:
-        getattr(terrain, name)(small)
+        getattr(features, name)(small)
     small["dsm"] = small["dem"]
-    cells_of(small, terrain, {"traversability": ATTRIBUTES[:3]})
+    cells_of(small, {"traversability": ATTRIBUTES[:3]})
 
 
 def xrspatial_memory(dem, out):
@@ -108,17 +110,6 @@ def xrspatial_memory(dem, out):
     started = time.perf_counter()
     for name in ATTRIBUTES:
         getattr(xrspatial, name)(ground)
-    return time.perf_counter() - started
-
-
-def xdem_memory(dem, out):
-    import xdem
-
-    ground = xdem.DEM(str(dem))
-    ground.load()
-    names = {"tri": "terrain_ruggedness_index", "tpi": "topographic_position_index"}
-    started = time.perf_counter()
-    xdem.terrain.get_terrain_attribute(ground, [names.get(name, name) for name in ATTRIBUTES])
     return time.perf_counter() - started
 
 
@@ -136,23 +127,22 @@ def in_memory(dem):
 
 def trustbo_cells(dem, out):
     """Traversability of 10 x 10 cells from a DEM in memory."""
-    from trustbo import terrain
-
-    warm_up(terrain, dem)
+    warm_up(dem)
     ground = in_memory(dem)
     ground["dsm"] = ground["dem"]
     before = peak()
     started = time.perf_counter()
     features = {"traversability": ATTRIBUTES[:3]}
-    cells_of(ground, terrain, features)
+    cells_of(ground, features)
     return time.perf_counter() - started, peak() - before
 
 
-def cells_of(ground, terrain, features):
-    from trustbo.terrain.awareness import cell_maps, ingredients
+def cells_of(ground, features):
+    from trustbo.workspace import Grid
+    from trustbo.workspace.awareness import cell_maps, feature_specs
 
-    grid = terrain.Grid.over(ground, (10, 10))
-    return cell_maps(ground, grid, ingredients(features), max_slope=0.8, keep_pixels=False)
+    grid = Grid.over(ground, (10, 10))
+    return cell_maps(ground, grid, feature_specs(features), max_slope=0.8, keep_pixels=False)
 
 
 def xrspatial_cells(dem, out):
@@ -273,8 +263,6 @@ def attributes(folder, sizes):
         ours = measure("trustbo_memory", dem, folder, repeats)
         row("trustbo, in memory", ours, base, GDALDEM_TARGET[n])
         row("xarray-spatial, in memory", measure("xrspatial_memory", dem, folder, repeats), base)
-        if n <= 4000:
-            row("xdem, in memory", measure("xdem_memory", dem, folder, repeats), base)
         if shutil.which("gdaldem"):
             compare(folder)
 

@@ -22,7 +22,7 @@ def main() -> None:
     workspace, mean = result.workspace, tb.models.params_of(result.posterior).mean()
     cost = result.planner.cost_map(mean, per_robot=True)
     drawn = {
-        "maps": plots.trust_maps(result),
+        "maps": result.plot_maps(),
         "terrain": plots.terrain_maps(workspace),
         "path_posterior": [
             plots.path_posterior(result.maps()["path_probability"], workspace, result.path)

@@ -1,15 +1,27 @@
-"""What every test runs under."""
+"""Settings of every test, and fixtures that several rooms share."""
 
 from pathlib import Path
 
 import jax
 import matplotlib as mpl
 import pytest
+from matplotlib.figure import Figure
 
 mpl.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def blank_figures(monkeypatch):
+    """Save figures without what they show: to draw all those of a report takes seconds."""
+    save = Figure.savefig
+
+    def save_blank(figure, file, **options):
+        save(Figure(figure.get_size_inches()), file, **options)
+
+    monkeypatch.setattr(Figure, "savefig", save_blank)
 
 
 @pytest.fixture

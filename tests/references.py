@@ -163,3 +163,55 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
         "bottleneck": least,
         "stationary": np.exp(-stationary - toll),
     }[objective]
+
+
+def pooled_posterior(missions, n_points=(60, 30), reach=0.12):
+    """Posterior of the pooled model under the default priors, by the midpoint rule.
+
+    Given beta0, delta_w and delta_v, rates are jointly normal with a mean linear in (beta, b):
+    these integrate out in closed form, the other three over a grid.
+
+    Args:
+        missions: Complete missions.
+        n_points: Points of the grid for beta0, and for each of the other two.
+        reach: Largest standard deviation on the grid, far in the tail.
+
+    Returns:
+        For each of (beta0, delta_w, delta_v): its points and their weights; for each of (beta, b):
+        means and standard deviations of normals, and their weights.
+    """
+    beta0, deltas = ((np.arange(n) + 0.5) / n for n in n_points)
+    deltas *= reach
+    w, v = np.meshgrid(deltas, deltas, indexing="ij")
+    n_weights = missions[0].awareness.shape[-1] + 1
+    prior_precision = np.diag(1.0 / np.r_[np.ones(n_weights - 1), 0.5] ** 2)
+    log_weight = np.empty((len(beta0), *w.shape))
+    mean, sd = (np.empty((*log_weight.shape, n_weights)) for _ in range(2))
+    for i, a in enumerate(beta0):
+        precision = np.broadcast_to(prior_precision, (*w.shape, n_weights, n_weights)).copy()
+        h = np.zeros((*w.shape, n_weights))
+        log_density = np.log(a * (1.0 - a)) - 0.5 * (w**2 + v**2) / 0.2**2
+        noise = {}  # by length of the mission
+        for n in {len(mission.contact_rate) for mission in missions}:
+            roll = np.linalg.inv(np.eye(n) - a * np.eye(n, k=-1))
+            start = a * roll[:, 0]
+            cov = w[..., None, None] ** 2 * roll @ roll.T + v[..., None, None] ** 2 * np.eye(n)
+            cov += 0.5**2 * np.outer(start, start)
+            noise[n] = roll, start, np.linalg.inv(cov), np.linalg.slogdet(cov)[1]
+        for mission in missions:
+            roll, start, inverse, log_det = noise[len(mission.contact_rate)]
+            for robot in range(mission.contact_rate.shape[1]):
+                design = roll @ np.c_[mission.awareness[:, robot], np.ones(len(roll))]
+                residual = mission.contact_rate[:, robot] - 0.5 * start
+                weighted = inverse @ residual
+                precision += design.T @ inverse @ design
+                h += weighted @ design
+                log_density -= 0.5 * (weighted @ residual + log_det)
+        cov = np.linalg.inv(precision)
+        mean[i] = (cov @ h[..., None])[..., 0]
+        sd[i] = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+        log_weight[i] = log_density + 0.5 * ((h * mean[i]).sum(-1) + np.linalg.slogdet(cov)[1])
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    marginals = [weight.sum(axes) for axes in ((1, 2), (0, 2), (0, 1))]
+    return list(zip((beta0, deltas, deltas), marginals, strict=True)), (mean, sd, weight)

@@ -30,6 +30,8 @@ PAGES = [
 NAMESPACES = (
     "trustbo",
     "trustbo.terrain",
+    "trustbo.workspace",
+    "trustbo.logs",
     "trustbo.models",
     "trustbo.planning",
     "trustbo.simulation",

@@ -31,7 +31,7 @@ def test_every_public_name_is_there():
 
 def test_jax_s_configuration_is_untouched_by_importing():
     program = (
-        "import jax, trustbo, trustbo.models, trustbo.loop; "
+        "import jax, trustbo, trustbo.models, trustbo.campaign; "
         "print(jax.config.jax_enable_x64, jax.numpy.ones(()).dtype)"
     )
     assert printed(program) == "False float32"

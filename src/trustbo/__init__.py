@@ -1,7 +1,7 @@
 """Bayesian optimisation of trustworthy paths for multi-robot bounding overwatch.
 
 Implements Zheng, Smereka, Mikulski and Wang, "Bayesian Optimization Based Trustworthiness Model for
-Multi-robot Bounding Overwatch" (2021). Names are loaded when first used; `__init__.pyi` lists them.
+Multi-robot Bounding Overwatch" (2021). Names are loaded at first use; `__init__.pyi` lists them.
 """
 
 import lazy_loader

@@ -1,16 +1,24 @@
-from . import export, models, planning, plots, report, simulation, study, terrain
-from .campaign import Campaign
+from . import export, logs, models, planning, plots, report, simulation, study, terrain, workspace
+from .campaign import (
+    Campaign,
+    CampaignOptions,
+    RegretBound,
+    Result,
+    Seconds,
+    iterate,
+    load_result,
+    missions,
+    resume,
+)
 from .data import Bound, Mission, Robot, Team
 from .errors import PosteriorError, ShapeError, TerrainError, TrustboError
-from .loop import iterate, missions, resume
 from .planning import NoPathError
-from .result import Result, load_result
-from .stopping import RegretBound, Seconds
-from .terrain import Workspace
+from .workspace import Workspace
 
 __all__ = [
     "Bound",
     "Campaign",
+    "CampaignOptions",
     "Mission",
     "NoPathError",
     "PosteriorError",
@@ -26,6 +34,7 @@ __all__ = [
     "export",
     "iterate",
     "load_result",
+    "logs",
     "missions",
     "models",
     "planning",
@@ -35,5 +44,6 @@ __all__ = [
     "simulation",
     "study",
     "terrain",
+    "workspace",
 ]
 __version__: str

@@ -1,4 +1,4 @@
-"""What goes in and out of a mission: robots, teams, bounds, missions."""
+"""Robots, teams, and the missions they run, bound by bound."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,7 +21,7 @@ Cell = tuple[int, int]
 Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
 STATUSES: tuple[str, ...] = get_args(Status)
 FEATURES = ("traversability", "visibility")
-"""The paper's z1 and z2, the names of the first two features."""
+"""Names of the first two features, z1 and z2 of the paper."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Robot:
         vertical_fov: Half the vertical field of view, rad, measured from the plane of the body.
         sensor_height: Height of the lidar above ground, m.
         target_height: Height of the point others aim at, m above ground; by default the lidar.
-        max_slope: Steepest pitch or roll the robot stands, rad.
+        max_slope: Steepest pitch or roll that the robot withstands, rad.
         detection: Quality of the lidar: share of clear looks that find their target, in (0, 1].
-        acquire: How many looks in a row must find a target for a track, and contact, to begin.
-        drop: How many looks in a row must miss it for them to end.
+        acquire: Number of successive looks that must find a target before contact begins.
+        drop: Number of successive looks that must miss it before contact ends.
 
     Raises:
-        TrustboError: A value is not positive, an angle is beyond a quarter turn, a share over 1,
-            or a number of looks not whole.
+        TrustboError: A value is not positive, an angle exceeds a quarter turn, a share exceeds 1,
+            or a number of looks is not whole.
     """
 
     speed: float = 2.0
@@ -77,12 +77,12 @@ class Team:
 
     Attributes:
         n_robots: Number of robots in T2; taken from `robots` where these are given.
-        robots: The members of T2; by default `n_robots` equal ones.
-        lead: T1.
-        names: One name per member of T2; by default r1, r2, ...
+        robots: Members of T2; by default `n_robots` equal ones.
+        lead: Lead robot T1.
+        names: Names of the members of T2; by default r1, r2, ...
 
     Raises:
-        TrustboError: No robots, or names that are not one distinct name per robot.
+        TrustboError: There are no robots, or not one distinct name per robot.
     """
 
     n_robots: int = 3
@@ -102,33 +102,33 @@ class Team:
 
     @property
     def max_slope(self) -> float:
-        """Steepest slope every member stands, rad."""
+        """Steepest slope that every member withstands, rad."""
         return min(robot.max_slope for robot in (self.lead, *self.robots))
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """What one bound measured, one row per overwatching robot.
+    """Measurements of one bound, one row per overwatching robot.
 
     Attributes:
         cell: Planning cell entered, (row, col).
         awareness: Situational awareness, shape (robot, feature), in [0, 1]; NaN where not measured.
         contact_rate: Share of the running time in contact, shape (robot,); NaN where not measured.
         duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
-        status: How the bound ended.
+        status: Outcome of the bound, `"ok"` or the reason that ended the mission.
         t0: Start of the bound, s since the mission's start.
         poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
             from east, anticlockwise. None where not recorded.
-        contact: Shape (tick, robot), whether each robot had contact. None where not recorded.
-        exposure: How often each robot looked (ticks), shape (robot,); NaN where not recorded. The
-            rate is the share of these with contact.
-        states: Motion and sensing of each robot, shape (tick, robot, state), see
-            `simulation.STATES`. None where not recorded.
+        contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
+        n_ticks: Number of ticks, shape (robot,), of which `contact_rate` is the share with contact;
+            NaN where not recorded.
+        states: Motion and sensing of each robot, shape (tick, robot, state), see `logs.STATES`.
+            None where not recorded.
 
     Raises:
         ShapeError: The arrays disagree on the number of robots.
-        TrustboError: A value outside [0, 1], a duration that is not positive, an exposure below
-            one tick, a rate that is no share of the ticks, an unknown status.
+        TrustboError: A value outside [0, 1], a duration that is not positive, an n_ticks below 1,
+            a rate that is not a share of the ticks, or an unknown status.
     """
 
     cell: Cell
@@ -139,7 +139,7 @@ class Bound:
     t0: float = 0.0
     poses: np.ndarray | None = None
     contact: np.ndarray | None = None
-    exposure: np.ndarray = None  # pyright: ignore[reportAssignmentType]
+    n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
     states: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -156,8 +156,8 @@ class Bound:
                 f"got {lengths[0]}, {lengths[1]}, {lengths[2]}."
             )
         require_choice("status", self.status, STATUSES)
-        ticks = np.full(lengths[0], np.nan) if self.exposure is None else self.exposure
-        object.__setattr__(self, "exposure", _as_array("exposure", ticks))
+        ticks = np.full(lengths[0], np.nan) if self.n_ticks is None else self.n_ticks
+        object.__setattr__(self, "n_ticks", _as_array("n_ticks", ticks))
         for name, values in (("awareness", self.awareness), ("contact_rate", self.contact_rate)):
             _require_unit_interval(f"{name} of the bound into cell {self.cell}", values)
         if (self.duration <= 0).any():
@@ -166,15 +166,15 @@ class Bound:
         self._require_ticks()
 
     def _require_ticks(self) -> None:
-        ticks, rate = self.exposure, self.contact_rate
+        ticks, rate = self.n_ticks, self.contact_rate
         if ticks.shape != rate.shape:
-            raise ShapeError(f"exposure of a bound must be {rate.shape}; got shape {ticks.shape}.")
+            raise ShapeError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
         for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
-            raise TrustboError(f"exposure[{i}] = {ticks[i]:g} must be a whole number of ticks.")
+            raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
         off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
         for i in np.flatnonzero(off):
             raise TrustboError(
-                f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (exposure)."
+                f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
             )
 
     @property
@@ -190,14 +190,14 @@ class Bound:
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """One traversal of a path: its bounds, as far as they were run, and how it ended.
+    """One traversal of a path: the bounds that were run, and the outcome.
 
     Attributes:
-        path: The planned cells, start first, each (row, col).
-        bounds: The bounds run; bound k enters `path[k]`. Fewer than planned if the mission ended
-            early; the last one then carries the same status as the mission.
-        status: `"ok"` if the goal was reached.
-        features: Names of the features, in the order of the awareness' last axis.
+        path: Planned cells, start first, each (row, col).
+        bounds: Bounds that were run; bound k enters `path[k]`. There are fewer than planned if the
+            mission ended early; the last one then has the status of the mission.
+        status: `"ok"` if the mission reached the goal, else the reason that it did not.
+        features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
 
     Raises:
@@ -250,22 +250,22 @@ class Mission:
         duration: ArrayLike | None = None,
         status: str = "ok",
         *,
-        exposure: ArrayLike | None = None,
+        n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
     ) -> Self:
-        """Make a mission of a user's own log.
+        """Make a mission from the arrays of a log.
 
         Args:
             path: Planned cells, start first.
             awareness: Shape (bound, robot, feature), in [0, 1].
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
-            status: How the mission ended.
-            exposure: Ticks, shape (bound, robot) or (bound,), of which `contact_rate` is the share
-                with contact; None where not recorded.
-            features: Names; by default traversability, visibility, z3, ...
-            robots: Names; by default r1, r2, ...
+            status: Outcome of the mission.
+            n_ticks: Number of ticks, shape (bound, robot) or (bound,), of which `contact_rate` is
+                the share with contact; None where not recorded.
+            features: Names of the features; by default traversability, visibility, z3, ...
+            robots: Names of the robots; by default r1, r2, ...
 
         Raises:
             ShapeError: Axes that do not fit together.
@@ -279,7 +279,7 @@ class Mission:
             )
         seconds, ticks = (
             _per_robot(name, values, y.shape)
-            for name, values in (("duration", duration), ("exposure", exposure))
+            for name, values in (("duration", duration), ("n_ticks", n_ticks))
         )
         cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
         if len(y) > len(cells) - 1:
@@ -294,13 +294,13 @@ class Mission:
                 seconds[k],
                 status if k == last else "ok",
                 float(starts[k]),
-                exposure=ticks[k],
+                n_ticks=ticks[k],
             )
             for k in range(len(y))
         )
         return cls(cells, bounds, status, tuple(features), tuple(robots))
 
-    # Stacked once: every refit asks every mission for these.
+    # Stacked once: every refit reads these of every mission.
 
     @cached_property
     def awareness(self) -> np.ndarray:
@@ -318,9 +318,9 @@ class Mission:
         return self._stacked("duration")
 
     @cached_property
-    def exposure(self) -> np.ndarray:
+    def n_ticks(self) -> np.ndarray:
         """Ticks, shape (bound, robot); NaN where not recorded."""
-        return self._stacked("exposure")
+        return self._stacked("n_ticks")
 
     def _stacked(self, name: str) -> np.ndarray:
         array = np.stack([getattr(bound, name) for bound in self.bounds])
@@ -334,7 +334,7 @@ def default_features(n_features: int) -> tuple[str, ...]:
 
 
 def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    """Values per (bound, robot), given so, per bound, or not at all."""
+    """Values per (bound, robot), from values per (bound, robot), per bound, or None."""
     array = _as_array(what, np.nan if values is None else values)
     if array.ndim == 1:
         array = array[:, None]

@@ -1,4 +1,4 @@
-"""The errors trustbo raises for input it refuses; each is also a ValueError."""
+"""Errors that trustbo raises for input it refuses; each is also a ValueError."""
 
 import math
 import operator
@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 
 class TrustboError(ValueError):
-    """Input that trustbo refuses: the message names the value and the remedy."""
+    """Input that trustbo refuses; the message names the value and the remedy."""
 
 
 class ShapeError(TrustboError):
@@ -18,10 +18,10 @@ class TerrainError(TrustboError):
 
 
 class PosteriorError(TrustboError):
-    """A posterior whose diagnostics say it must not be used.
+    """A posterior with diagnostics beyond their limits.
 
     Attributes:
-        posterior: The refused posterior (ArviZ DataTree), for inspection.
+        posterior: Refused posterior (ArviZ DataTree), for inspection.
     """
 
     def __init__(self, message: str, posterior: object = None) -> None:
@@ -30,10 +30,10 @@ class PosteriorError(TrustboError):
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is one of `choices`; else an error that lists them.
+    """Return `value` if it is one of `choices`.
 
     Raises:
-        TrustboError: `value` is not among the choices.
+        TrustboError: `value` is not among the choices, which the message lists.
     """
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
@@ -45,7 +45,7 @@ def require_whole(what: str, value: object, minimum: int) -> int:
     """Return `value` as an int if it is a whole number of at least `minimum`.
 
     Raises:
-        TrustboError: It is not.
+        TrustboError: `value` is no such number.
     """
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
@@ -60,7 +60,7 @@ def require_positive(what: str, value: object) -> float:
     """Return `value` as a float if it is a positive, finite number.
 
     Raises:
-        TrustboError: It is not.
+        TrustboError: `value` is no such number.
     """
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
@@ -75,7 +75,7 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     """Return `value` as two ints if it is a pair of whole numbers, such as a cell (row, col).
 
     Raises:
-        TrustboError: It is not.
+        TrustboError: `value` is no such pair.
     """
     try:
         first, second = (operator.index(i) for i in value)  # pyright: ignore[reportGeneralTypeIssues]

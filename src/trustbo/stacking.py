@@ -1,4 +1,4 @@
-"""Missions of any length as one batch of arrays."""
+"""Stacking of missions of any length into one batch of arrays."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,28 +14,28 @@ class MissionBatch(NamedTuple):
     """Missions stacked and padded with NaN, ready for compiled code.
 
     Both leading axes are padded to a bucket, so that compiled code is reused from one mission to
-    the next; a padded bound has NaN contact rates, which the models read as "not measured".
+    the next. A padded bound has NaN contact rates, which models take as not measured.
     """
 
     awareness: np.ndarray
     """Shape (mission, bound, robot, feature); 0 in the padding."""
     contact_rate: np.ndarray
     """Shape (mission, bound, robot); NaN in the padding."""
-    exposure: np.ndarray
-    """Ticks of each bound, of that shape; NaN in the padding and where not recorded."""
+    n_ticks: np.ndarray
+    """Number of ticks, shape (mission, bound, robot); NaN in the padding and where not recorded."""
 
 
 def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionBatch:
     """Stack missions of any length into one batch.
 
     Args:
-        missions: At least one mission; all with the same robots and features.
-        pad: Grow the axes to their buckets: bounds to a multiple of 8, missions to a power of two
-            from 8 on. Without it, bounds are padded to the longest mission only.
+        missions: Missions of the same robots and features, at least one.
+        pad: Whether to pad the axes to buckets: bounds to a multiple of 8, missions to a power of
+            two from 8 on. Otherwise bounds are padded to the longest mission.
 
     Raises:
-        ShapeError: No missions, or missions that disagree on robots or features.
-        TrustboError: An awareness value is NaN (contact rates may be missing, awareness may not).
+        ShapeError: There are no missions, or they disagree on robots or features.
+        TrustboError: An awareness value is NaN; only contact rates may be missing.
     """
     require_same_team(missions)
     first = missions[0]
@@ -54,7 +54,7 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
     for j, mission in enumerate(missions):
         batch.awareness[j, : len(mission.bounds)] = mission.awareness
         batch.contact_rate[j, : len(mission.bounds)] = mission.contact_rate
-        batch.exposure[j, : len(mission.bounds)] = mission.exposure
+        batch.n_ticks[j, : len(mission.bounds)] = mission.n_ticks
     return batch
 
 
@@ -62,7 +62,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
     """Check that there are missions, all with the same robots and features.
 
     Raises:
-        ShapeError: There are none, or they disagree.
+        ShapeError: There are no missions, or they disagree on robots or features.
     """
     if isinstance(missions, Mission):
         raise ShapeError("missions must be a list of missions; got one. Write [mission].")
@@ -78,11 +78,11 @@ def require_same_team(missions: Sequence[Mission]) -> None:
 
 
 def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Replace awareness that a mission did not measure (NaN) by that of a map.
+    """Fill awareness that a mission did not measure (NaN) with that of a map.
 
     Args:
-        mission: The mission.
-        awareness: Shape (robot, row, col, feature), such as `Workspace.awareness`.
+        mission: Mission as it was measured.
+        awareness: Map of shape (robot, row, col, feature), such as `Workspace.awareness`.
     """
     if not np.isnan(mission.awareness).any():
         return mission

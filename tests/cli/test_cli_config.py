@@ -8,6 +8,7 @@ from trustbo.cli.config import flags_of
 from trustbo.errors import TrustboError
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_file_gives_every_flag_and_flags_win(invoke, rasters, tmp_path, monkeypatch):
     (rasters / "mission.yaml").write_text(
         "dem: dem.tif\ndsm: dsm.tif\nstart: [2, 0]\ngoal: 0,2\nshape: 3,3\nsampler: exact\n"

@@ -21,6 +21,7 @@ PROGRAM = (
 )
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(invoke, flags, tmp_path):
     out = tmp_path / "out"
     arguments = ["run", *flags, "--iterations", 500, "--seed", 2, "--out", out, "--quiet"]
@@ -48,6 +49,7 @@ def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(invoke, flags, tmp_path):
     assert (out / "report.html").exists()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_resume_of_what_is_done_says_so_and_changes_nothing(invoke, finished, tmp_path):
     whole, folder = tb.load_result(finished[0]), tmp_path / "copy"
     shutil.copytree(finished[0], folder)
@@ -78,7 +80,9 @@ def test_a_refused_posterior_is_exit_3_and_says_what_is_kept(tmp_path, capsys):
     assert ended.value.exit_code == 3
     error, hint = capsys.readouterr().err.splitlines()
     assert error == "error: posterior refused after a longer retry: 7 divergences."
-    assert hint.startswith(f"hint: what was measured is kept in {tmp_path}/measured.nc. Run again")
+    assert hint.startswith(
+        f"hint: the measured missions are kept in {tmp_path}/measured.nc. Run again"
+    )
     with pytest.raises(tb.PosteriorError), one_line_errors(debug=True):
         raise tb.PosteriorError("posterior refused.")
 

@@ -47,6 +47,7 @@ def test_run_s_files_say_the_same(finished):
     assert "after 2 missions" in (out / "report.html").read_text()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_run_passes_every_choice_on(invoke, flags, tmp_path):
     done = invoke(
         *("run", *flags, "--iterations", 9, "--awareness", "belief", "--replan", "bound"),
@@ -92,12 +93,29 @@ def test_run_on_real_terrain(name, epsg, shape, ends, place, invoke, real_terrai
     assert (tmp_path / "report.html").stat().st_size < 3e6
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_demo_runs_on_the_rasters_it_writes(invoke, tmp_path):
     out = tmp_path / "demo"
     done = invoke("demo", "--iterations", 1, "--sampler", "exact", "--out", out, "--quiet")
     assert done.exit_code == 0, done.output
     assert {"dem.tif", "dsm.tif", "maps.png", "report.html"} <= {p.name for p in out.iterdir()}
     assert "mission  status" not in done.output
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp_path):
+    feet = tmp_path / "feet.tif"
+    shutil.copy(rasters / "dem.tif", feet)
+    with rasterio.open(feet, "r+") as source:
+        source.write(source.read() / np.float32(0.3048))
+        source.units = ["ft"]
+    # A short range, for else nothing would hide the lead.
+    short = ("--lidar-range", 20, "--iterations", 1, "--quiet")
+    done = invoke("run", "--dem", feet, *flags[4:], *short, "--out", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert done.stderr.count("are converted to metres") == 1
+    assert done.stderr.count("no surface (DSM) is given") == 1
+    assert json.loads((tmp_path / "result.json").read_text())["n_missions"] == 1
 
 
 @pytest.mark.parametrize(
@@ -150,6 +168,7 @@ def kept_in(folder):
     return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_campaign_is_not_erased_unless_asked_for(invoke, flags, finished, tmp_path):
     out = tmp_path / "mine"
     shutil.copytree(finished[0], out)

@@ -22,7 +22,7 @@ def test_there_is_a_row_per_mission_bound_and_robot(result, tmp_path):
         i = mission.robots.index(row["robot"])
         assert (int(row["row"]), int(row["col"])) == bound.cell
         assert (row["status"], row["mission_status"]) == (bound.status, mission.status)
-        for name in ("contact_rate", "duration", "exposure"):
+        for name in ("contact_rate", "duration", "n_ticks"):
             assert float(row[name]) == getattr(bound, name)[i]
         z = [float(row[name]) for name in ("traversability", "visibility")]
         np.testing.assert_array_equal(z, bound.awareness[i])

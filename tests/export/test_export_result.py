@@ -83,7 +83,7 @@ def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, mo
     monkeypatch.setitem(sys.modules, "rosbags", None)
     absent = left_out(nowhere, tmp_path)
     assert list(absent) == [*NEEDS_A_PLACE, "ros1_bag", "ros2_bag"]
-    assert "only a workspace made from a terrain has a place on Earth" in absent["gpx"]
+    assert "only a workspace made from a terrain has a CRS" in absent["gpx"]
     assert 'pip install "trustbo[ros]"' in absent["ros2_bag"]
     (tmp_path / "path.csv").mkdir()
     assert list(left_out(result, tmp_path)) == ["csv", "ros1_bag", "ros2_bag"]
@@ -95,7 +95,7 @@ def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, mo
 def test_without_a_terrain_there_are_tables_netcdf_and_ros(nowhere, tmp_path):
     pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
     for name in NEEDS_A_PLACE:
-        with pytest.raises(TrustboError, match="only a workspace made from a terrain has a place"):
+        with pytest.raises(TrustboError, match="only a workspace made from a terrain has a CRS"):
             export_result(nowhere, tmp_path / "out", ["csv", name])
     assert list(tmp_path.iterdir()) == []
     rest = [name for name in FORMATS if name not in NEEDS_A_PLACE]

@@ -58,7 +58,7 @@ def test_a_frame_may_be_in_another_crs_or_in_none(result, nowhere, centers):
     np.testing.assert_array_equal(bare.get_coordinates(), centers)
     with pytest.raises(TrustboError, match=r"unknown crs 'EPSG:0'; give e\.g\. 'EPSG:4326'"):
         path_frame(result, crs="EPSG:0")
-    with pytest.raises(TrustboError, match="only a workspace made from a terrain has a place"):
+    with pytest.raises(TrustboError, match="only a workspace made from a terrain has a CRS"):
         path_frame(nowhere)
 
 
@@ -182,9 +182,9 @@ def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, t
         with pytest.raises(TrustboError, match=f"unknown suffix '{suffix}'; {choices}"):
             write_path(tmp_path / name, result)
     for name in ("path.geojson", "path.gpx", "path.gpkg"):
-        with pytest.raises(TrustboError, match=r"has a place on Earth; use Workspace\.from_t"):
+        with pytest.raises(TrustboError, match=r"has a CRS; use Workspace\.from_t"):
             write_path(tmp_path / name, nowhere)
-    with pytest.raises(TrustboError, match="a plan does not say where it is; give the workspace"):
+    with pytest.raises(TrustboError, match="a plan has no workspace; give the workspace"):
         write_path(tmp_path / "path.csv", plan)
     alone = tb.Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5))
     with pytest.raises(ShapeError, match=r"the plan has 3 robots, the workspace \('r1',\)"):

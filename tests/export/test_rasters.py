@@ -106,7 +106,7 @@ def test_a_large_one_is_laid_out_for_the_cloud(result, tmp_path):
 
 def test_what_is_no_map_of_the_cells_is_refused(result, maps, nowhere, tmp_path):
     workspace, path = result.workspace, tmp_path / "maps.tif"
-    with pytest.raises(TrustboError, match="only a workspace made from a terrain has a place on"):
+    with pytest.raises(TrustboError, match="only a workspace made from a terrain has a CRS"):
         write_geotiff(path, maps, nowhere.workspace)
     with pytest.raises(ShapeError, match=r"map 'awareness' has dims \('robot', .*\(row, col\)"):
         write_geotiff(path, workspace.awareness, workspace)

@@ -10,7 +10,8 @@ import pytest
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.export import occupancy, write_ros_bag
+from trustbo.export import write_ros_bag
+from trustbo.export.ros import occupancy
 
 rosbags = pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
 

@@ -9,7 +9,8 @@ import yaml
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.export import occupancy, write_ros_map
+from trustbo.export import write_ros_map
+from trustbo.export.ros import occupancy
 
 
 @pytest.fixture(scope="module")

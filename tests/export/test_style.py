@@ -8,7 +8,8 @@ import pytest
 import xarray as xr
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.export import write_geotiff, write_style
+from trustbo.export import write_geotiff
+from trustbo.export.style import write_style
 
 
 def read(path):

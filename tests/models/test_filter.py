@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models.test_statespace import random_params
+from models.likelihood.test_scalar import random_params
 from references import dense_log_likelihood, dense_posterior_of_trust
 
 from trustbo.errors import ShapeError, TrustboError

@@ -11,8 +11,9 @@ from numpyro.infer import MCMC, NUTS
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
-from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
-from trustbo.models.nuts import run_nuts
+from trustbo.models import PooledTrust, Priors, diagnostics, fit, params_of
+from trustbo.models.samplers import run
+from trustbo.models.samplers.nuts import run_nuts
 from trustbo.stacking import stack_missions
 
 SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]
@@ -109,26 +110,39 @@ def test_more_missions_and_other_priors_meet_the_same_compiled_program(posterior
     assert run_nuts._cache_size() == compiled
 
 
-def test_missing_rates_are_predicted_through(missions):
+HEAVY = Priors(b=dist.Cauchy(0.0, 0.5), delta_v=dist.HalfCauchy(0.2))
+
+
+@pytest.fixture(scope="module")
+def with_a_gap(missions):
+    """Rates are missing, and priors have no mean: one program for both."""
     rates = missions[0].contact_rate.copy()
     rates[2:4, 1] = np.nan
     gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
-    posterior = fit([gap, *missions[1:]])
+    return fit([gap, *missions[1:]], PooledTrust(HEAVY))
+
+
+def test_missing_rates_are_predicted_through(with_a_gap):
+    posterior = with_a_gap
     sd = posterior["latent"]["trust_sd"].sel(mission=0, robot="r2")
     assert sd.notnull().sel(bound=slice(1, 7)).all()
     assert sd.sel(bound=3) > sd.sel(bound=6)
     assert np.isnan(posterior["observed_data"]["contact_rate"].sel(mission=0, bound=3, robot="r2"))
 
 
-def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions):
-    with pytest.raises(PosteriorError, match=r"bulk ESS of beta0 is \d+ \(at least 400\)") as error:
-        fit(missions, n_draws=40, n_warmup=50)
-    assert error.value.posterior["posterior"].sizes["draw"] == 80  # after one longer retry
-    assert fit(missions, n_draws=40, n_warmup=50, check=False).attrs["retries"] == 0
+def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypatch):
+    """A limit that no run meets, rather than short ones that would be compiled for nothing else."""
+    assert (run.MAX_RHAT, run.MIN_ESS) == (1.01, 400.0)
+    monkeypatch.setattr(run, "MIN_ESS", 1e6)
+    expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
+    with pytest.raises(PosteriorError, match=expected) as error:
+        fit(missions)
+    assert error.value.posterior["posterior"].sizes["draw"] == 2000  # after one longer retry
+    assert fit(missions, check=False).attrs["retries"] == 0
 
 
 def test_params_come_out_of_the_posterior_and_go_through_its_draws(posterior):
-    params = TrustParams.from_posterior(posterior)
+    params = params_of(posterior)
     assert np.shape(params.beta) == (4000, 2)
     assert params.x0_mean == 0.5
     one = params.draw(7)
@@ -195,11 +209,9 @@ def test_a_prior_must_be_a_scalar_distribution(name):
             Priors(**{name: value})
 
 
-def test_priors_without_a_mean_can_be_fitted(missions):
-    heavy = Priors(b=dist.Cauchy(0.0, 0.5), delta_v=dist.HalfCauchy(0.2))
-    posterior = fit(missions, PooledTrust(heavy))
-    assert diagnostics(posterior)["r_hat"] <= 1.01
-    assert heavy.mean(2)["b"] == 0.0
+def test_priors_without_a_mean_can_be_fitted(with_a_gap):
+    assert diagnostics(with_a_gap)["r_hat"] <= 1.01
+    assert HEAVY.mean(2)["b"] == 0.0
 
 
 def test_trust_before_the_first_bound_cannot_have_a_negative_sd():

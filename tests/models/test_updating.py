@@ -19,9 +19,10 @@ from trustbo.models import (
     TrustParams,
     fit,
     moment_matched,
+    params_of,
     sample_statistics,
 )
-from trustbo.models.spectral import log_likelihood, spectrum
+from trustbo.models.likelihood.gram_jax import log_likelihood, spectrum
 from trustbo.stacking import stack_missions
 
 THETA = np.array([[0.5, 0.01, 0.02], [0.8, 0.03, 0.001], [-0.2, 0.2, 0.1]])
@@ -154,7 +155,7 @@ def test_robots_with_nothing_in_common_are_so_many_pooled_fits():
 
 def test_matched_priors_have_the_posterior_s_moments():
     posterior = fit(simulate_missions(4), sampler="exact")
-    draws = TrustParams.from_posterior(posterior)
+    draws = params_of(posterior)
     matched = moment_matched(draws, Priors())
     assert isinstance(matched.beta0, dist.Beta)
     for name in ("beta0", "b", "delta_w", "delta_v"):

@@ -8,9 +8,8 @@ from scipy.stats import multivariate_normal
 from trustbo.errors import ShapeError
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams, sample_prior
 from trustbo.models.params import CoupledParams
-from trustbo.planning import information_gain
 from trustbo.planning.dynamics import transition
-from trustbo.planning.information import rate_noise
+from trustbo.planning.information import information_gain, rate_noise
 
 PATH = [(0, 0), (0, 1), (1, 2), (2, 2)]
 

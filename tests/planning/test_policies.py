@@ -6,16 +6,11 @@ import pytest
 from references import path_values, walks
 
 from trustbo.errors import TrustboError
-from trustbo.models import (
-    CoupledTrust,
-    HierarchicalTrust,
-    PooledTrust,
-    TrustParams,
-    sample_prior,
-)
-from trustbo.planning import POLICIES, AwarenessBelief, Planner, drift, policies
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams, sample_prior
+from trustbo.planning import POLICIES, Planner, policies
+from trustbo.planning.dynamics import drift
 from trustbo.planning.policies import resolve_policy
-from trustbo.terrain import Workspace
+from trustbo.workspace import AwarenessBelief, Workspace
 
 ENDS = ((3, 0), (0, 3))
 N_DRAWS = 60
@@ -106,14 +101,23 @@ def test_they_weigh_mean_against_spread_as_told(planner):
     assert of[bold.path].std() >= of[calm.path].std()
 
 
-@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust(), CoupledTrust()])
+@pytest.mark.parametrize(
+    ("model", "objective"),
+    [
+        (PooledTrust(), "success"),
+        (PooledTrust(), "stationary"),
+        (HierarchicalTrust(), "terminal"),
+        (CoupledTrust(), "terminal"),
+    ],
+)
 @pytest.mark.parametrize("name", list(POLICIES))
-def test_every_policy_plans_an_admissible_path_and_repeats_it(name, model, planner):
-    draws = prior_draws(model)
+def test_every_policy_plans_an_admissible_path_and_repeats_it(name, model, objective, workspace):
+    planner, draws = Planner(workspace, *ENDS, objective), prior_draws(model)
     for going_by in (planner, uncertain(planner)):
         plans = [POLICIES[name](jax.random.key(2), draws, going_by) for _ in range(2)]
         assert planner.require_path(plans[0].path) == plans[0].path
-        assert len(plans[0].path) - 1 <= planner.longest
+        if objective == "terminal":
+            assert len(plans[0].path) - 1 <= planner.shortest + 2
         assert plans[0].path == plans[1].path
         # What it says of the path is under the posterior mean, whatever it was chosen by.
         mean = going_by.evaluate(plans[0].path, draws.mean())

@@ -7,7 +7,7 @@ from references import walks
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models import HierarchicalTrust, PooledTrust, sample_prior
 from trustbo.planning import NoPathError, Planner, roll_trust
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 N = 4
 
@@ -122,7 +122,7 @@ def test_the_summary_is_over_the_trust_maps_of_draws(workspace, draws):
 
 @pytest.mark.parametrize("team", ["mean", "min"])
 def test_trust_maps_of_vector_trust_are_the_best_of_all_paths(workspace, team):
-    draws = sample_prior(HierarchicalTrust(), 2, 2, seed=1, n_robots=2)
+    draws = sample_prior(HierarchicalTrust(), 2, 200, seed=4, n_robots=2)
     planner = Planner(workspace, (3, 0), (0, 3), team=team)
     params = draws.draw(0)
     found = planner.trust_map(params)
@@ -130,7 +130,7 @@ def test_trust_maps_of_vector_trust_are_the_best_of_all_paths(workspace, team):
     for cell in planner.graph:
         if cell == (3, 0):
             continue
-        fewest = int(planner.course.bounds_from_start[cell])
+        fewest = int(planner.paths.bounds_from_start[cell])
         trusts = []
         for path in walks(passable, (3, 0), cell, fewest + 2, u_turns=False):
             z = workspace.awareness.values[:, *zip(*path[1:], strict=True)]

@@ -40,11 +40,12 @@ def test_parameters_can_be_chosen_and_truths_given(result):
 
 def test_robots_of_their_own_have_panels_of_their_own():
     rng = np.random.default_rng(1)
-    path = [(0, k) for k in range(13)]
+    path = [(0, k) for k in range(9)]
     missions = [
         tb.Mission.from_arrays(
-            path, rng.uniform(size=(12, 2, 2)), rng.uniform(0.4, 0.9, (12, 2)), robots=("a", "b")
+            path, rng.uniform(size=(8, 2, 2)), rng.uniform(0.4, 0.9, (8, 2)), robots=("a", "b")
         )
+        for _ in range(2)
     ]
     model = tb.models.CoupledTrust(inter_robot="none")
     posterior = tb.models.fit(missions, model, sampler="exact")

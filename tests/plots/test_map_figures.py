@@ -30,11 +30,11 @@ def test_probabilities_of_cells_go_from_0_to_1(result):
 
 
 def test_columns_can_be_chosen_and_are_whole_numbers(result):
-    axes = tb.plots.trust_maps(result, n_columns=1)
+    axes = result.plot_maps(n_columns=1)
     assert len({ax.get_position().x0 for ax in axes}) == 1
     assert [ax.get_xlabel() for ax in axes] == ["", "", "east (m)"]
     with pytest.raises(tb.TrustboError, match="n_columns must be a whole number from 1 on; got 0"):
-        tb.plots.trust_maps(result, n_columns=0)
+        result.plot_maps(n_columns=0)
 
 
 def test_fonts_are_the_user_s_and_sizes_the_figure_s(result):
@@ -42,7 +42,7 @@ def test_fonts_are_the_user_s_and_sizes_the_figure_s(result):
     sizes = []
     for settings in ({}, theirs):
         with plt.rc_context(settings):
-            figure = tb.plots.trust_maps(result)[0].figure
+            figure = result.plot_maps()[0].figure
             figure.canvas.draw()
         texts = [text for text in figure.findobj(Text) if text.get_text()]
         sizes.append(([text.get_fontsize() for text in texts], *figure.get_size_inches()))
@@ -52,7 +52,7 @@ def test_fonts_are_the_user_s_and_sizes_the_figure_s(result):
 
 
 def test_figures_are_vectors_but_for_the_maps(result, tmp_path):
-    axes = tb.plots.trust_maps(result)
+    axes = result.plot_maps()
     axes[0].figure.savefig(tmp_path / "maps.svg")
     text = (tmp_path / "maps.svg").read_text()
     assert text.count("<path") > 20  # lines and letters

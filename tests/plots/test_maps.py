@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
+from trustbo.plots.maps import draw_hillshade
 
 
 def test_one_panel_per_iteration_and_one_for_the_end(result):
@@ -66,7 +67,7 @@ def test_terrain_maps_show_surface_traversability_and_visibility(result):
 
 
 def test_every_map_has_shadows_and_the_first_a_scale(result):
-    first, *others = tb.plots.trust_maps(result)
+    first, *others = result.plot_maps()
     assert [text.get_text() for text in first.texts] == ["20 m"]
     for ax in (first, *others):
         shadow = ax.images[1].get_array()
@@ -106,7 +107,7 @@ def test_level_ground_keeps_its_colour_whatever_lies_beside_it():
         warnings.simplefilter("ignore", UserWarning)  # such ground makes for odd indices
         workspace = tb.Workspace.from_terrain(terrain, (2, 2))
     _, ax = plt.subplots()
-    tb.plots.draw_hillshade(ax, workspace, exaggerate=1.0)
+    draw_hillshade(ax, workspace, exaggerate=1.0)
     shadow = ax.images[0].get_array()[..., 3]
     np.testing.assert_allclose(shadow[2:18, 2:18], 0.0, atol=1e-12)  # level
     np.testing.assert_allclose(shadow[2:18, 23:38], 0.0, atol=1e-12)  # lit

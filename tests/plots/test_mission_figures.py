@@ -64,7 +64,7 @@ def test_a_plan_s_bands_are_its_own(result):
 
 
 def test_a_plan_of_other_robots_is_refused(result):
-    with pytest.raises(tb.ShapeError, match="the plan is of 3 robots; got the names"):
+    with pytest.raises(tb.ShapeError, match="the plan has 3 robots; got the names"):
         tb.plots.plan_trust(result.plan, ["a", "b"])
     with pytest.raises(tb.ShapeError, match=r"contact_rate must be \(\d, 3\).*got shape \(2, 4\)"):
         tb.plots.plan_trust(result.plan, result.workspace.team.names, np.zeros((2, 4)))

@@ -12,17 +12,11 @@ import trustbo as tb
 from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator
-from trustbo.simulation.mujoco import MujocoBackend
-from trustbo.simulation.sight import Surface, chance, optics
-from trustbo.simulation.vehicle import (
-    WHEEL_RADIUS,
-    Ground,
-    Physics,
-    center_of_mass,
-    crop,
-    grip_of,
-)
-from trustbo.terrain import Workspace, assemble_terrain, synthetic_terrain
+from trustbo.simulation.mujoco import MujocoSimulator
+from trustbo.simulation.vehicle import WHEEL_RADIUS, Ground, Physics, center_of_mass, crop, grip_of
+from trustbo.terrain import assemble_terrain, synthetic_terrain
+from trustbo.workspace import Workspace
+from trustbo.workspace.sight import Surface, detection_probability, optics
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 HUSKY = Robot()
@@ -70,7 +64,7 @@ def drive(workspace, surface, starts, goals, *, robot=HUSKY, heading=0.0, second
 
     Positions are in metres from the left and from the top edge.
     """
-    simulator = MujocoBackend(workspace, **options)
+    simulator = MujocoSimulator(workspace, **options)
     origin = simulator._surface.origin
     simulator._surface = surface._replace(origin=origin)
     flip = np.array([1.0, -1.0])
@@ -292,10 +286,10 @@ def test_robots_that_want_one_place_collide_or_block_each_other(flat, monkeypatc
 def test_without_a_route_or_with_too_little_time_a_drive_fails(flat):
     dem = np.zeros((60, 60))
     dem[:, 30] = 30.0  # a wall nobody can cross
-    mission = MujocoBackend(workspace_of(dem, shape=(2, 2))).run([(0, 0), (0, 1)], seed=0)
+    mission = MujocoSimulator(workspace_of(dem, shape=(2, 2))).run([(0, 0), (0, 1)], seed=0)
     assert mission.status == "stuck"
     assert len(mission.bounds) == 1
-    mission = MujocoBackend(flat, bound_timeout=5.0).run(PATH, seed=0)
+    mission = MujocoSimulator(flat, bound_timeout=5.0).run(PATH, seed=0)
     assert (mission.status, len(mission.bounds)) == ("timeout", 1)
     assert mission.duration[0, 0] == pytest.approx(5.0)
 
@@ -318,7 +312,7 @@ def test_a_drive_whose_physics_breaks_down_is_aborted(flat, monkeypatch, tmp_pat
 
 
 def test_a_mission_is_much_like_a_kinematic_one_on_easy_ground(wooded):
-    mission = MujocoBackend(wooded).run(PATH, seed=3)
+    mission = MujocoSimulator(wooded).run(PATH, seed=3)
     kinematic = KinematicSimulator(wooded).run(PATH, seed=3)
     assert mission.status == "ok"
     np.testing.assert_allclose(mission.duration, kinematic.duration, rtol=0.25)
@@ -335,7 +329,7 @@ def test_a_mission_is_much_like_a_kinematic_one_on_easy_ground(wooded):
 
 
 def test_contact_is_what_sight_says_of_the_recorded_poses(wooded):
-    mission = MujocoBackend(wooded, sight="bare").run(PATH, seed=3)
+    mission = MujocoSimulator(wooded, sight="bare").run(PATH, seed=3)
     simulator, team = KinematicSimulator(wooded, sight="bare"), wooded.team
     for bound in mission.bounds:
         poses = bound.poses[..., :2]
@@ -344,10 +338,13 @@ def test_contact_is_what_sight_says_of_the_recorded_poses(wooded):
         for i, robot in enumerate(team.robots):
             by_t2, by_lead = optics(robot, team.lead), optics(team.lead, robot)
             lead, t2 = poses[:, 0], poses[:, 1 + i]
-            seen = np.concatenate([
-                chance(simulator._surface, simulator.sight, t2[:until], lead[:until], by_t2),
-                chance(simulator._surface, simulator.sight, lead[until:], t2[until:], by_lead),
-            ])  # fmt: skip
+            scene = simulator._surface, simulator.sight
+            seen = np.concatenate(
+                [
+                    detection_probability(*scene, t2[:until], lead[:until], by_t2),
+                    detection_probability(*scene, lead[until:], t2[until:], by_lead),
+                ]
+            )
             np.testing.assert_array_equal(bound.contact[:, i], seen > 0.5)
         assert ((bound.contact_rate >= 0.0) & (bound.contact_rate <= 1.0)).all()
 
@@ -355,23 +352,24 @@ def test_contact_is_what_sight_says_of_the_recorded_poses(wooded):
 def test_contact_is_lost_beyond_the_lidar_s_range():
     team = Team(robots=(Robot(lidar_range=12.0),), lead=Robot(lidar_range=12.0))
     workspace = workspace_of(np.zeros((60, 60)), team)
-    bound = MujocoBackend(workspace).run(PATH[:2], seed=0).bounds[0]
+    bound = MujocoSimulator(workspace).run(PATH[:2], seed=0).bounds[0]
     gap = np.linalg.norm(bound.poses[:, 0, :2] - bound.poses[:, 1, :2], axis=1)
     np.testing.assert_array_equal(bound.contact[:, 0], gap <= 12.0)
     assert 0.0 < bound.contact_rate[0] < 1.0
 
 
 def test_the_same_seed_gives_the_same_mission_even_in_a_fresh_process(wooded):
-    simulator = MujocoBackend(wooded)
+    simulator = MujocoSimulator(wooded)
     first, again, other = (simulator.run(PATH[:2], seed=s) for s in (7, 7, 8))
     np.testing.assert_array_equal(first.bounds[0].poses, again.bounds[0].poses)
     np.testing.assert_array_equal(first.contact_rate, again.contact_rate)
     assert (first.bounds[0].poses[20] != other.bounds[0].poses[20]).any()
     program = (
-        "from trustbo.terrain import Workspace, synthetic_terrain\n"
-        "from trustbo.simulation.mujoco import MujocoBackend\n"
+        "from trustbo.terrain import synthetic_terrain\n"
+        "from trustbo.workspace import Workspace\n"
+        "from trustbo.simulation.mujoco import MujocoSimulator\n"
         "w = Workspace.from_terrain(synthetic_terrain((90.0, 90.0), seed=5, relief=6.0), (3, 3))\n"
-        f"bound = MujocoBackend(w).run({PATH[:2]}, seed=7).bounds[0]\n"
+        f"bound = MujocoSimulator(w).run({PATH[:2]}, seed=7).bounds[0]\n"
         "print(bound.poses.tobytes().hex(), bound.contact.tobytes().hex())"
     )
     printed = subprocess.run(
@@ -385,7 +383,7 @@ def test_the_same_seed_gives_the_same_mission_even_in_a_fresh_process(wooded):
 
 
 def test_running_bound_by_bound_is_running_the_mission(wooded):
-    simulator = MujocoBackend(wooded)
+    simulator = MujocoSimulator(wooded)
     whole = simulator.run(PATH, seed=4)
     simulator.reset(PATH[0], 4, next_cell=PATH[1])
     first = simulator.run_bound(1, PATH[1], next_cell=PATH[2])
@@ -403,7 +401,7 @@ def test_gaps_edges_and_other_pixels_are_no_obstacle():
     dem[rng.uniform(size=dem.shape) < 0.01] = np.nan
     coarse = rng.normal(0.0, 0.2, (12, 12))
     for workspace in (workspace_of(dem), workspace_of(coarse, resolution=5.0)):
-        mission = MujocoBackend(workspace).run(PATH[:2], seed=0)
+        mission = MujocoSimulator(workspace).run(PATH[:2], seed=0)
         assert mission.status == "ok"
         assert np.isfinite(mission.bounds[-1].poses).all()
 
@@ -412,7 +410,7 @@ def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
     terrain = tb.terrain.read_terrain(*real_terrain("wellington"))
     with pytest.warns(UserWarning, match=r"openness"):
         workspace = Workspace.from_terrain(terrain, (6, 8))
-    simulator = MujocoBackend(workspace, sight="transmittance")
+    simulator = MujocoSimulator(workspace, sight="transmittance")
     result = tb.iterate(
         workspace,
         (4, 3),
@@ -440,23 +438,23 @@ def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
 
 
 def test_settings_are_recorded_and_bad_ones_refused(flat):
-    simulator = MujocoBackend(flat, sight="bare", friction=0.7, stuck_after=5.0)
+    simulator = MujocoSimulator(flat, sight="bare", friction=0.7, stuck_after=5.0)
     described = simulator.describe()
-    assert described["simulator"] == "MujocoBackend"
+    assert described["simulator"] == "MujocoSimulator"
     assert described["friction"] == 0.7
     assert described["sight"] == "bare"
     assert described["mujoco"] == mujoco.__version__
     with pytest.raises(TrustboError, match=r"friction must be positive and finite; got -1"):
-        MujocoBackend(flat, friction=-1.0)
+        MujocoSimulator(flat, friction=-1.0)
     with pytest.raises(TrustboError, match=r"stuck_after must be positive and finite; got 0"):
-        MujocoBackend(flat, stuck_after=0.0)
+        MujocoSimulator(flat, stuck_after=0.0)
     with pytest.raises(TrustboError, match=r"step must be positive and finite; got nan"):
-        MujocoBackend(flat, step=np.nan)
+        MujocoSimulator(flat, step=np.nan)
     with pytest.raises(TrustboError, match=r"unknown sight mode 'fog'"):
-        MujocoBackend(flat, sight="fog")
+        MujocoSimulator(flat, sight="fog")
 
 
 def test_without_mujoco_the_remedy_is_named(flat, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(TrustboError, match=r'pip install "trustbo\[mujoco\]"'):
-        MujocoBackend(flat)
+        MujocoSimulator(flat)

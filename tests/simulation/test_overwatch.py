@@ -9,8 +9,9 @@ import xarray as xr
 
 from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
-from trustbo.simulation import KinematicSimulator, Sight
-from trustbo.terrain import Workspace, assemble_terrain, synthetic_terrain
+from trustbo.simulation import KinematicSimulator
+from trustbo.terrain import assemble_terrain, synthetic_terrain
+from trustbo.workspace import Sight, Workspace
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 
@@ -93,7 +94,8 @@ def test_the_same_seed_gives_the_same_mission_even_in_a_fresh_process(wooded):
     np.testing.assert_array_equal(first.bounds[1].poses, again.bounds[1].poses)
     assert (first.contact_rate != other.contact_rate).any()
     program = (
-        "from trustbo.terrain import Workspace, synthetic_terrain\n"
+        "from trustbo.terrain import synthetic_terrain\n"
+        "from trustbo.workspace import Workspace\n"
         "from trustbo.simulation import KinematicSimulator\n"
         "w = Workspace.from_terrain(synthetic_terrain((90.0, 90.0), seed=5, relief=6.0), (3, 3))\n"
         f"print(KinematicSimulator(w).run({PATH}, seed=7).contact_rate.tolist())"

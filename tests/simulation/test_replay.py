@@ -10,9 +10,9 @@ from simulators import ModelSimulator
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.records import missions_from_tree, missions_to_tree
-from trustbo.simulation.replay import ReplayBackend
-from trustbo.simulation.tables import write_table
+from trustbo.logs.netcdf import missions_from_tree, missions_to_tree
+from trustbo.logs.table import write_table
+from trustbo.simulation.replay import ReplaySimulator
 
 ENDS = ((3, 0), (0, 3))
 LEFT, MIDDLE = [(2, 0), (1, 0), (0, 0)], [(2, 0), (1, 1), (0, 0)]
@@ -46,44 +46,44 @@ def assert_same_result(again, recorded):
 
 
 def test_a_path_is_replayed_in_the_order_it_was_recorded():
-    backend = ReplayBackend([mission(LEFT, 0.1), mission(MIDDLE, 0.2), mission(LEFT, 0.3)])
-    assert [m.contact_rate[0, 0] for m in backend.remaining] == [0.1, 0.2, 0.3]
-    rates = [backend.run(path, seed=0).contact_rate[0, 0] for path in (LEFT, LEFT, MIDDLE)]
+    replay = ReplaySimulator([mission(LEFT, 0.1), mission(MIDDLE, 0.2), mission(LEFT, 0.3)])
+    assert [m.contact_rate[0, 0] for m in replay.remaining] == [0.1, 0.2, 0.3]
+    rates = [replay.run(path, seed=0).contact_rate[0, 0] for path in (LEFT, LEFT, MIDDLE)]
     assert rates == [0.1, 0.3, 0.2]
-    assert backend.remaining == ()
-    backend.rewind()
-    assert backend.run(np.array(LEFT), seed=1).contact_rate[0, 0] == 0.1
+    assert replay.remaining == ()
+    replay.rewind()
+    assert replay.run(np.array(LEFT), seed=1).contact_rate[0, 0] == 0.1
 
 
 def test_a_path_that_was_never_recorded_is_refused_with_the_nearest():
-    backend = ReplayBackend([mission(LEFT), mission(MIDDLE), mission(AROUND)])
+    replay = ReplaySimulator([mission(LEFT), mission(MIDDLE), mission(AROUND)])
     message = (
         r"path 2,0 1,1 1,2 0,0 was never recorded\. Nearest of 3 left: "
         r"mission 2, 2 of 3 bounds agree: 2,0 1,1 0,1 0,0; mission 1, 1 of 3"
     )
     with pytest.raises(TrustboError, match=message):
-        backend.run([(2, 0), (1, 1), (1, 2), (0, 0)], seed=0)
-    backend.run(LEFT, seed=0)
+        replay.run([(2, 0), (1, 1), (1, 2), (0, 0)], seed=0)
+    replay.run(LEFT, seed=0)
     with pytest.raises(TrustboError, match=r"was recorded, but as mission 0, replayed by now"):
-        backend.run(LEFT, seed=0)
+        replay.run(LEFT, seed=0)
     for path in (MIDDLE, AROUND):
-        backend.run(path, seed=0)
+        replay.run(path, seed=0)
     with pytest.raises(TrustboError, match=r"all 3 missions are replayed; rewind\(\) starts over"):
-        backend.run(LEFT[:2], seed=0)
+        replay.run(LEFT[:2], seed=0)
 
 
 def test_or_else_the_next_one_is_replayed_whatever_its_path():
     missions = [mission(LEFT), mission(MIDDLE), mission(AROUND)]
-    backend = ReplayBackend(missions, on_missing="next")
-    assert backend.run(AROUND, seed=0) is missions[2]  # the path asked for comes first
-    assert [backend.run(AROUND, seed=0) for _ in range(2)] == missions[:2]
+    replay = ReplaySimulator(missions, on_missing="next")
+    assert replay.run(AROUND, seed=0) is missions[2]  # the path asked for comes first
+    assert [replay.run(AROUND, seed=0) for _ in range(2)] == missions[:2]
     with pytest.raises(TrustboError, match="all 3 missions are replayed"):
-        backend.run(AROUND, seed=0)
+        replay.run(AROUND, seed=0)
 
 
 def test_a_campaign_learns_from_a_log_whatever_it_would_have_run(workspace, recorded):
-    backend = ReplayBackend(recorded.missions, on_missing="next")
-    result = run(workspace, simulator=backend, seed=7, policy="random")
+    replay = ReplaySimulator(recorded.missions, on_missing="next")
+    result = run(workspace, simulator=replay, seed=7, policy="random")
     assert [m.path for m in result.missions] != [
         tuple((int(r), int(c)) for r, c in path if r >= 0) for path in result.history["path"].values
     ]
@@ -96,37 +96,37 @@ def test_a_campaign_learns_from_a_log_whatever_it_would_have_run(workspace, reco
 
 def test_a_mission_is_replayed_bound_by_bound():
     one, other = mission(MIDDLE, 0.2), mission(AROUND, 0.3)
-    backend = ReplayBackend([one, other])
-    backend.reset((2, 0), 0)
-    assert backend.run_bound(1, (1, 1), next_cell=(0, 1)) is other.bounds[0]
-    assert backend.run_bound(2, (0, 1)) is other.bounds[1]
-    backend.close()
-    assert backend.remaining == (one,)
+    replay = ReplaySimulator([one, other])
+    replay.reset((2, 0), 0)
+    assert replay.run_bound(1, (1, 1), next_cell=(0, 1)) is other.bounds[0]
+    assert replay.run_bound(2, (0, 1)) is other.bounds[1]
+    replay.close()
+    assert replay.remaining == (one,)
     with pytest.raises(TrustboError, match=r"call reset\(start, seed\) before run_bound"):
-        backend.run_bound(1, (1, 1))
-    backend.reset((2, 0), 0)
+        replay.run_bound(1, (1, 1))
+    replay.reset((2, 0), 0)
     with pytest.raises(TrustboError, match="bounds are replayed in turn: 1 is next; got 2"):
-        backend.run_bound(2, (1, 1))
+        replay.run_bound(2, (1, 1))
     with pytest.raises(TrustboError, match="path 2,0 0,1 was never recorded"):
-        backend.run_bound(1, (0, 1))
-    assert backend.run_bound(1, (1, 1)) is one.bounds[0]
+        replay.run_bound(1, (0, 1))
+    assert replay.run_bound(1, (1, 1)) is one.bounds[0]
     with pytest.raises(
         TrustboError, match=r"mission 0, begun .* enters \(0, 0\) with bound 2, not"
     ):
-        backend.run_bound(2, (0, 1))
-    backend.reset((2, 0), 0)
+        replay.run_bound(2, (0, 1))
+    replay.reset((2, 0), 0)
     with pytest.raises(TrustboError, match="all 2 missions are replayed"):
-        backend.run_bound(1, (1, 1))
+        replay.run_bound(1, (1, 1))
 
 
 def test_a_mission_that_ended_early_goes_no_further():
-    backend = ReplayBackend([mission(LEFT, n_bounds=1, status="stuck")])
-    backend.reset((2, 0), 0)
-    backend.run_bound(1, (1, 0))
+    replay = ReplaySimulator([mission(LEFT, n_bounds=1, status="stuck")])
+    replay.reset((2, 0), 0)
+    replay.run_bound(1, (1, 0))
     with pytest.raises(TrustboError, match='mission 0 ended as "stuck" with bound 1; bound 2 was'):
-        backend.run_bound(2, (0, 0))
-    backend.rewind()
-    assert backend.run(LEFT, seed=0).status == "stuck"
+        replay.run_bound(2, (0, 0))
+    replay.rewind()
+    assert replay.run(LEFT, seed=0).status == "stuck"
 
 
 def test_a_replayed_table_gives_the_posterior_of_the_run_that_wrote_it(
@@ -134,15 +134,15 @@ def test_a_replayed_table_gives_the_posterior_of_the_run_that_wrote_it(
 ):
     """Exactly: text keeps every bit, and plans, hence paths, follow from the posteriors."""
     write_table(recorded.missions, tmp_path / "missions.csv")
-    backend = ReplayBackend.from_table(tmp_path / "missions.csv")
-    assert_same_result(run(workspace, simulator=backend), recorded)
+    replay = ReplaySimulator.from_table(tmp_path / "missions.csv")
+    assert_same_result(run(workspace, simulator=replay), recorded)
 
 
 def test_a_replayed_result_gives_its_posterior_again(workspace, recorded, tmp_path):
     recorded.save(tmp_path)
     for path in (tmp_path, tmp_path / "missions.nc"):
-        backend = ReplayBackend.from_netcdf(path)
-        assert_same_result(run(workspace, simulator=backend), recorded)
+        replay = ReplaySimulator.from_netcdf(path)
+        assert_same_result(run(workspace, simulator=replay), recorded)
 
 
 @pytest.mark.parametrize("with_states", [False, True])
@@ -160,10 +160,10 @@ def test_a_saved_mission_comes_back_with_its_ticks(with_states, tmp_path):
         progress=False,
     )
     result.save(tmp_path)
-    back = ReplayBackend.from_netcdf(tmp_path).missions[0]
+    back = ReplaySimulator.from_netcdf(tmp_path).missions[0]
     for a, b in zip(back.bounds, result.missions[0].bounds, strict=True):
         assert (a.cell, a.t0, a.status) == (b.cell, b.t0, b.status)
-        for name in ("poses", "contact", "awareness", "contact_rate", "duration", "exposure"):
+        for name in ("poses", "contact", "awareness", "contact_rate", "duration", "n_ticks"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
         np.testing.assert_array_equal(a.states, b.states)
         assert (a.states is not None) == with_states
@@ -172,20 +172,20 @@ def test_a_saved_mission_comes_back_with_its_ticks(with_states, tmp_path):
 def test_bad_input_is_named(tmp_path):
     for nothing in ([], mission(LEFT)):
         with pytest.raises(TrustboError, match="give a list of at least one mission"):
-            ReplayBackend(nothing)
+            ReplaySimulator(nothing)
     with pytest.raises(TrustboError, match="mission 0 must be a Mission; got 'log'"):
-        ReplayBackend(["log"])
+        ReplaySimulator(["log"])
     with pytest.raises(TrustboError, match="unknown on_missing 'skip'; choose one of error, next"):
-        ReplayBackend([mission(LEFT)], on_missing="skip")
+        ReplaySimulator([mission(LEFT)], on_missing="skip")
     with pytest.raises(TrustboError, match=r"path\[0\] must be two whole numbers"):
-        ReplayBackend([mission(LEFT)]).run([(0.5, 1)], seed=0)
+        ReplaySimulator([mission(LEFT)]).run([(0.5, 1)], seed=0)
     with pytest.raises(TrustboError, match=r"there is no file '.*missions\.nc'"):
-        ReplayBackend.from_netcdf(tmp_path)
+        ReplaySimulator.from_netcdf(tmp_path)
     xr.Dataset({"a": 1}).to_netcdf(tmp_path / "other.nc")
     (tmp_path / "text.nc").write_text("text")
     for name in ("other.nc", "text.nc"):
         with pytest.raises(TrustboError, match=rf"{name}' holds no missions"):
-            ReplayBackend.from_netcdf(tmp_path / name)
+            ReplaySimulator.from_netcdf(tmp_path / name)
 
 
 def test_states_of_some_bounds_only_come_back_for_these():
@@ -196,7 +196,7 @@ def test_states_of_some_bounds_only_come_back_for_these():
         simulator[keep] = tb.simulation.KinematicSimulator(workspace, record_states=keep)
     missions = [simulator[keep].run([(2, 0), (1, 1)], seed=0) for keep in (True, False)]
     tree = missions_to_tree(missions)
-    assert [str(name) for name in tree["ticks"]["state"].values] == list(tb.simulation.STATES)
+    assert [str(name) for name in tree["ticks"]["state"].values] == list(tb.logs.STATES)
     with_states, without = missions_from_tree(tree)
     np.testing.assert_array_equal(with_states.bounds[0].states, missions[0].bounds[0].states)
     assert without.bounds[0].states is None

@@ -6,10 +6,12 @@ import pytest
 import trustbo as tb
 from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
-from trustbo.simulation import STATES, Degradation, KinematicSimulator, Threat
+from trustbo.logs import STATES
+from trustbo.simulation import Degradation, KinematicSimulator, Threat
 from trustbo.simulation.sensing import contact_of, new_tracks
-from trustbo.simulation.sight import Sight, chance
-from trustbo.terrain import CompositeIndex, Workspace, synthetic_terrain
+from trustbo.terrain import CompositeIndex, synthetic_terrain
+from trustbo.workspace import Workspace
+from trustbo.workspace.sight import Sight, detection_probability
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 CIRCLE = {"center": (0, 0), "radius": 1}
@@ -129,6 +131,16 @@ def test_nobody_goes_through_forbidden_ground(flat):
     assert all((b.poses[..., 1] < grid.top - 44.0).all() for b in cut_off.bounds)
 
 
+@pytest.mark.parametrize("cell", PATH)
+def test_a_mission_into_or_out_of_a_forbidden_cell_is_stuck(flat, cell):
+    x, y = flat.grid.center(cell)
+    square = [(x - 15, y - 15), (x + 15, y - 15), (x + 15, y + 15), (x - 15, y + 15)]
+    simulator = KinematicSimulator(flat, threats=[Threat("forbid", polygon=square)])
+    mission = simulator.run(PATH, seed=0)
+    assert mission.status == "stuck"
+    assert len(mission.bounds) == max(1, PATH.index(cell))  # it gets as far as that
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -189,7 +201,7 @@ def test_states_see_as_far_as_the_simulator_s_sight(wooded, mode):
     angle = 2.0 * np.pi / 12 * np.arange(12)
     there = here[:, None] + reach * np.stack([np.cos(angle), -np.sin(angle)], axis=1)
     ends = np.repeat(here, 12, axis=0), there.reshape(-1, 2)
-    cast = chance(surface, Sight(mode), *ends, np.array([1.0, 1.0, np.inf, 1.0]))
+    cast = detection_probability(surface, Sight(mode), *ends, np.array([1.0, 1.0, np.inf, 1.0]))
     shares = lidar.visible_share[rows, cols]
     if mode == "wall":  # which also tests the lines that a ray crosses the fewer of
         assert np.abs(shares - cast.reshape(-1, 12).mean(1)).mean() < 0.02

@@ -14,19 +14,15 @@ from trustbo.terrain import (
     assemble_terrain,
     canopy_cover,
     canopy_height,
-    curvature,
     exposure,
     openness,
     pixel_features,
     rays,
     register_feature,
-    roughness,
     slope,
-    step_height,
-    tpi,
-    tri,
     vegetation_density,
 )
+from trustbo.terrain.features import curvature, roughness, step_height, tpi, tri
 
 GDAL = Path(__file__).parent.parent / "data" / "gdal"
 SHORT = {name: f for name, f in FEATURES.items() if name not in ("openness", "aspect")}

@@ -1,22 +1,22 @@
-"""`--config`: flags from a YAML file."""
+"""Flags from a YAML file, for `--config`."""
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import typer
 
+from trustbo.campaign.options import unknown
 from trustbo.cli.errors import fail
 from trustbo.errors import TrustboError
 
 _FILES = ("dem", "dsm")
-"""Paths that are relative to the file, not to where the program is run."""
+"""Flags whose paths are relative to the file, not to the working directory."""
 _NOT_IN_FILE = ("config",)
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:
-    """Make what a file says the command's defaults, before its other flags are looked at."""
+    """Make a file's flags the command's defaults, before its other flags are read."""
     if path is not None:
         known = [str(p.name) for p in context.command.params if p.name not in _NOT_IN_FILE]
         try:
@@ -26,20 +26,22 @@ def read_config(context: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
-def flags_of(path: Path, known: Iterable[str]) -> dict[str, str]:
-    """Flags by name, as they would be typed.
+def flags_of(path: Path, known: Collection[str]) -> dict[str, str]:
+    """Read flags by name, as they would be typed.
 
     Args:
-        path: A YAML file, a mapping of long flags (with dashes or underscores) to values.
-        known: The flags there are, with underscores.
+        path: YAML file, a mapping of long flags (with dashes or underscores) to values.
+        known: Names of all flags, with underscores.
 
     Raises:
-        TrustboError: No such file, no YAML, a flag there is not, or a value that is no value.
+        TrustboError: No such file, no YAML, an unknown flag, or a value of another type.
     """
     flags: dict[str, str] = {}
     for key, value in _read(path).items():
         name = str(key).replace("-", "_")
-        _require_known(path, name, list(known))
+        if name not in known:
+            error = unknown("flag", _flag(name), map(_flag, known))
+            raise TrustboError(f"{path}: {error}")
         if name in flags:
             raise TrustboError(f"{path}: {_flag(name)} is given twice; leave one out.")
         text = _typed(path, name, value)
@@ -49,7 +51,7 @@ def flags_of(path: Path, known: Iterable[str]) -> dict[str, str]:
 
 
 def _read(path: Path) -> Mapping[Any, Any]:
-    from trustbo.study.configuration import read_yaml
+    from trustbo.files import read_yaml
 
     content = read_yaml(path)
     if content is None:
@@ -61,18 +63,8 @@ def _read(path: Path) -> Mapping[Any, Any]:
     return content
 
 
-def _require_known(path: Path, name: str, known: list[str]) -> None:
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-        choices = [_flag(choice) for choice in near or known]
-        raise TrustboError(
-            f"{path}: unknown flag {_flag(name)!r}; {'did you mean' if near else 'choose one of'} "
-            f"{', '.join(choices)}?"
-        )
-
-
 def _typed(path: Path, name: str, value: object) -> str | None:
-    """A value as it would be typed; None leaves the flag at its default."""
+    """Write a value as it would be typed; None leaves the flag at its default."""
     if isinstance(value, list | tuple) and all(type(item) is int for item in value):
         return ",".join(str(item) for item in value)  # a cell as YAML writes pairs
     if value is None or isinstance(value, str | int | float):  # bool is an int

@@ -1,7 +1,8 @@
-"""`trustbo demo`: the whole of it, on a made terrain."""
+"""`trustbo demo`: a campaign on a synthetic terrain."""
 
 from pathlib import Path
 
+from trustbo.campaign.options import POLICY, SAMPLER
 from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import require_outputs
@@ -9,10 +10,10 @@ from trustbo.cli.run import require_names, run
 
 
 def demo(
-    policy: options.Policy = "greedy",
+    policy: options.Policy = POLICY,
     objective: options.Objective = "mean",
     model: options.Model = "pooled",
-    sampler: options.Sampler = "nuts",
+    sampler: options.Sampler = SAMPLER,
     iterations: options.Iterations = 8,
     seed: options.Seed = 0,
     config: options.Config = None,
@@ -21,13 +22,13 @@ def demo(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Run a campaign on a made terrain of 500 m x 500 m, whose DEM and DSM are written out too.
+    """Run a campaign on a synthetic terrain of 500 m x 500 m, and write its DEM and DSM too.
 
     Example: trustbo demo --sampler exact --iterations 4 --out out/demo
 
-    Then open out/demo/report.html. The objective is the mean trust on the way,
-    which makes for a telling picture; that of the paper, the default of run, is
-    trust at the goal, which the last few bounds decide.
+    Then open out/demo/report.html. The objective here is the mean trust on the
+    way, which every bound changes; the paper's, which is the default of run, is
+    trust at the goal, which depends on the last few bounds.
     """
     from trustbo import terrain
     from trustbo.files import write_file

@@ -1,4 +1,4 @@
-"""How commands end: in one line and an exit code, without a traceback."""
+"""Errors of commands: one line and an exit code, without a traceback."""
 
 import sys
 import warnings
@@ -12,16 +12,16 @@ import typer
 from trustbo.errors import PosteriorError, TrustboError
 
 FAILED, BAD_INPUT, REFUSED, INTERRUPTED = 1, 2, 3, 130
-"""Exit codes; see the program's epilog."""
+"""Exit codes; the epilog of the program explains them."""
 
 
 @contextmanager
 def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]:
-    """Say what went wrong in one line, and how to go on; warnings in a line each.
+    """Print an error in one line, and the way on; each warning in a line.
 
     Args:
-        debug: Show the traceback of an error instead.
-        campaign: The folder of the campaign that is at work, if one is.
+        debug: Whether to show the traceback of an error instead.
+        campaign: Folder of the campaign that is at work, if one is.
     """
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
@@ -52,7 +52,7 @@ def fail(error: Exception, code: int, hint: str = "") -> NoReturn:
 
 
 def complain(error: str, hint: str = "") -> None:
-    """Say what is wrong in one line, and in another what may help."""
+    """Print an error in one line, and a hint in another."""
     print(f"error: {error}", file=sys.stderr)
     if hint:
         print(f"hint: {hint}", file=sys.stderr)
@@ -60,15 +60,19 @@ def complain(error: str, hint: str = "") -> None:
 
 def _way_on(campaign: Path | None) -> str:
     if campaign is None:
-        return "the same command goes on with what is left."
+        return "the same command runs the rest."
     if (campaign / "campaign.json").exists():
         return f"all missions so far are kept: trustbo resume {campaign} goes on."
     return "nothing was begun yet."
 
 
 def _after_refusal(campaign: Path | None) -> str:
-    kept = "" if campaign is None else f"what was measured is kept in {campaign / 'measured.nc'}. "
+    kept = (
+        ""
+        if campaign is None
+        else f"the measured missions are kept in {campaign / 'measured.nc'}. "
+    )
     return (
-        f"{kept}Run again with a model that asks less of so few data (--model pooled), longer "
-        "paths (more cells: --shape), or another --seed, and another --out or --overwrite."
+        f"{kept}Run again with a model of fewer parameters (--model pooled), longer paths (more "
+        "cells: --shape), or another --seed, and another --out or --overwrite."
     )

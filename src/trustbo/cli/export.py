@@ -17,15 +17,16 @@ def export(
     """Write a result's maps and path for GIS, GPS units and robots.
 
     Example: trustbo export out/demo --format geotiff --format gpx
-    Everything there is: trustbo export out/demo --format all --out for-the-field
+    All formats: trustbo export out/demo --format all --out for-the-field
 
-    Of all, what cannot be written (a place on Earth without a terrain, a bag that
-    is there already) is left out, which is said; what is asked for by name must be.
+    With all, formats that cannot be written (a place on Earth without a terrain, a
+    bag that exists already) are left out with a line that says so; a format asked
+    for by name is an error then.
     """
     with one_line_errors(debug):
+        from trustbo.campaign.result import load_result
         from trustbo.export import FORMATS, export_result
         from trustbo.export.everything import left_out
-        from trustbo.result import load_result
 
         for name in formats:
             require_choice("format", name, (*FORMATS, "all"))

@@ -1,48 +1,89 @@
-"""The options that commands share, and what their help says."""
+"""Flags that commands share, and their help."""
 
+import inspect
+import re
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from trustbo.campaign.options import LEARNING, PLANNING, RUNNING, CampaignOptions
 from trustbo.cli.config import read_config
 
-WHERE, TEAM, PATHS, LEARNING, LENGTH, PROGRAM = (
-    "Where", "Who, and what they see", "Which path is good", "How it learns", "How long it goes on",
-    "This program",
+PLACE, TEAM, PATHS, MODEL, MISSIONS, PROGRAM = (
+    "Terrain and grid", "Robots and sight", "Paths", "Learning", "Missions", "Program",
 )  # fmt: skip
+_PANELS = {PLANNING: PATHS, LEARNING: MODEL, RUNNING: MISSIONS}
+_METAVARS = {int: "N", float: "X", str: "NAME", type(None): "VALUE"}
 
 
 def _option(panel: str, text: str, *names: str, **more: Any) -> Any:
     return typer.Option(*names, help=text, rich_help_panel=panel, **more)
 
 
-# --- where ---
+def with_campaign_options[Command: Callable[..., None]](command: Command) -> Command:
+    """Give a command, as its `**options`, a flag for each field of `CampaignOptions`.
+
+    Fields whose default cannot be typed have none.
+    """
+    signature = inspect.signature(command)
+    parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    entries = re.findall(
+        r"^    (\w+): (.+?\.)(?=\s)", inspect.cleandoc(CampaignOptions.__doc__ or ""), re.M | re.S
+    )
+    texts = {name: " ".join(text.split()) for name, text in entries}
+    for option in fields(CampaignOptions):
+        kind = type(option.default)
+        if kind not in _METAVARS:
+            continue
+        panel, text = _PANELS[option.metadata["part"]], texts.get(option.name, "")
+        parser = _whole_or_name if option.default is None else None
+        flag = _option(panel, text, metavar=_METAVARS[kind], parser=parser)
+        of_flag: Any = {"default": option.default, "annotation": Annotated[kind, flag]}
+        parameters.append(inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, **of_flag))
+    command.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
+    return command
+
+
+def _whole_or_name(text: str) -> int | str:
+    return int(text) if text.isdigit() else text
+
+
+# --- terrain and grid ---
 Dem = Annotated[
-    Path, _option(WHERE, "Heights of the ground (DEM), e.g. a GeoTIFF.", metavar="FILE")
+    Path, _option(PLACE, "Heights of the ground (DEM), e.g. a GeoTIFF.", metavar="FILE")
 ]
 Dsm = Annotated[
-    Path, _option(WHERE, "Heights of the canopy (DSM), of the same place.", metavar="FILE")
+    Path | None,
+    _option(
+        PLACE,
+        "Heights of the canopy (DSM) of the same place; without one, no canopy is known.",
+        metavar="FILE",
+    ),
 ]
-Start = Annotated[str, _option(WHERE, "First cell; row 0 is the north.", metavar="ROW,COL")]
-Goal = Annotated[str, _option(WHERE, "Last cell.", metavar="ROW,COL")]
-Shape = Annotated[str, _option(WHERE, "Planning grid.", metavar="ROWS,COLS")]
+Start = Annotated[str, _option(PLACE, "First cell; row 0 is in the north.", metavar="ROW,COL")]
+Goal = Annotated[str, _option(PLACE, "Last cell.", metavar="ROW,COL")]
+Shape = Annotated[str, _option(PLACE, "Planning grid.", metavar="ROWS,COLS")]
 Crs = Annotated[
-    str | None, _option(WHERE, "Of rasters that carry none, e.g. EPSG:32633.", metavar="CRS")
+    str | None, _option(PLACE, "CRS of rasters that carry none, e.g. EPSG:32633.", metavar="CRS")
 ]
 Resolution = Annotated[
-    float | None, _option(WHERE, "Pixel size of rasters that do not say it.", metavar="M")
+    float | None, _option(PLACE, "Pixel size of rasters that carry none.", metavar="M")
 ]
 
-# --- who ---
-Robots = Annotated[int, _option(TEAM, "How many overwatch the lead.", metavar="N")]
-MaxSlope = Annotated[float, _option(TEAM, "Steepest slope they stand.", metavar="DEG")]
-LidarRange = Annotated[float, _option(TEAM, "How far they track each other.", metavar="M")]
+# --- robots and sight ---
+Robots = Annotated[int, _option(TEAM, "Number of robots that overwatch the lead.", metavar="N")]
+MaxSlope = Annotated[float, _option(TEAM, "Steepest slope that robots can drive.", metavar="DEG")]
+LidarRange = Annotated[
+    float, _option(TEAM, "Range within which robots track each other.", metavar="M")
+]
 SightMode = Annotated[
     str,
     _option(
         TEAM,
-        "What blocks sight: bare (the ground), wall (canopy too), transmittance (canopy dims it).",
+        "Obstacles to sight: bare (the ground), wall (canopy too), transmittance (canopy dims it).",
         metavar="MODE",
     ),
 ]
@@ -52,26 +93,18 @@ Objective = Annotated[
     str,
     _option(
         PATHS,
-        "terminal (trust at the goal, as in the paper), mean (on the way), success (that every "
-        "bound succeeds), bottleneck (the least on the way), stationary.",
+        "Objective of a path: terminal (trust at the goal, as in the paper), mean (on the way), "
+        "success (of every bound), bottleneck (the least on the way), stationary.",
         metavar="NAME",
     ),
-]
-TeamTrust = Annotated[
-    str, _option(PATHS, "The team's trust is the mean or the min of its robots'.", metavar="NAME")
-]
-Connectivity = Annotated[int, _option(PATHS, "8, or 4 for no diagonal bounds.", metavar="N")]
-MaxBounds = Annotated[
-    str | None,
-    _option(PATHS, "shortest, shortest+2, or the most bounds allowed.", metavar="BOUNDS"),
 ]
 
 # --- learning ---
 Policy = Annotated[
     str,
     _option(
-        LEARNING,
-        "How the next path is chosen: greedy, optimistic, thompson, information, ucb, ei, "
+        MODEL,
+        "Choice of the next path: greedy, optimistic, thompson, information, ucb, ei, "
         "epsilon_greedy, cvar, random.",
         metavar="NAME",
     ),
@@ -79,52 +112,43 @@ Policy = Annotated[
 Model = Annotated[
     str,
     _option(
-        LEARNING,
-        "Robots are alike (pooled), similar (hierarchical), or influence each other (coupled).",
+        MODEL,
+        "Trust model: robots are alike (pooled), similar (hierarchical), or influence each other "
+        "(coupled).",
         metavar="NAME",
     ),
 ]
 Observation = Annotated[
     str,
     _option(
-        LEARNING,
-        "What contact rates are: gaussian (as in the paper), censored, beta_binomial.",
+        MODEL,
+        "Family of contact rates: gaussian (as in the paper), censored, beta_binomial.",
         metavar="NAME",
     ),
 ]
 Sampler = Annotated[
     str,
     _option(
-        LEARNING,
-        "nuts; exact (importance sampling, which need not compile; pooled only); joint (nuts, for "
-        "other than gaussian).",
+        MODEL,
+        "Sampler of the posterior: nuts; exact (importance sampling, which need not compile; "
+        "pooled only); joint (nuts, for other than gaussian).",
         metavar="NAME",
     ),
 ]
-Awareness = Annotated[
-    str,
-    _option(
-        LEARNING, "Trust the awareness map (map), or let missions correct it (belief).",
-        metavar="NAME",
-    ),
-]  # fmt: skip
 
-# --- how long ---
+# --- missions ---
 Iterations = Annotated[
-    int, _option(LENGTH, "How many missions to run and learn from.", metavar="N")
+    int, _option(MISSIONS, "Number of missions to run and learn from.", metavar="N")
 ]
 StopRegret = Annotated[
     float | None,
     _option(
-        LENGTH,
+        MISSIONS,
         "Stop when the path is within this share of the best with probability 0.9, e.g. 0.05.",
         metavar="SHARE",
     ),
 ]
-Replan = Annotated[
-    str, _option(LENGTH, "Plan again after each mission, or each bound.", metavar="WHEN")
-]
-Seed = Annotated[int, _option(LENGTH, "Same seed, same result.", metavar="N")]
+Seed = Annotated[int, _option(MISSIONS, "Seed of everything random.", metavar="N")]
 
 # --- program ---
 Config = Annotated[
@@ -148,28 +172,30 @@ Out = Annotated[
 Overwrite = Annotated[
     bool, _option(PROGRAM, "Replace the campaign that the folder holds.", "--overwrite")
 ]
-Quiet = Annotated[bool, _option(PROGRAM, "No progress bar, no table.", "--quiet", "-q")]
+Quiet = Annotated[bool, _option(PROGRAM, "Show no progress bar and no table.", "--quiet", "-q")]
 Debug = Annotated[bool, _option(PROGRAM, "Show the whole traceback of an error.", "--debug")]
 Folder = Annotated[Path, typer.Argument(help="Folder of the campaign's results.", metavar="FOLDER")]
 Total = Annotated[
     int | None,
     _option(
-        LENGTH, "How many missions in all; by default as many as it was begun for.",
+        MISSIONS, "Number of missions in all; by default as many as it was begun for.",
         "--iterations", metavar="N",
     ),
 ]  # fmt: skip
 OutFile = Annotated[
     Path | None,
-    _option(PROGRAM, "The page; by default report.html in the folder.", "--out", metavar="FILE"),
+    _option(
+        PROGRAM, "File of the page; by default report.html in the folder.", "--out", metavar="FILE"
+    ),
 ]
 Title = Annotated[str | None, _option(PROGRAM, "Title of the page.", metavar="TEXT")]
 Formats = Annotated[
     list[str],
     typer.Option(
         "--format",
-        help="geotiff, cog, netcdf (maps); geojson, gpx, geopackage (the path); csv (path and "
-        "missions); ros_map, ros1_bag, ros2_bag (cost and path); or all that can be written. Give "
-        "it once for each.",
+        help="Format, given once for each: geotiff, cog, netcdf (maps); geojson, gpx, geopackage "
+        "(the path); csv (path and missions); ros_map, ros1_bag, ros2_bag (cost and path); or all "
+        "that can be written.",
         metavar="NAME",
     ),
 ]
@@ -191,18 +217,21 @@ ExportResolution = Annotated[
 
 # --- of a study ---
 StudyConfig = Annotated[
-    Path, typer.Argument(help="The study, in YAML; see docs/studies.md.", metavar="CONFIG")
+    Path, typer.Argument(help="Study in YAML; see docs/studies.md.", metavar="CONFIG")
 ]
 StudyOut = Annotated[
-    Path, _option(PROGRAM, "Folder for the results; made if need be.", "--out", metavar="FOLDER")
+    Path, _option(PROGRAM, "Folder for the results, made if need be.", "--out", metavar="FOLDER")
 ]
 Executor = Annotated[
     str,
     typer.Option(
-        help="serial, loky, dask, or a scheduler's address, tcp://host:8786.", metavar="WHERE"
+        help="Executor of the runs: serial, loky, dask, or a scheduler's address, tcp://host:8786.",
+        metavar="NAME",
     ),
 ]
 Workers = Annotated[
     int | None,
-    typer.Option(help="Processes of loky or dask; by default one for each core.", metavar="N"),
+    typer.Option(
+        help="Number of processes of loky or dask; by default one for each core.", metavar="N"
+    ),
 ]

@@ -1,4 +1,4 @@
-"""What a campaign's folder gets when it is done, for people and for GIS."""
+"""Figures, report and maps in the folder of a campaign that is done."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from trustbo.errors import TrustboError
 
 if TYPE_CHECKING:
-    from trustbo.result import Result
+    from trustbo.campaign.result import Result
 
 _FILES = ("report.html", "maps.png", "terrain.png", "maps.tif", "maps.qml", "path.geojson")
 
@@ -15,15 +15,15 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
     """Refuse a folder that cannot take the results, before any work.
 
     Args:
-        out: The folder, which need not exist yet.
-        *others: Files that it is to get, beside those of `write_outputs`.
-        overwrite: Whether a campaign may be there already.
+        out: Folder, which need not exist yet.
+        *others: Files to be written there, beside those of `write_outputs`.
+        overwrite: Whether it may hold a campaign already.
 
     Raises:
-        TrustboError: It holds a campaign or a result; its name belongs to a file, or that of a
-            file to a folder.
+        TrustboError: The folder holds a campaign or a result; its name belongs to a file, or the
+            name of a file to a folder.
     """
-    from trustbo.export.checks import require_file
+    from trustbo.files import require_file
 
     if not overwrite and (out / "campaign.json").exists():
         raise TrustboError(
@@ -39,12 +39,12 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
 
 
 def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
-    """Write figures, report and maps beside a result, and say where they are.
+    """Write figures, report and maps beside a result, and print their names.
 
     Args:
-        result: The result, kept in `out` already.
-        out: The folder.
-        table: Whether to print a row per mission, too.
+        result: Result, kept in `out` already.
+        out: Folder of the result.
+        table: Whether to print a row for each mission too.
 
     Raises:
         TrustboError: The folder's name belongs to a file.
@@ -54,12 +54,12 @@ def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
     from trustbo.report import write_report
 
     written = ["report.html", "maps.png"]
-    write_figure(out / "maps.png", plots.trust_maps(result))
+    write_figure(out / "maps.png", result.plot_maps())
     on_terrain = result.workspace.terrain is not None
     if on_terrain and result.workspace.pixels is not None:
         write_figure(out / "terrain.png", plots.terrain_maps(result.workspace))
         written.append("terrain.png")
-    if on_terrain:  # else there is no place on earth to export to
+    if on_terrain:  # else the maps have no place on Earth
         from trustbo.export import export_result
 
         written += [file.name for file in export_result(result, out, ("geotiff", "geojson"))]
@@ -89,7 +89,7 @@ def write_figure(path: Path, axes) -> None:
 
 
 def _print_table(result: "Result") -> None:
-    """One line per mission, and what was learned."""
+    """Print one line for each mission, and the recommended path."""
     name, label = ("r_hat", "R-hat") if "r_hat" in result.history else ("k_hat", "k-hat")
     print(f"mission  status  contact  objective  {label}  path")
     for i in result.history["iteration"].values:

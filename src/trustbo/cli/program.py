@@ -17,13 +17,13 @@ from trustbo.cli.study import study
 EPILOG = """
 Exit codes: 0 done; 1 done, but some of a study's runs failed, or an
 unforeseen error (with a traceback); 2 bad input; 3 a posterior was refused,
-what was measured is kept; 130 interrupted.
+measured missions are kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
 _PANELS = (
-    ("A campaign", (demo, run, resume)),
-    ("What it came to", (report, export)),
-    ("Many campaigns", (study,)),
+    ("Campaigns", (demo, run, resume)),
+    ("Results", (report, export)),
+    ("Studies", (study,)),
 )
 
 app = typer.Typer(
@@ -50,22 +50,23 @@ def _show_version(asked: bool) -> None:
 @app.callback()
 def _program(
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Say which.")
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version."),
     ] = False,
 ) -> None:
-    """Learn how far robots can be trusted where, and plan the most trustworthy path.
+    """Learn the trust in robots on a terrain, and plan the most trustworthy path.
 
-    See it work:   trustbo demo
-    On your own:   trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
-    How it works:  trustbo run --help
+    On a synthetic terrain:  trustbo demo
+    On your own:             trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
+    All flags:               trustbo run --help
     """
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the program, and leave with its exit code; misuse, too, is one line.
+    """Run the program and exit with its code; misuse is one line and a hint too.
 
     Args:
-        arguments: What would follow `trustbo` in a shell; by default what does.
+        arguments: Words after `trustbo` in a shell; by default those of this process.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
@@ -73,6 +74,6 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        complain(str(error.format_message()), f"{name} --help says what there is.")
+        complain(str(error.format_message()), f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)

@@ -1,4 +1,4 @@
-"""`trustbo report`: a result as one page to read."""
+"""`trustbo report`: a result as one page."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ def report(
 
     Example: trustbo report out/demo --out demo.html
 
-    The page needs no network and no other file. Of a campaign that was
-    interrupted it shows what was learned until then.
+    The page needs no network and no other file. For a campaign that was
+    interrupted, it shows the missions learned from until then.
     """
     with one_line_errors(debug):
-        from trustbo.result import load_result
+        from trustbo.campaign.result import load_result
 
         result = load_result(folder)
         use_no_screen()

@@ -1,4 +1,4 @@
-"""`trustbo resume`: on with a campaign that was interrupted, or is to be longer."""
+"""`trustbo resume`: go on with a campaign that was interrupted, or is to be longer."""
 
 import json
 from pathlib import Path
@@ -25,17 +25,16 @@ def resume(
     Example: trustbo resume out/demo
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
-    What comes out is what would have come out without the interruption. All
-    flags are as the campaign was begun with; only a rule to stop is not kept
-    in the folder, so give --stop-regret again.
+    The result is the same as without the interruption. The folder keeps all flags
+    but --stop-regret, which has to be given again.
     """
     with one_line_errors(debug, campaign=folder):
         if iterations is not None:
             require_whole("n_iterations", iterations, 1)
         state = _state(folder)
         require_outputs(folder, overwrite=True)
-        from trustbo.loop import resume as go_on
-        from trustbo.stopping import RegretBound
+        from trustbo.campaign.loop import resume as go_on
+        from trustbo.campaign.stopping import RegretBound
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
         total = iterations or state["notes"]["n_iterations"]
@@ -52,7 +51,7 @@ def resume(
 
 
 def _state(folder: Path) -> dict[str, Any]:
-    """What the campaign's folder says of it."""
+    """Read the state of a campaign from its folder."""
     file = folder / "campaign.json"
     if not file.exists():
         raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
@@ -67,9 +66,11 @@ def _state(folder: Path) -> dict[str, Any]:
 
 
 def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
-    """The simulator the campaign was begun with."""
-    from trustbo import archive, records
-    from trustbo.simulation import KinematicSimulator, Sight
+    """Make the simulator that the campaign was begun with."""
+    from trustbo.logs import netcdf as records
+    from trustbo.simulation import KinematicSimulator
+    from trustbo.workspace import Sight
+    from trustbo.workspace import netcdf as archive
 
     workspace = archive.workspace_from_tree(records.read_tree(folder / "workspace.nc"))
     sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])

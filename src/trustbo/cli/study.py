@@ -21,15 +21,14 @@ def study(
 
     Example: trustbo study config.yaml --out out/study
 
-    The folder gets a file for each run, summary.csv (regret, or the plans' value
-    where no truth is known, per policy and mission), and regret.png. Called
-    again, it goes on where it stopped.
+    The folder gets a file for each run, summary.csv (for each policy and mission the
+    regret, or the plan's value where no truth is known) and regret.png. The same
+    command again runs the rest.
     """
     use_no_screen()
     with one_line_errors(debug):
         from trustbo import plots
-        from trustbo.export.checks import require_file
-        from trustbo.files import write_text
+        from trustbo.files import require_file, write_text
         from trustbo.study import axes_of, run_study, summary
 
         for name in ("summary.csv", "regret.png"):

@@ -1,17 +1,15 @@
-"""Results as files that other programs open: GIS, GPS, robots, tables."""
+"""Results as files for other programs: GIS, GPS, robots, tables."""
 
 from trustbo.export.everything import FORMATS, export_result
 from trustbo.export.netcdf import write_netcdf
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.rasters import write_geotiff
-from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
-from trustbo.export.style import write_style
+from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.tables import write_csv
 
 __all__ = [
     "FORMATS",
     "export_result",
-    "occupancy",
     "path_frame",
     "write_csv",
     "write_geotiff",
@@ -19,5 +17,4 @@ __all__ = [
     "write_path",
     "write_ros_bag",
     "write_ros_map",
-    "write_style",
 ]

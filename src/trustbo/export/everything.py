@@ -1,4 +1,4 @@
-"""A result in several formats at once, in one folder."""
+"""Export of a result in several formats to one folder."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,33 +9,29 @@ from typing import NamedTuple
 
 import xarray as xr
 
+from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.export.checks import (
-    require_crs,
-    require_file,
-    require_names_for_netcdf,
-    require_names_for_sql,
-)
+from trustbo.export.checks import require_crs, require_names_for_netcdf, require_names_for_sql
 from trustbo.export.netcdf import write_netcdf
 from trustbo.export.paths import write_path
 from trustbo.export.rasters import write_geotiff
 from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
-from trustbo.result import Result, require_folder
-from trustbo.simulation.bagfile import require_new_bag
+from trustbo.files import require_file, require_folder
+from trustbo.logs.bagfile import require_new_bag
 
 
 @dataclass(frozen=True, eq=False)
 class _Content:
-    """What is to be written."""
+    """Result to write."""
 
     result: Result
     resolution: float | None
 
     @cached_property
     def maps(self) -> xr.Dataset:
-        """The maps, made once and only if a format asks for them: they may take long."""
+        """Maps of the result, made once and only if a format needs them, as they can take long."""
         return self.result.maps()
 
 
@@ -43,11 +39,11 @@ class _Format(NamedTuple):
     text: str
     files: tuple[str, ...]
     write: Callable[[_Content, Path], None]
-    """Called with the first of the files."""
+    """Function of the content and the first of the files."""
     on_earth: bool = False
-    """Whether it needs a CRS."""
+    """Whether the format needs a CRS."""
     require: Callable[[Result], None] | None = None
-    """Refuses a result that it cannot hold."""
+    """Check that refuses a result the format cannot hold."""
 
 
 def export_result(
@@ -57,23 +53,23 @@ def export_result(
     *,
     resolution: float | None = None,
 ) -> list[Path]:
-    """Write a result's maps and its recommended path to a folder.
+    """Write the maps and the recommended path of a result to a folder.
 
     Args:
-        result: What a campaign learned.
-        folder: Made if need be. Files in it are replaced, but bags are not.
-        formats: Which of `FORMATS`.
+        result: Result of a campaign.
+        folder: Folder to write to; files in it are replaced, bags are not.
+        formats: Names of formats, keys of `FORMATS`.
         resolution: Side of a pixel of the maps for ROS, m; by default that of a cell, or a tenth of
-            its shorter side where cells are not square.
+            its shorter side if cells are not square.
 
     Returns:
-        The files written; of a ROS 2 bag, its folder.
+        Files written; the folder of a ROS 2 bag.
 
     Raises:
-        TrustboError: Before anything is written: an unknown format; one that needs a place on
-            Earth, of a result without a terrain; a bag that exists, or no rosbags; a resolution
-            that is not positive, or without a format for ROS; what `occupancy` refuses; or files
-            that cannot be.
+        TrustboError: A format is unknown, or needs a CRS that the result lacks; a bag exists, or
+            rosbags is not installed; the resolution is not positive, far too fine, or given
+            without a format for ROS; a cost is outside [0, 1]; or a file cannot be written. Then
+            nothing is written.
     """
     names = [formats] if isinstance(formats, str) else dict.fromkeys(formats)
     chosen = {name: _FORMATS[require_choice("format", name, _FORMATS)] for name in names}
@@ -96,10 +92,10 @@ def export_result(
 
 
 def left_out(result: Result, folder: str | PathLike[str]) -> dict[str, str]:
-    """The formats that this result, folder and machine cannot give, each with the reason.
+    """Return the formats that cannot be written, each with the reason.
 
     Raises:
-        TrustboError: The folder's name belongs to a file.
+        TrustboError: The name of the folder belongs to a file.
     """
     target, reasons = require_folder(folder), {}
     for name in _FORMATS:
@@ -114,8 +110,8 @@ def _require_possible(name: str, result: Result, target: Path) -> None:
     """Refuse a format that cannot be written.
 
     Raises:
-        TrustboError: It needs a place on Earth, and there is no terrain; it is a bag that exists,
-            or there is no rosbags; a name that it cannot hold; or a folder is in the way.
+        TrustboError: The format needs a CRS that the result lacks, or cannot hold one of its names;
+            a bag exists, or rosbags is not installed; or a folder has the name of a file.
     """
     kind = _FORMATS[name]
     if kind.on_earth:
@@ -133,7 +129,7 @@ def _write_maps(content: _Content, file: Path) -> None:
     maps = content.maps
     write_geotiff(file, maps, content.result.workspace, style=False)
     row, col = content.result.path[0]
-    # The start's trust is assumed: it must not stretch the colours of what was learned.
+    # The trust of the start cell is assumed; it must not set the limits of the colours.
     learned = maps.where((maps["row"] != row) | (maps["col"] != col))
     write_style(file.with_suffix(".qml"), learned)
 
@@ -163,7 +159,7 @@ def _write_path(content: _Content, file: Path) -> None:
 
 def _require_netcdf(result: Result) -> None:
     features = result.workspace.awareness["feature"].values
-    # Result.maps gives those that are called as a coordinate another name.
+    # Result.maps renames features that have the name of a coordinate.
     require_names_for_netcdf(str(name) for name in features if "/" in str(name))
 
 
@@ -208,4 +204,4 @@ _FORMATS = {
     "ros2_bag": _Format("cost map and path as a bag of ROS 2 (mcap)", ("path_ros2",), _write_bag),
 }
 FORMATS = {name: kind.text for name, kind in _FORMATS.items()}
-"""What `export_result` writes, by name."""
+"""Descriptions of the formats of `export_result`, by name."""

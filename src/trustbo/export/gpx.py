@@ -6,19 +6,19 @@ import geopandas as gpd
 import numpy as np
 import xarray as xr
 
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 _NAMESPACE = "http://www.topografix.com/GPX/1/1"
 _HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
 
 
 def gpx_route(frame: gpd.GeoDataFrame, workspace: Workspace, name: str) -> str:
-    """The XML of a route.
+    """Return the XML of a route.
 
     Args:
-        frame: Of `path_frame`, in degrees on WGS 84.
-        workspace: Whose robots and ground they are.
-        name: Of the route.
+        frame: Points of `path_frame`, in degrees on WGS 84.
+        workspace: Workspace of the path.
+        name: Name of the route.
     """
     root = ET.Element("gpx", version="1.1", creator="trustbo", xmlns=_NAMESPACE)
     route = ET.SubElement(root, "rte")
@@ -30,7 +30,7 @@ def gpx_route(frame: gpd.GeoDataFrame, workspace: Workspace, name: str) -> str:
     rows = frame.drop(columns="geometry").to_dict("records")
     for row, place, height in zip(rows, frame.geometry, heights, strict=True):
         point = ET.SubElement(route, "rtept", lat=f"{place.y:.8f}", lon=f"{place.x:.8f}")
-        # The order of these is the schema's.
+        # The order is that of the schema.
         if np.isfinite(height):
             ET.SubElement(point, "ele").text = f"{height:.2f}"
         ET.SubElement(point, "name").text = str(row["bound"])
@@ -49,7 +49,7 @@ def _trust(row: dict, robots: tuple[str, ...]) -> str:
 
 
 def _ground(frame: gpd.GeoDataFrame, workspace: Workspace) -> np.ndarray:
-    """Height of the ground at each cell's centre, m; NaN where it is not known."""
+    """Height of the ground at the centre of each cell, m; NaN where it is not known."""
     if workspace.terrain is None:
         return np.full(len(frame), np.nan)
     x, y = (xr.DataArray(frame[axis].to_numpy(), dims="cell") for axis in ("x", "y"))

@@ -1,33 +1,27 @@
-"""Maps as netCDF, by the CF conventions."""
+"""Maps as netCDF, after the CF conventions."""
 
 from os import PathLike
 
 import numpy as np
 from rasterio.transform import from_origin
 
-from trustbo.export.checks import (
-    Maps,
-    find_crs,
-    require_file,
-    require_maps,
-    require_names_for_netcdf,
-)
-from trustbo.files import write_file
-from trustbo.terrain import Workspace
+from trustbo.export.checks import Maps, find_crs, require_maps, require_names_for_netcdf
+from trustbo.files import require_file, write_file
+from trustbo.workspace import Workspace
 
 
 def write_netcdf(path: str | PathLike[str], maps: Maps, workspace: Workspace) -> None:
-    """Write maps of the planning cells as netCDF-4 by CF-1.8, dims (y, x), north first.
+    """Write maps of the planning cells as netCDF-4 after CF-1.8, dims (y, x), north first.
 
     Args:
-        path: The file; a complete one replaces it, or nothing.
-        maps: Dims (row, col), e.g. `Result.maps()`.
-        workspace: Whose cells they are. Without a terrain there is no CRS, and x and y are metres
-            from the grid's lower left corner.
+        path: File to write, or to replace.
+        maps: Maps (row, col), e.g. `Result.maps()`.
+        workspace: Workspace of the cells. Without a terrain there is no CRS, and x and y are metres
+            from the lower left corner of the grid.
 
     Raises:
-        ShapeError: Other dims, or another number of cells.
-        TrustboError: The path is no file to be, or a map's name is none that netCDF takes.
+        ShapeError: The dims or the number of cells differ.
+        TrustboError: The file cannot be written, or netCDF cannot hold the name of a map.
     """
     bands, target = require_maps(maps, workspace), require_file(path)
     require_names_for_netcdf(map(str, bands.data_vars))
@@ -44,7 +38,7 @@ def write_netcdf(path: str | PathLike[str], maps: Maps, workspace: Workspace) ->
             attrs["long_name"] = f"{axis} coordinate of projection"
             attrs["standard_name"] = f"projection_{axis}_coordinate"
         data[axis].attrs = attrs
-        data[axis].encoding = {"_FillValue": None}  # CF: coordinates miss nothing
+        data[axis].encoding = {"_FillValue": None}  # CF: coordinates have no missing values
     if crs is not None:
         transform = from_origin(grid.left, grid.top, grid.cell_width, grid.cell_height)
         data = data.rio.write_crs(crs).rio.write_transform(transform)

@@ -11,14 +11,14 @@ import pandas as pd
 from pyproj.exceptions import CRSError
 from shapely import LineString
 
+from trustbo.campaign.result import Result
 from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.export.checks import find_crs, require_crs, require_file, require_names_for_sql
+from trustbo.export.checks import find_crs, require_crs, require_names_for_sql
 from trustbo.export.gpx import gpx_route
-from trustbo.files import to_json, write_file, write_text
+from trustbo.files import require_file, to_json, write_file, write_text
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
-from trustbo.result import Result
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 _WGS84 = "EPSG:4326"
@@ -28,23 +28,22 @@ _NAME = "most trustworthy path"
 def path_frame(
     plan: Plan | Result, workspace: Workspace | None = None, *, crs: Any = _WGS84
 ) -> gpd.GeoDataFrame:
-    """A path as points, one per cell.
+    """Return a path as points, one per cell.
 
     Args:
-        plan: The path, or a result for the one it recommends.
-        workspace: Where it is; of a result, its own.
-        crs: Of the geometry, anything that pyproj knows; None for the grid's own, or none at all
-            without a terrain.
+        plan: Plan, or result whose recommended path is meant.
+        workspace: Workspace of the plan; by default that of the result.
+        crs: CRS of the geometry, anything that pyproj accepts; None for that of the grid, if any.
 
     Returns:
-        Columns `bound` (0 for the start), `row`, `col`, `x`, `y` (of the cell's centre, metres in
-        the grid's CRS), and for each robot the expected trust after the bound `trust_<robot>`, with
-        its 5 % and 95 % quantiles over the posterior `trust_<robot>_low` and `_high`, NaN for bound
-        0; `geometry` in `crs`.
+        Columns `bound` (0 for the start), `row`, `col`, `x` and `y` (centre of the cell, metres in
+        the CRS of the grid); for each robot the expected trust after the bound, `trust_<robot>`,
+        and its 5 % and 95 % quantiles over the posterior, `trust_<robot>_low` and `_high`, NaN for
+        bound 0; `geometry` in `crs`.
 
     Raises:
-        ShapeError: The plan has other robots than the workspace.
-        TrustboError: No place on Earth, an unknown CRS, or a path that is not in the workspace.
+        ShapeError: The plan and the workspace differ in their numbers of robots.
+        TrustboError: The workspace has no CRS, `crs` is unknown, or the path leaves the workspace.
     """
     plan, workspace = plan_of(plan, workspace)
     own = find_crs(workspace) if crs is None else require_crs(workspace)
@@ -62,28 +61,29 @@ def path_frame(
 def write_path(
     path: str | PathLike[str], plan: Plan | Result, workspace: Workspace | None = None
 ) -> None:
-    """Write a path in the format that the file's suffix says.
+    """Write a path in the format of the suffix.
 
     ======== ========================================================================
     .geojson RFC 7946: a LineString from start to goal, then a Point per cell with
              its `bound`, `cell` and trust; longitude and latitude on WGS 84.
-    .gpx     GPX 1.1: a route; each point has the bound as its name, the trust as its
-             description and, if the workspace has a terrain, the ground's elevation
-             in metres above the datum of the DEM.
+    .gpx     GPX 1.1: a route; the name of each point is the bound, its description
+             the trust, its elevation that of the ground above the datum of the DEM,
+             in metres, if the workspace has a terrain.
     .gpkg    GeoPackage: layers `path` (LineString) and `bounds` (points), in the
              terrain's CRS.
     .csv     The points as a table, with longitude and latitude if there is a CRS.
     ======== ========================================================================
 
     Args:
-        path: The file; a complete one replaces it, or nothing.
-        plan: The path, or a result for the one it recommends.
-        workspace: Where it is; of a result, its own. Only a table can do without a terrain.
+        path: File to write, or to replace.
+        plan: Plan, or result whose recommended path is meant.
+        workspace: Workspace of the plan; by default that of the result. Without a terrain, only a
+            table can be written.
 
     Raises:
-        ShapeError: The plan has other robots than the workspace.
-        TrustboError: An unknown suffix, no place on Earth, a path that is not in the workspace, or
-            a file that cannot be.
+        ShapeError: The plan and the workspace differ in their numbers of robots.
+        TrustboError: The suffix is unknown, the workspace has no CRS, the path leaves the
+            workspace, or the file cannot be written.
     """
     plan, workspace = plan_of(plan, workspace)
     suffix = require_choice("suffix", Path(path).suffix.lower(), _WRITERS)
@@ -91,16 +91,16 @@ def write_path(
 
 
 def plan_of(plan: Plan | Result, workspace: Workspace | None) -> tuple[Plan, Workspace]:
-    """A plan, and where it is.
+    """Return a plan and its workspace.
 
     Raises:
-        ShapeError: The plan has other robots than the workspace.
-        TrustboError: Neither says where the plan is, or the path is not in the workspace.
+        ShapeError: The plan and the workspace differ in their numbers of robots.
+        TrustboError: No workspace is given, or the path leaves it.
     """
     if isinstance(plan, Result):
         plan, workspace = plan.plan, workspace or plan.workspace
     if workspace is None:
-        raise TrustboError("a plan does not say where it is; give the workspace too.")
+        raise TrustboError("a plan has no workspace; give the workspace too.")
     for k, cell in enumerate(plan.path):
         workspace.require_cell(f"path[{k}]", cell)
     n_robots = plan.trust.shape[1]
@@ -110,7 +110,7 @@ def plan_of(plan: Plan | Result, workspace: Workspace | None) -> tuple[Plan, Wor
 
 
 def _table(plan: Plan, workspace: Workspace) -> pd.DataFrame:
-    """The columns of `path_frame`, but for the geometry."""
+    """Return the columns of `path_frame` without the geometry."""
     row, col = np.array(plan.path).T
     x, y = np.array([workspace.grid.center(cell) for cell in plan.path]).T
     columns = {"bound": np.arange(len(row)), "row": row, "col": col, "x": x, "y": y}
@@ -122,7 +122,7 @@ def _table(plan: Plan, workspace: Workspace) -> pd.DataFrame:
 
 
 def _facts(plan: Plan) -> dict[str, object]:
-    """What is said of the whole path."""
+    """Return the properties of the whole path."""
     return {
         "name": _NAME,
         "bounds": len(plan.path) - 1,
@@ -135,7 +135,7 @@ def _facts(plan: Plan) -> dict[str, object]:
 def _write_geojson(file: Path, plan: Plan, workspace: Workspace) -> None:
     frame = path_frame(plan, workspace)
     lon, lat = frame.geometry.x, frame.geometry.y
-    # RFC 7946, 11.2: no more digits than there is precision; the eighth is a millimetre.
+    # RFC 7946, 11.2: no more digits than the precision; the eighth is a millimetre.
     positions = [[round(a, 8), round(b, 8)] for a, b in zip(lon, lat, strict=True)]
     features = [_feature("LineString", positions, _facts(plan))]
     trust = frame.filter(like="trust_").to_dict("records")

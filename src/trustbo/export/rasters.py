@@ -8,10 +8,10 @@ import numpy as np
 import rasterio
 from rasterio.transform import from_origin
 
-from trustbo.export.checks import Maps, require_crs, require_file, require_maps
+from trustbo.export.checks import Maps, require_crs, require_maps
 from trustbo.export.style import write_style
-from trustbo.files import write_file
-from trustbo.terrain import Workspace
+from trustbo.files import require_file, write_file
+from trustbo.workspace import Workspace
 
 
 def write_geotiff(
@@ -27,16 +27,15 @@ def write_geotiff(
     Bands are float32, named after their variables, with the long name as metadata; NaN is nodata.
 
     Args:
-        path: The file, .tif or .tiff; a complete one replaces it, or nothing.
-        maps: Dims (row, col), e.g. `Result.maps()`.
-        workspace: Whose cells they are; made from a terrain.
-        cog: Whether to lay it out as a Cloud Optimized GeoTIFF, for maps on a web server.
-        style: Whether to write a style beside it, which QGIS takes up by its name; see
-            `write_style`.
+        path: .tif or .tiff file to write, or to replace.
+        maps: Maps (row, col), e.g. `Result.maps()`.
+        workspace: Workspace of the cells, made from a terrain.
+        cog: Whether to write a Cloud Optimized GeoTIFF, for maps on a web server.
+        style: Whether to write a style for QGIS beside it, the .qml file of the same name.
 
     Raises:
-        ShapeError: Other dims, or another number of cells.
-        TrustboError: The workspace has no terrain, hence no CRS; or a path that is no such file.
+        ShapeError: The dims or the number of cells differ.
+        TrustboError: The workspace has no terrain, hence no CRS, or the file cannot be written.
     """
     crs, bands = require_crs(workspace), require_maps(maps, workspace)
     target = require_file(path, ".tif", ".tiff")
@@ -44,7 +43,7 @@ def write_geotiff(
     if style:
         require_file(legend)
     grid = workspace.grid
-    # Averages stay within the range of the values in the overviews, cubic (GDAL's choice) does not.
+    # Averages stay within the range of the values; cubic resampling, GDAL's default, does not.
     layout: dict[str, Any] = {"driver": "GTiff", "interleave": "band"}
     layout = {"driver": "COG", "overview_resampling": "average"} if cog else layout
 

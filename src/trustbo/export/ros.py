@@ -1,8 +1,8 @@
 """Maps and paths for ROS: files of map_server and Nav2, and bags.
 
-All is in the frame `map`, x east and y north, in metres. By default that is the terrain's CRS; as
-RViz draws in float32, which is coarse that far out, `origin=(0.0, 0.0)` puts the lower left corner
-of the grid there instead.
+Coordinates are in the frame `map`, x east and y north, in metres: by default those of the terrain's
+CRS. RViz draws in float32, which is coarse so far from 0; `origin=(0.0, 0.0)` puts the lower left
+corner of the grid there instead.
 """
 
 import math
@@ -14,25 +14,25 @@ import numpy as np
 import xarray as xr
 import yaml
 
+from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.export.checks import require_file, require_maps
+from trustbo.export.checks import require_maps
 from trustbo.export.paths import plan_of
-from trustbo.files import write_file, write_text
+from trustbo.files import require_file, write_file, write_text
+from trustbo.logs.bagfile import STORAGES, Record, require_new_bag, write_messages
+from trustbo.logs.messages import GRID, PATH, Messages
 from trustbo.planning import Plan
-from trustbo.result import Result
-from trustbo.simulation.bagfile import STORAGES, Record, require_new_bag, write_messages
-from trustbo.simulation.messages import GRID, PATH, Messages
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 IMPASSABLE, UNKNOWN = 100, -1
-# 99 and 100 are what a costmap publishes for "inscribed" and "lethal": no robot may go there.
+# Costmaps publish 99 and 100 for "inscribed" and "lethal", where no robot may go.
 WORST_PASSABLE = 98
 _MOST_PIXELS = 100_000_000
-_TIME = 1_000_000_000  # of the messages, ns; not 0, which means "unknown" in ROS
+_TIME = 1_000_000_000  # time of the messages, ns; 0 means "unknown" in ROS
 
 
 class _Raster(NamedTuple):
-    """A map as ROS has it."""
+    """Map in the layout of ROS."""
 
     values: np.ndarray  # (row, col), int8, the southern row first
     resolution: float  # m
@@ -43,22 +43,22 @@ class _Raster(NamedTuple):
 def occupancy(
     cost: xr.DataArray, workspace: Workspace, *, resolution: float | None = None
 ) -> np.ndarray:
-    """A cost map as ROS has it.
+    """Return the occupancy grid of a cost map.
 
     Args:
-        cost: Dims (row, col), in [0, 1]; NaN where it is not known, e.g. `Result.maps()["cost"]`.
-        workspace: Whose cells they are.
-        resolution: Side of a pixel, m, each as the cell at its centre; by default that of a cell,
-            or a tenth of its shorter side where cells are not square.
+        cost: Cost map (row, col), in [0, 1], NaN where unknown, e.g. `Result.maps()["cost"]`.
+        workspace: Workspace of the cells.
+        resolution: Side of a pixel, m, by default that of a cell, or a tenth of its shorter side if
+            cells are not square. A pixel has the cost of the cell at its centre.
 
     Returns:
         Shape (height, width), int8, the southern row first: 100 times the cost, but at most 98,
-        100 where no robot can go, -1 where the cost is not known. Pixels begin at the grid's lower
-        left corner; those whose centres are beyond its other edges are -1.
+        100 in impassable cells, -1 where the cost is unknown. Pixels begin at the lower left corner
+        of the grid; those with centres beyond its other edges are -1.
 
     Raises:
-        ShapeError: Other dims, or another number of cells.
-        TrustboError: A cost outside [0, 1]; or a resolution that is not positive, or far too fine.
+        ShapeError: The dims or the number of cells differ.
+        TrustboError: A cost is outside [0, 1], or the resolution is not positive, or far too fine.
     """
     (values,) = require_maps(cost.rename("cost"), workspace).data_vars.values()
     known = values.values
@@ -74,7 +74,7 @@ def occupancy(
         raise TrustboError(
             f"resolution={side:g} m gives {height * width:.1e} pixels; take a coarser one."
         )
-    # Sizes are whole but for rounding, and so may the quotient be.
+    # The quotient may be whole up to rounding.
     y, x = ((np.arange(math.ceil(n - 1e-6)) + 0.5) * side for n in (height, width))
     row, col = rows - 1 - (y // grid.cell_height).astype(int), (x // grid.cell_width).astype(int)
     within = (row >= 0)[:, None] & (col < cols)
@@ -94,24 +94,26 @@ def write_ros_map(
     """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml file, and a .pgm beside it.
 
     Args:
-        path: The .yaml (or .yml) file.
-        cost: See `occupancy`.
-        workspace: Whose cells they are.
-        resolution: See `occupancy`.
-        origin: Where the grid's lower left corner is to be in the frame `map`, m; by default where
-            it is in the CRS.
+        path: .yaml or .yml file to write, or to replace.
+        cost: Cost map (row, col), in [0, 1], NaN where unknown, e.g. `Result.maps()["cost"]`. It is
+            written as 100 times the cost, at most 98; 100 is impassable, -1 unknown.
+        workspace: Workspace of the cells.
+        resolution: Side of a pixel, m, by default that of a cell, or a tenth of its shorter side if
+            cells are not square.
+        origin: Position of the lower left corner of the grid in the frame `map`, m; by default its
+            position in the CRS.
 
     Raises:
-        ShapeError: Other dims, or another number of cells.
-        TrustboError: What `occupancy` refuses; an origin that is no position; or a path that is no
-            such file.
+        ShapeError: The dims or the number of cells differ.
+        TrustboError: A cost is outside [0, 1]; the resolution is not positive, or far too fine; the
+            origin is not a position; or the file cannot be written.
     """
     target = require_file(path, ".yaml", ".yml")
     picture = require_file(target.with_suffix(".pgm"))
     raster = _raster(cost, workspace, resolution, origin)
     height, width = raster.values.shape
-    # Pictures begin in the north. In raw mode, map_server takes a pixel's byte as the value, where
-    # 255 is -1 as int8; Nav2 does if it is at most 100, and takes any other as unknown.
+    # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value,
+    # 255 as -1; Nav2 does so up to 100, and takes larger bytes as unknown.
     pixels = raster.values[::-1].astype(np.uint8).tobytes()
     head = f"P5\n{width} {height}\n255\n".encode("ascii")
     record = {
@@ -120,12 +122,12 @@ def write_ros_map(
         "resolution": raster.resolution,
         "origin": [*raster.corner, 0.0],
         "negate": 0,
-        # Both loaders ask for these, but raw mode has no use for them: the values are their own.
+        # Both loaders require these, although raw mode does not use them.
         "occupied_thresh": 0.65,
         "free_thresh": 0.196,
     }
     write_file(picture, lambda file: file.write_bytes(head + pixels))
-    # Last: it speaks of the picture.
+    # Last, as it names the picture.
     write_text(target, yaml.safe_dump(record, sort_keys=False, default_flow_style=None))
 
 
@@ -142,23 +144,23 @@ def write_ros_bag(
 ) -> None:
     """Write a cost map and a path as a ROS bag, for RViz and Foxglove.
 
-    `/trustbo/cost` has one nav_msgs/OccupancyGrid, `/trustbo/path` one nav_msgs/Path from centre to
-    centre, each pose heading for the next; both are latched (transient local).
+    `/trustbo/cost` has one nav_msgs/OccupancyGrid, `/trustbo/path` one nav_msgs/Path through the
+    centres of the cells, each pose towards the next; both are latched (transient local).
 
     Args:
-        path: A `.bag` file for ROS 1, or a folder for ROS 2; written whole or not at all.
-        plan: The path, or a result for the one it recommends.
-        cost: See `occupancy`.
-        workspace: Where they are.
-        version: Of ROS, 1 or 2; by default as the path says.
-        storage: Of ROS 2, "mcap" or "sqlite3".
-        resolution: See `occupancy`.
-        origin: See `write_ros_map`.
+        path: New `.bag` file for ROS 1, or new folder for ROS 2.
+        plan: Plan, or result whose recommended path is meant.
+        cost: Cost map, see `write_ros_map`.
+        workspace: Workspace of the cells.
+        version: Version of ROS, 1 or 2; by default that of the suffix.
+        storage: Storage of ROS 2, "mcap" or "sqlite3".
+        resolution: Side of a pixel, m, see `write_ros_map`.
+        origin: Position of the lower left corner, m, see `write_ros_map`.
 
     Raises:
-        ShapeError: Other dims, or another number of cells or robots.
-        TrustboError: No rosbags; a path that exists, or is of the other version; or what
-            `write_ros_map` refuses.
+        ShapeError: The dims, or the number of cells or robots, differ.
+        TrustboError: rosbags is not installed; the path exists, or is of the other version; or an
+            argument is refused by `write_ros_map`.
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
@@ -197,7 +199,7 @@ def _resolution(workspace: Workspace, resolution: float | None) -> float:
     if resolution is not None:
         return require_positive("resolution", resolution)
     height, width = workspace.grid.cell_height, workspace.grid.cell_width
-    # Pixels of ROS are square; with ten to a cell, its edges are off by a twentieth at most.
+    # Pixels of ROS are square; with ten per cell, its edges are off by a twentieth at most.
     return width if math.isclose(height, width, rel_tol=1e-6) else min(height, width) / 10.0
 
 
@@ -212,7 +214,7 @@ def _position(origin: tuple[float, float]) -> np.ndarray:
 
 
 def _poses(plan: Plan, workspace: Workspace, shift: np.ndarray) -> np.ndarray:
-    """Centres of the cells, each heading for the next, the last as the one before; (cell, 3)."""
+    """Poses at the centres of the cells, towards the next centre, shape (cell, 3)."""
     centers = np.array([workspace.grid.center(cell) for cell in plan.path]) + shift
     steps = np.diff(centers, axis=0)
     heading = np.arctan2(steps[:, 1], steps[:, 0])

@@ -1,4 +1,4 @@
-"""Colours of a raster in QGIS, as a layer style (.qml)."""
+"""Layer style (.qml) with the colours of a raster in QGIS."""
 
 import math
 from os import PathLike
@@ -7,8 +7,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from trustbo.errors import require_choice
-from trustbo.export.checks import Maps, as_dataset, require_file
-from trustbo.files import write_text
+from trustbo.export.checks import Maps, as_dataset
+from trustbo.files import require_file, write_text
 
 _VIRIDIS = (
     (68, 1, 84),
@@ -23,23 +23,23 @@ _VIRIDIS = (
     (189, 223, 38),
     (253, 231, 37),
 )
-"""Stops at tenths; straight lines between them are within 14 of 255 of matplotlib's."""
+"""Stops at tenths; linear interpolation is within 14 of 255 of matplotlib's colours."""
 _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 
 
 def write_style(path: str | PathLike[str], maps: Maps, *, band: str | None = None) -> None:
-    """Write how QGIS is to colour a raster of `write_geotiff`: viridis over a band's values.
+    """Write the style of a raster of `write_geotiff`: viridis over the values of one band.
 
-    QGIS takes it up by itself when it is named as the raster, but .qml.
+    QGIS loads the style of the same name beside a raster.
 
     Args:
-        path: The file, .qml.
-        maps: As `write_geotiff` wrote them; what is NaN in these does not count.
-        band: Which of them to show; by default the first.
+        path: .qml file to write, or to replace.
+        maps: Maps of the raster; NaN is left out of the limits of the colours.
+        band: Name of the map to show; by default the first.
 
     Raises:
         ShapeError: There are no maps.
-        TrustboError: An unknown band, or a path that is no such file.
+        TrustboError: The band is unknown, or the file cannot be written.
     """
     target = require_file(path, ".qml")
     bands = as_dataset(maps)
@@ -57,7 +57,7 @@ def write_style(path: str | PathLike[str], maps: Maps, *, band: str | None = Non
     renderer = ET.SubElement(pipe, "rasterrenderer", kind | of_band | limits)
     ET.SubElement(renderer, "rasterTransparency")
     origin = ET.SubElement(renderer, "minMaxOrigin")
-    # "None": the limits are as given here, not taken anew from what is on the screen.
+    # "None": the limits are those given here, not those of the visible part.
     for tag, text in {"limits": "None", "extent": "WholeRaster", "statAccuracy": "Exact"}.items():
         ET.SubElement(origin, tag).text = text
     renderer.append(_shader(low, high))
@@ -70,7 +70,7 @@ def write_style(path: str | PathLike[str], maps: Maps, *, band: str | None = Non
 
 
 def _shader(low: float, high: float) -> ET.Element:
-    """Colours by value, and the ramp that QGIS shows for editing."""
+    """Return the colours by value, and the ramp that QGIS shows for editing."""
     shader = ET.Element("rastershader")
     ramp = ET.SubElement(
         shader,
@@ -103,13 +103,13 @@ def _shader(low: float, high: float) -> ET.Element:
             label=f"{value:.{_decimals(low, high)}f}",
             alpha="255",
         )
-    # A continuous legend would show the labels of the two ends alone.
+    # A continuous legend would label the two ends only.
     ET.SubElement(ramp, "rampLegendSettings", useContinuousLegend="0", direction="0")
     return shader
 
 
 def _limits(values: np.ndarray) -> tuple[float, float]:
-    """Least and largest finite value, held apart where there is only one, or none."""
+    """Return the least and the largest finite value, 1 apart if there is only one, or none."""
     finite = values[np.isfinite(values)].astype(float)
     if not finite.size:
         return 0.0, 1.0
@@ -118,7 +118,7 @@ def _limits(values: np.ndarray) -> tuple[float, float]:
 
 
 def _decimals(low: float, high: float) -> int:
-    """Decimals with which the labels of neighbouring stops differ."""
+    """Number of decimals with which the labels of neighbouring stops differ."""
     return max(0, 2 - math.floor(math.log10(high - low)))
 
 

@@ -1,37 +1,37 @@
-"""What missions measured and what was learned of them, as one table for pandas or R."""
+"""Table of measurements and of learned trust, for pandas or R."""
 
 from os import PathLike
 
 import numpy as np
 import pandas as pd
 
-from trustbo.export.checks import require_file
-from trustbo.files import write_text
-from trustbo.result import Result
-from trustbo.simulation.rows import column_of
+from trustbo.campaign.result import Result
+from trustbo.files import require_file, write_text
+from trustbo.logs.rows import column_of
 
 _TRUST = ("trust_mean", "trust_sd")
 
 
 def write_csv(path: str | PathLike[str], result: Result) -> None:
-    """Write a table with one row per mission (from 0), bound that was run (from 1), and robot.
+    """Write a table with a row for each mission (from 0), bound run (from 1) and robot.
 
     Columns are `mission`, `bound`, `robot`, `row` and `col` of the cell entered, `contact_rate`,
-    `duration` (s), `exposure` (ticks), `status` of the bound, `mission_status`, a column for each
-    awareness feature as in `simulation.write_table`, and `trust_mean` and `trust_sd`, latent trust
-    under the last posterior. A blank is "not measured", or a mission that it is not of.
+    `duration` (s), `n_ticks`, `status` of the bound, `mission_status`, a column for each awareness
+    feature as in `logs.write_table`, and `trust_mean` and `trust_sd`, latent trust under the last
+    posterior. A blank stands for a value that was not measured, or for the trust of a mission that
+    the last posterior does not cover.
 
     Args:
-        path: The file; a complete one replaces it, or nothing.
-        result: What a campaign learned.
+        path: File to write, or to replace.
+        result: Result of a campaign.
 
     Raises:
-        TrustboError: The path is no file to be.
+        TrustboError: The file cannot be written.
     """
     target = require_file(path)
     latent = result.posterior["latent"].to_dataset()
     trust = {name: latent[name].values for name in _TRUST}
-    # With update="moment_matched" a posterior is of its last mission alone.
+    # With update="moment_matched" a posterior covers its last mission only.
     first = len(result.missions) - latent.sizes["mission"]
     rows = []
     for j, mission in enumerate(result.missions):
@@ -47,7 +47,7 @@ def write_csv(path: str | PathLike[str], result: Result) -> None:
                         "col": col,
                         "contact_rate": bound.contact_rate[i],
                         "duration": bound.duration[i],
-                        "exposure": bound.exposure[i],
+                        "n_ticks": bound.n_ticks[i],
                         "status": bound.status,
                         "mission_status": mission.status,
                     }
@@ -58,5 +58,5 @@ def write_csv(path: str | PathLike[str], result: Result) -> None:
 
 
 def _column(feature: str) -> str:
-    """As in `simulation.write_table`, and apart from the columns of latent trust."""
+    """Return the column of `logs.write_table`, renamed if it is one of latent trust."""
     return f"awareness_{feature}" if feature in _TRUST else column_of(feature)

@@ -3,18 +3,18 @@
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
-from trustbo.models.calibration import sbc
-from trustbo.models.contact_rate import ContactRate, TrustSample
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.filter import TrustFilter, TrustState
 from trustbo.models.fit import fit
 from trustbo.models.hierarchical import HierarchicalTrust
+from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.prior import prior_predictive, sample_prior
+from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
-from trustbo.models.sampling import diagnostics
+from trustbo.models.samplers.convergence import diagnostics
+from trustbo.models.sbc import sbc
 from trustbo.models.updating import ExactPosterior, moment_matched, sample_statistics
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""The paper's coupled form (1)-(2): what robots do to each other."""
+"""The paper's coupled form (1)-(2): robots that influence each other."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class CoupledTrust(TrustModel):
         require_choice("inter_robot", self.inter_robot, INTER_ROBOT)
 
     def sample_params(self, n_robots: int, n_features: int) -> Params:
-        """Sample statements; see the class for what couples the robots."""
+        """Sample statements; see the class for the coupling of the robots."""
         if self.inter_robot == "full":
             return self._sample_full(n_robots, n_features)
         priors, robot = self.priors, (n_robots,)
@@ -73,8 +73,8 @@ class CoupledTrust(TrustModel):
     def _covariance(self, noise: str, sd_prior: Distribution, n_robots: int) -> Array:
         sd = sample(f"delta_{noise}", sd_prior, (n_robots,))
         factor = jnp.eye(n_robots)
-        # Counts of ticks are independent given trust: their noise has no correlations.
-        if n_robots > 1 and not (noise == "v" and self.observation == "beta_binomial"):
+        # Rates that are independent given trust have noise without correlations.
+        if n_robots > 1 and (noise == "w" or self.family.correlates):
             lkj = LKJCholesky(n_robots, self.priors.concentration)
             factor = jnp.asarray(numpyro.sample(f"corr_{noise}", lkj))
         factor = sd[:, None] * factor
@@ -93,16 +93,21 @@ class CoupledTrust(TrustModel):
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of the matrices; or, of robots apart, of each robot's coefficients."""
+        """Axes of the matrices, or of each robot's coefficients if robots are apart."""
         if self.inter_robot == "full":
             return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
         gamma = {"gamma": ("follower",)} if self.inter_robot == "ordered" else {}
         return {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]} | gamma
 
     @property
+    def robots_are_apart(self) -> bool:
+        """Whether `inter_robot` is `"none"`."""
+        return self.inter_robot == "none"
+
+    @property
     def robot_sets(self) -> str | None:
         """Each robot has its own, if nothing couples them."""
-        return "each" if self.inter_robot == "none" else None
+        return "each" if self.robots_are_apart else None
 
 
 def _matrix(diagonal: Array, off_diagonal: Array) -> Array:

@@ -47,6 +47,11 @@ class HierarchicalTrust(TrustModel):
             numpyro.deterministic(name, getattr(params, name))
         return params
 
+    @property
+    def partial_pooling(self) -> "HierarchicalTrust":
+        """The model itself."""
+        return self
+
     def assemble(self, sites: Mapping[str, Array]) -> RobotParams:
         """Each robot's parameters."""
         c, _, _ = self.robot_coefficients(sites)
@@ -75,7 +80,7 @@ class HierarchicalTrust(TrustModel):
         return jnp.concatenate(columns, axis=1)
 
     def robot_sites(self, deviations: Array) -> dict[str, Array]:
-        """The other way round."""
+        """Sites of deviations: the inverse of `robot_deviations`."""
         columns = {"e_beta0": 0, "e_beta": slice(1, -1), "e_b": -1}
         return {name: deviations[:, column] for name, column in columns.items()}
 
@@ -86,7 +91,7 @@ class HierarchicalTrust(TrustModel):
         return all(support is constraints.real for support in supports)
 
     def mean_sites(self, mu: Array) -> dict[str, Array]:
-        """The means' sites, on their own real lines, of those of the coefficients."""
+        """Sites of the means, on their own real lines."""
         return {"mean_beta0": mu[0], "mean_beta": mu[1:-1], "mean_b": mu[-1]}
 
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
@@ -95,7 +100,7 @@ class HierarchicalTrust(TrustModel):
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of each robot's coefficients, of their means and spreads, and of the noises."""
+        """Axes of each robot's coefficients, their means and spreads, and the noises."""
         return {
             "beta0": ("robot",),
             "beta": ("robot", "feature"),

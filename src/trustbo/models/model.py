@@ -1,8 +1,9 @@
-"""What all trust models share: the numpyro model, likelihood, simulation, prior prediction."""
+"""The base of all trust models: numpyro model, likelihood, simulation, sufficient statistics."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,19 +15,21 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.models import spectral
-from trustbo.models.contact_rate import (
+from trustbo.models.likelihood.contact_rate import (
     ContactRate,
     TrustSample,
     mission_log_likelihood,
     simulate_missions,
 )
-from trustbo.models.gram import Statistics, require_forgetting, sufficient_statistics
-from trustbo.models.observation import OBSERVATIONS
-from trustbo.models.params import Params, TrustParams, check_params
+from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
+from trustbo.models.params import Params, check_params
 from trustbo.models.priors import Priors
-from trustbo.models.spectral import Spectrum
+from trustbo.models.ticks import broadcast_ticks, require_ticks
 from trustbo.stacking import MissionBatch, stack_missions
+
+if TYPE_CHECKING:
+    from trustbo.models.hierarchical import HierarchicalTrust
 
 RESPONSES = ("level", "change")
 
@@ -37,12 +40,13 @@ class TrustModel(ABC):
 
     Attributes:
         priors: Prior of each parameter; by default those of the family of observations.
-        observation: `"gaussian"`, the paper's; `"censored"`, rates of 0 and 1 being limits;
-            `"beta_binomial"`, ticks in contact out of `Bound.exposure` ticks, trust being a logit.
-        response: Whether the rate measures trust, `"level"`, or its `"change"` over the bound.
+        observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
+            and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
+            trust being a logit.
+        response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
 
     Raises:
-        TrustboError: An unknown name, or `"change"` with the beta-binomial family.
+        TrustboError: A name is unknown, or the family does not allow `"change"`.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
@@ -50,9 +54,9 @@ class TrustModel(ABC):
     response: str = "level"
 
     def __post_init__(self) -> None:
-        require_choice("observation", self.observation, OBSERVATIONS)
+        require_choice("observation", self.observation, FAMILIES)
         require_choice("response", self.response, RESPONSES)
-        if self.observation == "beta_binomial" and self.response == "change":
+        if self.lag and not self.family.allows_change:
             raise TrustboError(
                 'response "change" is not a share of ticks: use observation "gaussian" or '
                 '"censored".'
@@ -62,23 +66,23 @@ class TrustModel(ABC):
         elif not isinstance(self.priors, Priors):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
 
-    # --- what a model defines ---
+    # --- defined by each model ---
 
     @abstractmethod
     def sample_params(self, n_robots: int, n_features: int) -> Params:
-        """Sample statements of the parameters; what they assemble to."""
+        """Sample statements of the parameters, assembled."""
 
     @abstractmethod
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
-        """By how much each intercept lies below the level trust has on average.
+        """Distance of each intercept below the average level of trust.
 
         Args:
-            sites: The parameters as they are sampled.
+            sites: Parameters as they are sampled.
             mean_y: Mean rate, or its logit.
             mean_z: Mean awareness, shape (feature,).
 
         Returns:
-            By name of the intercept's site, the part of the mean level that others bring.
+            Part of the mean level that does not come from the intercept, by name of its site.
         """
 
     @property
@@ -88,13 +92,37 @@ class TrustModel(ABC):
 
     @property
     def robot_sets(self) -> str | None:
-        """Whose parameters sufficient statistics are gathered of: `"all"` robots, or `"each"`.
+        """Robots that sufficient statistics are gathered of together: `"all"`, or `"each"` alone.
 
         None where there are no such statistics: the exact sampler cannot treat the model.
         """
         return None
 
-    # --- what all models share ---
+    @property
+    def robots_are_apart(self) -> bool:
+        """Whether robots do not influence each other."""
+        return True
+
+    @property
+    def priors_are_independent(self) -> bool:
+        """Whether each field of the parameters is drawn from the prior of its name, alone."""
+        return False
+
+    @property
+    def partial_pooling(self) -> "HierarchicalTrust | None":
+        """The model, if its robots' coefficients are drawn from a common distribution."""
+        return None
+
+    def options(self) -> dict[str, str]:
+        """Options by name, without the priors."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "priors"}
+
+    # --- shared by all models ---
+
+    @property
+    def family(self) -> Family:
+        """The family of observations."""
+        return FAMILIES[self.observation]
 
     @property
     def x0(self) -> dict[str, float]:
@@ -111,48 +139,39 @@ class TrustModel(ABC):
         awareness: Array,
         contact_rate: Array | None = None,
         *,
-        exposure: Array | None = None,
-        weight: Array | None = None,
-        shared: bool = False,
-        joint: bool | None = None,
-        pilot: Array | None = None,
-        spectrum: Spectrum | None = None,
+        n_ticks: Array | None = None,
     ) -> None:
         """The numpyro model.
 
         Args:
             awareness: Shape (mission, bound, robot, feature).
             contact_rate: Shape (mission, bound, robot), NaN where not measured; None draws it.
-            exposure: Ticks, of that shape; the beta-binomial family needs them.
-            weight: Of each mission's log density, shape (mission,).
-            shared: No rate is missing before the last of a mission.
-            joint: Sample the noise that latent trust is made of; by default where it cannot be
-                integrated out.
-            pilot: See `observation.Observed`.
-            spectrum: Sums over complete missions that the pooled Gaussian likelihood is taken from,
-                in the place of `contact_rate`.
+            n_ticks: Ticks, of that shape; the beta-binomial family needs them.
         """
         n_missions, n_bounds, n_robots, n_features = awareness.shape
-        params = self.sample_params(n_robots, n_features)
-        if spectrum is not None and isinstance(params, TrustParams):
-            numpyro.factor("contact_rate", spectral.log_likelihood(params, spectrum, self.lag))
-            return
-        noise = None
-        if self.observation != "gaussian" if joint is None else joint:
-            shape = (n_bounds, n_missions, n_robots)
-            noise = numpyro.sample("noise", dist.Normal(0.0, 1.0).expand(shape).to_event(3))
+        params, innovations = self.sample_params(n_robots, n_features), None
+        if not self.family.integrates_out:
+            innovations = sample_innovations((n_bounds, n_missions, n_robots))
+        self.sample_rates(params, awareness, contact_rate, n_ticks, innovations)
+
+    def sample_rates(
+        self,
+        params: Params,
+        awareness: Array,
+        contact_rate: Array | None = None,
+        n_ticks: Array | None = None,
+        innovations: Array | None = None,
+    ) -> None:
+        """Sample statement of the contact rates given parameters."""
         rates = ContactRate(
             params,
             awareness,
-            exposure=exposure,
-            noise=noise,
-            weight=weight,
-            pilot=pilot,
+            n_ticks=n_ticks,
+            innovations=innovations,
             observation=self.observation,
             lag=self.lag,
-            shared=shared,
         )
-        with numpyro.plate("mission", n_missions):
+        with numpyro.plate("mission", len(awareness)):
             numpyro.sample("contact_rate", rates, obs=contact_rate)
 
     def log_likelihood(
@@ -165,25 +184,25 @@ class TrustModel(ABC):
 
         Args:
             params: Parameters with leading axes (...,).
-            missions: The missions; a contact rate that is NaN was not measured.
-            seed: Of the importance sampling.
+            missions: Missions; a contact rate that is NaN was not measured.
+            seed: Seed of the importance sampling.
 
         Returns:
             Nats, shape (..., mission).
 
         Raises:
-            ShapeError: Parameters of another number of features or robots.
-            TrustboError: Awareness that is NaN, a covariance that is not positive definite, or no
-                exposure where the family needs it.
+            ShapeError: The parameters are for another number of features or robots.
+            TrustboError: Awareness is NaN, a covariance is not positive definite, or n_ticks is
+                missing where the family needs it.
         """
         batch = stack_missions(missions)
         check_params(params, batch.awareness.shape[2], batch.awareness.shape[3])
-        require_exposure(self, batch)
+        require_ticks(self.family, batch)
         leading = params.leading
         with jax.enable_x64(True):
             key = jax.random.key(seed)
-            data = (batch.awareness, batch.contact_rate, batch.exposure)
-            values = mission_log_likelihood(self.observation, self.lag, params.flat(), *data, key)
+            data = (batch.awareness, batch.contact_rate, batch.n_ticks)
+            values = mission_log_likelihood(self.family, self.lag, params.flat(), *data, key)
         return np.asarray(values)[:, : len(missions)].reshape(*leading, len(missions))
 
     def simulate(
@@ -191,7 +210,7 @@ class TrustModel(ABC):
         key: Array,
         params: Params,
         awareness: ArrayLike,
-        exposure: ArrayLike | None = None,
+        n_ticks: ArrayLike | None = None,
     ) -> TrustSample:
         """Missions drawn from the model for given parameters.
 
@@ -199,13 +218,13 @@ class TrustModel(ABC):
             key: Random key.
             params: Parameters without leading axes.
             awareness: Shape (mission, bound, robot, feature).
-            exposure: Ticks of each bound, of shape (mission, bound, robot) or broadcast to it; the
+            n_ticks: Ticks of each bound, of shape (mission, bound, robot) or broadcast to it; the
                 beta-binomial family needs them.
 
         Raises:
-            ShapeError: Awareness of other axes, parameters with leading axes, or parameters of
+            ShapeError: Awareness has other axes, or the parameters have leading axes or are for
                 another number of features or robots.
-            TrustboError: A covariance that is not positive definite, or no exposure.
+            TrustboError: A covariance is not positive definite, or n_ticks is missing.
         """
         z = np.asarray(awareness, dtype=float)
         if z.ndim != 4 or params.leading:
@@ -214,12 +233,10 @@ class TrustModel(ABC):
                 f"got {z.shape}, and parameters with leading axes {params.leading}."
             )
         check_params(params, z.shape[2], z.shape[3])
-        if exposure is None and self.observation == "beta_binomial":
-            raise TrustboError(NO_EXPOSURE)
-        ticks = np.broadcast_to(np.asarray(1.0 if exposure is None else exposure), z.shape[:3])
+        ticks = broadcast_ticks(self.family, n_ticks, z.shape[:3])
         with jax.enable_x64(True):
             params64 = type(params)(*(jnp.asarray(p, dtype=float) for p in params))
-            drawn = simulate_missions(self.observation, self.lag, params64, z, ticks * 1.0, key)
+            drawn = simulate_missions(self.family, self.lag, params64, z, ticks * 1.0, key)
         return TrustSample(*(np.swapaxes(np.asarray(a), 0, 1) for a in drawn))
 
     def update(
@@ -232,13 +249,13 @@ class TrustModel(ABC):
         """Sufficient statistics with more missions, for `sample_statistics`.
 
         Args:
-            statistics: Of earlier missions; None for none.
-            missions: The new ones.
-            forgetting: How much the earlier ones still count, in (0, 1].
+            statistics: Statistics of earlier missions; None for none.
+            missions: New missions.
+            forgetting: Weight of the earlier missions, in (0, 1].
 
         Raises:
-            ShapeError: Missions of another number of robots or features.
-            TrustboError: A model without such statistics, or a factor outside (0, 1].
+            ShapeError: The number of robots or features changed.
+            TrustboError: The model has no such statistics, or the weight is outside (0, 1].
         """
         self.require_exact()
         require_forgetting(forgetting)
@@ -266,10 +283,10 @@ class TrustModel(ABC):
         """Refuse a model that has no sufficient statistics.
 
         Raises:
-            TrustboError: Observations that are not Gaussian, or robots that share some parameters
-                only, or influence each other.
+            TrustboError: Observations are not Gaussian, or robots share some parameters only, or
+                influence each other.
         """
-        if self.robot_sets is None or self.observation != "gaussian":
+        if self.robot_sets is None or not self.family.integrates_out:
             raise TrustboError(
                 'sampler "exact" needs Gaussian observations, and PooledTrust or '
                 f'CoupledTrust(inter_robot="none"); got {self.describe()}. Use sampler="nuts".'
@@ -277,8 +294,7 @@ class TrustModel(ABC):
 
     def describe(self) -> str:
         """The model's name and options."""
-        options = [f.name for f in fields(self) if f.name != "priors"]
-        listed = ", ".join(f'{name}="{getattr(self, name)}"' for name in options)
+        listed = ", ".join(f'{name}="{value}"' for name, value in self.options().items())
         return f"{type(self).__name__}({listed})"
 
 
@@ -287,30 +303,23 @@ def sample(name: str, prior: dist.Distribution, shape: tuple[int, ...] = ()) -> 
     return numpyro.sample(name, prior.expand(shape).to_event(len(shape)))  # pyright: ignore
 
 
+def sample_innovations(shape: tuple[int, int, int]) -> Array:
+    """Sample statement of the innovations of latent trust, (bound, mission, robot)."""
+    innovations = dist.Normal(0.0, 1.0).expand(shape).to_event(3)
+    return numpyro.sample("innovations", innovations)  # pyright: ignore[reportReturnType]
+
+
 def register[Model: TrustModel](cls: type[Model]) -> type[Model]:
     """Make a model a pytree, so that compiled samplers take its priors as data."""
     meta = [f.name for f in fields(cls) if f.name != "priors"]
     return jax.tree_util.register_dataclass(cls, data_fields=["priors"], meta_fields=meta)
 
 
-def require_exposure(model: TrustModel, batch: MissionBatch) -> None:
-    """Refuse missions without ticks if the model counts them.
+def require_model(model: object) -> None:
+    """Refuse anything but a trust model.
 
     Raises:
-        TrustboError: A measured rate has no exposure.
+        TrustboError: It is none.
     """
-    if model.observation != "beta_binomial":
-        return
-    without = ~np.isnan(batch.contact_rate) & ~(batch.exposure >= 1.0)
-    if without.any():
-        j, k, i = np.argwhere(without)[0]
-        raise TrustboError(
-            f"mission {j}, bound {k + 1}, robot {i} has a contact rate but no exposure. "
-            f"{NO_EXPOSURE}"
-        )
-
-
-NO_EXPOSURE = (
-    "The beta-binomial family counts ticks: give exposure, the number of ticks of each bound "
-    '(Mission.from_arrays(..., exposure=...)), or use observation "censored".'
-)
+    if not isinstance(model, TrustModel):
+        raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")

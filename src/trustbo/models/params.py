@@ -9,18 +9,21 @@ import xarray as xr
 from jax import Array
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models.statespace import ScalarSSM
-from trustbo.models.vectorspace import VectorSSM
+from trustbo.models.likelihood.live import ApartFilter, CoupledFilter
+from trustbo.models.likelihood.scalar import ScalarSSM
+from trustbo.models.likelihood.vector import VectorSSM
 
 Numbers = Any
 """A float, a NumPy array, or a JAX array or tracer."""
 
 
 class _Draws:
-    """What parameters of every kind can do; mixed into their tuples."""
+    """Methods of parameters of every kind; mixed into their tuples."""
 
     AXES: ClassVar[Mapping[str, tuple[str, ...]]]
     """Axes of each field behind the leading ones; none where not listed."""
+    WEIGHTS: ClassVar[str] = "beta"
+    """Name of the field with the weights of features."""
     _fields: ClassVar[tuple[str, ...]]
 
     @property
@@ -29,6 +32,30 @@ class _Draws:
         name = next(iter(self.AXES))
         shape = np.shape(getattr(self, name))
         return shape[: len(shape) - len(self.AXES[name])]
+
+    @property
+    def n_robots(self) -> int | None:
+        """Number of robots; None where all share their parameters."""
+        return self._size("b", "robot")
+
+    @property
+    def n_features(self) -> int:
+        """Number of features."""
+        return self._size(self.WEIGHTS, "feature") or 0
+
+    def alike(self, n_robots: int) -> list[list[int]]:
+        """Groups of robots that share their parameters."""
+        everyone = list(range(n_robots))
+        return [everyone] if self.n_robots is None else [[i] for i in everyone]
+
+    def of_robot(self, robot: int) -> Self:
+        """Parameters of one robot, the axis (robot,) dropped."""
+        picked = {
+            name: np.take(getattr(self, name), robot, axis=axes.index("robot") - len(axes))
+            for name, axes in self.AXES.items()
+            if "robot" in axes
+        }
+        return self._replace(**picked)  # pyright: ignore[reportAttributeAccessIssue]
 
     def draw(self, index: int) -> Self:
         """One draw out of many, with its leading axis dropped."""
@@ -55,20 +82,9 @@ class _Draws:
 
         return self._map(expand)
 
-    @classmethod
-    def from_posterior(cls, posterior: xr.DataTree) -> Self:
-        """All draws of a posterior, chains joined: leading axis (draw,).
-
-        Raises:
-            TrustboError: The posterior is of another model.
-        """
-        params = params_of(posterior)
-        if not isinstance(params, cls):
-            raise TrustboError(
-                f"a posterior of {posterior.attrs['model']} has {type(params).__name__}, not "
-                f"{cls.__name__}; use trustbo.models.params_of(posterior)."
-            )
-        return params
+    def _size(self, name: str, axis: str) -> int | None:
+        axes = self.AXES.get(name, ())
+        return np.shape(getattr(self, name))[axes.index(axis) - len(axes)] if axis in axes else None
 
     def _map(self, function: Any) -> Self:
         core = {name: len(self.AXES.get(name, ())) for name in self._fields}
@@ -109,6 +125,10 @@ class TrustParams(_Draws, _Trust):
         p = self
         return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
 
+    def live(self, lag: float, n_robots: int) -> ApartFilter:
+        """One bound of the Kalman filter; the leading axis is (draw,)."""
+        return ApartFilter(self, lag, n_robots)
+
 
 class RobotParams(_Draws, _Trust):
     """Parameters of robots with coefficients of their own, that do not influence each other.
@@ -132,6 +152,10 @@ class RobotParams(_Draws, _Trust):
         p = self
         return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
 
+    def live(self, lag: float, n_robots: int) -> ApartFilter:
+        """One bound of the Kalman filter; the leading axis is (draw,)."""
+        return ApartFilter(self, lag, n_robots)
+
 
 class _Coupled(NamedTuple):
     B0: Numbers
@@ -151,6 +175,7 @@ class CoupledParams(_Draws, _Coupled):
     """
 
     __slots__ = ()
+    WEIGHTS: ClassVar = "B"
     AXES: ClassVar = {
         "B": ("feature", "robot", "robot_"),
         "B0": ("robot", "robot_"),
@@ -164,6 +189,10 @@ class CoupledParams(_Draws, _Coupled):
         drift = jnp.einsum("jkim,mai->kja", awareness, self.B) + jnp.reshape(self.b, (1, 1, -1))
         p = self
         return VectorSSM(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd, lag)
+
+    def live(self, lag: float, n_robots: int) -> CoupledFilter:
+        """One bound of the Kalman filter; the leading axis is (draw,)."""
+        return CoupledFilter(self, lag, n_robots)
 
 
 Params = TrustParams | RobotParams | CoupledParams
@@ -205,7 +234,7 @@ def params_of(posterior: xr.DataTree) -> Params:
     """All draws of a posterior as parameters, chains joined: leading axis (draw,).
 
     Args:
-        posterior: What `fit` returned.
+        posterior: DataTree from `fit`.
 
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, according to the model.
@@ -217,10 +246,10 @@ def params_of(posterior: xr.DataTree) -> Params:
         str(n): np.ascontiguousarray(draws[n].transpose("sample", ...).values)
         for n in draws.data_vars
     }
-    return params_from(sites, {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")})
+    return assemble_params(sites, {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")})
 
 
-def params_from(sites: Mapping[str, np.ndarray], x0: Mapping[str, float]) -> Params:
+def assemble_params(sites: Mapping[str, np.ndarray], x0: Mapping[str, float]) -> Params:
     """Parameters from their sites by name, with leading axis (draw,), and x0_mean and x0_sd."""
     if "gamma" in sites:
         return ordered_params(sites, **x0)
@@ -239,10 +268,10 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     """Refuse parameters that do not match the data; `n_robots` None leaves robots unchecked.
 
     Raises:
-        ShapeError: Another number of robots or features than the data's.
-        TrustboError: A covariance that is not symmetric and positive definite.
+        ShapeError: The number of robots or features differs from that of the data.
+        TrustboError: A covariance is not symmetric and positive definite.
     """
-    name = "B" if isinstance(params, CoupledParams) else "beta"
+    name = params.WEIGHTS
     axes, shape = params.AXES[name], np.shape(getattr(params, name))
     if len(shape) < len(axes):
         raise ShapeError(f"params.{name} must end in the axes {axes}; got shape {shape}.")
@@ -270,12 +299,12 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
             _require_covariance(f"params.{field}", value)
 
 
-def _require_covariance(what: str, value: np.ndarray) -> None:
+def _require_covariance(name: str, value: np.ndarray) -> None:
     if not np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12):
-        raise TrustboError(f"{what} must be symmetric; got {value!r}.")
+        raise TrustboError(f"{name} must be symmetric; got {value!r}.")
     smallest = np.linalg.eigvalsh(value).min()
     if not smallest > 0.0:
         raise TrustboError(
-            f"{what} must be positive definite; its smallest eigenvalue is {smallest:.3g}. Robots "
+            f"{name} must be positive definite; its smallest eigenvalue is {smallest:.3g}. Robots "
             "cannot be perfectly correlated, nor have no noise at all."
         )

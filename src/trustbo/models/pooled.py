@@ -1,4 +1,4 @@
-"""The paper's one-robot form (3)-(4): every robot shares one set of parameters."""
+"""The paper's one-robot form (3)-(4): all robots share one set of parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,3 +40,8 @@ class PooledTrust(TrustModel):
     def robot_sets(self) -> str:
         """All robots share their parameters."""
         return "all"
+
+    @property
+    def priors_are_independent(self) -> bool:
+        """Each parameter has a prior of its own."""
+        return True

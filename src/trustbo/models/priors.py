@@ -9,7 +9,9 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution, constraints
 
+from trustbo import zheng2023
 from trustbo.errors import TrustboError, require_positive
+from trustbo.models.likelihood.families import FAMILIES
 
 _SCALES = ("delta_w", "delta_v", "tau")
 
@@ -20,25 +22,25 @@ class Priors:
 
     `Priors()` is the default of DESIGN: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5),
     delta_w and delta_v ~ HalfNormal(0.2), the second argument being a standard deviation, and
-    x_0 ~ N(0.5, 0.5^2), which the paper leaves open. What a model does not have, it ignores.
+    x_0 ~ N(0.5, 0.5^2), which the paper leaves open. A model ignores parameters it does not have.
 
     Attributes:
-        beta0: Autoregression; of the coupled model, the diagonal of B0.
-        beta: Weight of each feature, independent; of the coupled model, the diagonals of B_m. A
+        beta0: Autoregression; the diagonal of B0 in the coupled model.
+        beta: Weight of each feature, independent; the diagonals of B_m in the coupled model. A
             distribution of batch shape (feature,) gives each feature its own.
         b: Intercept.
         delta_w: Standard deviation of the process noise.
-        delta_v: Standard deviation of the observation noise; of the beta-binomial family, the
+        delta_v: Standard deviation of the observation noise; in the beta-binomial family, the
             square root of the ratio of excess to binomial variance (concentration delta_v^-2).
-        coupling: What robots do to each other: off-diagonals of B0 and B_m, and gamma.
+        coupling: Influence of robots on each other: off-diagonals of B0 and B_m, and gamma.
         tau: Spread of the robots' coefficients in the hierarchical model.
-        concentration: Of the LKJ prior of the coupled model's noise correlations.
+        concentration: Concentration of the LKJ prior of noise correlations, coupled model.
         x0_mean: Mean of trust before the first bound.
         x0_sd: Its standard deviation; 0 fixes it.
 
     Raises:
-        TrustboError: Something that is no such distribution, a noise or tau that can be negative,
-            or a negative `x0_sd`.
+        TrustboError: A prior is no such distribution, a noise or tau can be negative, or `x0_sd`
+            is negative.
     """
 
     # Built on demand: importing trustbo must create no JAX array.
@@ -88,46 +90,25 @@ class Priors:
 
     @classmethod
     def default(cls, observation: str = "gaussian") -> Self:
-        """The default priors of a family of observations.
+        """Default priors of a family of observations.
 
-        For `"beta_binomial"` trust is a logit, and everything wider: beta_m ~ N(0, 2), b ~ N(0, 1),
-        delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
+        Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
+        b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
         """
-        if observation != "beta_binomial":
-            return cls()
-        with jax.enable_x64(True):
-            return cls(
-                beta=dist.Normal(0.0, 2.0),
-                b=dist.Normal(0.0, 1.0),
-                delta_w=dist.HalfNormal(0.5),
-                x0_mean=0.0,
-                x0_sd=1.5,
-            )
+        return cls(**FAMILIES[observation].priors())
 
     @classmethod
     def zheng2023(cls) -> Self:
-        """The vague priors in the manner of the authors' later code, for comparison.
+        """Vague priors in the manner of the authors' later code, for comparison.
 
-        Everything normal with sd 10, noises half-Cauchy. With few missions the posterior is
+        All are normal with sd 10, noises half-Cauchy. With few missions the posterior is
         multimodal in practice (beta0 near 1 with small weights, or near 0 with large ones): look at
-        R-hat before you believe it.
+        R-hat before you use it.
         """
-        with jax.enable_x64(True):
-            vague = dist.Normal(0.0, 10.0)
-            noise = dist.HalfCauchy(1.0)
-            return cls(
-                beta0=vague,
-                beta=vague,
-                b=vague,
-                delta_w=noise,
-                delta_v=noise,
-                coupling=vague,
-                tau=noise,
-                concentration=1.0,
-            )
+        return cls(**zheng2023.vague_priors())
 
     def mean(self, n_features: int) -> dict[str, np.ndarray]:
-        """Prior mean of each parameter; 0 for one that has none, as a Cauchy has not."""
+        """Prior mean of each parameter; 0 for one without a mean, such as a Cauchy."""
         means = {}
         for name in ("beta0", "beta", "b", "delta_w", "delta_v"):
             value = np.asarray(getattr(self, name).mean, dtype=float)

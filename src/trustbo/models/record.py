@@ -1,6 +1,5 @@
 """A model's settings as a record that JSON can hold, and the model again."""
 
-from dataclasses import fields
 from typing import Any
 
 from trustbo.errors import TrustboError
@@ -14,16 +13,15 @@ _MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, C
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Its class, its options, and its priors as text."""
-    options = {f.name: getattr(model, f.name) for f in fields(model) if f.name != "priors"}
-    return {"class": type(model).__name__, **options, "priors": model.priors.describe()}
+    """Class, options, and priors as text."""
+    return {"class": type(model).__name__, **model.options(), "priors": model.priors.describe()}
 
 
 def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -> TrustModel:
-    """The model of a record; with priors or a class of your own, give it again.
+    """Model of a record; one with priors or a class of the user's own has to be given again.
 
     Raises:
-        TrustboError: It has to be given and was not, or another was given.
+        TrustboError: The model has to be given and was not, or another was given.
     """
     if given is not None:
         if model_to_record(given) != record:

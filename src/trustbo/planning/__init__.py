@@ -1,10 +1,8 @@
-"""From a posterior to the most trustworthy path."""
+"""Planning: from a posterior to the most trustworthy path."""
 
 from trustbo.planning import policies
-from trustbo.planning.belief import AwarenessBelief
-from trustbo.planning.dynamics import Dynamics, drift, dynamics, roll_trust
-from trustbo.planning.graph import NoPathError, cell_graph
-from trustbo.planning.information import information_gain
+from trustbo.planning.dynamics import Dynamics, roll_trust
+from trustbo.planning.graph import NoPathError
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.planner import Planner
@@ -15,17 +13,12 @@ __all__ = [
     "OBJECTIVES",
     "POLICIES",
     "QUANTILES",
-    "AwarenessBelief",
     "DrawnPaths",
     "Dynamics",
     "NoPathError",
     "Plan",
     "Planner",
     "Policy",
-    "cell_graph",
-    "drift",
-    "dynamics",
-    "information_gain",
     "policies",
     "roll_trust",
 ]

@@ -1,4 +1,4 @@
-"""How expected trust moves: one linear recursion for every model, and what a path makes of it."""
+"""Recursion of expected trust: one linear form for every model, and its roll along a path."""
 
 from typing import NamedTuple
 
@@ -10,15 +10,15 @@ from trustbo.errors import ShapeError
 from trustbo.models.params import CoupledParams, Params, RobotParams, check_params
 
 TEAMS = ("mean", "min")
-"""What the team's trust is: the mean of its robots', or the least."""
+"""Trust of the team: mean or least of the trust of its robots."""
 
 
 class Dynamics(NamedTuple):
     """Expected trust x_k = transition x_{k-1} + drift(cell), x_0 = start; leading axes (...,).
 
     Fields: transition (..., state, state), drift (..., state, row, col), start (..., state), and
-    views (view, state): the team's trust is the least of `views @ x`. The states are the robots;
-    or, where all have one beta0 and the team's trust is their mean, just that mean.
+    views (view, state): trust of the team is the least of `views @ x`. States are the robots; one
+    state, their mean, suffices where all have one beta0 and trust of the team is the mean.
     """
 
     transition: np.ndarray
@@ -28,31 +28,31 @@ class Dynamics(NamedTuple):
 
     @property
     def is_scalar(self) -> bool:
-        """Whether one number says all about the team."""
+        """True if the state is a single number, trust of the team."""
         return self.views.shape == (1, 1)
 
     def draw(self, index: int) -> "Dynamics":
-        """One draw, without its leading axis."""
+        """Select one draw, without its leading axis."""
         return self.take(index)
 
     def take(self, which: int | slice | np.ndarray) -> "Dynamics":
-        """Some of the draws."""
+        """Select some of the draws."""
         return Dynamics(self.transition[which], self.drift[which], self.start[which], self.views)
 
     def stacked(self) -> "Dynamics":
-        """One draw as many: with a leading axis of length 1."""
+        """Add a leading axis (draw,) of length 1."""
         return Dynamics(self.transition[None], self.drift[None], self.start[None], self.views)
 
     def flat(self) -> "Dynamics":
-        """With exactly one leading axis (draw,)."""
+        """Reshape to exactly one leading axis (draw,)."""
 
         def one(value: np.ndarray, core: int) -> np.ndarray:
             return value.reshape(-1, *value.shape[value.ndim - core :])
 
         return Dynamics(one(self.transition, 2), one(self.drift, 3), one(self.start, 1), self.views)
 
-    def settled(self) -> np.ndarray:
-        """The team's trust if it stayed in each cell for ever, (..., row, col)."""
+    def steady_state(self) -> np.ndarray:
+        """Limit of the team's trust if it stayed in each cell, shape (..., row, col)."""
         if self.is_scalar:
             return self.drift[..., 0, :, :] / (1.0 - self.transition)
         n_states = self.start.shape[-1]
@@ -61,13 +61,13 @@ class Dynamics(NamedTuple):
         return levels.min(-3)
 
 
-def dynamics(
+def trust_dynamics(
     params: Params, awareness: ArrayLike, team: str = "mean", x0: ArrayLike | None = None
 ) -> Dynamics:
-    """The recursion of expected trust under parameters with leading axes (...,).
+    """Build the recursion of expected trust under parameters with leading axes (...,).
 
     Args:
-        params: Of any model.
+        params: Parameters of any model.
         awareness: Shape (robot, row, col, feature), or (draw, robot, row, col, feature) with one
             map for each draw of the parameters.
         team: `"mean"` or `"min"`.
@@ -89,7 +89,7 @@ def dynamics(
         views = np.eye(n_robots) if team == "min" else np.full((1, n_robots), 1.0 / n_robots)
         return Dynamics(transition(params, n_robots), drift(params, z), start, views)
     beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
-    # The mean of the robots obeys the same equation.
+    # The mean over robots obeys the same equation.
     u = drift(params, z.mean(-4, keepdims=True) if n_robots > 1 else z)
     return Dynamics(
         np.broadcast_to(beta0, (*leading, 1, 1)), u, start.mean(-1, keepdims=True), np.eye(1)
@@ -107,7 +107,7 @@ def transition(params: Params, n_robots: int) -> np.ndarray:
 
 
 def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
-    """What one bound adds to each robot's trust, u = sum_m beta_m z_m + b.
+    """Increment of each robot's trust by one bound, u = sum_m beta_m z_m + b.
 
     Args:
         params: Parameters with leading axes (...,).
@@ -158,12 +158,12 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
     """
     z = np.asarray(awareness, dtype=float)
     along = np.moveaxis(z, -3, -2)[..., None, :]  # (..., robot, bound, 1, feature): a map, one wide
-    moves = dynamics(params, along, "min", x0)
-    return roll(moves.transition, moves.drift[..., 0], moves.start)
+    dynamics = trust_dynamics(params, along, "min", x0)
+    return roll(dynamics.transition, dynamics.drift[..., 0], dynamics.start)
 
 
 def roll(transition: np.ndarray, drift: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """The recursion itself: drift (..., state, bound), returns x of shape (..., bound, state)."""
+    """Roll the recursion: drift (..., state, bound) to x of shape (..., bound, state)."""
     leading, (n_states, n_bounds) = drift.shape[:-2], drift.shape[-2:]
     trust = np.empty((*leading, n_bounds, n_states))
     _roll(

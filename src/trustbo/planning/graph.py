@@ -1,4 +1,4 @@
-"""The graph of passable cells, and which cells can be reached in how many bounds."""
+"""Graph of passable cells, and the fewest bounds between cells."""
 
 from collections.abc import Mapping
 
@@ -8,7 +8,7 @@ from numba import njit
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 Steps = tuple[tuple[int, int], ...]
 MOVES: Mapping[int, Steps] = {
@@ -23,10 +23,10 @@ class NoPathError(TrustboError, nx.NetworkXNoPath):
 
 
 def require_connectivity(connectivity: int) -> int:
-    """Return it if it is 4 or 8.
+    """Return the connectivity if it is 4 or 8.
 
     Raises:
-        TrustboError: It is not.
+        TrustboError: Another number.
     """
     if connectivity not in MOVES:
         raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
@@ -34,10 +34,10 @@ def require_connectivity(connectivity: int) -> int:
 
 
 def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:
-    """Passable cells as nodes `(row, col)`, possible bounds as edges.
+    """Build the graph with passable cells `(row, col)` as nodes and possible bounds as edges.
 
     Args:
-        workspace: Where.
+        workspace: Planning grid with its passable cells.
         connectivity: 4, or 8 to allow diagonal bounds too.
 
     Returns:
@@ -62,7 +62,7 @@ def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:
 
 
 def move_lengths(workspace: Workspace, connectivity: int) -> np.ndarray:
-    """Metres of each move, in the order of `MOVES`."""
+    """Length of each move in metres, in the order of `MOVES`."""
     size = workspace.grid.cell_height, workspace.grid.cell_width
     return np.hypot(*(np.array(MOVES[connectivity]) * size).T)
 
@@ -70,7 +70,7 @@ def move_lengths(workspace: Workspace, connectivity: int) -> np.ndarray:
 def fewest_bounds(passable: np.ndarray, cell: Cell, connectivity: int) -> np.ndarray:
     """Fewest bounds between a cell and every other, shape (row, col); -1 where there is no way."""
     rows, cols = passable.shape
-    # A margin that none can enter: no move has to ask whether it leaves the grid.
+    # A closed margin saves the test whether a move leaves the grid.
     known = np.full((rows + 2, cols + 2), -1, np.int32)
     known[1:-1, 1:-1][~passable] = _CLOSED
     known[[0, -1]] = known[:, [0, -1]] = _CLOSED
@@ -103,7 +103,7 @@ def require_way(
     """Refuse ends that are not connected.
 
     Raises:
-        NoPathError: Saying how many cells can be reached.
+        NoPathError: No path; the message counts the cells that can be reached.
     """
     if to_goal[start] < 0:
         n_reached = int((fewest_bounds(passable, start, connectivity) >= 0).sum())

@@ -1,4 +1,4 @@
-"""How much a path would teach about the parameters."""
+"""Expected information of a mission about the parameters."""
 
 from collections.abc import Sequence
 
@@ -14,14 +14,14 @@ def information_gain(
 ) -> np.ndarray:
     """Expected reduction of the parameters' entropy by one mission over each path, in nats.
 
-    Between the parameters and the contact rates of a mission, the mutual information if both were
-    jointly normal: 1/2 log det(I + N^-1 C), with C the covariance over draws of the expected rates
-    (bound, robot), and N that of the rates' noise at the mean of the draws.
+    Mutual information of the parameters and the contact rates of a mission, both taken as jointly
+    normal: 1/2 log det(I + N^-1 C), with C the covariance over draws of the expected rates
+    (bound, robot), and N the covariance of the rates' noise at the mean of the draws.
 
     Args:
         params: Draws with leading axis (draw,).
         awareness: Shape (robot, row, col, feature), or with a leading axis (draw,).
-        paths: Cells, start first.
+        paths: Paths as cells, start first.
 
     Returns:
         Shape (path,).
@@ -36,7 +36,7 @@ def information_gain(
         rates = roll_trust(params, np.swapaxes(along, -3, -2))
         flat = rates.reshape(len(rates), -1)
         n = flat.shape[1]
-        # A shorter mission's noise is the leading part of a longer one's.
+        # The noise of a shorter mission is the leading block of that of a longer one.
         L = np.linalg.cholesky(noise[:n, :n])
         white = np.linalg.solve(L, (flat - flat.mean(0)).T) / np.sqrt(len(flat))
         gains.append(0.5 * np.linalg.slogdet(np.eye(n) + white @ white.T)[1])
@@ -47,9 +47,9 @@ def rate_noise(params: Params, n_bounds: int, n_robots: int) -> np.ndarray:
     """Covariance of a mission's contact rates given the parameters.
 
     Args:
-        params: One draw.
-        n_bounds: Of the mission.
-        n_robots: Of the team.
+        params: One draw of the parameters.
+        n_bounds: Number of bounds of the mission.
+        n_robots: Number of robots.
 
     Returns:
         Shape (bound * robot, bound * robot), bounds first.

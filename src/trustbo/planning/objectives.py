@@ -1,4 +1,4 @@
-"""What a path is worth: the five objectives, from the team's expected trust along it."""
+"""The five objectives: value of a path from the team's expected trust along it."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -8,23 +8,23 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 
-class Aim(NamedTuple):
-    """What a path should be best at."""
+class Objective(NamedTuple):
+    """An objective by name, and the weight of the path's length in it."""
 
-    objective: str
+    name: str
     length_weight: float = 0.0
-    """What a metre of the path costs, in units of trust (or of log probability)."""
+    """Cost of a metre of the path, in units of trust (or of log probability)."""
 
 
 class PathTrust(NamedTuple):
-    """What the value of a path is computed from; leading axes (...,) such as (draw,)."""
+    """Trust along a path and the path's length cost; leading axes (...,) such as (draw,)."""
 
     trust: np.ndarray
-    """The team's expected trust after each bound, shape (..., bound)."""
-    settled: np.ndarray
-    """The level that trust would settle at in each cell, u / (1 - beta0), likewise."""
-    toll: np.ndarray | float = 0.0
-    """The path's length times `length_weight`."""
+    """Expected trust of the team after each bound, shape (..., bound)."""
+    steady_state: np.ndarray
+    """Limit of the team's trust if it stayed in each cell, u / (1 - beta0), likewise."""
+    length_cost: np.ndarray | float = 0.0
+    """Length of the path times `length_weight`."""
 
 
 def softplus(x: ArrayLike) -> np.ndarray:
@@ -33,20 +33,20 @@ def softplus(x: ArrayLike) -> np.ndarray:
 
 
 OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = {
-    "terminal": lambda path: expit(path.trust[..., -1] - path.toll),
-    "mean": lambda path: path.trust.mean(-1) - path.toll,
+    "terminal": lambda path: expit(path.trust[..., -1] - path.length_cost),
+    "mean": lambda path: path.trust.mean(-1) - path.length_cost,
     "success": lambda path: np.exp(-softplus(-path.trust).sum(-1)),
     "bottleneck": lambda path: path.trust.min(-1),
-    "stationary": lambda path: np.exp(-softplus(-path.settled).sum(-1) - path.toll),
+    "stationary": lambda path: np.exp(-softplus(-path.steady_state).sum(-1) - path.length_cost),
 }
-"""Value of a path, to be maximised; the toll is the path's metres times `length_weight`.
+"""Value of a path, to be maximised; the length cost is the path's metres times `length_weight`.
 
-terminal: sigma(x^K - toll), one minus the paper's cost (6) where there is none. mean: mean trust
-over the bounds, less the toll. success: product of sigma(x^k), the probability that every bound
-succeeds. bottleneck: least trust on the way. stationary: as success, with the level trust would
-settle at in each cell, free of history, times exp(-toll).
+terminal: sigma(x^K - length cost), one minus the paper's cost (6) without length cost. mean: mean
+trust over the bounds, less the length cost. success: product of sigma(x^k), the probability that
+every bound succeeds. bottleneck: least trust on the path. stationary: the product of sigma of each
+cell's steady-state trust, independent of history, times exp(-length cost).
 """
 ADDITIVE = ("terminal", "mean", "stationary")
-"""The objectives that can take a length weight."""
+"""Objectives that admit a length weight."""
 LABELLED = ("success", "bottleneck")
-"""The objectives that need the whole history of a path, and beta0 >= 0."""
+"""Objectives that depend on the whole history of a path, and need beta0 >= 0."""

@@ -1,4 +1,4 @@
-"""A plan: a path and what is expected of it."""
+"""A plan: a path and its expected trust, value and exactness."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,29 +8,29 @@ import numpy as np
 from trustbo.data import Cell
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
-"""Of `Plan.bands`: the ends of the 90 % and of the 50 % band."""
+"""Quantiles of `Plan.bands`: ends of the 90 % and of the 50 % band."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A path and what is expected of it.
+    """A path with its expected trust, value and exactness.
 
     Attributes:
         path: Cells, start first.
-        positions: Their centres, shape (cell, 2), x and y in CRS metres.
-        length: From centre to centre, m.
+        positions: Centres of the cells, shape (cell, 2), x and y in CRS metres.
+        length: Length from centre to centre, m.
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over draws of the parameters, shape (quantile, bound,
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
-        value: The objective, to be maximised (see `OBJECTIVES`).
+        value: Value of the objective, to be maximised (see `OBJECTIVES`).
         success: Product over the bounds of sigma(team's trust): the probability that all succeed.
-        objective: The objective's name.
-        exact: Whether no admissible path is better.
-        bound: Largest value that any admissible path can have; `value` where exact, NaN for a path
-            that was given.
-        revisits: How often the path enters a cell again.
-        engine: What found it: "networkx", "numba", or "given".
-        seconds: How long that took.
+        objective: Name of the objective.
+        exact: True if no admissible path is better.
+        bound: Upper bound on the value of any admissible path; `value` where exact, NaN for a given
+            path.
+        revisits: Number of bounds that enter a cell again.
+        engine: Engine that found the path, "networkx" or "numba"; or "given".
+        seconds: Time of the search, s.
     """
 
     path: tuple[Cell, ...]
@@ -49,7 +49,7 @@ class Plan:
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
-    """A plan as plain lists and numbers."""
+    """Convert a plan to plain lists and numbers."""
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in vars(plan).items()
@@ -57,7 +57,7 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 
 def plan_from_record(record: dict[str, Any]) -> Plan:
-    """The plan that `plan_to_record` laid out."""
+    """Convert the record of `plan_to_record` to a plan."""
     values: dict[str, Any] = dict(record)
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])

@@ -1,9 +1,8 @@
 """Policies: from posterior draws to the next plan.
 
-A policy is any callable `policy(key, posterior, planner) -> Plan`; your own may be passed wherever
-a name may. Whatever a path was chosen by, what its plan expects is expected under the posterior
-mean. Where the awareness is uncertain, the planner holds a map for each draw, and the i-th
-draw of the parameters goes with the i-th of these.
+A policy is any callable `policy(key, posterior, planner) -> Plan`, and may be passed in place of a
+name. Trust and value of every plan are expectations under the posterior mean, for each policy. With
+uncertain awareness, the planner holds one map for each draw of the parameters.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,16 +15,16 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.information import information_gain
+from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
-from trustbo.planning.posterior import choose
-from trustbo.planning.walks import walks_of
+from trustbo.planning.posterior import choose_draws
 
 Policy = Callable[[Array, Params, Planner], Plan]
-"""Chooses the next plan, given a random key, draws with leading axis (draw,), and the planner."""
+"""Function from a random key, draws with leading axis (draw,) and a planner to the next plan."""
 
 N_DRAWS = 200
-"""Draws that the policies which compare paths plan under."""
+"""Number of draws under which policies plan to compare paths."""
 
 
 def greedy(key: Array, posterior: Params, planner: Planner) -> Plan:
@@ -41,30 +40,30 @@ def thompson(key: Array, posterior: Params, planner: Planner) -> Plan:
 
 
 def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: float = 0.9) -> Plan:
-    """Best path if each cell adds the upper quantile over draws of what it may add to trust."""
-    params, chosen = choose(posterior, 1000, _seed(key))
-    moves = planner.dynamics(params, draws=chosen)
+    """Best path under the upper quantile over draws of each cell's drift u."""
+    params, chosen = choose_draws(posterior, 1000, _seed(key))
+    dynamics = planner.dynamics(params, draws=chosen)
     best = Dynamics(
-        moves.transition.mean(0),
-        np.quantile(moves.drift, quantile, axis=0),
-        moves.start.mean(0),
-        moves.views,
+        dynamics.transition.mean(0),
+        np.quantile(dynamics.drift, quantile, axis=0),
+        dynamics.start.mean(0),
+        dynamics.views,
     )
     return planner.evaluate(planner.best_path(best), posterior.mean())
 
 
 def ucb(key: Array, posterior: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """The path with the highest mean plus `kappa` sd of its value over draws."""
+    """Path with the highest mean plus `kappa` sd of its value over draws."""
     return _best_candidate(
         key, posterior, planner, lambda values: values.mean(0) + kappa * values.std(0)
     )
 
 
 def ei(key: Array, posterior: Params, planner: Planner) -> Plan:
-    """The path expected to improve most on the one that is best on average.
+    """Path with the largest expected improvement on the path that is best on average.
 
     E[max(0, value - incumbent's value)] over draws, both under the same draw; the incumbent itself
-    is taken where nothing is expected to improve on it.
+    where no path is expected to improve on it.
     """
 
     def improvement(values: np.ndarray) -> np.ndarray:
@@ -75,7 +74,7 @@ def ei(key: Array, posterior: Params, planner: Planner) -> Plan:
 
 
 def cvar(key: Array, posterior: Params, planner: Planner, *, alpha: float = 0.2) -> Plan:
-    """The path with the best mean over its worst share `alpha` of draws (risk-averse)."""
+    """Path with the best mean over its worst share `alpha` of draws (risk-averse)."""
 
     def tail(values: np.ndarray) -> np.ndarray:
         n_worst = max(1, round(alpha * len(values)))
@@ -85,14 +84,15 @@ def cvar(key: Array, posterior: Params, planner: Planner, *, alpha: float = 0.2)
 
 
 def information(key: Array, posterior: Params, planner: Planner, *, n_random: int = 50) -> Plan:
-    """The path that most reduces the entropy of the parameters (see `information_gain`).
+    """Path that most reduces the entropy of the parameters (see `information_gain`).
 
-    Of the draws' best paths and some drawn at random.
+    Candidates are the draws' best paths and `n_random` random ones.
     """
     drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=_seed(key))
     rng = np.random.default_rng(_seed(key))
-    paths = list(drawn.candidates) + [walks_of(planner.course).draw(rng) for _ in range(n_random)]
-    params, _ = choose(posterior, N_DRAWS, _seed(key))
+    sampler = path_sampler(planner.paths)
+    paths = list(drawn.candidates) + [sampler.draw(rng) for _ in range(n_random)]
+    params, _ = choose_draws(posterior, N_DRAWS, _seed(key))
     gains = information_gain(params, planner.mean_awareness, paths)
     return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
 
@@ -100,22 +100,22 @@ def information(key: Array, posterior: Params, planner: Planner, *, n_random: in
 def epsilon_greedy(
     key: Array, posterior: Params, planner: Planner, *, epsilon: float = 0.1
 ) -> Plan:
-    """Greedy; but, with probability `epsilon`, a random path."""
+    """Greedy; with probability `epsilon`, a random path."""
     chance, other = jax.random.split(key)
     explores = float(jax.random.uniform(chance)) < epsilon
     return (random if explores else greedy)(other, posterior, planner)
 
 
 def random(key: Array, posterior: Params, planner: Planner) -> Plan:
-    """A path drawn uniformly from the admissible ones, whatever was learned.
+    """Path drawn uniformly from the admissible ones, independent of the posterior.
 
     For `stationary`, which admits simple paths of any length, from those of up to two bounds more
     than the fewest.
 
     Raises:
-        TrustboError: Walks must not enter a cell twice, and of 10 000 drawn every one did.
+        TrustboError: Revisits are forbidden, and each of 10 000 walks drawn had one.
     """
-    path = walks_of(planner.course).draw(np.random.default_rng(_seed(key)))
+    path = path_sampler(planner.paths).draw(np.random.default_rng(_seed(key)))
     return planner.evaluate(path, posterior.mean())
 
 
@@ -130,11 +130,11 @@ POLICIES: Mapping[str, Policy] = {
     "cvar": cvar,
     "random": random,
 }
-"""The policies by name."""
+"""Policies by name."""
 
 
 def resolve_policy(policy: str | Policy) -> Policy:
-    """The policy of that name, or the callable itself.
+    """Return the policy of that name, or the callable itself.
 
     Raises:
         TrustboError: Neither a known name nor callable.
@@ -152,7 +152,7 @@ def _best_candidate(
     planner: Planner,
     score: Callable[[np.ndarray], np.ndarray],
 ) -> Plan:
-    """Of the paths that are best under some draw, the one whose values (draw, path) score best."""
+    """Plan the path with the best score of its values (draw, path) among the draws' best paths."""
     drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=_seed(key))
     chosen = int(np.argmax(score(drawn.values_of(drawn.candidates))))
     return planner.evaluate(drawn.candidates[chosen], posterior.mean())

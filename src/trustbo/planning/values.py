@@ -1,45 +1,97 @@
-"""What given paths are worth under given dynamics."""
+"""Values of given paths under given dynamics, and the plan of a given path."""
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.planning.course import Course
-from trustbo.planning.dynamics import Dynamics, roll
-from trustbo.planning.objectives import OBJECTIVES, Aim, PathTrust, softplus
+from trustbo.models.params import Params
+from trustbo.planning.dynamics import Dynamics, roll, roll_trust
+from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.plan import QUANTILES, Plan
+from trustbo.planning.problem import PlanningProblem
 
 Path = Sequence[Cell] | np.ndarray
 """Cells, start first; or an array of them, shape (cell, 2)."""
 
 
-def path_value(moves: Dynamics, aim: Aim, course: Course, path: Path) -> np.ndarray:
-    """The objective of one path, shape (...,) as the leading axes of `moves`."""
+def path_value(
+    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
+) -> np.ndarray:
+    """Value of one path, shape (...,) as the leading axes of `dynamics`."""
     path = np.asarray(path)
-    trust = trust_along(moves, path)
-    settled = np.full(trust.shape, np.nan)
-    if aim.objective == "stationary":
+    trust = trust_along(dynamics, path)
+    steady_state = np.full(trust.shape, np.nan)
+    if objective.name == "stationary":
         rows, cols = path[1:].T
-        along = moves._replace(drift=moves.drift[..., rows, cols][..., None, :])
-        settled = along.settled()[..., 0, :]
-    toll = aim.length_weight * path_length(course, path)
-    return OBJECTIVES[aim.objective](PathTrust(trust, settled, toll))
+        along = dynamics._replace(drift=dynamics.drift[..., rows, cols][..., None, :])
+        steady_state = along.steady_state()[..., 0, :]
+    length_cost = objective.length_weight * path_length(admissible, path)
+    return OBJECTIVES[objective.name](PathTrust(trust, steady_state, length_cost))
 
 
-def trust_along(moves: Dynamics, path: Path) -> np.ndarray:
-    """The team's expected trust after each bound of a path, shape (..., bound)."""
+def trust_along(dynamics: Dynamics, path: Path) -> np.ndarray:
+    """Expected trust of the team after each bound of a path, shape (..., bound)."""
     rows, cols = np.asarray(path)[1:].T
-    states = roll(moves.transition, moves.drift[..., rows, cols], moves.start)
-    return (states @ moves.views.T).min(-1)
+    states = roll(dynamics.transition, dynamics.drift[..., rows, cols], dynamics.start)
+    return (states @ dynamics.views.T).min(-1)
 
 
-def path_length(course: Course, path: Path) -> float:
+def path_length(admissible: AdmissiblePaths, path: Path) -> float:
     """Metres from cell centre to cell centre."""
-    grid = course.workspace.grid
+    grid = admissible.workspace.grid
     steps = np.diff(np.asarray(path), axis=0) * (grid.cell_height, grid.cell_width)
     return float(np.hypot(*steps.T).sum())
 
 
-def entry_cost(passable: np.ndarray, moves: Dynamics) -> np.ndarray:
-    """What entering each cell costs a `stationary` path, (..., row, col); inf if impassable."""
-    return np.where(passable, softplus(-moves.settled()), np.inf)
+def entry_cost(passable: np.ndarray, dynamics: Dynamics) -> np.ndarray:
+    """Cost of entering each cell for `stationary`, (..., row, col); inf if impassable."""
+    return np.where(passable, softplus(-dynamics.steady_state()), np.inf)
+
+
+def evaluate(
+    problem: PlanningProblem, path: tuple[Cell, ...], params: Params, x0: ArrayLike | None = None
+) -> Plan:
+    """Evaluate a path that is not checked; see `Planner.evaluate`."""
+    flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
+    cells = flat.reshape(-1, 2)
+    rows, cols = cells.T
+    z = problem.awareness if params.leading else problem.mean_awareness
+    along = z[..., rows[1:], cols[1:], :]  # ([draw], robot, bound, feature)
+    if along.ndim == 4:
+        along = along[np.arange(params.leading[0]) % len(along)]
+    draws = roll_trust(params, np.swapaxes(along, -3, -2), x0)
+    draws = draws.reshape(-1, *draws.shape[-2:])
+    trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
+    team = trust.mean(1) if problem.team == "mean" else trust.min(1)
+    if objective.name == "stationary":
+        dynamics = problem.dynamics(params, x0)
+        value = path_value(dynamics, objective, problem.paths, cells).mean()
+    else:
+        cost = objective.length_weight * length
+        value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
+    return Plan(
+        path=path,
+        positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
+        length=length,
+        trust=trust,
+        bands=_bands(draws),
+        value=float(value),
+        success=float(np.exp(-softplus(-team).sum())),
+        objective=objective.name,
+        exact=False,
+        bound=np.nan,
+        revisits=len(path) - len(set(path)),
+        engine="given",
+        seconds=0.0,
+    )
+
+
+def _bands(trust: np.ndarray) -> np.ndarray:
+    """Quantiles over draws (draw, bound, robot); one draw is repeated for every quantile."""
+    if len(trust) == 1:
+        return np.repeat(trust, len(QUANTILES), axis=0)
+    return np.quantile(trust, QUANTILES, axis=0)

@@ -1,11 +1,10 @@
-"""Figures: each function takes data and returns Axes; nothing is computed here but the layout."""
+"""Figures. Each function takes data and returns Axes; only the layout is computed here."""
 
 from trustbo.plots.animation import animate_mission
 from trustbo.plots.calibration import calibration
 from trustbo.plots.campaign import campaign_history, parameter_history
 from trustbo.plots.maps import (
     cell_map,
-    draw_hillshade,
     draw_path,
     draw_scale,
     path_posterior,
@@ -21,7 +20,6 @@ __all__ = [
     "calibration",
     "campaign_history",
     "cell_map",
-    "draw_hillshade",
     "draw_path",
     "draw_scale",
     "loadings",

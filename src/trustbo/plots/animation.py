@@ -1,4 +1,4 @@
-"""A mission as a film: robots over the hillshade, who sees the lead, and the contact so far."""
+"""Animation of a mission: robots over the hillshade, lines of sight to the lead, contact."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -19,25 +19,25 @@ from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.files import write_file
 from trustbo.plots.layout import as_text, extent_of, grid_lines, plain
 from trustbo.plots.maps import draw_hillshade, draw_path, draw_scale, draw_scale_of
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 SEEN, UNSEEN = "#009e73", "#d55e00"
-"""Bluish green and vermilion of Okabe and Ito (2008); lines out of sight are dashed, too."""
+"""Bluish green and vermilion of Okabe and Ito (2008); lines out of sight are also dashed."""
 SUFFIXES = (".gif", ".mp4")
-_SECONDS = 12.0  # how long a film is, if nothing is said
-_STEADY = 21  # ticks over which the camera's place is averaged
-_GROWN = 0.5  # m above ground from which a pixel counts as vegetation
+_SECONDS = 12.0  # default length of an animation
+_STEADY = 21  # number of ticks over which the position of the camera is averaged
+_GROWN = 0.5  # least height of vegetation above the ground, m
 _DASHED, _DOTTED = (0, (3, 2)), (0, (1, 2))
 _MARKERS = "osDv^Pp8hH"
 
 
 class Film(NamedTuple):
-    """What is shown at each tick of a mission."""
+    """State of a mission at each of its ticks."""
 
     time: np.ndarray  # (tick,), s since the mission's start
-    bound: np.ndarray  # (tick,), which bound it is
+    bound: np.ndarray  # (tick,), number of the bound, from 1
     poses: np.ndarray  # (tick, 1 + robot, 2), m from the map's lower left corner, the lead first
-    contact: np.ndarray  # (tick, robot), whether the robot sees the lead
+    contact: np.ndarray  # (tick, robot), contact of the robot with the lead
     rate: np.ndarray  # (tick, robot), contact rate of the bound so far
 
 
@@ -50,26 +50,27 @@ def animate_mission(
     fps: int = 8,
     dpi: int = 80,
 ) -> FuncAnimation:
-    """Show a mission as it went: robots, lines of sight, and the contact rate of the bound so far.
+    """Animate a mission: robots, lines of sight, and the contact rate of the bound so far.
 
-    On the left, the team from near, over the surface's hillshade with vegetation in grey; on the
-    right, where that is. A line from a robot to the lead is green and solid while they have
-    contact, red and dashed while they have not, and so is its bar, filled or hatched. In a
-    notebook, `HTML(animation.to_jshtml())` shows the animation.
+    The left panel follows the team over the hillshade of the surface, vegetation in grey; the right
+    one shows the whole terrain. A line from a robot to the lead is green and solid during contact,
+    else red and dashed; the bar of the robot is then filled or hatched. In a notebook,
+    `HTML(animation.to_jshtml())` shows the animation.
 
     Args:
-        mission: One with the poses and contact of every tick, as simulators and bags give it.
-        workspace: Where it was.
-        path: A `.gif` or `.mp4` file to write. MP4 needs ffmpeg, or the extra `video`.
-        speedup: Seconds of the mission to a second of film; by default such that it lasts 12 s.
+        mission: Mission with the poses and contact of every tick, from a simulator or a bag.
+        workspace: Workspace of the mission.
+        path: `.gif` or `.mp4` file to write. MP4 needs ffmpeg, or the extra `video`.
+        speedup: Seconds of the mission per second of animation; the default makes it last 12 s.
         fps: Frames per second.
-        dpi: Dots per inch of the file.
+        dpi: Resolution of the file, dots per inch.
 
     Returns:
-        The animation. If it was written to a file, its figure is closed.
+        Animation. If it was written to a file, its figure is closed.
 
     Raises:
-        TrustboError: No poses, another kind of file, a number that is not positive, or no ffmpeg.
+        TrustboError: The mission has no poses, the suffix is another, a number is not positive, or
+            there is no ffmpeg.
     """
     target = None if path is None else Path(path)
     if target is not None:
@@ -115,7 +116,7 @@ def _film(mission: Mission, workspace: Workspace) -> Film:
 
 
 def _stage(mission: Mission, workspace: Workspace, film: Film):
-    """The figure as it is before the first frame, and what draws a tick on it."""
+    """Return the figure before the first frame, and the function that draws a tick on it."""
     figure, axes = plt.subplot_mosaic(
         [["near", "all"], ["near", "bars"]],
         figsize=(7.2, 4.8),
@@ -130,7 +131,7 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
     draw_scale(axes["all"], workspace.grid)
     frame = Rectangle((0, 0), 1, 1, fill=False, edgecolor="black", linewidth=1.2, zorder=9)
     axes["all"].add_patch(frame)
-    cast = _Cast(near, mission.robots)
+    team = _Team(near, mission.robots)
     heights = bars.barh(
         [as_text(name) for name in mission.robots],
         np.zeros(len(mission.robots)),
@@ -144,12 +145,12 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
     plain(bars)
     center, half = _window(film, workspace)
     draw_scale_of(near, 2.0 * half)
-    # Laid out once: doing so for each frame would take most of the time.
+    # Laid out once; the layout of each frame would take most of the time.
     figure.canvas.draw()
     figure.set_layout_engine("none")
 
     def draw(tick: int):
-        cast.place(film.poses[tick], film.contact[tick])
+        team.place(film.poses[tick], film.contact[tick])
         for bar, rate, seen in zip(heights, film.rate[tick], film.contact[tick], strict=True):
             bar.set_width(rate)
             bar.set(facecolor=SEEN if seen else UNSEEN, hatch="" if seen else "////")
@@ -164,8 +165,8 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
     return figure, draw
 
 
-class _Cast:
-    """The robots, and the line from each to the lead."""
+class _Team:
+    """Markers of the robots, and the line from each to the lead."""
 
     def __init__(self, ax: Axes, names: Sequence[str]) -> None:
         style = {"markeredgecolor": "black", "linestyle": "none", "zorder": 5, "color": "white"}
@@ -188,7 +189,7 @@ class _Cast:
         ax.legend(handles=[*own, *lines], loc="upper left", fontsize=7, framealpha=0.85)
 
     def place(self, poses: np.ndarray, contact: np.ndarray) -> None:
-        """Put them where they are at a tick; the lead's pose comes first."""
+        """Move the markers to the poses of a tick, the lead first."""
         (x, y), *others = poses
         for line, robot, pose, seen in zip(self.sight, self.robots, others, contact, strict=True):
             line.set_data([x, pose[0]], [y, pose[1]])
@@ -198,7 +199,7 @@ class _Cast:
 
 
 def _window(film: Film, workspace: Workspace) -> tuple[np.ndarray, float]:
-    """What is seen near the team: its centre at each tick, shape (tick, 2), and half its width."""
+    """Window around the team: its centre at each tick, shape (tick, 2), and half its width."""
     middle = (film.poses.min(1) + film.poses.max(1)) / 2.0
     # The camera does not jump where robots start or stop.
     center = uniform_filter1d(middle, min(_STEADY, len(middle)), axis=0, mode="nearest")
@@ -227,14 +228,14 @@ def _save(animation: FuncAnimation, path: Path, ffmpeg: str, fps: int, dpi: int)
         write_file(path, lambda file: animation.save(file, PillowWriter(fps=fps), dpi=dpi))
         return
     with mpl.rc_context({"animation.ffmpeg_path": ffmpeg}):
-        # Even numbers of pixels, and a pixel format that every player knows.
+        # Even numbers of pixels, and a pixel format that every player supports.
         even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
         film = FFMpegWriter(fps=fps, extra_args=even)
         write_file(path, lambda file: animation.save(file, film, dpi=dpi))
 
 
 def _ffmpeg() -> str:
-    """Where ffmpeg is: on the PATH, or in the package of the extra `video`."""
+    """Return the path of ffmpeg: on the PATH, or in the package of the extra `video`."""
     if writers.is_available("ffmpeg"):
         return str(mpl.rcParams["animation.ffmpeg_path"])
     try:

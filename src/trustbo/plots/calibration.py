@@ -1,4 +1,4 @@
-"""Are posteriors calibrated? Ranks and coverage of simulation-based calibration."""
+"""Ranks and coverage of simulation-based calibration."""
 
 import numpy as np
 import xarray as xr
@@ -12,20 +12,20 @@ _PROBABILITY = 0.95
 
 
 def calibration(ranks: xr.Dataset) -> np.ndarray:
-    """Do ranks of the truth among posterior draws look uniform, and do intervals hold the truth?
+    """Compare ranks of true values among posterior draws, and coverage of intervals, with theory.
 
-    On the left, how far each parameter's empirical distribution of ranks lies from uniform. In a
-    band of the Kolmogorov-Smirnov statistic, grey, a whole curve stays with a probability of 95 %
-    if its parameter is calibrated. On the right, the share of truths in central intervals, and in
-    grey where 95 % of such shares should lie (binomial).
+    Left: difference of each parameter's empirical distribution of ranks from the uniform one. If
+    the parameter is calibrated, the whole curve stays within the grey band with a probability of
+    95 % (Kolmogorov-Smirnov). Right: share of true values in central intervals; the grey bars hold
+    95 % of such shares if the parameter is calibrated (binomial).
 
     Args:
-        ranks: What `models.sbc` returned.
+        ranks: Dataset of `models.sbc`.
 
     Returns:
-        The Axes, shape (2,).
+        Axes, shape (2,).
     """
-    figure, _, panels = small_multiples(2, 2, (3.4, 2.9), room=1.2)
+    figure, _, panels = small_multiples(2, 2, (3.4, 2.9), margin=1.2)
     curves, cover = panels
     n, names = ranks.sizes["dataset"], [str(name) for name in ranks["parameter"].values]
     shades = colormaps["viridis"](np.linspace(0.0, 0.85, len(names)))
@@ -35,7 +35,7 @@ def calibration(ranks: xr.Dataset) -> np.ndarray:
     curves.axhspan(-far, far, color="0.9", linewidth=0.0)
     for i, name in enumerate(names):
         pit = np.sort(ranks["pit"].sel(parameter=name).values)
-        # A step at each rank: from how far below it is to how far above.
+        # A step at each rank.
         x = np.concatenate([[0.0], np.repeat(pit, 2), [1.0]])
         above = np.concatenate([[0.0, 0.0], np.repeat(np.arange(1, n + 1) / n, 2)])
         style = {"color": shades[i], "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.1}

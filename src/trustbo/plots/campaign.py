@@ -1,4 +1,4 @@
-"""A campaign mission by mission: what was learned of the parameters, and how missions went."""
+"""History of a campaign: posteriors of the parameters, and outcomes of the missions."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.models.datatree import labelled_draws
+from trustbo.models.posterior_tree import labelled_draws
 from trustbo.planning import QUANTILES
 from trustbo.plots.layout import as_text, lowest, plain, small_multiples
 from trustbo.plots.mission import INNER, LINE
@@ -24,23 +24,23 @@ def parameter_history(
     truth: Mapping[str, float] | None = None,
     n_columns: int | None = None,
 ) -> np.ndarray:
-    """The posterior of each parameter after each mission, the prior before the first.
+    """Draw the posterior of each parameter after each mission, and the prior.
 
     Thin bars hold 90 % of the draws, thick ones 50 %, dots are medians. Panels are scaled to the
-    posteriors: a wide prior, in grey, may reach beyond.
+    posteriors; a wide prior, in grey, may extend beyond them.
 
     Args:
-        posteriors: One for each mission, such as `Result.posteriors`.
-        names: Which parameters, such as `["beta0", "beta"]`; by default all.
+        posteriors: Posterior after each mission, such as `Result.posteriors`.
+        names: Parameters to draw, such as `["beta0", "beta"]`; by default all.
         truth: True values by label, such as `{"beta[visibility]": 0.4}`, where they are known.
         n_columns: Panels per row; by default three.
 
     Returns:
-        The Axes, shape (parameter,), titled by labels such as "beta[visibility]".
+        Axes, shape (parameter,), titled by labels such as "beta[visibility]".
 
     Raises:
-        TrustboError: No posteriors, a parameter or label that there is not, or so many that none
-            could be read.
+        TrustboError: There are no posteriors, a parameter or label is unknown, or there are too
+            many parameters to be legible.
     """
     if not posteriors:
         raise TrustboError("there are no posteriors; give one for each mission.")
@@ -72,25 +72,25 @@ def parameter_history(
 
 
 def campaign_history(history: xr.Dataset) -> np.ndarray:
-    """What each plan promised, and the contact that its mission kept.
+    """Draw the objective of each plan, and the contact rate of its mission.
 
-    A filled dot marks a path other than the mission's before; a cross, with its status, a mission
-    that did not reach the goal.
+    A filled dot marks a path that differs from the previous one; a cross, with the status, a
+    mission that did not reach the goal.
 
     Args:
         history: `Result.history` or `Campaign.history`.
 
     Returns:
-        The Axes, shape (2,): the plans' objective, the missions' mean contact rate.
+        Axes, shape (2,): objective of the plans, mean contact rate of the missions.
 
     Raises:
-        TrustboError: No mission yet.
+        TrustboError: The history has no mission.
     """
     if not history.sizes.get("iteration"):
         raise TrustboError("the history has no mission yet; tell the campaign one first.")
     _, axes, panels = small_multiples(2, 1, (4.6, 1.6), sharex=True)
     mission, changed = history["iteration"].values, history["path_changed"].values.astype(bool)
-    changed[0] |= mission[0] == 1  # there was none before
+    changed[0] |= mission[0] == 1  # the first path is new
     status = [str(s) for s in history["status"].values]
     failed = np.array([s != "ok" for s in status])
     for ax, name, label in (
@@ -132,7 +132,7 @@ def _draw_parameter(ax: Axes, prior: np.ndarray | None, after: Sequence[np.ndarr
             x, middle, "o", color=colour, markersize=4.5, markeredgecolor="white",
             markeredgewidth=0.6,
         )  # fmt: skip
-    # The first mission or two may say little: what later ones say sets the scale.
+    # The first missions may be uninformative; the later ones set the scale.
     settled = ends[:, len(after) // 4 :]
     low, high = float(settled.min()), float(settled.max())
     margin = 0.15 * max(high - low, 1e-6 * max(abs(high), 1.0))
@@ -140,7 +140,7 @@ def _draw_parameter(ax: Axes, prior: np.ndarray | None, after: Sequence[np.ndarr
 
 
 def _scalars(posterior: xr.DataTree, group: str, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Draws (draw,) by label; nothing where there is no such group."""
+    """Draws (draw,) by label; empty if there is no such group."""
     if group not in posterior:
         return {}
     chosen = posterior[group].to_dataset()[list(names)]

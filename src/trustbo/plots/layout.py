@@ -1,4 +1,4 @@
-"""How figures are laid out: small multiples, maps in metres, colour bars."""
+"""Layout of figures: small multiples, maps in metres, colour bars."""
 
 from typing import Any
 
@@ -8,31 +8,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from trustbo.errors import require_whole
-from trustbo.terrain import Grid
+from trustbo.workspace import Grid
 
 MARKERS = "osD^vPX*<>"
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
-"""Of curves beside each other, in order, so that they can be told apart without colour."""
+"""Line styles of curves in one panel, in order, to tell them apart without colour."""
 
 
 def small_multiples(
-    n: int, n_columns: int | None, size: tuple[float, float], room: float = 0.0, **shared: Any
+    n: int, n_columns: int | None, size: tuple[float, float], margin: float = 0.0, **shared: Any
 ) -> tuple[Figure, np.ndarray, np.ndarray]:
-    """A figure of equal panels, row by row.
+    """Make a figure of equal panels, row by row.
 
     Args:
-        n: How many.
-        n_columns: Panels per row, at most; None for three, or two of four.
-        size: Of one panel, width and height, inches.
-        room: Beside them, inches.
-        shared: `sharex`, `sharey`.
+        n: Number of panels.
+        n_columns: Largest number of panels per row; None for three, or two if there are four.
+        size: Width and height of one panel, inches.
+        margin: Width beside the panels, for a colour bar or a legend, inches.
+        shared: Options `sharex` and `sharey` of `plt.subplots`.
 
     Returns:
-        The figure, all its Axes (row, column), and those to be used, shape (n,); the others are
-        made invisible.
+        Figure, all its Axes (row, column), and those of the panels, shape (n,); the others are
+        invisible.
 
     Raises:
-        TrustboError: A number of columns that is none.
+        TrustboError: `n_columns` is not a whole number from 1 on.
     """
     usual = 2 if n == 4 else 3
     columns = min(usual if n_columns is None else require_whole("n_columns", n_columns, 1), n)
@@ -40,7 +40,7 @@ def small_multiples(
     figure, axes = plt.subplots(
         rows,
         columns,
-        figsize=(size[0] * columns + room, size[1] * rows),
+        figsize=(size[0] * columns + margin, size[1] * rows),
         squeeze=False,
         layout="constrained",
         **shared,
@@ -54,34 +54,34 @@ def small_multiples(
 def map_panels(
     grid: Grid, n: int, n_columns: int | None, width: float = 2.6
 ) -> tuple[Figure, np.ndarray, np.ndarray]:
-    """As `small_multiples`, for maps; more of them in a row where the terrain is tall."""
+    """Make a figure of maps, see `small_multiples`; a tall terrain has more of them in a row."""
     tall = tallness(grid)
     if tall >= 2:
         width, n_columns = 0.6 * width, 5 if n_columns is None else n_columns
     size = width, width * tall + 0.35
-    return small_multiples(n, n_columns, size, room=1.2, sharex=True, sharey=True)
+    return small_multiples(n, n_columns, size, margin=1.2, sharex=True, sharey=True)
 
 
 def colour_bar(figure, image, axes, label: str, **options) -> None:
-    """A colour bar in the figures' sizes."""
+    """Add a colour bar with small numbers."""
     bar = figure.colorbar(image, ax=axes, pad=0.02, **{"aspect": 18, "shrink": 0.9} | options)
     bar.set_label(label, fontsize=8)
     bar.ax.tick_params(labelsize=7)
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of a map, m from its lower left corner: CRS metres are long."""
+    """Left, right, bottom and top of a map, m from its lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)
 
 
 def tallness(grid: Grid) -> float:
-    """Height over width, within what fits a page."""
+    """Height over width, clipped to fit a page."""
     ratio = grid.shape[0] * grid.cell_height / (grid.shape[1] * grid.cell_width)
     return float(np.clip(ratio, 0.25, 5.0))
 
 
 def grid_lines(ax: Axes, grid: Grid) -> None:
-    """The edges of the cells."""
+    """Draw the edges of the cells."""
     for col in range(1, grid.shape[1]):
         ax.axvline(col * grid.cell_width, color="white", linewidth=0.3, alpha=0.5)
     for row in range(1, grid.shape[0]):
@@ -89,7 +89,7 @@ def grid_lines(ax: Axes, grid: Grid) -> None:
 
 
 def label_maps(axes: np.ndarray) -> None:
-    """Axes (row, column) of maps in metres, labelled where nothing is beside them."""
+    """Label the outer Axes of a figure (row, column) of maps in metres."""
     for ax in axes.ravel():
         ax.set_aspect("equal")
         ax.tick_params(labelsize=7)
@@ -101,7 +101,7 @@ def label_maps(axes: np.ndarray) -> None:
 
 
 def lowest(axes: np.ndarray) -> list[Axes]:
-    """The Axes (row, column) with no visible ones below them."""
+    """Return the Axes, of all (row, column), with no visible ones below them."""
     last = len(axes) - 1
     return [
         ax
@@ -112,11 +112,11 @@ def lowest(axes: np.ndarray) -> list[Axes]:
 
 
 def as_text(name: str) -> str:
-    """A user's name as it is: matplotlib would take dollar signs for formulas."""
+    """Escape dollar signs, which matplotlib takes for formulas."""
     return name.replace("$", r"\$")
 
 
 def plain(ax: Axes) -> None:
-    """No frame above and on the right, small numbers."""
+    """Remove the upper and right frame, and make numbers small."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.tick_params(labelsize=7)

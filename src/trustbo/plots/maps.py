@@ -1,7 +1,7 @@
-"""Maps of trust, and what every map has: hillshade, scale, metres."""
+"""Maps of planning cells over the hillshade, with a path, a scale and a colour bar."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -13,53 +13,52 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from trustbo.data import Cell
-from trustbo.plots.layout import (
-    as_text,
-    colour_bar,
-    extent_of,
-    label_maps,
-    map_panels,
-    tallness,
-)
-from trustbo.terrain import Grid, Workspace, pixel_size
-
-if TYPE_CHECKING:
-    from trustbo.result import Result
+from trustbo.plots.layout import as_text, colour_bar, extent_of, label_maps, map_panels, tallness
+from trustbo.terrain import pixel_size
+from trustbo.workspace import Grid, Workspace
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
 SHADOW = 0.55
-"""How dark the darkest shadow of the hillshade is."""
+"""Opacity of the darkest shadow of the hillshade."""
 CLOSED = "0.75"
-"""Grey of cells and pixels where no robot can go."""
+"""Grey of impassable cells and pixels."""
 
 
-def trust_maps(result: "Result", *, n_columns: int | None = None) -> np.ndarray:
-    """The paper's Fig. 5: the trust map of each iteration with the path planned on it.
+def trust_maps(
+    history: xr.Dataset,
+    trust_map: xr.DataArray,
+    path: Sequence[Cell],
+    workspace: Workspace,
+    *,
+    n_columns: int | None = None,
+) -> np.ndarray:
+    """Draw the trust map of each iteration with the path planned on it, Fig. 5 of the paper.
 
     One more panel shows the map and the recommended path after the last mission.
 
     Args:
-        result: A result of `iterate`.
+        history: Map and path of each iteration, such as `Result.history`.
+        trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
+        path: Path recommended then, such as `Result.path`.
+        workspace: Workspace of the cells.
         n_columns: Panels per row; by default 3, or more where the terrain is tall.
 
     Returns:
-        The Axes, shape (iteration + 1,).
+        Axes, shape (iteration + 1,).
     """
-    history = result.history
     maps = [history["trust_map"].isel(iteration=i) for i in range(history.sizes["iteration"])]
-    paths = [_cells(path) for path in history["path"].values]
+    paths: list[Sequence[Cell]] = [_cells(cells) for cells in history["path"].values]
     titles = [f"mission {i}" for i in history["iteration"].values]
     titles[0] += " (from the prior)"
-    maps, paths = [*maps, result.trust_map], [*paths, result.path]
+    maps, paths = [*maps, trust_map], [*paths, path]
     titles.append(f"after {len(titles)} mission{'s' if len(titles) > 1 else ''}")
-    # The first map comes from the prior and may be far off, and the start cell's trust is assumed,
-    # not learned: the rest sets the colours.
+    # The first map comes from the prior, and the trust of the start cell is assumed: neither sets
+    # the limits of the colours.
     everything = np.stack([trust.values for trust in maps])
     learned = everything[1:].copy()
     learned[:, *paths[0][0]] = np.nan
     low, high = np.nanmin(learned), np.nanmax(learned)
-    workspace = result.workspace
     figure, axes, panels = map_panels(workspace.grid, len(maps), n_columns)
     for ax, trust, path, title in zip(panels, maps, paths, titles, strict=True):
         cell_map(ax, trust, workspace, low=low, high=high)
@@ -78,23 +77,24 @@ def robot_maps(
     label: str = "cost",
     n_columns: int | None = None,
 ) -> np.ndarray:
-    """One map for each robot, in the same colours.
+    """Draw a map for each robot, all on one scale of colours.
 
     Args:
-        maps: Dims (robot, row, col), such as `planner.cost_map(params, per_robot=True)`: the
-            paper's cost f = 1 - sigma(trust).
-        workspace: Whose cells they are.
-        path: A path to draw on each.
-        label: What is shown, for the colour bar.
+        maps: Maps (robot, row, col), such as `planner.cost_map(params, per_robot=True)`, the cost
+            f = 1 - sigma(trust) of the paper.
+        workspace: Workspace of the cells.
+        path: Path to draw on each map.
+        label: Label of the colour bar.
         n_columns: Panels per row; by default two, or more where the terrain is tall.
 
     Returns:
-        The Axes, shape (robot,).
+        Axes, shape (robot,).
     """
     maps = maps.transpose("robot", "row", "col")
     names = [str(name) for name in maps["robot"].values]
     limits = float(maps.min()), float(maps.max())
-    n_columns = _two(workspace) if n_columns is None else n_columns
+    if n_columns is None and tallness(workspace.grid) < 2:
+        n_columns = 2
     figure, axes, panels = map_panels(workspace.grid, len(names), n_columns)
     for ax, name, own in zip(panels, names, maps, strict=True):
         cell_map(ax, own, workspace, low=limits[0], high=limits[1])
@@ -108,15 +108,15 @@ def robot_maps(
 def path_posterior(
     share: xr.DataArray, workspace: Workspace, path: Sequence[Cell] | None = None
 ) -> Axes:
-    """Where the best path may be: each cell's probability to be on it.
+    """Draw the probability of each cell to be on the best path.
 
     Args:
-        share: Dims (row, col), in [0, 1], such as `planner.path_posterior(posterior)`.
-        workspace: Whose cells they are.
-        path: A path to draw, such as the recommended one.
+        share: Probabilities (row, col), such as `planner.path_posterior(posterior)`.
+        workspace: Workspace of the cells.
+        path: Path to draw, such as the recommended one.
 
     Returns:
-        The Axes.
+        Axes of the map.
     """
     figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
     cell_map(ax, share, workspace, low=0.0, high=1.0)
@@ -134,17 +134,17 @@ def cell_map(
     low: float | None = None,
     high: float | None = None,
 ) -> AxesImage:
-    """Draw a map of the planning cells over its terrain's hillshade; closed cells are grey.
+    """Draw a map of the planning cells under the hillshade; impassable cells are grey.
 
     Args:
-        ax: Where to draw.
-        values: Dims (row, col).
-        workspace: Whose cells they are.
+        ax: Axes to draw on.
+        values: Map (row, col).
+        workspace: Workspace of the cells.
         low: Value of the darkest colour.
         high: Value of the brightest colour.
 
     Returns:
-        The image, for a colour bar.
+        Image, for a colour bar.
     """
     ax.set_facecolor(CLOSED)
     data = np.where(workspace.passable.values, values.transpose("row", "col").values, np.nan)
@@ -159,26 +159,26 @@ def cell_map(
 def draw_hillshade(
     ax: Axes, workspace: Workspace, heights: str = "dem", *, exaggerate: float = 2.0
 ) -> None:
-    """Shadows over what is drawn already, if there is a terrain in memory.
+    """Draw the shadows of the terrain over a map, if the terrain is in memory.
 
     Args:
-        ax: Where to draw.
-        workspace: Whose terrain.
-        heights: `"dem"` for the ground's, `"dsm"` for the surface's.
-        exaggerate: How many times steeper than it is the ground is to look.
+        ax: Axes to draw on.
+        workspace: Workspace of the terrain.
+        heights: `"dem"` for the ground, `"dsm"` for the surface.
+        exaggerate: Factor of the slopes.
     """
     terrain = workspace.terrain
     if terrain is None or workspace.pixels is None:
         return
-    # At most some 800 pixels a side: more cannot be seen.
+    # At most some 800 pixels a side; more would not be visible.
     step = -(-max(terrain["dem"].shape) // 800)
     dem = terrain[heights].values[::step, ::step]
     height, width = pixel_size(terrain)
     known = np.isfinite(dem)
     ground = np.where(known, dem, np.nanmean(dem))
     south, east = np.gradient(exaggerate * ground, height * step, width * step)
-    # Level ground has a light of 1, and so keeps its colour: that of the colour bar. The sun is in
-    # the north-west at 45 degrees; not matplotlib's shading, which stretches light to its extremes.
+    # Sun in the north-west at 45 degrees. Level ground has a light of 1 and keeps the colour of the
+    # colour bar, unlike in matplotlib's shading, which stretches the light to its extremes.
     light = (1.0 + (east + south) / np.sqrt(2.0)) / np.sqrt(1.0 + east**2 + south**2)
     shadow = np.zeros((*dem.shape, 4))
     shadow[..., 3] = np.where(known, SHADOW * np.clip(1.0 - light, 0.0, 1.0), 0.0)
@@ -186,12 +186,12 @@ def draw_hillshade(
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
-    """A bar of a round number of metres in the lower right corner of a map."""
+    """Draw a bar of a round number of metres in the lower right corner of a map."""
     draw_scale_of(ax, grid.shape[1] * grid.cell_width)
 
 
 def draw_scale_of(ax: Axes, width: float) -> None:
-    """As `draw_scale`, on Axes that are so many metres wide."""
+    """Draw a scale bar, see `draw_scale`, on Axes `width` metres wide."""
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
     outline = [patheffects.Stroke(linewidth=4.0, foreground="white"), patheffects.Normal()]
@@ -238,10 +238,6 @@ def _extend(below: bool, above: bool) -> str:
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
 
 
-def _two(workspace: Workspace) -> int | None:
-    return 2 if tallness(workspace.grid) < 2 else None
-
-
 def _finish(
     figure: Figure,
     axes: np.ndarray,
@@ -250,7 +246,7 @@ def _finish(
     limits: tuple[float, float],
     extend: str = "neither",
 ) -> None:
-    """The scale, metres, and one colour bar for all panels."""
+    """Add the scale, labels in metres, and one colour bar for all panels."""
     draw_scale(axes[0, 0], workspace.grid)
     label_maps(axes)
     if not workspace.passable.all():

@@ -1,4 +1,4 @@
-"""Trust of each robot along a mission: what was expected, what was learned, what was measured."""
+"""Trust of each robot along a mission: expected, learned, and beside measured contact rates."""
 
 from collections.abc import Sequence
 
@@ -12,28 +12,28 @@ from trustbo.planning import QUANTILES, Plan
 from trustbo.plots.layout import as_text, lowest, plain, small_multiples
 
 OUTER, INNER, LINE = "#c6dcec", "#7fb2d6", "#003f66"
-"""Three lightnesses of one blue: the 90 % band, the 50 % band, and what lies in their middle."""
+"""Three lightnesses of one blue: the 90 % band, the 50 % band, and the line in their middle."""
 _SIZE = 2.7, 2.0
 
 
 def mission_trust(
     posterior: xr.DataTree, mission: int = -1, *, n_columns: int | None = None
 ) -> np.ndarray:
-    """Latent trust of each robot along a mission, and the contact rates it was learned from.
+    """Draw latent trust of each robot along a mission, and the measured contact rates.
 
-    Bands hold 50 % and 90 % of the posterior, the line is its median, over the draws of trust in
-    the group `latent`. Dots are contact rates; bounds that were not measured have none.
+    Bands hold 50 % and 90 % of the draws of trust in the group `latent`, the line is their median.
+    Dots are contact rates; bounds that were not measured have none.
 
     Args:
-        posterior: What `fit` returned, or `Result.posterior`.
-        mission: Which one, counted from 0, or from the last by negative numbers.
+        posterior: Posterior of `models.fit`, or `Result.posterior`.
+        mission: Index of the mission, from 0; negative indices count from the last.
         n_columns: Panels per row; by default three.
 
     Returns:
-        The Axes, shape (robot,).
+        Axes, shape (robot,).
 
     Raises:
-        TrustboError: No such mission.
+        TrustboError: There is no such mission.
     """
     latent = posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
@@ -59,23 +59,23 @@ def plan_trust(
     *,
     n_columns: int | None = None,
 ) -> np.ndarray:
-    """Trust of each robot that a plan expects along its path, with bands over the parameters.
+    """Draw the expected trust of each robot along a plan, with bands over the posterior.
 
     Args:
-        plan: A plan over a posterior, such as `campaign.ask()` or `Result.plan`.
-        robots: The robots' names, such as `workspace.team.names`.
-        contact_rate: What was measured when it was run, shape (bound, robot), if it was.
+        plan: Plan over a posterior, such as `campaign.ask()` or `Result.plan`.
+        robots: Names of the robots, such as `workspace.team.names`.
+        contact_rate: Contact rates measured when the plan was run, shape (bound, robot), if any.
         n_columns: Panels per row; by default three.
 
     Returns:
-        The Axes, shape (robot,).
+        Axes, shape (robot,).
 
     Raises:
-        ShapeError: Another number of robots or bounds than the plan's.
+        ShapeError: The number of robots or bounds differs from that of the plan.
     """
     n_bounds, n_robots = plan.trust.shape
     if len(robots) != n_robots:
-        raise ShapeError(f"the plan is of {n_robots} robots; got the names {tuple(robots)}.")
+        raise ShapeError(f"the plan has {n_robots} robots; got the names {tuple(robots)}.")
     rates = np.full(plan.trust.shape, np.nan)
     if contact_rate is not None:
         measured = np.asarray(contact_rate, dtype=float)
@@ -100,7 +100,7 @@ def _panels(
     n_columns: int | None,
 ) -> np.ndarray:
     figure, axes, panels = small_multiples(
-        len(robots), n_columns, _SIZE, room=0.3, sharex=True, sharey=True
+        len(robots), n_columns, _SIZE, margin=0.3, sharex=True, sharey=True
     )
     for i, (ax, name) in enumerate(zip(panels, robots, strict=True)):
         _draw(ax, bounds, middle[:, i], bands[:, :, i], rates[:, i], named)

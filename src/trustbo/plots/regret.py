@@ -1,4 +1,4 @@
-"""How soon do policies find the best path? Regret against mission, from many runs."""
+"""Regret of policies, mission by mission, over many runs."""
 
 from collections.abc import Sequence
 
@@ -13,8 +13,8 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.plots.layout import DASHES, MARKERS
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-"""Of the runs: ends of the thin bars and of the thick ones, and the marker between them."""
-_SPREAD = 0.6  # of a mission's width, over which the curves stand side by side
+"""Quantiles over the runs: ends of the thin bars, of the thick bars, and the marker."""
+_SPREAD = 0.6  # width of the curves side by side, as a share of a mission's
 _MEANING = {
     "regret": "regret of the path recommended",
     "regret_followed": "regret of the path followed",
@@ -29,24 +29,24 @@ def regret_curves(
     variable: str = "regret",
     relative: bool = False,
 ) -> np.ndarray:
-    """Median of a study's regret after each mission, and how it spreads over the runs.
+    """Draw the regret of a study after each mission: its median and its spread over the runs.
 
-    Thin bars hold 90 % of the runs, thick ones half of them. Curves differ by colour, lightness,
-    dashes and marker at once, so that they can be told apart without colour too.
+    Thin bars hold 90 % of the runs, thick ones 50 %. Curves differ in colour, lightness, dashes and
+    marker, to be told apart without colour as well.
 
     Args:
-        dataset: As `study.load_study` gives it: dims (run, mission).
-        by: The coordinate of runs that each curve is for.
-        panels: The coordinate of runs that each panel is for, such as `"terrain"`.
-        variable: What to show, `"regret"` or `"regret_followed"`.
-        relative: As a share of the best path's value.
+        dataset: Runs of a study, dims (run, mission), from `study.load_study`.
+        by: Coordinate of the runs with a value for each curve.
+        panels: Coordinate of the runs with a value for each panel, such as `"terrain"`.
+        variable: Variable to draw, `"regret"` or `"regret_followed"`.
+        relative: Whether to divide by the value of the best path.
 
     Returns:
-        The Axes, shape (panel,).
+        Axes, shape (panel,).
 
     Raises:
-        TrustboError: A coordinate there is not, or no regret is known: no simulator of the study
-            knows the truth.
+        TrustboError: A coordinate is unknown; or no regret is, as no simulator of the study knows
+            the truth.
     """
     require_choice("variable", variable, _MEANING)
     for name in (by, panels or by):
@@ -56,7 +56,7 @@ def regret_curves(
     regret = dataset[variable] / abs(dataset["oracle"]) if relative else dataset[variable]
     if not np.isfinite(regret).any():
         raise TrustboError(
-            'no regret is known: the truth is, where a study\'s simulator is of the kind "model".'
+            'no regret is known: only simulators of the kind "model" know the truth.'
         )
     names = list(dict.fromkeys(dataset[by].values.tolist()))
     values = [None] if panels is None else list(dict.fromkeys(dataset[panels].values.tolist()))
@@ -78,8 +78,8 @@ def regret_curves(
         ax.set_title(f"{title}{counted} runs each", fontsize=9, loc="left")
     what = "share of the best value" if relative else "in units of the objective"
     axes[0].set_ylabel(f"{_MEANING[variable]},\n{what}")
-    axes[0].set_ylim(bottom=-0.03 * axes[0].get_ylim()[1])  # markers at 0 are seen whole
-    # Beside the panels, where it hides nothing.
+    axes[0].set_ylim(bottom=-0.03 * axes[0].get_ylim()[1])  # shows markers at 0 whole
+    # Beside the panels, so that it covers no curve.
     axes[-1].figure.legend(
         *axes[0].get_legend_handles_labels(),
         title=f"{by}: median,\n50 % and 90 % of runs",
@@ -93,7 +93,7 @@ def regret_curves(
 def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str) -> None:
     mission = regret["mission"].values
     shades = colormaps["viridis"](np.linspace(0.0, 0.8, len(names)))
-    # Side by side: shaded bands would hide each other.
+    # Side by side; shaded bands would cover each other.
     dodge = np.linspace(-0.5, 0.5, len(names)) * _SPREAD if len(names) > 1 else [0.0]
     for i, name in enumerate(names):
         own = regret.values[regret[by].values == name]

@@ -1,4 +1,4 @@
-"""The terrain and what is made of it."""
+"""Terrain, the indices of its pixels, and their composition."""
 
 from collections.abc import Mapping
 
@@ -19,24 +19,25 @@ from trustbo.plots.layout import (
     small_multiples,
 )
 from trustbo.plots.maps import CLOSED, COLOURS, draw_hillshade, draw_scale
-from trustbo.terrain import CompositeIndex, Workspace
+from trustbo.terrain import CompositeIndex
+from trustbo.workspace import Workspace
 
 AGREES, OPPOSES = "#0072b2", "#d55e00"
 """Blue and vermilion of Okabe and Ito (2008): safe for the colour-blind."""
 
 
 def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.ndarray:
-    """The paper's Fig. 4: the surface, and traversability, visibility and what else there is.
+    """Draw the surface and the index of each feature, Fig. 4 of the paper.
 
     Args:
-        workspace: A workspace made from a terrain in memory.
+        workspace: Workspace made from a terrain in memory.
         n_columns: Panels per row; by default all in one.
 
     Returns:
-        The Axes, shape (1 + feature,).
+        Axes, shape (1 + feature,).
 
     Raises:
-        TrustboError: The workspace has no terrain, or one that is lazily read.
+        TrustboError: The workspace has no terrain, or one that is read lazily.
     """
     terrain, pixels = workspace.terrain, workspace.pixels
     if terrain is None or pixels is None:
@@ -74,16 +75,16 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
 
 
 def loadings(composites: Mapping[str, CompositeIndex]) -> np.ndarray:
-    """What each composite is made of: one bar per feature, as it enters the index.
+    """Draw the loadings of each composite, one bar per feature.
 
     Args:
-        composites: Fitted ones by name, such as `Workspace.composites`.
+        composites: Fitted composites by name, such as `Workspace.composites`.
 
     Returns:
-        The Axes, shape (composite,).
+        Axes, shape (composite,).
 
     Raises:
-        TrustboError: No composite.
+        TrustboError: There are no composites.
     """
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")

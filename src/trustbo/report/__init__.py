@@ -1,4 +1,4 @@
-"""A campaign's result as one page to read."""
+"""Result of a campaign as one HTML page."""
 
 from trustbo.report.page import write_report
 

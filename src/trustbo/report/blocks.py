@@ -1,4 +1,4 @@
-"""What a page consists of: sections of tables and pictures, as plain text and data."""
+"""Parts of a page, as plain text and data: sections, tables, pictures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class Table:
-    """A table; its first column names the rows.
+    """Table with row names in the first column.
 
     Attributes:
-        caption: What it shows, in a sentence.
+        caption: Caption, one sentence.
         head: Names of the columns.
-        rows: Cells as text, as many in each row as there are columns.
-        text_columns: The columns, besides the first, that hold words: they are set flush left.
+        rows: Cells as text, one per column.
+        text_columns: Columns of words, besides the first; they are set flush left.
     """
 
     caption: str
@@ -24,12 +24,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Image:
-    """A drawing and the size it is meant to be seen at.
+    """Image and its size on the page.
 
     Attributes:
-        uri: All of it, as a data URI.
-        width: CSS pixels.
-        height: CSS pixels.
+        uri: Content of the image, as a data URI.
+        width: Width, CSS pixels.
+        height: Height, CSS pixels.
     """
 
     uri: str
@@ -39,13 +39,13 @@ class Image:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure, drawn for a wide page and again for a phone.
+    """Figure, drawn for wide pages and again for phones.
 
     Attributes:
-        alt: What is seen, for those who do not see it.
-        caption: What it shows, in a sentence or two.
-        wide: For pages.
-        narrow: For phones, with fewer panels in a row: text stays readable.
+        alt: Description for readers who cannot see the figure.
+        caption: Caption, one or two sentences.
+        wide: Image for wide pages.
+        narrow: Image for phones, with fewer panels in a row, so that text stays legible.
     """
 
     alt: str
@@ -57,12 +57,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page.
+    """Section of the page.
 
     Attributes:
-        slug: Its anchor.
-        title: Its heading.
-        text: A sentence or two before its blocks, or nothing.
+        slug: Anchor of the section.
+        title: Heading.
+        text: Introduction of one or two sentences, or none.
         blocks: Tables and pictures.
     """
 
@@ -74,12 +74,12 @@ class Section:
 
 @dataclass(frozen=True)
 class Fact:
-    """One thing that the summary says.
+    """Statement of the summary.
 
     Attributes:
-        name: What it is about, in a word or two.
-        text: One or two sentences.
-        good: Whether it is as it should be; None where there is nothing to judge.
+        name: Subject, one or two words.
+        text: Statement, one or two sentences.
+        good: Whether the fact is good; None if there is nothing to judge.
     """
 
     name: str

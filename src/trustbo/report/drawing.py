@@ -1,4 +1,4 @@
-"""Figures as images that a page carries in itself."""
+"""Figures as images embedded in a page."""
 
 import base64
 import io
@@ -16,20 +16,20 @@ from PIL import features
 from trustbo.report.blocks import Image, Picture
 
 PHONE = 3.55
-"""Width of figures for phones, inches: at 96 CSS pixels each, a little under the screen's."""
+"""Width of figures for phones, inches of 96 CSS pixels, a little less than the screen."""
 _PIXELS = 96
 _DOTS, _QUALITY = 160, 85
-"""Of what is raster in them, such as hillshades: dots per inch, and how well WebP keeps them."""
+"""Resolution of rasters such as hillshades, dots per inch, and their quality in WebP."""
 _PNG = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
     "svg.hashsalt": "trustbo",
     "figure.facecolor": "white",
 }
-"""Fonts as outlines, the same on every machine; names of elements the same on every run."""
+"""Fonts as outlines, equal on all machines; names of elements equal in all runs."""
 
 Draw = Callable[[int | None], Axes | np.ndarray]
-"""Draws with so many panels in a row, or as many as it likes."""
+"""Function that draws a figure with a given number of panels per row; None for its default."""
 
 
 def picture(
@@ -38,11 +38,11 @@ def picture(
     """Draw a figure twice, for pages and for phones.
 
     Args:
-        draw: Draws it, with so many panels in a row.
-        alt: What is seen.
-        caption: What it shows.
-        phone_columns: Panels in a row on phones.
-        shrink: Whether panels get lower as they get narrower on phones, as maps do.
+        draw: Function that draws the figure.
+        alt: Description for readers who cannot see the figure.
+        caption: Caption.
+        phone_columns: Panels per row on phones.
+        shrink: Whether panels keep their proportions on phones, as maps do.
     """
     with plt.rc_context(_STYLE):
         wide, narrow = _figure(draw(None)), _figure(draw(phone_columns))
@@ -68,7 +68,7 @@ def _image(figure: Figure) -> Image:
 
 
 def _smaller(png: re.Match[str]) -> str:
-    """The raster in WebP, which every browser reads: a hillshade is a tenth of its PNG."""
+    """Return the raster in WebP, where a hillshade has a tenth of the size of its PNG."""
     if not features.check("webp"):
         return png[0]
     file = io.BytesIO()

@@ -1,32 +1,32 @@
-"""The figures of a page, each with what it shows in words."""
+"""Figures of a page, each with its caption and its description."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from trustbo import plots
+from trustbo.campaign.result import Result
 from trustbo.models import params_of
-from trustbo.models.datatree import labelled_draws
+from trustbo.models.posterior_tree import labelled_draws
 from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
 from trustbo.report.numbers import counted, joined, number
-from trustbo.result import Result
 
 MOST_MAPS = 11
-"""Missions whose maps are shown; of longer campaigns, the first, the last, and some between."""
+"""Number of missions with a map; of longer campaigns the first, the last, and some between."""
 MOST_PARAMETERS = 30
 
 
 def trust_maps(result: Result) -> Picture:
-    """The trust map after each mission, and the paths."""
+    """Draw the trust map and the path of each mission."""
     n = result.history.sizes["iteration"]
     shown = np.unique(np.linspace(0, n - 1, min(n, MOST_MAPS)).round().astype(int))
     some = replace(result, history=result.history.isel(iteration=shown))
 
     def draw(n_columns: int | None):
-        axes = plots.trust_maps(some, n_columns=n_columns)
+        axes = some.plot_maps(n_columns=n_columns)
         axes[-1].set_title(f"after {counted(n, 'mission')}", fontsize=9)
-        if n_columns is not None:  # a phone has no room for more
+        if n_columns is not None:  # narrow, for phones
             axes[0].set_title("mission 1 (prior)", fontsize=9)
         return axes
 
@@ -49,7 +49,7 @@ def trust_maps(result: Result) -> Picture:
 
 
 def path_posterior(result: Result) -> Picture:
-    """Where the best path may be."""
+    """Draw the probability of each cell to be on the best path."""
     share = result.planner.path_posterior(result.posterior)
     values = share.values
     sure = int((values >= 0.95).sum())
@@ -58,14 +58,14 @@ def path_posterior(result: Result) -> Picture:
         lambda _: plots.path_posterior(share, result.workspace, path=result.path),
         f"Map of the probability of each cell to be on the best path: {counted(sure, 'cell')} with "
         f"at least 95 %, {counted(likely, 'more cell')} with 5 % to 95 %.",
-        "The share of posterior draws whose best path enters a cell; white, the recommended path. "
-        "Where cells beside the path are likely, too, more missions may change it.",
+        "Share of posterior draws whose best path enters a cell; white, the recommended path. "
+        "If other cells are likely too, more missions may change the path.",
         shrink=True,
     )
 
 
 def robot_costs(result: Result) -> Picture:
-    """What each cell costs each robot."""
+    """Draw the cost map of each robot."""
     cost = result.planner.cost_map(params_of(result.posterior).mean(), per_robot=True)
     alike = bool(np.allclose(cost.values, cost.values[:1], equal_nan=True))
     shown = cost.isel(robot=slice(1)) if alike else cost
@@ -92,21 +92,21 @@ def robot_costs(result: Result) -> Picture:
 
 
 def terrain(result: Result) -> Picture:
-    """The ground, and what is made of it."""
+    """Draw the surface and the index of each feature."""
     features = joined([str(name) for name in result.workspace.awareness["feature"].values])
     closed = int((~result.workspace.passable).sum())
     return picture(
         lambda n_columns: plots.terrain_maps(result.workspace, n_columns=n_columns),
         f"Maps of the surface's height, and of {features}. {counted(closed, 'cell')} of the "
         "planning grid cannot be entered.",
-        f"The surface (DSM), and what planning makes of it per pixel: {features}, 0 worst, 1 best. "
+        f"Surface (DSM), and the index of each pixel: {features}, 0 worst, 1 best. "
         "Lines are the planning grid.",
         shrink=True,
     )
 
 
 def parameters(result: Result) -> Picture | None:
-    """What was learned of the parameters, mission by mission; None if they are too many."""
+    """Draw the parameters, mission by mission; None if there are too many."""
     sites = result.posterior["posterior"].to_dataset()
     sizes: dict[str, int] = {}
     for _, name, _, _ in labelled_draws(sites):
@@ -129,7 +129,7 @@ def parameters(result: Result) -> Picture | None:
         lambda n_columns: plots.parameter_history(
             result.posteriors, names=shown, n_columns=n_columns
         ),
-        f"{counted(total, 'panel')}, one for each parameter: how its posterior narrows over "
+        f"{counted(total, 'panel')}, one for each parameter: its posterior over "
         f"{counted(len(result.posteriors), 'mission')}. The table has the numbers.",
         caption,
         phone_columns=2,
@@ -137,7 +137,7 @@ def parameters(result: Result) -> Picture | None:
 
 
 def last_mission(result: Result) -> Picture:
-    """Trust along the last mission."""
+    """Draw trust along the last mission."""
     mission = result.missions[-1]
     low, high = (number(float(f(mission.contact_rate)), 2) for f in (np.nanmin, np.nanmax))
     return picture(
@@ -151,14 +151,14 @@ def last_mission(result: Result) -> Picture:
 
 
 def history(result: Result) -> Picture:
-    """Objective and contact rate over the campaign."""
+    """Draw the objective and the contact rate over the campaign."""
     first, last = (number(float(v)) for v in result.history["objective"].values[[0, -1]])
     return picture(
         lambda _: plots.campaign_history(result.history),
         f"Two curves over {counted(len(result.missions), 'mission')}: the objective when planned, "
         f"from {first} to {last}, and the contact rate measured.",
-        "What each plan promised, and the contact its mission kept. The first plan comes from the "
-        "prior, and may promise anything.",
+        "Objective of each plan, and mean contact rate of its mission. The first plan comes from "
+        "the prior, and its objective may be far off.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Numbers as people read them: no more digits than they are sure of."""
+"""Numbers and words as text."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ MINUS, NONE = "\N{MINUS SIGN}", "\N{EN DASH}"
 
 
 def number(value: float, decimals: int | None = None) -> str:
-    """A number with so many decimals; by default, to about three significant digits.
+    """Format a number with `decimals` decimals; by default to about three significant digits.
 
     NaN is a dash; the minus is a minus sign, not a hyphen.
     """
@@ -24,22 +24,22 @@ def number(value: float, decimals: int | None = None) -> str:
 
 
 def decimals_for(spread: float) -> int:
-    """As many decimals as show the spread (such as an sd) to two digits; from 0 to 6."""
+    """Return the number of decimals that shows a spread, such as an sd, to two digits; 0 to 6."""
     if not math.isfinite(spread) or spread <= 0.0:
         return 3
     return min(max(1 - math.floor(math.log10(spread)), 0), 6)
 
 
 def cell_text(cell: Sequence[int]) -> str:
-    """A cell, as on the command line: "9,0"."""
+    """Format a cell as on the command line: "9,0"."""
     return f"{cell[0]},{cell[1]}"
 
 
 def joined(names: Sequence[str]) -> str:
-    """Names in a sentence: "a, b and c"."""
+    """Join names: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def counted(n: int, noun: str) -> str:
-    """So many of them: "1 mission", "2 missions"."""
+    """Format a count: "1 mission", "2 missions"."""
     return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""The page: one HTML file that needs no other."""
+"""Page of a result: one HTML file that needs no other."""
 
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -6,26 +6,25 @@ from os import PathLike
 
 import jinja2
 
+from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError
-from trustbo.export.checks import require_file
-from trustbo.files import write_text
+from trustbo.files import require_file, write_text
 from trustbo.report import figures, tables
 from trustbo.report.blocks import Picture, Section, Table
 from trustbo.report.numbers import counted
 from trustbo.report.summary import facts_of
-from trustbo.result import Result
 
 
 def write_report(path: str | PathLike[str], result: Result, *, title: str | None = None) -> None:
-    """Write a result as one HTML page, figures and all; the same result gives the same bytes.
+    """Write a result as one HTML page with its figures; equal results give equal bytes.
 
     Args:
-        path: The file, e.g. "report.html"; a complete one replaces it, or nothing.
-        result: What `iterate` returned, or `load_result`.
-        title: Of the page; by default it says how many missions there were.
+        path: HTML file to write, or to replace.
+        result: Result of a campaign.
+        title: Title of the page; by default it has the number of missions.
 
     Raises:
-        TrustboError: The result has no mission, or the path is no file to be.
+        TrustboError: The result has no mission, or the file cannot be written.
     """
     target = require_file(path)
     if not result.missions:
@@ -48,12 +47,12 @@ def write_report(path: str | PathLike[str], result: Result, *, title: str | None
 
 
 def _sections(result: Result) -> Iterator[Section]:
-    """All parts of the page, in the order of what a reader wants to know."""
+    """Yield the sections of the page, the most important first."""
     yield Section("maps", "Trust maps", "", [figures.trust_maps(result)])
     yield Section("path", "The recommended path", "", [tables.bounds_table(result)])
     yield Section(
-        "where",
-        "Where the best path may be",
+        "certainty",
+        "Certainty of the path",
         "The recommended path is the best under the posterior mean; under single draws of the "
         "posterior, others may be.",
         [figures.path_posterior(result)],
@@ -63,14 +62,14 @@ def _sections(result: Result) -> Iterator[Section]:
         yield Section("terrain", "Terrain", "", [figures.terrain(result)])
     yield Section(
         "learned",
-        "What was learned",
-        _what_parameters_mean(result),
+        "Parameters",
+        _meaning_of_parameters(result),
         [block for block in _learned(result) if block is not None],
     )
     yield Section(
         "last",
         "Trust along the last mission",
-        _how_it_ended(result),
+        _last_outcome(result),
         [figures.last_mission(result)],
     )
     yield Section(
@@ -83,7 +82,7 @@ def _learned(result: Result) -> tuple[Picture | None, Table]:
     return figures.parameters(result), tables.parameter_table(result)
 
 
-def _what_parameters_mean(result: Result) -> str:
+def _meaning_of_parameters(result: Result) -> str:
     itself, awareness = ("B0", "B") if "B0" in result.posterior["posterior"] else ("beta0", "beta")
     return (
         f"The parameters of the model, {result.settings['model']}: trust follows itself by "
@@ -91,7 +90,7 @@ def _what_parameters_mean(result: Result) -> str:
     )
 
 
-def _how_it_ended(result: Result) -> str:
+def _last_outcome(result: Result) -> str:
     mission = result.missions[-1]
     n, status = len(mission.bounds), mission.status
     if status == "ok":

@@ -1,16 +1,14 @@
-"""What a result comes to, in sentences."""
+"""Summary of a result in sentences."""
 
 import numpy as np
 from scipy.special import expit
 
-from trustbo.models.sampling import MAX_RHAT, MIN_ESS
+from trustbo.campaign.result import Result
+from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import cell_text, counted, joined, number
-from trustbo.result import Result
 
-MAX_KHAT = 0.7
-"""How even the exact sampler's weights must be; of NUTS, what `models.fit` asks."""
 _MEANS = {
     "terminal": "the chance \N{GREEK SMALL LETTER SIGMA}(trust) at the goal, 1 minus the paper's "
     "cost (6)",
@@ -22,7 +20,7 @@ _MEANS = {
 
 
 def facts_of(result: Result) -> list[Fact]:
-    """Where it was, what is recommended, and how sure that is."""
+    """Return the facts of the summary: campaign, recommendation, value, diagnostics."""
     plan = result.plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
@@ -76,7 +74,7 @@ def _exactness(plan: Plan) -> str:
         return "It is exact: under the posterior mean, no admissible path is better."
     if np.isfinite(plan.bound):
         return f"It is not proven best: a path may be worth up to {number(plan.bound)}."
-    return "Whether a path is better was not looked into."
+    return "Exactness was not checked: another path may be better."
 
 
 def _success(plan: Plan) -> str:
@@ -90,7 +88,7 @@ def _success(plan: Plan) -> str:
 
 
 def _soundness(result: Result) -> Fact:
-    """The worst diagnostics over the posteriors of all missions."""
+    """Judge the worst diagnostics over the posteriors of all missions."""
     history, said, good = result.history, [], True
     if "r_hat" in history:
         rhat = float(np.nanmax(history["r_hat"]))
@@ -106,15 +104,15 @@ def _soundness(result: Result) -> Fact:
         khat, kish = (float(f(history[n])) for f, n in ((np.nanmax, "k_hat"), (np.nanmin, "kish")))
         good = good and khat <= MAX_KHAT
         said.append(
-            f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below 0.5; usable: "
-            f"up to {MAX_KHAT}), its effective points {number(kish, 0)} at least"
+            f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below {GOOD_KHAT}; "
+            f"usable: up to {MAX_KHAT}), its effective points {number(kish, 0)} at least"
         )
     verdict = "They are well sampled" if good else "Do not rely on them"
     return Fact("Posteriors", f"{verdict}: {'; '.join(said)}.", good)
 
 
 def _end(result: Result) -> str:
-    """Why it ended, or how it goes on."""
+    """Return the reason of the end, or the way to go on."""
     text = result.stop_reason
     if text == "n_iterations":
         return "All missions asked for were run."

@@ -1,18 +1,18 @@
-"""The tables of a page."""
+"""Tables of a page."""
 
 import arviz as az
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.result import Result
 from trustbo.files import to_json
-from trustbo.models.datatree import labelled_draws
+from trustbo.models.posterior_tree import labelled_draws
 from trustbo.report.blocks import Table
 from trustbo.report.numbers import NONE, cell_text, decimals_for, number
-from trustbo.result import Result
 
 
 def bounds_table(result: Result) -> Table:
-    """The recommended path bound by bound: each robot's expected trust, and its 90 % band."""
+    """Tabulate the recommended path: expected trust of each robot after each bound."""
     plan, names = result.plan, result.workspace.team.names
     low, high = plan.bands[0], plan.bands[-1]
     places = max(decimals_for(float(np.median(high - low)) / 3.3), 2)  # 90 % is +- 1.65 sd
@@ -34,9 +34,9 @@ def bounds_table(result: Result) -> Table:
 
 
 def parameter_table(result: Result) -> Table:
-    """Each parameter's posterior after the last mission."""
+    """Tabulate the posterior of each parameter after the last mission."""
     posterior = result.posterior
-    # The exact sampler's draws are nearly independent: k-hat speaks for them, not R-hat.
+    # The draws of the exact sampler are nearly independent; its diagnostic is k-hat, not R-hat.
     diagnosed = posterior.attrs["sampler"] != "exact"
     sites = posterior["posterior"].to_dataset()
     with np.errstate(invalid="ignore"):
@@ -49,7 +49,7 @@ def parameter_table(result: Result) -> Table:
         low, high = np.quantile(draws, (0.05, 0.95))
         row = [label, *(number(float(v), places) for v in (draws.mean(), sd, low, high))]
         if rhat is not None and ess is not None:
-            moves = bool(np.ptp(draws) > 0.0)  # what does not is a constant of the model
+            moves = bool(np.ptp(draws) > 0.0)  # else it is a constant of the model
             row.append(number(float(ess[name][where]), 0) if moves else NONE)
             row.append(number(float(rhat[name][where]), 3) if moves else NONE)
         rows.append(row)
@@ -57,12 +57,12 @@ def parameter_table(result: Result) -> Table:
     caption = "The posterior of each parameter after the last mission"
     if diagnosed:
         head += ["bulk ESS", "R-hat"]
-        caption += ", and how well it was sampled"
+        caption += ", and its diagnostics"
     return Table(f"{caption}.", head, rows)
 
 
 def history_table(result: Result) -> Table:
-    """One row for each mission."""
+    """Tabulate the missions, one per row."""
     history = result.history
     columns = {
         "status": lambda row: str(row["status"].item()).replace("_", " "),
@@ -93,9 +93,9 @@ def history_table(result: Result) -> Table:
 
 
 def settings_table(result: Result) -> Table:
-    """What the campaign was run with."""
+    """Tabulate the settings of the campaign."""
     rows = [(name.replace("_", " "), _plain(value)) for name, value in result.settings.items()]
-    return Table("What the campaign was run with.", ("setting", "value"), rows, text_columns=(1,))
+    return Table("Settings of the campaign.", ("setting", "value"), rows, text_columns=(1,))
 
 
 def _change(row: xr.Dataset) -> str:

@@ -1,4 +1,4 @@
-"""A world that changes: threats that appear, and lidars that degrade."""
+"""Changes of the world between missions: threats that appear, lidars that degrade."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,24 +8,24 @@ from rasterio.features import geometry_mask
 from rasterio.transform import Affine
 
 from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
-from trustbo.simulation.sight import Surface
+from trustbo.workspace.sight import Surface
 
 KINDS = ("jam", "forbid")
 
 
 @dataclass(frozen=True)
 class Threat:
-    """A region that jams sight, or that nobody may enter, for some missions.
+    """Region that jams sight, or that no robot may enter, in some missions.
 
     Attributes:
-        kind: `"jam"`: looks from or at a robot inside find only 1 - `strength` of what they would;
-            `"forbid"`: no way leads through.
+        kind: `"jam"`: detection from or of a robot inside is 1 - `strength` times as probable;
+            `"forbid"`: no route leads through.
         center: x and y of a circle, CRS metres.
-        radius: Of the circle, m.
+        radius: Radius of the circle, m.
         polygon: Corners (x, y) of a region instead of a circle.
-        strength: Of a jam, in (0, 1].
-        first_mission: The first it is there for; missions count from 0.
-        last_mission: The last; None: for good.
+        strength: Strength of a jam, in (0, 1].
+        first_mission: First mission with the threat; missions count from 0.
+        last_mission: Last mission with the threat; None: no last.
 
     Raises:
         TrustboError: Neither a circle nor a polygon, an unknown kind, or a value out of range.
@@ -52,11 +52,11 @@ class Threat:
             raise TrustboError(f"strength must be in (0, 1]; got {self.strength!r}.")
 
     def is_there(self, mission: int) -> bool:
-        """Whether a mission meets it."""
+        """Whether it acts in a mission."""
         return is_between(mission, self.first_mission, self.last_mission)
 
     def mask(self, surface: Surface) -> np.ndarray:
-        """The pixels whose centres are inside, shape (row, col)."""
+        """Pixels with centres inside, shape (row, col)."""
         rows, cols = surface.ground.shape
         if self.polygon is not None:
             height, width = surface.pixel
@@ -77,13 +77,13 @@ class Threat:
 
 @dataclass(frozen=True)
 class Degradation:
-    """A lidar of T2 that gets worse from some mission on.
+    """Lidar of a robot of T2 that is worse in some missions.
 
     Attributes:
-        robot: Its name.
-        detection: Share of the looks that still find what they should.
-        first_mission: The first it holds for; missions count from 0.
-        last_mission: The last; None: for good.
+        robot: Name of the robot.
+        detection: Factor on the probability of detection, in [0, 1].
+        first_mission: First mission with the worse lidar; missions count from 0.
+        last_mission: Last mission with it; None: no last.
 
     Raises:
         TrustboError: A value out of range.
@@ -100,20 +100,20 @@ class Degradation:
             raise TrustboError(f"detection must be in [0, 1]; got {self.detection!r}.")
 
     def is_there(self, mission: int) -> bool:
-        """Whether a mission meets it."""
+        """Whether it acts in a mission."""
         return is_between(mission, self.first_mission, self.last_mission)
 
 
 def is_between(mission: int, first: int, last: int | None) -> bool:
-    """Whether first <= mission <= last; without a last, for good."""
+    """Whether first <= mission <= last; None: no last."""
     return first <= mission and (last is None or mission <= last)
 
 
 def require_missions(first: int, last: int | None) -> None:
-    """Refuse numbers that are no range of missions.
+    """Check that two numbers are a range of missions.
 
     Raises:
-        TrustboError: They are none.
+        TrustboError: They are not.
     """
     require_whole("first_mission", first, 0)
     if last is not None:

@@ -1,4 +1,4 @@
-"""What a robot measures on its way: its motion, what it can see, and the awareness of both."""
+"""Measurements of a robot as it drives: state of motion and sensing, and awareness."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -9,9 +9,10 @@ import xarray as xr
 
 from trustbo.data import Bound, Robot
 from trustbo.errors import require_choice
-from trustbo.records import STATES
-from trustbo.simulation.sight import Sight, Surface
-from trustbo.terrain import CompositeIndex, Workspace, openness, pixel_size
+from trustbo.logs.netcdf import STATES
+from trustbo.terrain import CompositeIndex, openness, pixel_size
+from trustbo.workspace import Workspace
+from trustbo.workspace.sight import Sight, Surface
 
 _PARTS, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
 _OPAQUE = 1e6
@@ -19,7 +20,7 @@ _OPAQUE = 1e6
 
 
 class Measure:
-    """Awareness that robots measure where they drive."""
+    """Awareness and states that robots measure along their tracks."""
 
     def __init__(
         self,
@@ -29,14 +30,14 @@ class Measure:
         tick: float,
         realtime: Mapping[str, CompositeIndex],
     ) -> None:
-        """Prepare.
+        """Prepare the maps of pixels.
 
         Args:
-            workspace: The maps and the team.
-            surface: The terrain.
-            sight: What hinders sight.
+            workspace: Workspace with maps and team.
+            surface: Terrain.
+            sight: Model of sight.
             tick: Time between two poses, s.
-            realtime: See `KinematicSimulator`.
+            realtime: Real-time indices by feature, see `KinematicSimulator`.
 
         Raises:
             TrustboError: A real-time index of an unknown feature.
@@ -51,11 +52,11 @@ class Measure:
         self._maps = np.stack([pixels[name].values for name in self._names], axis=-1)
 
     def __call__(self, ways: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> np.ndarray:
-        """Mean awareness along some ways, shape (way, robot, feature).
+        """Mean awareness along tracks, shape (track, robot, feature).
 
         Args:
-            ways: Poses of each, shape (tick, robot, 3).
-            states: Of each, shape (tick, robot, state), for real-time indices; empty without.
+            ways: Poses of each track, shape (tick, robot, 3).
+            states: States of each, shape (tick, robot, state), for real-time indices; else empty.
         """
         poses = np.concatenate(ways)
         starts = np.cumsum([0, *(len(way) for way in ways[:-1])])
@@ -68,7 +69,7 @@ class Measure:
                 columns["offline"] = values[..., m].ravel()
                 fused = index.of_columns({n: columns[n] for n in index.signs})
                 values[..., m] = fused.reshape(values.shape[:-1])
-        # Once arrived, a robot waits for the others: those ticks say nothing about the way.
+        # A robot that has arrived waits for the others: those ticks do not measure its track.
         moved = np.any(np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2]) != 0.0, axis=-1)
         moved[starts] = True
         weight = moved[..., None] & np.isfinite(values)
@@ -77,13 +78,13 @@ class Measure:
             return total / np.add.reduceat(weight, starts, axis=0, dtype=np.int64)
 
     def states(self, poses: np.ndarray) -> np.ndarray:
-        """`STATES` of each robot at each tick, shape (tick, robot, state)."""
+        """Values of `STATES` of each robot at each tick, shape (tick, robot, state)."""
         motion = _motion(self._surface, self._workspace.team.robots, poses, self._tick)
         seen = self._lidar.at(self._surface.nearest(poses[..., 0], poses[..., 1]))
         return np.concatenate([motion, seen], axis=-1)
 
     def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
-        """By feature, the map's value and the states of each robot on each bound, (sample)."""
+        """Map's value and mean states by feature, one sample per robot and bound, (sample)."""
         rows = [
             np.concatenate([self([b.poses[:, 1:]], [])[0], b.states.mean(0)], axis=1)
             for b in bounds
@@ -102,17 +103,17 @@ class Measure:
 
 
 class _LidarMaps(NamedTuple):
-    """How far a lidar's beams get from each pixel, and how many get as far as they can."""
+    """Mean range of a lidar's returns from each pixel, and share of clear beams."""
 
     return_range: np.ndarray  # (row, col), m
     visible_share: np.ndarray  # (row, col)
 
     @classmethod
     def of(cls, workspace: Workspace, surface: Surface, sight: Sight) -> Self:
-        """Of a team's lidar, by rays all around.
+        """Compute the maps of a team's lidar, by rays all around.
 
-        The mean range of returns is the integral of the share of beams that get so far. What
-        hinders sight hinders them: for "wall", a canopy that is opaque from the ground up.
+        The mean range of returns is the integral over range of the share of beams that reach it.
+        Beams are blocked by what blocks sight: for "wall", a canopy opaque from the ground up.
         """
         terrain, team = workspace.terrain, workspace.team
         assert terrain is not None  # noqa: S101  # `Worlds` has refused others
@@ -139,14 +140,14 @@ class _LidarMaps(NamedTuple):
         return cls(return_range, shares[-1])
 
     def at(self, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """Range and share at pixels (row, col), along a new last axis."""
+        """Values of both maps at pixels (row, col), along a new last axis."""
         return np.stack([self.return_range[pixels], self.visible_share[pixels]], axis=-1)
 
 
 def _motion(
     surface: Surface, robots: Sequence[Robot], poses: np.ndarray, tick: float
 ) -> np.ndarray:
-    """Speed ratio, and size of pitch and roll, of each robot at each tick, (tick, robot, 3)."""
+    """Speed ratio, and absolute pitch and roll, of each robot at each tick, (tick, robot, 3)."""
     row, col = surface.nearest(poses[..., 0], poses[..., 1])
     gx, gy = surface.gradient[:, row, col]
     ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])

@@ -1,4 +1,4 @@
-"""A simulator that is the trust model itself: the truth is known, and so is the best path."""
+"""Simulator that draws contact rates from a trust model: the true parameters are known."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,16 @@ from trustbo.data import Cell, Mission
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models import PooledTrust, TrustModel
 from trustbo.models.params import Params, check_params
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 _BUCKET = 8  # bounds: missions of about the same length share compiled code
 
 
 class ModelSimulator:
-    """Draws contact rates from a trust model with given parameters.
+    """Simulator that draws contact rates from a trust model with given parameters.
 
-    With it, what a campaign learns and plans can be held against the truth: `params` and
-    `awareness` say what a path is worth, and `Planner.plan(params)` which is best.
+    Posteriors and plans of a campaign can be compared with the truth: `params` and `awareness` give
+    the value of every path, `Planner.plan(params)` the best one.
     """
 
     def __init__(
@@ -29,22 +29,22 @@ class ModelSimulator:
         model: TrustModel | None = None,
         *,
         awareness: ArrayLike | None = None,
-        exposure: int | None = None,
+        n_ticks: int | None = None,
     ) -> None:
-        """Set up.
+        """Set the true parameters and awareness.
 
         Args:
-            workspace: Where.
-            params: The true parameters, one draw of them.
-            model: What they are parameters of; by default `PooledTrust()`. Its Gaussian rates are
-                cut to [0, 1], as rates are; where much is cut, the model is no longer quite true.
-            awareness: The true awareness, shape (robot, row, col, feature), where the workspace's
-                map is wrong; missions measure it where they pass.
-            exposure: Ticks of each bound, for `"beta_binomial"`.
+            workspace: Planning grid with awareness and passability.
+            params: True parameters, one draw of them.
+            model: Trust model with these parameters; by default `PooledTrust()`. Gaussian rates are
+                clipped to [0, 1]: where many are, the data no longer follow the model.
+            awareness: True awareness, shape (robot, row, col, feature), if it differs from the
+                workspace's map; missions measure it along their path.
+            n_ticks: Ticks of each bound, for `"beta_binomial"`.
 
         Raises:
             ShapeError: Parameters or awareness of other robots or features, or of many draws.
-            TrustboError: An exposure that is no number of ticks, or is missing.
+            TrustboError: An n_ticks that is no number of ticks, or is missing.
         """
         self.workspace, self.params = workspace, params
         self.model = PooledTrust() if model is None else model
@@ -55,31 +55,31 @@ class ModelSimulator:
         if params.leading:
             raise ShapeError(f"give one draw of params; they have leading axes {params.leading}.")
         check_params(params, shape[0], shape[3])
-        self.exposure = None if exposure is None else require_whole("exposure", exposure, 1)
-        if self.exposure is None and self.model.observation == "beta_binomial":
-            raise TrustboError("the beta-binomial family counts ticks: give exposure.")
+        self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
+        if self.n_ticks is None and self.model.family.needs_ticks:
+            raise TrustboError("the beta-binomial family counts ticks: give n_ticks.")
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
-        """The mission over a path; the same seed gives the same mission."""
+        """Run a path; the same seed gives the same mission."""
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         z = np.swapaxes(self.awareness[:, *zip(*cells[1:], strict=True)], 0, 1)
         n_bounds = len(z)
         padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
-        sample = self.model.simulate(jax.random.key(seed), self.params, padded[None], self.exposure)
+        sample = self.model.simulate(jax.random.key(seed), self.params, padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
         features, robots = (self.workspace.awareness[n].values for n in ("feature", "robot"))
-        ticks = None if self.exposure is None else np.full(rates.shape, self.exposure)
+        ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
         return Mission.from_arrays(
             cells,
             z,
             rates,
-            exposure=ticks,
+            n_ticks=ticks,
             features=tuple(str(name) for name in features),
             robots=tuple(str(name) for name in robots),
         )
 
     def describe(self) -> dict[str, object]:
-        """The truth, for the record."""
+        """Return the model and its true parameters."""
         truth = {name: np.asarray(value).tolist() for name, value in self.params._asdict().items()}
         return {
             "simulator": type(self).__name__,

@@ -1,4 +1,4 @@
-"""Missions with the physics of MuJoCo: robots that slip, get stuck, tip over and collide."""
+"""Simulator with the physics of MuJoCo: robots slip, get stuck, tip over and collide."""
 
 import math
 from collections.abc import Sequence
@@ -8,40 +8,41 @@ import numpy as np
 
 from trustbo.data import Cell, Robot
 from trustbo.errors import require_positive
-from trustbo.simulation.motion import ARRIVED, LOOKAHEAD, SLOWEST
+from trustbo.simulation.motion import ARRIVED, LOOKAHEAD
 from trustbo.simulation.overwatch import KinematicSimulator
-from trustbo.simulation.sight import Surface
 from trustbo.simulation.vehicle import Physics, crop, grip_of, require_mujoco, wheel_speeds
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.routes import SLOWEST
+from trustbo.workspace.sight import Surface
 
 MARGIN = 5.0
-"""Ground simulated around the pixels that a route may use, m."""
+"""Width of the ground simulated around the pixels that a route may use, m."""
 CONTROL = 0.05
 """Longest time between two commands to the wheels, s."""
 TIPPED, ON_ITS_SIDE = math.radians(75.0), math.radians(60.0)
 """Angle of a body with the vertical, and with the ground's normal, beyond which it has tipped."""
 PROGRESS = 0.25
-"""How far along its route a robot must come not to count as stuck, m."""
-CLEARANCE, WARY = 1.3, 4.0
-"""How far a robot keeps its middle from another's, and from where on it heeds it, m."""
-JUST_NOW = 3.0
-"""A robot that fails so soon after it touched another one has collided, s."""
+"""Distance along its route that a robot must gain not to be stuck, m."""
+CLEARANCE, AVOIDANCE_RANGE = 1.3, 4.0
+"""Distance that a robot keeps from another, centre to centre, and range of avoidance, m."""
+COLLISION_TIME = 3.0
+"""Longest time from a touch to a failure that counts as a collision, s."""
 STILL = 0.05
-"""A robot at its goal has moved if it was shoved, or has slid, so far, m."""
+"""Least displacement of a robot at its goal that counts as motion, m."""
 SLOW = 1.5
-"""Below this speed, a robot that reaches its goal stops there, m/s."""
+"""Highest speed at which a robot that reaches its goal stops there, m/s."""
 GRIP_SD, SLIP_SD = 0.1, 0.05
-"""Spread (log) of a robot's grip from drive to drive, and of a side's wheel speed in a tick."""
+"""Log standard deviations of a robot's grip per drive, and of a side's wheel speed per tick."""
 
 
-class MujocoBackend(KinematicSimulator):
-    """Skid-steer robots with weight, grip and torque on the DEM as a heightfield.
+class MujocoSimulator(KinematicSimulator):
+    """Simulator of skid-steer robots with weight, grip and torque on the DEM as a heightfield.
 
-    Bounds, formations, routes and contacts are those of `KinematicSimulator`; how robots get along
-    their routes is physics. They are Husky-sized (1.0 x 0.7 x 0.4 m, 50 kg) whatever their
-    `Robot`, whose `max_slope` decides how high their weight sits and how well their wheels grip:
-    they tip over and slide some degrees beyond it. They steer for a point ahead, slow down on
-    slopes as the kinematic ones do, and go round each other.
+    Bounds, formations, routes and contacts are those of `KinematicSimulator`; motion along the
+    routes is physics. All robots are of the size of a Husky (1.0 x 0.7 x 0.4 m, 50 kg); the
+    `max_slope` of a `Robot` sets the height of its centre of mass and the grip of its wheels: it
+    tips over and slides some degrees beyond it. Robots steer for a point ahead, slow down on slopes
+    as kinematic ones do, and go round each other.
 
     A mission ends as `"tipped"` if a body leans 75 degrees, or 60 degrees from the ground under it;
     as `"stuck"` if a robot comes no farther along its route for `stuck_after` seconds, has no
@@ -66,11 +67,11 @@ class MujocoBackend(KinematicSimulator):
 
         Args:
             workspace: A workspace made from a terrain.
-            friction: Mean friction coefficient of the wheels on the ground; None: as much as each
-                robot needs for its `max_slope`.
-            stuck_after: How long a robot may come no farther before it counts as stuck, s.
+            friction: Mean friction coefficient of the wheels on the ground; None: the least that
+                each robot needs for its `max_slope`.
+            stuck_after: Time without progress after which a robot is stuck, s.
             step: Longest physics step, s.
-            **options: `sight`, `tick` and whatever else `KinematicSimulator` takes.
+            **options: Options of `KinematicSimulator`, such as `sight` and `tick`.
 
         Raises:
             TrustboError: MuJoCo is not installed, a value that is not positive, or what
@@ -83,7 +84,7 @@ class MujocoBackend(KinematicSimulator):
         self.step = require_positive("step", step)
 
     def describe(self) -> dict[str, object]:
-        """The settings that decide what a mission measures, for the record."""
+        """Return the settings that decide what a mission measures."""
         return {
             **super().describe(),
             "friction": self.friction,
@@ -101,7 +102,7 @@ class MujocoBackend(KinematicSimulator):
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive several robots at once; poses (tick, robot, 3) until all are there or one fails."""
+        """Drive robots at the same time: poses (tick, robot, 3) until all arrive or one fails."""
         window = self._positions.window(*cells)
         legs: list[_Leg] = []
         for pose, robot, goal in zip(poses, robots, goals, strict=True):
@@ -135,26 +136,26 @@ class MujocoBackend(KinematicSimulator):
 
 
 class _Convoy:
-    """Robots that drive at the same time, each along its own route."""
+    """Group of robots that drive at the same time, each along its own route."""
 
     def __init__(
         self, physics: Physics, legs: "list[_Leg]", surface: Surface, stuck_after: float
     ) -> None:
-        """Set out; the surface's gradient tells who lies on its side."""
+        """Begin; the surface's gradient tells which robots lie on their side."""
         self._physics, self._legs = physics, legs
         self._surface, self._stuck_after = surface, stuck_after
         self._untouched = np.full(len(legs), np.inf)  # s
 
     def advance(self, slip: np.ndarray, seconds: float, n_steps: int) -> str:
-        """Command the wheels once and let the physics run; how things stand then.
+        """Command the wheels once, let the physics run and return the status.
 
         Args:
-            slip: What the wheels' speeds are multiplied with, shape (robot, side).
-            seconds: How long.
-            n_steps: In how many steps.
+            slip: Factors on the wheels' speeds, shape (robot, side).
+            seconds: Duration.
+            n_steps: Number of physics steps.
 
         Returns:
-            "underway", or the status that the drive ends with.
+            "underway", or the final status of the drive.
         """
         physics, legs, poses = self._physics, self._legs, self._physics.poses
         tilt = np.arccos(np.clip(physics.up[:, 2], -1.0, 1.0))
@@ -163,7 +164,7 @@ class _Convoy:
             if not leg.arrived:
                 others = np.delete(poses[:, :2], i, axis=0)
                 asked[i] = leg.steer(poses[i], tilt[i], others)
-        # What slipping wheels fall short of is asked of them on top; who has arrived brakes.
+        # Wheels that slip are asked for the missing speed on top; robots that have arrived brake.
         short = np.clip(asked - physics.rates, -1.0, 1.0)
         short[[leg.arrived for leg in legs]] = 0.0
         physics.command(wheel_speeds(*(asked + short).T) * slip)
@@ -172,21 +173,21 @@ class _Convoy:
             return "aborted"
         poses, speed = physics.poses, physics.speed
         self._untouched = np.where(physics.touching, 0.0, self._untouched + seconds)
-        hit = self._untouched < JUST_NOW
+        hit = self._untouched < COLLISION_TIME
         tipped = self._has_tipped(poses)
         if tipped.any():
             return "collision" if hit[tipped].any() else "tipped"
         for leg, pose, v in zip(legs, poses, speed, strict=True):
-            leg.look(pose[:2], v, seconds)
+            leg.update(pose[:2], v, seconds)
         stuck = physics.off_ground | [leg.idle >= self._stuck_after for leg in legs]
         if stuck.any():
             return "collision" if hit[stuck].any() else "stuck"
         return "ok" if all(leg.arrived for leg in legs) else "underway"
 
     def record(self, last: np.ndarray) -> np.ndarray:
-        """The poses to record after those last recorded, shape (robot, 3).
+        """Poses to record after the last ones, shape (robot, 3).
 
-        A robot that only creeps at its goal has not moved: it measures no more of its way.
+        A robot that only creeps at its goal has not moved: it measures nothing more.
         """
         if not self._physics.is_finite:
             return last
@@ -204,10 +205,10 @@ class _Convoy:
 
 
 class _Leg:
-    """One robot's way to its goal: the route, how far along it has come, and how to go on."""
+    """Route of one robot to its goal, its progress, and its steering."""
 
     def __init__(self, route: np.ndarray, robot: Robot) -> None:
-        """Set out; `route` has shape (point, 2), CRS metres."""
+        """Begin a route, shape (point, 2), CRS metres."""
         along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1)))
         self._along = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / 0.25) + 1))
         self._points = np.column_stack([np.interp(self._along, along, xy) for xy in route.T])
@@ -215,10 +216,10 @@ class _Leg:
         self._at, self._best = 0, 0.0
         self.idle, self.arrived = 0.0, False
 
-    def look(self, position: np.ndarray, speed: float, seconds: float) -> None:
-        """Note where the robot has come to, so many seconds after the last look.
+    def update(self, position: np.ndarray, speed: float, seconds: float) -> None:
+        """Update the progress of the robot, some seconds after the last update.
 
-        Who slides past the goal has not arrived.
+        A robot that slides past its goal has not arrived.
         """
         near = self._points[self._at : self._at + 12]
         self._at += int(np.argmin(((near - position) ** 2).sum(1)))
@@ -233,7 +234,7 @@ class _Leg:
         """Speed, m/s, and yaw rate, rad/s, towards a point ahead, round other robots.
 
         Args:
-            pose: x, y and heading.
+            pose: Pose of the robot: x, y and heading.
             tilt: Angle of the body with the vertical, rad.
             others: Positions of the other robots, shape (robot, 2), CRS metres.
         """
@@ -243,27 +244,27 @@ class _Leg:
         bearing = _around(math.atan2(dy, dx), left, others - pose[:2])
         error = _wrapped(bearing - pose[2])
         share = max(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / robot.max_slope)
-        # Slow enough to stop at the goal, and on the spot until it faces its way.
+        # Slow enough to stop at the goal; turns on the spot until it faces its route.
         speed = min(robot.speed * share, 2.0 * left) * max(0.0, math.cos(error))
         return speed, min(robot.turn_rate, max(-robot.turn_rate, 2.0 * error))
 
 
 def _around(bearing: float, left: float, others: np.ndarray) -> float:
-    """The bearing to steer for, bent so as to pass other robots with clearance.
+    """Bearing to steer for, corrected to pass other robots with clearance.
 
     Args:
-        bearing: To the point steered for, rad.
+        bearing: Bearing of the point steered for, rad.
         left: Distance to the goal, m.
-        others: Where the other robots are as seen from here, shape (robot, 2), m.
+        others: Positions of the other robots relative to this one, shape (robot, 2), m.
     """
     for x, y in others:
         gap = math.hypot(x, y)
-        if gap > min(left + 0.5, WARY):
+        if gap > min(left + 0.5, AVOIDANCE_RANGE):
             continue
         off = _wrapped(bearing - math.atan2(y, x))
         least = math.asin(min(1.0, CLEARANCE / max(gap, 1e-6)))
         if abs(off) < least:
-            # On the nearer side; head on, everybody keeps to the right.
+            # Pass on the nearer side; head on, to the right.
             bearing += (least if off > 1e-3 else -least) - off
     return _wrapped(bearing)
 

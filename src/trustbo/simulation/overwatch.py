@@ -1,4 +1,4 @@
-"""Bounding overwatch, simulated: who moves where, who sees whom, bound by bound."""
+"""Kinematic simulator of bounding overwatch: movements and contacts, bound by bound."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -11,21 +11,22 @@ from trustbo.errors import TrustboError, require_choice, require_positive, requi
 from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.measure import Measure
-from trustbo.simulation.motion import drive
-from trustbo.simulation.positions import SPACING
-from trustbo.simulation.sensing import Looks, contact_of, cut_at_lost_contact, new_tracks
-from trustbo.simulation.sight import Sight, chance
+from trustbo.simulation.motion import drive_together
+from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, detections, new_tracks
 from trustbo.simulation.world import Worlds
-from trustbo.terrain import CompositeIndex, Workspace
+from trustbo.terrain import CompositeIndex
+from trustbo.workspace import Workspace
+from trustbo.workspace.positions import SPACING
+from trustbo.workspace.sight import Sight
 
 
 class KinematicSimulator:
     """Unicycle robots on a DEM and DSM, in contact while their lidar has a line of sight.
 
-    One bound: the lead drives to its waypoint in the next cell while T2 watches from its positions
-    in the last; then T2 closes up to positions around the lead, chosen for sight of the waypoint
-    after, while the lead watches. Each tick, each robot of T2 is in contact with the lead or not;
-    its contact rate is the share of the bound's ticks, both phases, with contact. With
+    In the first phase of a bound the lead drives to its waypoint in the next cell while T2 watches
+    from its positions in the last; in the second, T2 closes up to positions around the lead, chosen
+    for sight of the next waypoint, while the lead watches. The contact rate of a robot of T2 is the
+    share of ticks, of both phases, in which it is in contact with the lead. With
     `bounding="alternate"` T2 does not close up but passes the lead in the next bound, so that they
     lead by turns; at the goal the one behind closes up.
 
@@ -52,17 +53,17 @@ class KinematicSimulator:
 
         Args:
             workspace: A workspace made from a terrain in memory.
-            sight: What hinders sight, or only its mode: "bare", "wall" or "transmittance".
-            tick: Time between two looks, s.
-            formation_radius: How far from the lead's waypoint T2 may stand, m.
-            bound_timeout: A bound that takes longer ends the mission as "timeout", s.
-            lost_contact_after: If no robot has had contact for this long, the mission ends as
-                "lost_contact", s. None: it goes on.
+            sight: Model of sight, or only its mode: "bare", "wall" or "transmittance".
+            tick: Length of a tick, s.
+            formation_radius: Largest distance of T2 from the lead's waypoint, m.
+            bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
+            lost_contact_after: Longest time without contact of any robot, s; the mission then ends
+                as "lost_contact". None: no limit.
             bounding: "successive" or "alternate".
-            threats: Regions that jam sight or forbid passage from some mission on.
-            degradations: Lidars of T2 that get worse from some mission on.
+            threats: Regions that jam sight or forbid passage in some missions.
+            degradations: Lidars of T2 that are worse in some missions.
             realtime: Fitted `CompositeIndex.realtime` by feature: measured awareness is then the
-                map's value fused with the robot's state. Rows to fit them on: `calibration`.
+                map's value fused with the robot's state. Samples to fit them on: `calibration`.
             record_states: Keep each robot's state at each tick, `Bound.states`.
 
         Raises:
@@ -98,7 +99,7 @@ class KinematicSimulator:
         self._enter(0)
 
     def describe(self) -> dict[str, object]:
-        """The settings that decide what a mission measures, for the record."""
+        """Return the settings that decide what a mission measures."""
         return {
             "simulator": type(self).__name__,
             "sight": self.sight.mode,
@@ -112,12 +113,12 @@ class KinematicSimulator:
         }
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Run a path, start to goal or as far as it goes.
+        """Run a path from start to goal, or until it fails.
 
         Args:
             path: Cells, each a neighbour of the last.
-            seed: Same seed, same mission, on any machine.
-            mission: Its number in the campaign, from 0: threats and degradations go by it.
+            seed: Seed of slip and detections; same seed, same mission, on any machine.
+            mission: Number of the mission, from 0, which threats and degradations go by.
 
         Raises:
             TrustboError: A cell that is off the grid or impassable, or fewer than two cells.
@@ -131,7 +132,7 @@ class KinematicSimulator:
 
         Args:
             path: Cells, each a neighbour of the last.
-            seeds: Of the missions.
+            seeds: Seeds of the missions.
             mission: See `run`.
 
         Raises:
@@ -164,9 +165,9 @@ class KinematicSimulator:
         """Put the team into a cell.
 
         Args:
-            start: The cell.
-            seed: Decides slip and contacts of all bounds to come.
-            next_cell: Where the lead will go first, if known: T2 takes positions that see it.
+            start: Start cell.
+            seed: Seed of slip and detections in all bounds to come.
+            next_cell: Cell of the first bound, if known: T2 takes positions that see it.
             mission: See `run`.
         """
         self._enter(mission)
@@ -177,36 +178,34 @@ class KinematicSimulator:
 
         Args:
             k: Number of the bound, 1 for the first.
-            cell: The cell to enter.
-            next_cell: The cell after it, if known: T2 takes positions that see it. None: it is the
-                goal.
+            cell: Cell to enter.
+            next_cell: Cell after it, which T2 takes positions to see; None: `cell` is the goal.
 
         Returns:
-            What was measured; if the status is not "ok", up to where the bound ended.
+            Measured data; if the status is not "ok", up to the tick in which the bound ended.
 
         Raises:
             TrustboError: `reset` was not called, or the cell is off the grid or impassable.
         """
         if self._state is None:
             raise TrustboError("call reset(start, seed) before run_bound.")
-        return self._bounds([self._state], k, self.workspace.require_cell("cell", cell), next_cell)[
-            0
-        ]
+        cell = self.workspace.require_cell("cell", cell)
+        return self._bounds([self._state], k, cell, next_cell)[0]
 
     def close(self) -> None:
-        """Forget where everybody is."""
+        """End the mission that runs bound by bound."""
         self._state = None
 
     def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
-        """What `CompositeIndex.realtime` is fitted on: robots on random bounds, without threats.
+        """Simulate random bounds, without threats, to fit `CompositeIndex.realtime` on.
 
         Args:
-            n_bounds: How many bounds, each from one passable cell to a neighbour.
-            seed: Same seed, same bounds.
+            n_bounds: Number of bounds, each from a passable cell to a neighbour.
+            seed: Seed of the bounds.
 
         Returns:
-            By feature, a Dataset (sample) of the map's value, `offline`, and the states of
-            `simulation.STATES`, averaged over a bound; one sample per robot and bound.
+            Dataset (sample) by feature: the map's value, `offline`, and the states of
+            `logs.STATES`, averaged over a bound; one sample per robot and bound.
         """
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         plain = copy.copy(self)
@@ -226,7 +225,7 @@ class KinematicSimulator:
         return plain._measure.samples(rows)
 
     def _enter(self, mission: int) -> None:
-        """Take the world as it is for a mission."""
+        """Switch to the world of a mission."""
         self._now = self._worlds.at(require_whole("mission", mission, 0))
         self._surface, self._positions, self._routes, *_ = self._now
 
@@ -244,70 +243,54 @@ class KinematicSimulator:
     def _bounds(
         self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
     ) -> list[Bound]:
-        """The same bound of several missions; their states move on."""
+        """Run the same bound of several missions, and update their states."""
         rngs = [np.random.default_rng([state.seed, k]) for state in states]
         drives = [
             self._drive(state, k, cell, next_cell, rng)
             for state, rng in zip(states, rngs, strict=True)
         ]
-        looked = [
-            self._looked(state, drive, chances, rng)
-            for state, drive, chances, rng in zip(
-                states, drives, self._chances(drives), rngs, strict=True
-            )
-        ]
-        ways = [
-            drive.poses[: len(contact)] for drive, (contact, _) in zip(drives, looked, strict=True)
-        ]
-        closing = [drive.closing(len(way)) for drive, way in zip(drives, ways, strict=True)]
-        moved = [self._measure.states(way[:, 1:]) if self._wants_states else None for way in ways]
+        found = detections(self._now, self.sight, self.workspace.team, drives)
+        contacts = [self._contact(*own) for own in zip(states, drives, found, rngs, strict=True)]
+        poses = [drive.poses[: len(c)] for drive, (c, _) in zip(drives, contacts, strict=True)]
+        closing = [drive.closing(len(p)) for drive, p in zip(drives, poses, strict=True)]
+        moved = [self._measure.states(p[:, 1:]) if self._wants_states else None for p in poses]
         awareness = self._measure(
-            [way[own, 1:] for way, own in zip(ways, closing, strict=True)],
+            [p[own, 1:] for p, own in zip(poses, closing, strict=True)],
             [x[own] for x, own in zip(moved, closing, strict=True) if x is not None],
         )
         bounds = []
-        for state, done, way, look, x, z in zip(
-            states, drives, ways, looked, moved, awareness, strict=True
+        for state, drive, track, (contact, status), x, z in zip(
+            states, drives, poses, contacts, moved, awareness, strict=True
         ):
-            contact, status = look
             n_ticks, n_robots = contact.shape
-            bound = Bound(
-                cell,
-                z,
-                contact.mean(0),
-                np.full(n_robots, n_ticks * self.tick),
-                status,
-                state.time,
-                way,
-                contact,
-                np.full(n_robots, n_ticks),
-                x if self.record_states else None,
-            )
-            state.cells, state.poses, state.time = done.cells, way[-1], bound.t1
-            bounds.append(bound)
+            duration, ticks = np.full(n_robots, n_ticks * self.tick), np.full(n_robots, n_ticks)
+            kept = x if self.record_states else None
+            of_bound = cell, z, contact.mean(0), duration, status, state.time
+            bounds.append(Bound(*of_bound, track, contact, ticks, kept))
+            state.cells, state.poses, state.time = drive.cells, track[-1], bounds[-1].t1
         return bounds
 
     def _drive(
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
     ) -> Drive:
-        """Who moves, and where to: the lead, then T2; or by turns."""
+        """Drive the lead, then T2; or only one of them, by turns."""
         team, cells, status = self.workspace.team, list(state.cells), "ok"
         poses, lead_moves = [state.poses[None]], []
         ticks_left = round(self.bound_timeout / self.tick)
-        for who in turns(self.bounding, k, next_cell is None):
-            if who == "lead":
-                i, them, robots = 0, slice(0, 1), (team.lead,)
+        for mover in turns(self.bounding, k, next_cell is None):
+            if mover == "lead":
+                i, members, robots = 0, slice(0, 1), (team.lead,)
                 goals = self._positions.waypoint(cell)[None]
             else:
-                i, them, robots = 1, slice(1, None), team.robots
+                i, members, robots = 1, slice(1, None), team.robots
                 goals = self._positions.formation(cell, next_cell)
             now = poses[-1][-1]
             way = cells[i], cell
-            moved, status = self._move(now[them], robots, list(goals), way, ticks_left, rng)
+            moved, status = self._move(now[members], robots, list(goals), way, ticks_left, rng)
             part = np.repeat(now[None], len(moved), axis=0)
-            part[:, them] = moved
+            part[:, members] = moved
             poses.append(part)
-            lead_moves.append(np.full(len(moved), who == "lead"))
+            lead_moves.append(np.full(len(moved), mover == "lead"))
             ticks_left -= len(moved)
             if status != "ok":
                 break
@@ -325,45 +308,23 @@ class KinematicSimulator:
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive several robots at once; poses (tick, robot, 3) until all are there or one fails."""
-        tracks, failures = [], []
+        """Drive robots at the same time: poses (tick, robot, 3) until all arrive or one fails."""
         window = self._positions.window(*cells)
-        for pose, robot, goal in zip(poses, robots, goals, strict=True):
-            route = self._routes.find(robot, pose[:2], goal, window)
-            if route is None:
-                track, status = pose[None], "stuck"
-            else:
-                track, status = drive(
-                    self._surface, robot, route, pose[2], self.tick, max(1, max_ticks), rng
-                )
-            tracks.append(track)
-            if status != "ok":
-                failures.append((len(track), status))
-        n_ticks, status = min(failures, default=(max(len(t) for t in tracks), "ok"))
-        held = [t[np.minimum(np.arange(n_ticks), len(t) - 1)] for t in tracks]
-        return np.stack(held, axis=1), status
+        routes = [
+            self._routes.find(robot, pose[:2], goal, window)
+            for pose, robot, goal in zip(poses, robots, goals, strict=True)
+        ]
+        return drive_together(self._surface, robots, routes, poses, self.tick, max_ticks, rng)
 
-    def _chances(self, drives: Sequence[Drive]) -> list[np.ndarray]:
-        """Probability that a look finds its target, (tick, robot): of all missions at once."""
-        looks = Looks.of(self.workspace.team, drives)
-        found = chance(self._surface, self.sight, looks.sensor, looks.target, looks.glass)
-        for mask, strength in self._now.jams:
-            inside = mask[self._surface.nearest(looks.sensor[:, 0], looks.sensor[:, 1])]
-            inside |= mask[self._surface.nearest(looks.target[:, 0], looks.target[:, 1])]
-            found[inside] *= 1.0 - strength
-        found = found.reshape(-1, len(self.workspace.team.robots))
-        found *= np.where(looks.t2_looks, self._now.detection, self.workspace.team.lead.detection)
-        return np.split(found, np.cumsum([len(drive.poses) for drive in drives])[:-1])
-
-    def _looked(
-        self, state: State, drive: Drive, chances: np.ndarray, rng: np.random.Generator
+    def _contact(
+        self, state: State, drive: Drive, probabilities: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, str]:
-        """Contact at each tick, (tick, robot), up to where the bound ends, and how it ends."""
-        found = rng.random(chances.shape) < chances
+        """Contact at each tick, (tick, robot), until the bound ends, and its status."""
+        found = rng.random(probabilities.shape) < probabilities
         contact = np.empty(found.shape, bool)
         for phase, watchers in enumerate(self._watchers):
-            who = drive.lead_moves == (phase == 0)
-            contact[who] = contact_of(found[who], watchers, state.tracks[phase])
+            own = drive.lead_moves == (phase == 0)
+            contact[own] = contact_of(found[own], watchers, state.tracks[phase])
         n_ticks, status = len(contact), drive.status
         if self.lost_contact_after is not None:
             patience = max(1, round(self.lost_contact_after / self.tick))

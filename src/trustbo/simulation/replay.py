@@ -1,4 +1,4 @@
-"""Recorded missions in the place of a simulator."""
+"""Simulator that replays recorded missions."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -7,35 +7,34 @@ from typing import Any, Self
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_pair
-from trustbo.records import missions_from_tree, read_tree
-from trustbo.simulation.tables import read_table
+from trustbo.logs.netcdf import missions_from_tree, read_tree
+from trustbo.logs.table import read_table
 
 ON_MISSING = ("error", "next")
 _NEAREST = 3
 
 
-class ReplayBackend:
-    """Replays missions that a robot, or another simulator, recorded.
+class ReplaySimulator:
+    """Simulator that replays missions recorded by robots or another simulator.
 
-    Each mission is replayed once: `run(path)` gives the first not yet replayed whose path is the
-    one asked for. A campaign replays itself if workspace, settings and seed are those of the run
-    that was recorded: then it asks for the same paths. With `on_missing="next"` a campaign learns
-    from the missions in the order they were recorded, whatever paths it asks for.
+    Each mission is replayed once: `run(path)` returns the first one left with that path. A campaign
+    with the workspace, settings and seed of the recorded run asks for the same paths, and so
+    replays it. With `on_missing="next"` a campaign learns from the missions in the order in which
+    they were recorded, independent of the paths it asks for.
 
-    `reset`, `run_bound` and `close` replay a mission bound by bound; only missions on the path
-    asked for, whatever `on_missing`.
+    `reset`, `run_bound` and `close` replay a mission bound by bound; `on_missing` does not apply.
 
     Attributes:
-        missions: All, in the order recorded.
+        missions: All missions, in the order recorded.
     """
 
     def __init__(self, missions: Sequence[Mission], *, on_missing: str = "error") -> None:
-        """Nothing is replayed yet.
+        """Start with all missions left.
 
         Args:
-            missions: The recorded missions.
-            on_missing: What `run` does where no mission is left on the path asked for: `"error"`,
-                or `"next"`, give the next one whatever its path (`Campaign.tell` learns from it).
+            missions: Recorded missions.
+            on_missing: Behaviour of `run` if no mission is left on its path: `"error"`, or
+                `"next"` to return the next one on another path (`Campaign.tell` learns from it).
 
         Raises:
             TrustboError: No missions, or an unknown `on_missing`.
@@ -53,26 +52,17 @@ class ReplayBackend:
         self._n_run = 0
 
     @classmethod
-    def from_table(
-        cls,
-        table: Any,
-        *,
-        start: Cell | None = None,
-        features: Sequence[str] | None = None,
-        robots: Sequence[str] | None = None,
-        on_missing: str = "error",
-    ) -> Self:
-        """Replay a table in long form: a CSV file or a DataFrame; see `read_table`."""
-        missions = read_table(table, start=start, features=features, robots=robots)
-        return cls(missions, on_missing=on_missing)
+    def from_table(cls, table: Any, *, on_missing: str = "error", **options: Any) -> Self:
+        """Replay a table in long form: a CSV file or a DataFrame; options as for `read_table`."""
+        return cls(read_table(table, **options), on_missing=on_missing)
 
     @classmethod
     def from_netcdf(cls, path: str | PathLike[str], *, on_missing: str = "error") -> Self:
         """Replay the `missions.nc` that `Result.save` wrote, ticks included.
 
         Args:
-            path: The file, or the folder it is in.
-            on_missing: As for `ReplayBackend`.
+            path: The file, or its folder.
+            on_missing: See `ReplaySimulator`.
 
         Raises:
             TrustboError: There is no such file, or it holds no missions.
@@ -89,11 +79,11 @@ class ReplayBackend:
 
     @property
     def remaining(self) -> tuple[Mission, ...]:
-        """The missions not yet replayed, in the order recorded."""
+        """Missions not yet replayed, in the order recorded."""
         return tuple(self.missions[j] for j in self._left)
 
     def describe(self) -> dict[str, object]:
-        """What was replayed, for the record."""
+        """Return the number of missions, and `on_missing`."""
         return {
             "simulator": type(self).__name__,
             "recorded_missions": len(self.missions),
@@ -101,16 +91,16 @@ class ReplayBackend:
         }
 
     def rewind(self) -> None:
-        """Make all missions as if not yet replayed."""
+        """Start over with all missions left."""
         self.close()
         self._left = list(range(len(self.missions)))
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
-        """The next recorded mission on a path.
+        """Return the next recorded mission on a path.
 
         Args:
             path: Cells, start first.
-            seed: Not used: what was recorded is not random.
+            seed: Not used.
 
         Raises:
             TrustboError: No mission on this path is left; the message names the nearest ones. With
@@ -131,7 +121,7 @@ class ReplayBackend:
         """Begin a mission at a cell.
 
         Args:
-            start: The cell.
+            start: Start cell.
             seed: Not used.
             next_cell: Not used.
         """
@@ -139,18 +129,18 @@ class ReplayBackend:
         self._start = require_pair("start", start)
 
     def run_bound(self, k: int, cell: Cell, next_cell: Cell | None = None) -> Bound:
-        """The next bound of the mission that is replayed.
+        """Return the next bound of the mission that is replayed.
 
-        The first bound decides on the mission: the first not yet replayed that starts at the cell
-        of `reset`, and goes on as asked for.
+        Bound 1 selects the mission: the first one left that starts at the cell of `reset` and
+        enters `cell`, and then `next_cell` if given.
 
         Args:
             k: Number of the bound, 1 for the first.
-            cell: The cell to enter.
-            next_cell: The cell after it, if known; for the first bound, it tells missions apart.
+            cell: Cell to enter.
+            next_cell: Cell after it, if known; used with bound 1.
 
         Raises:
-            TrustboError: `reset` was not called, a bound is out of turn, no mission goes that way,
+            TrustboError: `reset` was not called, a bound is out of order, no mission has that path,
                 or the mission that is replayed had ended, or went another way.
         """
         if self._start is None:
@@ -185,7 +175,7 @@ class ReplayBackend:
         self._start, self._current, self._n_run = None, None, 0
 
     def _missing(self, path: tuple[Cell, ...], recorded: Sequence[int]) -> str:
-        """Why a path, or the beginning of one, cannot be replayed, and what comes nearest."""
+        """Message for a path, or the beginning of one, that cannot be replayed."""
         if not self._left:
             return f"all {len(self.missions)} missions are replayed; rewind() starts over."
         if recorded:
@@ -207,7 +197,7 @@ class ReplayBackend:
         ]
         return (
             f"path {_text(path)} was never recorded. Nearest of {len(self._left)} left: "
-            f'{"; ".join(lines)}. Or learn from whatever comes next: on_missing="next".'
+            f'{"; ".join(lines)}. Or take the next mission on any path: on_missing="next".'
         )
 
 

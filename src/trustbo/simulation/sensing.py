@@ -1,4 +1,7 @@
-"""Who looks at whom, and what a lidar makes of its looks: tracks."""
+"""Contact by lidar: looks, which detect a robot or not, and tracks, which outlast some misses.
+
+At each tick, one look goes from each robot that stands to each that moves.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -8,20 +11,21 @@ from numba import njit
 
 from trustbo.data import Robot, Team
 from trustbo.simulation.bounding import Drive
-from trustbo.simulation.sight import optics
+from trustbo.simulation.world import World
+from trustbo.workspace.sight import Sight, detection_probability, optics
 
 
 class Looks(NamedTuple):
-    """Looks between the lead and each robot of T2: by those who stand, at those who move."""
+    """Looks between the lead and each robot of T2, from the one that stands to the other."""
 
     sensor: np.ndarray  # (tick * robot, 2), CRS metres
     target: np.ndarray  # likewise
-    glass: np.ndarray  # (tick * robot, 4), see `sight.optics`
+    optics: np.ndarray  # (tick * robot, 4), see `sight.optics`
     t2_looks: np.ndarray  # (tick, 1), else the lead does
 
     @classmethod
     def of(cls, team: Team, drives: Sequence[Drive]) -> Self:
-        """The looks of some bounds, one after the other."""
+        """Concatenate the looks of several bounds."""
         poses = np.concatenate([drive.poses[..., :2] for drive in drives])
         t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]
         lead = np.repeat(poses[:, :1], len(team.robots), axis=1)
@@ -35,18 +39,31 @@ class Looks(NamedTuple):
         )
 
 
+def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) -> list[np.ndarray]:
+    """Probability that a look detects its target, shape (tick, robot) for each bound."""
+    looks, surface = Looks.of(team, drives), world.surface
+    found = detection_probability(surface, sight, looks.sensor, looks.target, looks.optics)
+    for mask, strength in world.jams:
+        inside = mask[surface.nearest(looks.sensor[:, 0], looks.sensor[:, 1])]
+        inside |= mask[surface.nearest(looks.target[:, 0], looks.target[:, 1])]
+        found[inside] *= 1.0 - strength
+    found = found.reshape(-1, len(team.robots))
+    found *= np.where(looks.t2_looks, world.detection, team.lead.detection)
+    return np.split(found, np.cumsum([len(drive.poses) for drive in drives])[:-1])
+
+
 def new_tracks(n_robots: int) -> np.ndarray:
-    """Nobody tracked yet: (phase, robot, (tracked, run of contrary looks))."""
+    """Tracks of nobody: (phase, robot, (tracked, run of contrary looks))."""
     return np.zeros((2, n_robots, 2), np.int64)
 
 
 def contact_of(found: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
-    """Contact from looks: a track begins after some finds in a row, and ends after some misses.
+    """Contact from looks: a track begins after some detections in a row, and ends after misses.
 
     Args:
-        found: Whether each look found its target, shape (tick, robot).
-        watchers: Whose lidar looks, one per robot: they say how many finds and misses.
-        tracks: State of the tracks, shape (robot, 2); it is moved on.
+        found: Whether each look detected its target, shape (tick, robot).
+        watchers: Robots whose lidar looks, one per robot; they give the numbers of looks.
+        tracks: State of the tracks, shape (robot, 2), updated in place.
 
     Returns:
         Shape (tick, robot), bool.
@@ -72,7 +89,7 @@ def _track(found, limits, tracks, contact):
 
 
 def cut_at_lost_contact(contact: np.ndarray, patience: int, status: str) -> tuple[int, str]:
-    """How many ticks a bound has that ends when nobody has had contact for `patience` ticks."""
+    """Length in ticks and status of a bound that ends after `patience` ticks without contact."""
     alone = 0
     for k, any_contact in enumerate(contact.any(1)):
         alone = 0 if any_contact else alone + 1

@@ -1,4 +1,4 @@
-"""Skid-steer vehicles on a heightfield, in MuJoCo: their make, and how they stand and move."""
+"""Skid-steer vehicles on a heightfield in MuJoCo: model, placement and motion."""
 
 import math
 from collections.abc import Sequence
@@ -9,8 +9,8 @@ import numpy as np
 
 from trustbo.data import Robot
 from trustbo.errors import TrustboError
-from trustbo.simulation.positions import filled
-from trustbo.simulation.sight import Surface
+from trustbo.workspace.positions import filled
+from trustbo.workspace.sight import Surface
 
 # A Husky: 1.0 x 0.7 x 0.4 m over all, 50 kg.
 MASS, WHEEL_MASS = 50.0, 2.5
@@ -18,17 +18,17 @@ WHEEL_RADIUS, WHEEL_WIDTH = 0.165, 0.12
 WHEELBASE, TRACK = 0.66, 0.57
 """Distances of the axles, and of the left and right wheels, m."""
 STIFFNESS, DAMPING = 5000.0, 400.0
-"""Of the spring that carries each wheel, N/m and N s/m: it keeps all four on rough ground."""
+"""Stiffness and damping of a wheel's spring, N/m and N s/m: all four stay on rough ground."""
 TORQUE = 80.0
-"""Most that a motor gives its wheel, N m: enough to spin it on any grip."""
+"""Largest torque of a wheel's motor, N m: enough to spin it on any grip."""
 TIP_MARGIN, GRIP_MARGIN = math.radians(8.0), math.radians(12.0)
-"""How far beyond its `max_slope` a robot tips over on rigid springs, and slides, rad."""
+"""Angle beyond `max_slope` at which a robot tips over on rigid springs, and slides, rad."""
 APART = 1.1
-"""How far apart the middles of robots are put, m."""
+"""Least distance between the centres of robots that are placed, m."""
 SETTLING = 1.0
 """Longest wait until robots put on the ground are at rest, s."""
 _BODY, _CLEARANCE = (0.90, 0.45, 0.24), 0.13  # length, width, height; above ground, m
-_LOWEST, _HIGHEST = 0.10, 0.40  # where the centre of mass may be, m above ground
+_LOWEST, _HIGHEST = 0.10, 0.40  # limits of the centre of mass, m above ground
 _WHEELS = np.array([(x * WHEELBASE, y * TRACK) for x in (0.5, -0.5) for y in (0.5, -0.5)])
 _HULL = MASS - len(_WHEELS) * WHEEL_MASS
 # Wheels slip sideways in a turn: a skid-steer robot yaws as if its track were so much wider, by
@@ -37,20 +37,20 @@ _YAW_TRACK = 1.4 * (TRACK + WHEELBASE**2 / TRACK)
 
 
 class Ground(NamedTuple):
-    """A crop of the terrain, in metres from its own middle and from its lowest point."""
+    """Crop of the terrain, in metres from its centre and from its lowest point."""
 
     heights: np.ndarray  # (row, col), m, row 0 in the south
     pixel: tuple[float, float]  # height, width of a pixel, m
-    center: tuple[float, float]  # x and y of the middle, CRS metres
+    center: tuple[float, float]  # x and y of the centre, CRS metres
 
     @property
     def half_size(self) -> np.ndarray:
-        """Half the extent between the outer pixels' centres along x and y, m."""
+        """Half the distance between the outer pixels' centres along x and y, m."""
         rows, cols = self.heights.shape
         return 0.5 * np.array([(cols - 1) * self.pixel[1], (rows - 1) * self.pixel[0]])
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Bilinear height, m, at positions in metres from the middle."""
+        """Bilinear height, m, at positions in metres from the centre."""
         rows, cols = self.heights.shape
         col = np.clip((x + self.half_size[0]) / self.pixel[1], 0.0, cols - 1.001)
         row = np.clip((y + self.half_size[1]) / self.pixel[0], 0.0, rows - 1.001)
@@ -62,14 +62,14 @@ class Ground(NamedTuple):
 
 
 def crop(surface: Surface, window: tuple[int, int, int, int], margin: float) -> Ground:
-    """The ground of a window of pixels and a margin around it.
+    """Crop a window of pixels and a margin around it.
 
-    Missing heights are the nearest known; beyond the terrain's edge, the edge goes on.
+    Missing heights are those of the nearest pixel; beyond the terrain's edge, of the edge.
 
     Args:
-        surface: The terrain.
+        surface: Terrain.
         window: First row, end row, first col, end col.
-        margin: m.
+        margin: Width of the margin, m.
     """
     (height, width), (rows, cols) = surface.pixel, surface.ground.shape
     more = [math.ceil(margin / size) for size in surface.pixel]
@@ -94,7 +94,7 @@ def center_of_mass(robot: Robot) -> float:
 
 
 class Physics:
-    """Robots on a ground, driven by the speeds of their left and right wheels.
+    """Physics of robots on a ground, driven by the speeds of their left and right wheels.
 
     Poses are x, y (CRS metres) and heading (rad from east, anticlockwise).
     """
@@ -105,8 +105,8 @@ class Physics:
         """Build the model.
 
         Args:
-            ground: Where.
-            robots: Who; how steep they stand decides where their centre of mass is.
+            ground: Ground to drive on.
+            robots: Robots; their `max_slope` sets the centre of mass.
             grip: Friction coefficient of each robot's wheels.
             step: Physics step, s.
 
@@ -118,16 +118,16 @@ class Physics:
         self.model.hfield_data[:] = (ground.heights / _relief(ground)).ravel()
         self.data = self._mujoco.MjData(self.model)
         self._bodies = [self.model.body(f"robot{i}").id for i in range(len(robots))]
-        # Views of what MuJoCo works on, one row per robot.
+        # Views of MuJoCo's arrays, one row per robot.
         self._qpos = self.data.qpos.reshape(len(robots), -1)
         self._qvel = self.data.qvel.reshape(len(robots), -1)
         self._brake = self.model.dof_frictionloss.reshape(len(robots), -1)[:, 7::2]
 
     def place(self, poses: np.ndarray) -> None:
-        """Put the robots on the ground, parallel to it, and wait until they are at rest.
+        """Place the robots parallel to the ground, and wait until they are at rest.
 
         Args:
-            poses: Shape (robot, 3); robots that would stand in each other are moved apart.
+            poses: Shape (robot, 3); robots that would overlap are moved apart.
         """
         local = poses - [*self._ground.center, 0.0]
         local[:, :2] = _spread(local[:, :2])
@@ -146,12 +146,12 @@ class Physics:
         self._brake[:] = np.where(parked, TORQUE, 0.0)[:, None]
 
     def advance(self, n_steps: int) -> None:
-        """Let so many physics steps pass."""
+        """Advance by a number of physics steps."""
         self._mujoco.mj_step(self.model, self.data, n_steps)
 
     @property
     def poses(self) -> np.ndarray:
-        """Shape (robot, 3)."""
+        """Poses of the robots, shape (robot, 3)."""
         ahead = self._axes[0]
         heading = np.arctan2(ahead[:, 1], ahead[:, 0])
         return np.column_stack([self._qpos[:, :2] + self._ground.center, heading])
@@ -164,22 +164,22 @@ class Physics:
 
     @property
     def speed(self) -> np.ndarray:
-        """Speed of the bodies whichever way they go, shape (robot,), m/s."""
+        """Speed of the bodies in any direction, shape (robot,), m/s."""
         return np.linalg.norm(self._qvel[:, :3], axis=1)
 
     @property
     def up(self) -> np.ndarray:
-        """Unit vectors out of the robots' roofs, shape (robot, 3)."""
+        """Upward unit vectors of the bodies, shape (robot, 3)."""
         return self._axes[1]
 
     @property
     def is_finite(self) -> bool:
-        """Whether all motion is still in numbers."""
+        """Whether all positions and velocities are finite."""
         return bool(np.isfinite(self._qpos).all() and np.isfinite(self._qvel).all())
 
     @property
     def off_ground(self) -> np.ndarray:
-        """Whether each robot has left the ground's crop, shape (robot,)."""
+        """Whether each robot has left the crop, shape (robot,)."""
         inside = (np.abs(self._qpos[:, :2]) < self._ground.half_size).all(1)
         return ~inside | (self._qpos[:, 2] < -1.0)
 
@@ -228,19 +228,19 @@ def require_mujoco() -> ModuleType:
     try:
         import mujoco
     except ImportError:
-        raise TrustboError('MujocoBackend needs MuJoCo: pip install "trustbo[mujoco]".') from None
+        raise TrustboError('MujocoSimulator needs MuJoCo: pip install "trustbo[mujoco]".') from None
     return mujoco
 
 
 def _spread(xy: np.ndarray) -> np.ndarray:
-    """Positions (robot, 2) of which those too close have been pushed apart."""
+    """Positions (robot, 2), those too close pushed apart."""
     xy, turn = xy.copy(), 2.0 * np.pi * np.arange(len(xy)) / len(xy)
     for _ in range(100):
         gap = xy[:, None] - xy
         distance = np.linalg.norm(gap, axis=2) + APART * np.eye(len(xy))
         if (distance >= APART - 1e-3).all():
             break
-        # Those on one spot leave it in different directions.
+        # Robots on one spot leave it in different directions.
         xy += (
             0.01 * (distance.min(1) < 1e-3)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
         )
@@ -250,12 +250,12 @@ def _spread(xy: np.ndarray) -> np.ndarray:
 
 
 def _relief(ground: Ground) -> float:
-    """Height of the heightfield, m; MuJoCo wants one above 0."""
+    """Height of the heightfield, m; MuJoCo needs one above 0."""
     return max(float(ground.heights.max()), 1e-3)
 
 
 def _model(ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step: float) -> str:
-    """The model in MJCF, MuJoCo's XML."""
+    """Model in MJCF, MuJoCo's XML."""
     (rows, cols), (x, y) = ground.heights.shape, ground.half_size
     bodies = "".join(_body(i, r, g) for i, (r, g) in enumerate(zip(robots, grip, strict=True)))
     motors = "".join(
@@ -276,9 +276,9 @@ def _model(ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step:
 
 
 def _body(i: int, robot: Robot, grip: float) -> str:
-    """One vehicle; its origin is on the axles' plane, between the wheels."""
+    """MJCF of one vehicle; its origin is in the axles' plane, between the wheels."""
     length, width, height = _BODY
-    # Where the hull's mass must be for that of hull and wheels to be where it is wanted.
+    # Height of the hull that puts the centre of mass of hull and wheels at the wanted height.
     raised = (center_of_mass(robot) - WHEEL_RADIUS) * MASS / _HULL
     inertia = [_HULL / 12.0 * (a * a + b * b)
                for a, b in ((width, height), (length, height), (length, width))]  # fmt: skip

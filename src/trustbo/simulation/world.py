@@ -1,4 +1,4 @@
-"""The terrain as it is for a mission: with the threats that are there then."""
+"""Terrain of a mission, with the threats and degradations that act in it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,26 +7,26 @@ import numpy as np
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.simulation.events import Degradation, Threat
-from trustbo.simulation.motion import Routes
-from trustbo.simulation.positions import Positions, surface_of
-from trustbo.simulation.sight import Sight, Surface
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.positions import Positions, surface_of
+from trustbo.workspace.routes import Routes
+from trustbo.workspace.sight import Sight, Surface
 
 
 class World(NamedTuple):
-    """Where robots can go, stand and see."""
+    """Terrain, positions and routes of a mission, and what impairs its lidars."""
 
     surface: Surface
     positions: Positions
     routes: Routes
     jams: tuple[tuple[np.ndarray, float], ...]
-    """Pixels, shape (row, col), and strength."""
+    """Mask of the pixels inside, shape (row, col), and strength of each jam."""
     detection: np.ndarray
-    """Quality of T2's lidars, shape (robot,)."""
+    """Factor on the probability of detection by T2's lidars, shape (robot,)."""
 
 
 class Worlds:
-    """Made when they are needed, and kept: most missions see the same."""
+    """Worlds by mission, cached: most missions share one."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Worlds:
         threats: Sequence[Threat] = (),
         degradations: Sequence[Degradation] = (),
     ) -> None:
-        """Prepare; see `KinematicSimulator`.
+        """Prepare a terrain; see `KinematicSimulator` for the arguments.
 
         Raises:
             TrustboError: A workspace without a terrain in memory, or a robot not in the team.
@@ -51,13 +51,13 @@ class Worlds:
             require_choice("robot", degradation.robot, workspace.team.names)
         self.surface = surface_of(workspace.terrain, workspace.pixels)
         self._workspace, self._sight, self._radius = workspace, sight, formation_radius
-        self._ease = workspace.pixels["traversability"]
+        self._traversability = workspace.pixels["traversability"]
         self._threats, self._degradations = tuple(threats), tuple(degradations)
         self._known: dict[object, World] = {}
         self._grounds: dict[object, tuple[Surface, Positions, Routes]] = {}
 
     def at(self, mission: int) -> World:
-        """As it is for a mission, counted from 0."""
+        """World of a mission, counted from 0."""
         threats = tuple(t for t in self._threats if t.is_there(mission))
         worse = tuple(d for d in self._degradations if d.is_there(mission))
         key = tuple(map(id, (*threats, *worse)))
@@ -74,12 +74,14 @@ class Worlds:
         return World(*self._ground([t for t in threats if t.kind == "forbid"]), jams, detection)
 
     def _ground(self, closing: Sequence[Threat]) -> tuple[Surface, Positions, Routes]:
-        """Where robots can go; jams and worse lidars leave it as it is, and its routes known."""
+        """Surface, positions and routes, which jams and worse lidars leave unchanged."""
         key = tuple(map(id, closing))
         if key not in self._grounds:
             surface = self.surface
             for threat in closing:
                 surface = surface._replace(passable=surface.passable & ~threat.mask(surface))
-            positions = Positions(self._workspace, surface, self._sight, self._ease, self._radius)
+            positions = Positions(
+                self._workspace, surface, self._sight, self._traversability, self._radius
+            )
             self._grounds[key] = surface, positions, Routes(surface)
         return self._grounds[key]

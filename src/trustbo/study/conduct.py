@@ -1,4 +1,4 @@
-"""A study from its table to its results."""
+"""Running of a study, and its results."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -26,26 +26,26 @@ def run_study(
     n_workers: int | None = None,
     progress: bool = True,
 ) -> xr.Dataset:
-    """Run what of a study has not been run yet.
+    """Run the runs of a study that have not ended yet.
 
     Args:
-        study: A `Study`, a mapping of its settings, or a YAML file of them.
-        directory: Where results are kept, a file for each run. Called again, a study goes on where
-            it stopped, and runs again what failed.
-        executor: `None` or `"serial"`: here, one after the other. `"loky"` or `"dask"`: in a
-            process for each core, of a local cluster in the case of Dask. The address of a Dask
+        study: Study, a mapping of its settings, or a YAML file of them.
+        directory: Folder of the results, a file for each run. Called again, a study goes on where
+            it stopped, and repeats runs that failed.
+        executor: `None` or `"serial"`: this process, one run after the other. `"loky"` or `"dask"`:
+            a process for each core, of a local cluster in the case of Dask. The address of a Dask
             scheduler (`"tcp://..."`), a `distributed.Client`, or any `concurrent.futures.Executor`
             that does not fork.
-        n_workers: How many processes `"loky"` and `"dask"` start; by default one for each core.
+        n_workers: Number of processes that `"loky"` and `"dask"` start; by default one for each
+            core.
         progress: Whether to show a progress bar.
 
     Returns:
-        The results, as `load_study` gives them. Runs that failed are told of in a warning, and
-        listed by `failures`.
+        Results as `load_study` returns them. A warning names runs that failed; `failures` lists
+        them.
 
     Raises:
-        TrustboError: A study or an executor that cannot be, before any work starts; or every run
-            failed.
+        TrustboError: An impossible study or executor, before any work starts; or every run failed.
     """
     if isinstance(study, str | PathLike):
         study = read_study(study)
@@ -78,20 +78,20 @@ def run_study(
 
 
 def load_study(directory: str | PathLike[str]) -> xr.Dataset:
-    """The results of a study so far.
+    """Read the results of a study so far.
 
-    Runs that another study, or another version of trustbo, left in the folder are not among them.
+    Runs in the folder that are of another study, or another version of trustbo, are left out.
 
     Returns:
-        Dataset with dims run and mission (1, 2, ...): of each mission `value` (the objective its
-        plan was expected to have), `path` and `recommended` (row and col of each step, -1 after the
-        goal), `regret` (by how much the path recommended after it is worse than the best under the
-        true parameters, in units of the objective), `regret_followed` (of the path it followed),
-        `contact_rate` (mean), `status`, what `models.diagnostics` says of the posterior, and
-        seconds; of each run `oracle` (the best path's true value), `seconds` and `seconds_cpu` (of
-        its process). NaN where there is no truth to know, or no such mission. Coordinates of run:
-        its key, and its place along each axis of the study. Attributes: `n_runs` of the study, and
-        how many of them `n_failed`.
+        Dataset with dims run and mission (1, 2, ...). For each mission: `value` (expected objective
+        of its plan), `path` and `recommended` (row and col of each step, -1 after the goal),
+        `regret` (the value that the path recommended after it lacks to the best one, under the true
+        parameters, in units of the objective), `regret_followed` (the same for the path it
+        followed), `contact_rate` (mean), `status`, diagnostics of the posterior (see
+        `models.diagnostics`), and seconds. For each run: `oracle` (true value of the best path),
+        `seconds` and `seconds_cpu` (of its process). NaN where the truth is unknown, or where there
+        is no such mission. Coordinates of run: its key, and its label along each axis of the study.
+        Attributes: the study's number of runs, `n_runs`, and of failed ones, `n_failed`.
 
     Raises:
         TrustboError: The folder holds no study, or no run of it has ended.
@@ -107,7 +107,7 @@ def load_study(directory: str | PathLike[str]) -> xr.Dataset:
 
 
 def failures(directory: str | PathLike[str]) -> pd.DataFrame:
-    """The runs of a study that failed: labels, error and traceback, by key.
+    """List the runs of a study that failed: labels, error and traceback, by key.
 
     Raises:
         TrustboError: The folder holds no study.
@@ -125,14 +125,14 @@ def failures(directory: str | PathLike[str]) -> pd.DataFrame:
 
 
 def _require_version(record: dict[str, Any]) -> None:
-    """Make it an error that the worker's trustbo is another: the key says it is ours."""
+    """Make a record by another version of trustbo an error: the key has ours."""
     ours, theirs = version("trustbo"), record.get("versions", {}).get("trustbo")
     if theirs not in (None, ours):
         record["error"] = f"the worker has trustbo {theirs}, and the study {ours}"
 
 
 def _rehearse(runs: Sequence[Run]) -> None:
-    """Set up a campaign of each kind, so that what cannot be is refused now and not in an hour."""
+    """Set up a campaign of each kind, so that impossible ones are refused now, not in an hour."""
     seen = set()
     for run in runs:
         kind = repr({name: label for name, label in run.labels.items() if name != "seed"})

@@ -1,6 +1,5 @@
-"""What a study runs: a table of runs, checked before any work starts."""
+"""Settings of a study, checked before any work starts, and its table of runs."""
 
-import inspect
 import itertools
 import json
 from collections.abc import Mapping, Sequence
@@ -9,11 +8,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
-import yaml
-
+from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.errors import TrustboError, require_choice, require_whole
-from trustbo.loop import iterate
-from trustbo.models.sampling import SAMPLERS, require_sampler
+from trustbo.files import read_yaml
+from trustbo.models.samplers.run import SAMPLERS, require_sampler
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.models import MODELS
 from trustbo.study.parts import parts_of
@@ -21,42 +19,41 @@ from trustbo.study.run import Run
 from trustbo.study.simulators import SIMULATORS
 from trustbo.study.terrains import TERRAINS
 
-_OF_THE_STUDY = (
-    "workspace", "start", "goal", "n_iterations", "model", "policy", "objective", "sampler",
-    "simulator", "checkpoint", "callbacks", "seed", "progress",
-)  # fmt: skip
-OPTIONS = tuple(n for n in inspect.signature(iterate).parameters if n not in _OF_THE_STUDY)
-"""The options of `iterate` that a study passes on."""
+OPTIONS = (
+    *(option.name for option in fields(CampaignOptions) if option.name != "callbacks"),
+    "stop",
+)
+"""Names in `Study.options`."""
 
 
 @dataclass(frozen=True)
 class Study:
     """Every policy with every objective, model, sampler, simulator, terrain, option and seed.
 
-    Terrains, simulators and models are given by name, with settings: a mapping of your own names to
-    settings, whose `kind` says what they are settings of; or a list of kinds, with their defaults.
-    See docs/studies.md.
+    Terrains, simulators and models are given as a mapping of your own names to settings, the `kind`
+    among them; or as a list of kinds, with their defaults. See docs/studies.md.
 
     Attributes:
-        terrains: Where: kinds `synthetic`, `files`, `random`.
-        policies: Names of `planning.POLICIES`.
-        objectives: Names of `planning.OBJECTIVES`.
-        models: Kinds `pooled`, `hierarchical`, `coupled`.
+        terrains: Terrains of the kinds `synthetic`, `files`, `random`.
+        policies: Names in `planning.POLICIES`.
+        objectives: Names in `planning.OBJECTIVES`.
+        models: Models of the kinds `pooled`, `hierarchical`, `coupled`.
         samplers: `"nuts"`, `"exact"`, `"joint"`.
-        simulators: Kinds `kinematic`, `model`.
-        seeds: Seeds, or how many: 0, 1, ...
+        simulators: Simulators of the kinds `kinematic`, `model`.
+        seeds: Seeds, or their number: 0, 1, ...
         n_iterations: Missions of a run.
-        options: More options of `iterate`; a list of values means each of them.
+        options: Fields of `CampaignOptions` but callbacks, and `stop`, the settings of a
+            `RegretBound`; a list of values means each of them.
 
     Raises:
-        TrustboError: A name or a setting there is not, or a value that cannot be.
+        TrustboError: An unknown name or setting, or an impossible value.
     """
 
     terrains: Any
-    policies: Any = ("greedy",)
-    objectives: Any = ("terminal",)
+    policies: Any = (POLICY,)
+    objectives: Any = (OBJECTIVE,)
     models: Any = ("pooled",)
-    samplers: Any = ("nuts",)
+    samplers: Any = (SAMPLER,)
     simulators: Any = ("kinematic",)
     seeds: Any = 1
     n_iterations: int = 8
@@ -89,10 +86,10 @@ class Study:
 
     @classmethod
     def of(cls, configuration: "Study | Mapping[str, Any]") -> Self:
-        """The study with these settings.
+        """Study with these settings.
 
         Raises:
-            TrustboError: What is no mapping, or a setting there is not.
+            TrustboError: The settings are no mapping, or one of them is unknown.
         """
         if isinstance(configuration, cls):
             return configuration
@@ -106,7 +103,7 @@ class Study:
         return cls(**configuration)
 
     def runs(self) -> list[Run]:
-        """The table of runs, seed by seed, so that the first to end are of every kind."""
+        """List the runs, seed by seed, so that the first to end are of every kind."""
         axes: dict[str, Any] = {
             "seed": self.seeds,
             "terrain": self.terrains,
@@ -137,7 +134,7 @@ class Study:
         )
 
     def settings(self) -> dict[str, Any]:
-        """Everything as JSON can hold it; `Study.of` reads it."""
+        """Settings as JSON can hold them; `Study.of` reads them."""
         own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         for name in ("terrains", "simulators", "models"):
             own[name] = {label: part.settings() for label, part in own[name].items()}
@@ -148,7 +145,7 @@ def read_study(path: str | PathLike[str]) -> Study:
     """Read a study from a YAML file; paths of rasters are relative to its folder.
 
     Raises:
-        TrustboError: No such file, no YAML, or what `Study` refuses.
+        TrustboError: No such file, no YAML, or settings that `Study` refuses.
     """
     file = Path(path)
     configuration = read_yaml(file)
@@ -158,20 +155,6 @@ def read_study(path: str | PathLike[str]) -> Study:
         return Study.of(configuration)
     except TrustboError as error:
         raise TrustboError(f"{file}: {error}") from None
-
-
-def read_yaml(file: Path) -> Any:
-    """What a YAML file holds.
-
-    Raises:
-        TrustboError: No such file, or no YAML.
-    """
-    try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TrustboError(f"cannot read {str(file)!r}: {error.strerror}.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise TrustboError(f"{str(file)!r} is no YAML: {' '.join(str(error).split())}") from None
 
 
 def _with_paths_from(folder: Path, configuration: dict[str, Any]) -> dict[str, Any]:
@@ -190,7 +173,7 @@ def _with_paths_from(folder: Path, configuration: dict[str, Any]) -> dict[str, A
 
 
 def _listed(what: str, values: object) -> Sequence[Any]:
-    """Distinct values, of which there is at least one."""
+    """List of distinct values, at least one."""
     listed = list(values) if isinstance(values, list | tuple) else [values]
     if not listed or len({repr(value) for value in listed}) < len(listed):
         raise TrustboError(f"{what} must be at least one, and distinct; got {listed}.")

@@ -1,4 +1,4 @@
-"""Where runs are run: here, in processes of this machine, or on a Dask cluster."""
+"""Executors of runs: this process, processes of this machine, or a Dask cluster."""
 
 import warnings
 from collections.abc import Iterator, Sequence
@@ -13,25 +13,26 @@ from contextlib import contextmanager
 from typing import Any
 
 from trustbo.errors import TrustboError, require_choice
+from trustbo.parallel import n_cores
 from trustbo.study import workers
 from trustbo.study.run import Run, execute
-from trustbo.terrain.parallel import n_cores
 
 EXECUTORS = ("serial", "loky", "dask")
-_N_POOLS = 3  # in which no run ends, before a study gives up
+_N_POOLS = 3
+"""Pools in a row in which no run ends, before a study gives up."""
 _MISSING = '{0!r} is not installed; pip install "trustbo[study]".'
 
 
 def completed(
     runs: Sequence[Run], executor: object = None, *, n_workers: int | None = None
 ) -> Iterator[tuple[Run, dict[str, Any]]]:
-    """Each run with what it left, as they end.
+    """Execute runs; yield each with its record, as they end.
 
-    A run whose worker dies is run again: by Dask on another worker, else in a new pool.
+    A run whose worker dies is repeated: by Dask on another worker, else in a new pool.
 
     Args:
-        runs: What to run.
-        executor: See `run_study`.
+        runs: Runs to execute.
+        executor: Executor, see `run_study`.
         n_workers: Processes started for "loky" and "dask"; by default as many as there are cores.
 
     Raises:
@@ -53,7 +54,7 @@ def completed(
                     lost.append(run)
                 else:
                     yield run, record
-        if executor == "loky":  # whose pools do not survive a worker: another one, if it helps
+        if executor == "loky":  # a pool ends with a worker; another one may help
             tries = tries - 1 if len(lost) == len(pending) else _N_POOLS
         else:
             tries = 0
@@ -65,7 +66,7 @@ def completed(
 def _through(
     pool: Executor, runs: Sequence[Run], caller: tuple[str, int]
 ) -> Iterator[tuple[Run, dict[str, Any] | None]]:
-    """Each run with what it left; None if the pool broke before."""
+    """Each run with its record; None if the pool broke before."""
     futures: dict[Future[dict[str, Any]], Run] = {}
     broken: list[Run] = []
     try:
@@ -79,10 +80,10 @@ def _through(
                 record = future.result()
             except BrokenExecutor:
                 record = None
-            except Exception as error:  # the network's, or a worker's that Dask gave up on
+            except Exception as error:  # of the network, or of a worker that Dask gave up on
                 record = {"error": f"lost: {type(error).__name__}: {error}"}
             run = futures.pop(future)
-            # While it is held, Dask keeps the result, and makes it anew if the worker dies.
+            # While it is referenced, Dask keeps the result, and repeats the run if the worker dies.
             del future
             yield run, record
         yield from ((run, None) for run in broken)
@@ -92,7 +93,7 @@ def _through(
 
 
 def require_executor(executor: object) -> None:
-    """Refuse what runs cannot be given to.
+    """Refuse an executor that cannot run a study.
 
     Raises:
         TrustboError: An unknown name, or an executor that forks.
@@ -119,7 +120,7 @@ def require_executor(executor: object) -> None:
 
 @contextmanager
 def _pool(executor: Any, n_workers: int) -> Iterator[Executor]:
-    """The executor; one that is made here ends here."""
+    """Open the executor; one that is made here ends here."""
     if executor == "loky":
         yield from _loky(n_workers)
     elif isinstance(executor, str):

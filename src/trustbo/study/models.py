@@ -1,4 +1,4 @@
-"""What the runs of a study learn: trust models as plain settings."""
+"""Trust models of studies, as plain settings."""
 
 from dataclasses import asdict, dataclass
 from typing import ClassVar
@@ -10,7 +10,7 @@ from trustbo.study.parts import Part
 
 @dataclass(frozen=True, kw_only=True)
 class Model(Part):
-    """A trust model with its default priors, or `"zheng2023"`'s."""
+    """Trust model with its default priors, or those of `"zheng2023"`."""
 
     observation: str = "gaussian"
     response: str = "level"
@@ -22,7 +22,7 @@ class Model(Part):
         self.model()
 
     def model(self) -> models.TrustModel:
-        """The model."""
+        """Make the model."""
         own = asdict(self)
         vague = own.pop("priors") == "zheng2023"
         return self.make(models.Priors.zheng2023() if vague else None, **own)  # pyright: ignore
@@ -30,21 +30,21 @@ class Model(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class Pooled(Model):
-    """`models.PooledTrust`."""
+    """Settings of `models.PooledTrust`."""
 
     kind, make = "pooled", models.PooledTrust
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hierarchical(Model):
-    """`models.HierarchicalTrust`."""
+    """Settings of `models.HierarchicalTrust`."""
 
     kind, make = "hierarchical", models.HierarchicalTrust
 
 
 @dataclass(frozen=True, kw_only=True)
 class Coupled(Model):
-    """`models.CoupledTrust`."""
+    """Settings of `models.CoupledTrust`."""
 
     kind, make = "coupled", models.CoupledTrust
     inter_robot: str = "full"

@@ -1,4 +1,4 @@
-"""What a study is put together from: terrains, simulators and models, each as plain settings."""
+"""Parts of a study: terrains, simulators and models, each as plain settings."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -11,7 +11,7 @@ from trustbo.errors import TrustboError, require_choice
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """Settings of one thing that runs are made of; JSON can hold them."""
+    """Settings of one part of a run; JSON can hold them."""
 
     kind: ClassVar[str]
     REQUIRED: ClassVar[tuple[str, ...]] = ()
@@ -19,10 +19,10 @@ class Part:
 
     @classmethod
     def of(cls, what: str, settings: Mapping[str, Any]) -> Self:
-        """The part with these settings.
+        """Part with these settings.
 
         Raises:
-            TrustboError: A setting there is not, or one that is missing or impossible.
+            TrustboError: An unknown setting, or one that is missing or impossible.
         """
         known = {f.name: f for f in fields(cls)}
         for name in settings:
@@ -39,21 +39,21 @@ class Part:
         return {"kind": self.kind, **asdict(self)}
 
     def identity(self) -> dict[str, Any]:
-        """What the numbers depend on; by default all settings."""
+        """Settings that the numbers depend on; by default all."""
         return self.settings()
 
 
 def parts_of[P: Part](what: str, given: object, kinds: Iterable[type[P]]) -> dict[str, P]:
-    """Parts by the name the study calls them.
+    """Make parts, by their names in the study.
 
     Args:
-        what: Of which the study has some, e.g. "terrain".
+        what: Noun for messages, e.g. "terrain".
         given: Names of kinds, or a mapping of names to settings. The setting `kind` may be left
             out where the name is that of a kind.
-        kinds: The kinds there are.
+        kinds: All kinds.
 
     Raises:
-        TrustboError: Something else, or a kind or a setting there is not.
+        TrustboError: Another type, or an unknown kind or setting.
     """
     by_kind = {kind.kind: kind for kind in kinds}
     if isinstance(given, str):

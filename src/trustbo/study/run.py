@@ -1,4 +1,4 @@
-"""One run of a study: a campaign, and what is kept of it."""
+"""One run of a study: a campaign, and the record of it."""
 
 import hashlib
 import json
@@ -16,21 +16,18 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from trustbo.campaign import Campaign
+from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.loop import missions
+from trustbo.campaign.result import Result
+from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.loop import Callback, missions
 from trustbo.planning import Planner
-from trustbo.result import Result
 from trustbo.simulation import ModelSimulator, Simulator
-from trustbo.stopping import RegretBound
 from trustbo.study import workers
 from trustbo.study.models import Model
 from trustbo.study.simulators import Simulating
 from trustbo.study.terrains import Terrain
-
-OF_THE_LOOP = ("replan", "stop")
-"""The options that are not the campaign's own."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +35,16 @@ class Run:
     """One campaign of a study.
 
     Attributes:
-        labels: What it is called along each axis of the study.
-        terrain: Where.
-        simulator: What runs the paths.
-        model: The trust model.
+        labels: Its name along each axis of the study.
+        terrain: Terrain, with start and goal.
+        simulator: Simulator that runs the paths.
+        model: Trust model.
         policy: Name of the policy.
         objective: Name of the objective.
         sampler: Name of the sampler.
-        seed: Of the campaign.
-        n_iterations: How many missions.
-        options: More options of `iterate`.
+        seed: Seed of the campaign.
+        n_iterations: Number of missions.
+        options: Options of the campaign, see `Study`.
     """
 
     labels: dict[str, Any]
@@ -63,7 +60,7 @@ class Run:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All that its numbers depend on; names that the study gives to parts are not among it."""
+        """Everything that its numbers depend on; names that the study gives to parts are not."""
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "labels"}
         for name in ("terrain", "simulator", "model"):
             own[name] = own[name].identity()
@@ -75,12 +72,14 @@ class Run:
         text = json.dumps(_canonical(self.identity), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:20]
 
-    def begin(self, *callbacks: Callback) -> tuple[Campaign, Iterator[object], Simulator]:
-        """The campaign, its missions, of which none has been run yet, and what runs them.
+    def begin(self, *callbacks: Any) -> tuple[Campaign, Iterator[object], Simulator]:
+        """Set up the campaign, its missions, of which none has been run yet, and the simulator.
 
         Raises:
-            TrustboError: Settings that cannot be.
+            TrustboError: Impossible settings.
         """
+        options = dict(self.options)
+        stop = options.pop("stop", None)
         workspace = self.terrain.workspace()
         simulator = self.simulator.simulator(workspace)
         campaign = Campaign(
@@ -91,14 +90,11 @@ class Run:
             objective=self.objective,
             sampler=self.sampler,
             seed=self.seed,
-            **{name: v for name, v in self.options.items() if name not in OF_THE_LOOP},
+            callbacks=callbacks,
+            **options,
         )
-        looped = {name: v for name, v in self.options.items() if name in OF_THE_LOOP}
-        if isinstance(looped.get("stop"), Mapping):
-            looped["stop"] = RegretBound(**looped["stop"])
-        steps = missions(
-            campaign, simulator, n_iterations=self.n_iterations, callbacks=callbacks, **looped
-        )
+        rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
+        steps = missions(campaign, simulator, n_iterations=self.n_iterations, stop=rule)
         return campaign, steps, simulator
 
     def __str__(self) -> str:
@@ -107,7 +103,7 @@ class Run:
 
 @dataclass
 class _Referee:
-    """Holds each mission against the best path there is, where the truth is known."""
+    """Compares each mission with the best path, where the truth is known."""
 
     simulator: object = None
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -127,14 +123,14 @@ class _Referee:
 
 
 def execute(run: Run, caller: tuple[str, int]) -> dict[str, Any]:
-    """Run it in this process.
+    """Execute a run in this process.
 
     Args:
-        run: The run.
-        caller: Host and process the study was called in.
+        run: Run of a study.
+        caller: Host and process that the study was called in.
 
     Returns:
-        What is kept of it: of each mission and in all; or the `error` it failed with.
+        Record of the run and of each mission; or the `error` it failed with.
     """
     workers.prepare(caller)
     started, cpu = time.perf_counter(), time.process_time()
@@ -171,7 +167,7 @@ def _missions(run: Run) -> dict[str, Any]:
 
 
 def _rows(result: Result, refereed: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The history's numbers of each mission, and the referee's."""
+    """Numbers of each mission, from the history and the referee."""
     history = result.history
     scalars = [n for n, values in history.data_vars.items() if values.dims == ("iteration",)]
     rows = []
@@ -184,7 +180,7 @@ def _rows(result: Result, refereed: list[dict[str, Any]]) -> list[dict[str, Any]
 
 
 def _value(planner: Planner, path: tuple[Cell, ...], truth: ModelSimulator) -> float:
-    """What a path is truly worth; NaN if it does not lead from start to goal."""
+    """Value of a path under the truth; NaN if it does not lead from start to goal."""
     try:
         return planner.evaluate(path, truth.params).value
     except TrustboError:
@@ -192,7 +188,7 @@ def _value(planner: Planner, path: tuple[Cell, ...], truth: ModelSimulator) -> f
 
 
 def _canonical(value: Any) -> Any:
-    """The same text for the same number: 1 for 1.0, lists for tuples."""
+    """Value with one form for each number, 1 for 1.0, and lists for tuples."""
     if isinstance(value, dict):
         return {str(name): _canonical(v) for name, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

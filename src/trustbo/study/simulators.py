@@ -1,4 +1,4 @@
-"""What runs the paths of a study: simulators as plain settings."""
+"""Simulators of studies, as plain settings."""
 
 from dataclasses import asdict, dataclass
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from trustbo import models, simulation
 from trustbo.study.parts import Part
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulating(Part):
-    """What runs the paths."""
+    """Simulator that runs the paths."""
 
     def simulator(self, workspace: Workspace) -> simulation.Simulator:
-        """The simulator."""
+        """Make the simulator."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kinematic(Simulating):
-    """`simulation.KinematicSimulator`; it needs a ground."""
+    """Settings of `simulation.KinematicSimulator`, which needs a terrain."""
 
     kind = "kinematic"
     sight: str = "transmittance"
@@ -30,13 +30,13 @@ class Kinematic(Simulating):
     bounding: str = "successive"
 
     def simulator(self, workspace: Workspace) -> simulation.Simulator:
-        """The simulator."""
+        """Make the simulator."""
         return simulation.KinematicSimulator(workspace, **asdict(self))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FromModel(Simulating):
-    """`simulation.ModelSimulator` of the pooled model with these true parameters."""
+    """Settings of `simulation.ModelSimulator`: the pooled model with these true parameters."""
 
     kind = "model"
     REQUIRED = ("beta0", "beta", "b", "delta_w", "delta_v")
@@ -48,17 +48,15 @@ class FromModel(Simulating):
     x0_mean: float = 0.5
     x0_sd: float = 0.5
     observation: str = "gaussian"
-    exposure: int | None = None
+    n_ticks: int | None = None
 
     def simulator(self, workspace: Workspace) -> simulation.Simulator:
-        """The simulator."""
+        """Make the simulator."""
         own = asdict(self)
-        exposure, model = (
-            own.pop("exposure"),
-            models.PooledTrust(observation=own.pop("observation")),
-        )
+        n_ticks = own.pop("n_ticks")
+        model = models.PooledTrust(observation=own.pop("observation"))
         truth = models.TrustParams(**own | {"beta": np.array(self.beta, dtype=float)})
-        return simulation.ModelSimulator(workspace, truth, model, exposure=exposure)
+        return simulation.ModelSimulator(workspace, truth, model, n_ticks=n_ticks)
 
 
 SIMULATORS = (Kinematic, FromModel)

@@ -1,4 +1,4 @@
-"""A study's folder: what it runs, a file for each run that has ended, one for each that failed."""
+"""Folder of a study: its table of runs, and a file for each run that has ended or failed."""
 
 import json
 import math
@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from trustbo.errors import TrustboError
-from trustbo.files import write_text
-from trustbo.result import require_folder
+from trustbo.files import require_folder, write_text
 from trustbo.study.configuration import Study
 from trustbo.study.run import Run
 
@@ -17,7 +16,7 @@ class Store:
     """Reads and writes a study's folder; each file is written whole or not at all."""
 
     def __init__(self, directory: str | PathLike[str]) -> None:
-        """Of that folder, which need not exist yet.
+        """Use a folder, which need not exist yet.
 
         Raises:
             TrustboError: The folder's name belongs to a file.
@@ -25,12 +24,12 @@ class Store:
         self.folder = require_folder(directory)
 
     def write_study(self, study: Study, runs: list[Run]) -> None:
-        """Write what is to be run: `study.json`, the settings and the table of runs by key."""
+        """Write `study.json`: the settings, and the table of runs by key."""
         table = {run.key: run.labels for run in runs}
         self._write("study.json", {"study": study.settings(), "runs": table})
 
     def table(self) -> dict[str, dict[str, Any]]:
-        """Labels of each run of the study, by key.
+        """Read the labels of each run of the study, by key.
 
         Raises:
             TrustboError: The folder holds no study.
@@ -47,7 +46,7 @@ class Store:
         return self._run(key).is_file()
 
     def write(self, run: Run, record: dict[str, Any]) -> None:
-        """Write what a run left: to `runs/`, or to `failed/` if that is an error."""
+        """Write the record of a run: to `runs/`, or to `failed/` if it holds an error."""
         failed = "error" in record
         own = {"key": run.key, "labels": run.labels, "identity": run.identity, **record}
         self._write(f"{'failed' if failed else 'runs'}/{run.key}.json", own)
@@ -55,11 +54,11 @@ class Store:
             self._failure(run.key).unlink(missing_ok=True)
 
     def read(self, key: str) -> dict[str, Any]:
-        """What a run left that has ended."""
+        """Read the record of a run that has ended."""
         return json.loads(self._run(key).read_text(encoding="utf-8"))
 
     def failure(self, key: str) -> dict[str, Any] | None:
-        """What a run left that failed; None if it did not."""
+        """Read the record of a run that failed; None if it did not."""
         file = self._failure(key)
         return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
 
@@ -75,7 +74,7 @@ class Store:
 
 
 def _plain(value: Any) -> Any:
-    """NaN as null: JSON has no NaN."""
+    """Replace NaN by null, as JSON has no NaN."""
     if isinstance(value, dict):
         return {str(name): _plain(v) for name, v in value.items()}
     if isinstance(value, list | tuple):

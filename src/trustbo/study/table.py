@@ -1,4 +1,4 @@
-"""Results of runs as one Dataset, and what they say in short."""
+"""Results of runs as one Dataset, and a summary of it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,7 +17,7 @@ _NOT_AXES = ("key", "seed")
 def to_dataset(
     records: Mapping[str, Mapping[str, Any]], labels: Mapping[str, Mapping[str, Any]]
 ) -> xr.Dataset:
-    """Records of runs and their labels, both by key, as a Dataset (run, mission)."""
+    """Gather records of runs and their labels, both by key, in a Dataset (run, mission)."""
     runs = list(records.values())
     shape = (len(runs), max(len(run["missions"]) for run in runs))
     cells = [(i, j, row) for i, run in enumerate(runs) for j, row in enumerate(run["missions"])]
@@ -54,7 +54,7 @@ def to_dataset(
 
 
 def axes_of(dataset: xr.Dataset) -> list[str]:
-    """The coordinates along which the runs of a study differ, seeds apart."""
+    """Names of the coordinates along which the runs of a study differ, but for seeds."""
     return [
         str(name)
         for name, values in dataset.coords.items()
@@ -68,17 +68,17 @@ def summary(
     """Median and 90 % interval over runs of a variable, after each mission.
 
     Args:
-        dataset: As `load_study` gives it.
-        by: Coordinates to keep runs apart by; by default policy, and all others along which the
-            study's runs differ, seeds apart.
-        variable: Of which; with dims (run, mission).
+        dataset: Results of `load_study`.
+        by: Coordinates to group runs by; by default policy, and all others along which the study's
+            runs differ, but for seeds.
+        variable: Variable with dims (run, mission).
 
     Returns:
         Table indexed by these coordinates and mission: `median`, `low` and `high` (the 5 % and 95 %
-        quantiles over runs), and `n`, how many runs there are.
+        quantiles over runs), and the number of runs, `n`.
 
     Raises:
-        TrustboError: A coordinate or a variable there is not.
+        TrustboError: An unknown coordinate or variable.
     """
     of_run = [str(n) for n, c in dataset.coords.items() if c.dims == ("run",)]
     numeric = [str(n) for n, v in dataset.data_vars.items() if v.dims == ("run", "mission")]
@@ -101,6 +101,6 @@ def summary(
 
 
 def _labels(values: list[Any]) -> np.ndarray:
-    """Numbers as they are; anything else, or a mixture, as text."""
+    """Array of numbers; anything else, or a mixture, becomes text."""
     numbers = all(isinstance(value, int | float) for value in values)
     return np.array(values if numbers else [str(value) for value in values])

@@ -1,4 +1,4 @@
-"""Where the runs of a study are: terrains as plain settings."""
+"""Terrains of studies, as plain settings."""
 
 import hashlib
 from dataclasses import asdict, dataclass, replace
@@ -12,15 +12,15 @@ from trustbo import terrain
 from trustbo.data import Cell, Team
 from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.study.parts import Part
-from trustbo.terrain import Workspace
+from trustbo.workspace import Workspace
 
 EACH_RUN = "run"
-"""A terrain with this for a seed is another one in each run, that of the run's seed."""
+"""Seed of a terrain that differs between runs: it takes the run's seed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Terrain(Part):
-    """Where a run is: a grid, from whose bottom left corner to the top right one it leads."""
+    """Planning grid of a run, with start and goal; by default from bottom left to top right."""
 
     shape: tuple[int, int] = (10, 10)
     start: Cell | None = None
@@ -41,22 +41,22 @@ class Terrain(Part):
         return cast(Cell, self.start), cast(Cell, self.goal)
 
     def at(self, seed: int) -> "Terrain":
-        """The terrain of the run with this seed."""
+        """Terrain of the run with this seed."""
         each = getattr(self, "seed", 0) == EACH_RUN
         return replace(self, **{"seed": seed}) if each else self
 
     def workspace(self) -> Workspace:
-        """The workspace; made once per process, for a few terrains."""
+        """Workspace, which is made once per process, for a few terrains."""
         return _workspace(self)
 
     def make(self) -> Workspace:
-        """The workspace, made anew."""
+        """Make the workspace anew."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticTerrain(Terrain):
-    """A made terrain, see `terrain.synthetic_terrain`; `seed` may be `"run"`."""
+    """Synthetic terrain, see `terrain.synthetic_terrain`; `seed` may be `"run"`."""
 
     kind = "synthetic"
     size: tuple[float, float] = (500.0, 500.0)
@@ -72,7 +72,7 @@ class SyntheticTerrain(Terrain):
         _require_seed(self.seed)
 
     def make(self) -> Workspace:
-        """The workspace, made anew."""
+        """Make the workspace anew."""
         own = asdict(self)
         for name in ("shape", "start", "goal", "n_robots"):
             del own[name]
@@ -82,7 +82,7 @@ class SyntheticTerrain(Terrain):
 
 @dataclass(frozen=True, kw_only=True)
 class FileTerrain(Terrain):
-    """A DEM and a DSM, see `terrain.read_terrain`."""
+    """DEM and DSM from files, see `terrain.read_terrain`."""
 
     kind = "files"
     REQUIRED = ("dem", "dsm")
@@ -100,18 +100,18 @@ class FileTerrain(Terrain):
             object.__setattr__(self, name, str(path))
 
     def identity(self) -> dict[str, Any]:
-        """The files' content instead of their names: a study may move to another machine."""
+        """Settings with hashes instead of file names: a study may move to another machine."""
         return self.settings() | {name: _digest(getattr(self, name)) for name in ("dem", "dsm")}
 
     def make(self) -> Workspace:
-        """The workspace, made anew."""
+        """Make the workspace anew."""
         ground = terrain.read_terrain(self.dem, self.dsm, crs=self.crs, resolution=self.resolution)
         return Workspace.from_terrain(ground, self.shape, Team(n_robots=self.n_robots))
 
 
 @dataclass(frozen=True, kw_only=True)
 class RandomAwareness(Terrain):
-    """Awareness drawn uniformly for each cell, the same for every robot; no ground beneath.
+    """Awareness drawn uniformly for each cell, the same for every robot, without a terrain.
 
     `seed` may be `"run"`.
     """
@@ -126,7 +126,7 @@ class RandomAwareness(Terrain):
         require_whole("n_features", self.n_features, 1)
 
     def make(self) -> Workspace:
-        """The workspace, made anew."""
+        """Make the workspace anew."""
         rng = np.random.default_rng(cast(int, self.seed))
         z = rng.uniform(size=(*self.shape, self.n_features))
         return Workspace.from_awareness(np.repeat(z[None], self.n_robots, axis=0))

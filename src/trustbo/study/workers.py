@@ -1,4 +1,4 @@
-"""What a worker process does to itself: one core, and what it needs again is kept."""
+"""Set-up of a worker process: one core, freed memory kept, compiled code shared."""
 
 import ctypes
 import os
@@ -14,15 +14,15 @@ _ready = False
 
 
 def this_process() -> tuple[str, int]:
-    """Host and process."""
+    """Host and process number."""
     return socket.gethostname(), os.getpid()
 
 
 def prepare(caller: tuple[str, int]) -> None:
-    """Make this process a good worker, once, before JAX starts; unless it is the caller itself.
+    """Set this process up as a worker, once, before JAX starts; unless it is the caller itself.
 
     Args:
-        caller: Host and process the study was called in, which is left as it is.
+        caller: Host and process that the study was called in, which is not changed.
     """
     global _ready
     if _ready or this_process() == caller:
@@ -37,11 +37,11 @@ def pin_to_core() -> int | None:
     """Pin this process to a core that no other worker on this machine has taken.
 
     XLA's pool has as many threads as the process may use cores when it starts, whatever the usual
-    flags say; two workers of two threads each are in each other's way. The core is taken by a lock
-    on a file that stays open, which the system gives back when the process ends, however it ends.
+    flags say; two workers of two threads each slow each other down. The core is taken by a lock on
+    a file that stays open, which the system releases when the process ends, however it ends.
 
     Returns:
-        The core; None if all are taken, or where there is no affinity: nothing is pinned then.
+        Core; None if all are taken, or where there is no affinity: nothing is pinned then.
     """
     if not hasattr(os, "sched_setaffinity"):
         return None
@@ -58,7 +58,7 @@ def pin_to_core() -> int | None:
         except OSError:
             os.close(file)
             continue
-        # Affinity is each thread's own, and new threads inherit it.
+        # Each thread has its own affinity, and new threads inherit it.
         for thread in os.listdir("/proc/self/task"):
             os.sched_setaffinity(int(thread), {core})
         return core
@@ -66,12 +66,12 @@ def pin_to_core() -> int | None:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc keep memory that is freed, instead of asking the system for it again and again.
+    """Let glibc keep freed memory, instead of asking the system for it again and again.
 
     Dask's nanny sets MALLOC_TRIM_THRESHOLD_ to 64 KiB for its workers, with which a fit takes a
     third longer.
     """
-    with suppress(OSError, AttributeError):  # elsewhere than with glibc
+    with suppress(OSError, AttributeError):  # without glibc
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_M_MMAP_THRESHOLD, 32 << 20)
         mallopt(_M_TRIM_THRESHOLD, 256 << 20)
@@ -80,9 +80,9 @@ def keep_freed_memory() -> None:
 def keep_compiled_code() -> None:
     """Share compiled code with the workers before and beside this one, on disk.
 
-    In the user's cache folder, `$XDG_CACHE_HOME/trustbo/jax`, and not the study's: whoever can
-    write to it can run code here. What the user has set, e.g. by `JAX_COMPILATION_CACHE_DIR`, is
-    left.
+    The folder is in the user's cache, `$XDG_CACHE_HOME/trustbo/jax`, and not in the study's folder:
+    anyone who can write to it can run code here. A folder that the user has set, e.g. by
+    `JAX_COMPILATION_CACHE_DIR`, is used instead.
     """
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

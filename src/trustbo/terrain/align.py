@@ -1,4 +1,4 @@
-"""Two rasters brought onto one grid of metres, window by window."""
+"""Alignment of two rasters on one metric grid, window by window."""
 
 import dataclasses
 import math
@@ -14,15 +14,15 @@ from rasterio.warp import calculate_default_transform, reproject, transform_boun
 from rasterio.warp import transform as transform_points
 
 from trustbo.errors import TerrainError
-from trustbo.terrain.rasterview import Raster
+from trustbo.terrain.raster import Raster
 
-# A warp is computed by blocks: of so many columns of the result, of so many pixels of the source.
+# A warp is computed in blocks, limited in columns of the result and in pixels of the source.
 BLOCK = 2048
 BLOCK_PIXELS = 2**23
 
 
 def on_one_grid(ground: Raster, surface: Raster) -> tuple[Raster, Raster]:
-    """The ground on a metric grid, its own if it is one, and the surface on the same."""
+    """Warp the ground to a metric grid, unless it is on one, and the surface to the same."""
     if ground.crs.is_geographic or _distorts(ground):
         ground = _to_utm(ground)
     _require_overlap(ground, surface)
@@ -32,7 +32,7 @@ def on_one_grid(ground: Raster, surface: Raster) -> tuple[Raster, Raster]:
 
 
 def _distorts(raster: Raster) -> bool:
-    """Whether a metre on the map is more than 1 % off a metre on the ground."""
+    """Whether the scale of the map is more than 1 % off on the ground."""
     left, bottom, right, top = raster.bounds
     projection = Proj(raster.crs.to_wkt())
     lon, lat = projection((left + right) / 2, (bottom + top) / 2, inverse=True)
@@ -42,7 +42,7 @@ def _distorts(raster: Raster) -> bool:
 
 
 def _to_utm(raster: Raster) -> Raster:
-    """The raster on square metres of the UTM zone that it lies in."""
+    """Raster warped to square pixels in its UTM zone."""
     try:
         crs = raster.array(np.float32).rio.estimate_utm_crs()
     except (RuntimeError, ProjError):
@@ -88,10 +88,10 @@ def _same_grid(a: Raster, b: Raster) -> bool:
 
 
 def _warped(raster: Raster, crs: CRS, transform: Affine, shape: tuple[int, int]) -> Raster:
-    """The raster on another grid, bilinear, computed where it is read.
+    """Raster warped to another grid, bilinear, computed when it is read.
 
-    A pixel comes out the same in whatever window it is read: GDAL's kernel keeps one width, and
-    its transformer, which interpolates along rows, always gets whole blocks of columns.
+    A pixel has the same value in every window that is read: GDAL's kernel keeps one width, and its
+    transformer, which interpolates along rows, always gets whole blocks of columns.
     """
     scale = _scale(raster, crs, transform, shape)
     depth = max(1, min(BLOCK, int(BLOCK_PIXELS * scale[0] * scale[1] / BLOCK)))
@@ -152,7 +152,7 @@ def _window_under(
     box: tuple[float, float, float, float],
     scale: tuple[float, float],
 ) -> tuple[slice, slice] | None:
-    """The raster's rows and columns that a box in another CRS needs, None off the raster."""
+    """Rows and columns of the raster that a box in another CRS needs, None off the raster."""
     left, bottom, right, top = transform_bounds(crs, raster.crs, *box)
     if raster.crs.is_geographic:
         # The raster may count longitudes past 180 degrees, or from 0 to 360.

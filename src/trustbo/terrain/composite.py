@@ -1,4 +1,4 @@
-"""One index in [0, 1] out of several features, by their first principal component."""
+"""Index in [0, 1] of several features, by their first principal component."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,6 +12,7 @@ from scipy import stats
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
 
+from trustbo import zheng2023
 from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
 from trustbo.files import write_file
 
@@ -19,21 +20,21 @@ SCALINGS = ("percentile", "minmax", "logistic")
 METHODS = ("pca", "zheng2023")
 MAX_PIXELS = 1_000_000
 MIN_CALIBRATION = 200
-"""Rows a real-time index is fitted on at least: on fewer, its loadings are chance."""
+"""Least number of samples to fit a real-time index on: with fewer, its loadings are unstable."""
 
 REALTIME: Mapping[str, Mapping[str, int]] = {
     "traversability": {"offline": +1, "speed_ratio": +1, "pitch": -1, "roll": -1},
     "visibility": {"offline": +1, "return_range": +1, "visible_share": +1},
 }
-"""What the value of a bound is fused of: the map's, and the motion or the sensing state."""
+"""Inputs and signs of the real-time indices: the map's value, and motion or sensing state."""
 
 
 class CompositeIndex(TransformerMixin, BaseEstimator):
     """First principal component of winsorised, standardised features, oriented and scaled.
 
-    Each feature is cut at its 1st and 99th percentile and turned into z-scores; the first component
+    Each feature is winsorised at its 1st and 99th percentile and standardised; the first component
     is oriented so that the loadings agree with the declared signs (sum of loading x sign > 0),
-    never as the solver happens to return it; its score is mapped to [0, 1].
+    independent of the solver; its score is mapped to [0, 1].
 
     Attributes:
         loadings_: DataArray (feature), the oriented unit vector; 0 for a constant feature.
@@ -52,16 +53,16 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         """Declare the features.
 
         Args:
-            signs: +1 for each feature that raises the index, -1 for one that lowers it.
+            signs: Signs by feature: +1 if it raises the index, -1 if it lowers it.
             scaling: `"percentile"` maps the 2nd and 98th percentile of the score to 0 and 1,
                 `"minmax"` its extremes, `"logistic"` passes the standardised score through the
                 logistic function.
-            robust: Loadings from rank correlations (Spearman), which no outlier and no bent scale
-                can sway.
+            robust: Loadings from rank correlations (Spearman), robust to outliers and to monotone
+                transforms of the features.
             method: `"zheng2023"` is for comparison with the later code of the paper's authors:
                 features scaled by median and interquartile range, uncut, the component's sign left
                 to the solver, the score squashed by the logistic function.
-            min_samples: Refuse to be fitted on fewer samples.
+            min_samples: Least number of samples to fit on.
 
         Raises:
             TrustboError: An unknown scaling or method.
@@ -74,10 +75,10 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     @classmethod
     def realtime(cls, feature: str, **options: object) -> Self:
-        """The index of a bound as it is driven: the map's value fused with the robot's state.
+        """Make the index of a driven bound: the map's value fused with the robot's state.
 
-        Fit it once, on the bounds of a set of calibration missions, and keep it: fitted anew on a
-        short window, its signs flip.
+        Fit it once, on the bounds of a set of calibration missions, and keep it: fitted again on
+        few bounds, its signs may flip.
 
         Args:
             feature: `"traversability"`: the map's (`offline`) at the robot's true position, its
@@ -93,7 +94,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         return cls(signs, **{"min_samples": MIN_CALIBRATION} | options)  # pyright: ignore[reportArgumentType]
 
     def fit(self, features: xr.Dataset, y: None = None) -> Self:
-        """Learn cuts, loadings and scale.
+        """Fit the limits, the loadings and the scale.
 
         Args:
             features: One variable per declared feature, any dims; samples with a NaN are left out.
@@ -132,9 +133,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         return self
 
     def transform(self, features: xr.Dataset) -> xr.DataArray:
-        """The index of every sample, in [0, 1]; NaN where a feature is.
+        """Compute the index of every sample, in [0, 1]; NaN where a feature is.
 
-        Features that are all constant say nothing: the index is then 0.5 everywhere.
+        If all features are constant, the index is 0.5 everywhere.
 
         Raises:
             TerrainError: A declared feature is missing.
@@ -149,11 +150,11 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
     def of_columns(
         self, columns: Mapping[str, np.ndarray], out: np.ndarray | None = None
     ) -> np.ndarray:
-        """As `transform`, of arrays of one shape.
+        """Compute the index of arrays of one shape, as `transform` does.
 
         Args:
-            columns: By feature; each is asked for once, one after the other.
-            out: Where to write; by default a new array.
+            columns: Arrays by feature; each is accessed once, in order.
+            out: Array to write to; by default a new one.
 
         Raises:
             TrustboError: It has not been fitted.
@@ -174,14 +175,16 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             raise TrustboError("a CompositeIndex needs a feature at least; signs is empty.")
         if self._top - self._bottom < 1e-9:
             return np.where(np.isfinite(score), 0.5, np.nan)
-        if self.scaling == "logistic" or self.method == "zheng2023":
+        if self.method == "zheng2023":
+            return zheng2023.squash(score)
+        if self.scaling == "logistic":
             return 1.0 / (1.0 + np.exp(-score / self._spread))
         ends = np.asarray([self._bottom, self._top], score.dtype)
         _to_unit(score.reshape(-1), *ends)
         return score
 
     def to_dataset(self) -> xr.Dataset:
-        """All of it as arrays (feature) and attributes, as `save` writes it."""
+        """Convert a fitted index to arrays (feature) and attributes, as `save` writes them."""
         columns = {name: getattr(self, f"_{name}") for name in _COLUMNS}
         data = xr.Dataset(
             {name: ("feature", np.asarray(values, float)) for name, values in columns.items()}
@@ -199,7 +202,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
 
     @classmethod
     def from_dataset(cls, data: xr.Dataset) -> Self:
-        """What `to_dataset` took apart."""
+        """Make an index from the dataset of `to_dataset`."""
         names = [str(name) for name in data["feature"].values]
         attrs = data.attrs
         index = cls(
@@ -235,11 +238,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         return [features[name].values.ravel() for name in self.signs]
 
     def _standardise(self, x: np.ndarray) -> None:
-        """Learn where to cut, and centre and scale of each column."""
+        """Fit the limits, centre and scale of each column."""
         if self.method == "zheng2023":
-            self._low, self._high = (np.full(x.shape[1], end) for end in (-np.inf, np.inf))
-            quartiles = np.percentile(x, [25, 50, 75], axis=0)
-            self._mean, self._sd = quartiles[1], quartiles[2] - quartiles[0]
+            self._low, self._high, self._mean, self._sd = zheng2023.robust_scale(x)
         else:
             self._low, self._high = np.percentile(x, [1, 99], axis=0)
             x = np.clip(x, self._low, self._high)
@@ -248,7 +249,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         self._varies = self._sd > 1e-9 * np.maximum(1.0, np.abs(self._mean))
 
     def _scale(self, score: np.ndarray) -> None:
-        """Learn which scores become 0 and 1."""
+        """Fit the scores that become 0 and 1."""
         ends = [2, 98] if self.scaling == "percentile" else [0, 100]
         self._bottom, self._top = np.percentile(score, ends)
         if self._top - self._bottom < 1e-9:  # nearly all pixels are alike: take the extremes
@@ -288,7 +289,7 @@ def _components(z: np.ndarray, robust: bool) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz", "arcp", "reassoc"})
 def _add_score(score, x, low, high, mean, weight):
-    """One feature's part of the score; a comparison with NaN is false, so NaN goes through."""
+    """Add one feature to the score; comparisons with NaN are false, so NaN propagates."""
     for n in range(len(x)):
         v = low if x[n] < low else x[n]
         v = high if v > high else v

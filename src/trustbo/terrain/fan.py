@@ -1,8 +1,8 @@
-"""The same fan of rays from every pixel, a row of pixels at a time.
+"""Openness: transmittance along the same fan of rays from every pixel, row by row.
 
-All rays of one direction cross the lines between pixel centres at the same places relative to their
-pixel: crossings, neighbours and weights are worked out once, and each step of a whole row's rays is
-a plain vector operation. Ray by ray it is what `rays.ray_transmittance` computes.
+All rays of one direction cross the lines between pixel centres at the same offsets from their
+pixel: crossings, neighbours and weights are computed once, and each step of the rays of a row is a
+vector operation. Each ray has the transmittance of `rays.ray_transmittance`.
 """
 
 import math
@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.terrain.parallel import over_rows
+from trustbo.parallel import over_rows
 from trustbo.terrain.rays import share_inside
 
 _NO_DATA, _LEAST_NO_DATA = 1e30, 1e20  # higher than any ray, even with a small weight
@@ -23,20 +23,20 @@ _compiled = njit(
 
 
 class Fan(NamedTuple):
-    """Where the rays of each direction cross the lines between pixel centres."""
+    """Crossings of the rays of each direction with the lines between pixel centres."""
 
     n_crossings: np.ndarray  # (ray,)
-    t: np.ndarray  # (ray, crossing), where on the ray, in (0, 1)
-    counts: np.ndarray  # (ray, crossing), whether it is one of those that measure the canopy
+    t: np.ndarray  # (ray, crossing), position on the ray, in (0, 1)
+    counts: np.ndarray  # (ray, crossing), whether it measures the canopy
     neighbour: np.ndarray  # (ray, crossing, 2, 2), row and column offset of the two pixels
-    weight: np.ndarray  # (ray, crossing, 2), of their heights
+    weight: np.ndarray  # (ray, crossing, 2), weights of their heights
     corner: np.ndarray  # (ray, 4, 2), offsets of the four pixels around the end
     share: np.ndarray  # (ray, 4), their weights
     reach: np.ndarray  # (ray, 4), lowest and highest row offset of the end, column offset likewise
 
     @classmethod
     def around(cls, n_rays: int, reach: float, pixel: tuple[float, float]) -> "Fan":
-        """The fan of `n_rays` evenly spread directions, the first to the east."""
+        """Make the fan of `n_rays` evenly spread directions, the first to the east."""
         angle = 2.0 * math.pi / n_rays * np.arange(n_rays)
         # Rounded, so that a ray along the raster's edge does not leave it by a rounding error.
         down = np.round(reach * np.sin(angle) / pixel[0], 9)
@@ -55,7 +55,7 @@ class Fan(NamedTuple):
         corner = np.stack([[row, col], [row, col + 1], [row + 1, col], [row + 1, col + 1]])
         share = np.stack([(1 - fr) * (1 - fc), (1 - fr) * fc, fr * (1 - fc), fr * fc], axis=1)
         corner = np.moveaxis(corner, 2, 0)
-        # A pixel without weight may be off the raster: it must not be touched.
+        # A pixel without weight may be off the raster: it must not be read.
         heaviest = corner[np.arange(n_rays), share.argmax(1)]
         corner = np.where(share[..., None] > 1e-9, corner, heaviest[:, None])
         share = np.where(share > 1e-9, share, 0.0).astype(np.float32)
@@ -89,11 +89,11 @@ def openness(
         n_rays: Number of directions.
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Height of the canopy's lower edge as a share of its height.
-        rows: Of the pixels that are wanted; the others are NaN.
+        rows: Rows of pixels to compute; the others are NaN.
 
     Returns:
-        Shape (row, col), in [0, 1]; rays whose end is off the raster or without data do not count.
-        NaN where none counts.
+        Shape (row, col), in [0, 1]; rays that end off the raster or without data do not count. NaN
+        where none counts.
     """
     known = np.isfinite(ground)
     # From the middle of the heights: float32 is then good to a millimetre on any terrain.
@@ -112,9 +112,9 @@ def openness(
 
 
 def _crossings(down: float, right: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of one ray that ends at that offset: see `Fan`, without the leading axis."""
+    """Crossings of one ray that ends at an offset: fields of `Fan` without the leading axis."""
     crossings: dict[float, tuple[float, np.ndarray, bool]] = {}
-    # The lines that it crosses the more of come last: where two meet, theirs counts.
+    # The axis with more crossings comes last: where two lines meet, its crossing is kept.
     for axis in (1, 0) if abs(down) >= abs(right) else (0, 1):
         far = (down, right)[axis]
         for line in range(1, math.ceil(abs(far))):
@@ -161,7 +161,7 @@ def _openness(ground, surface, fan, numbers, result, first, last):
 
 @_compiled
 def _march(ground, surface, fan, k, numbers, i, j, n, work):
-    """Metres inside the canopy, and whether the ground lets pass, of n pixels' rays."""
+    """Metres inside the canopy, and whether the ground blocks, for the rays of n pixels."""
     eye, target, reach, crown_base = numbers[0], numbers[1], numbers[2], numbers[4]
     z, rise, inside, through, above, below = work[0], work[1], work[2], work[3], work[4], work[5]
     end, depth = work[6], work[7]  # ground and canopy height where the rays end
@@ -202,7 +202,7 @@ def _march(ground, surface, fan, k, numbers, i, j, n, work):
 
 @_compiled
 def _block(g0, g1, w0, w1, t, n, z, rise, through):
-    """Whether the rays pass a crossing."""
+    """Block the rays below the ground at a crossing."""
     for m in range(n):
         passes = z[m] + t * rise[m] >= w0 * g0[m] + w1 * g1[m]
         through[m] = through[m] if passes else np.float32(0.0)
@@ -210,7 +210,7 @@ def _block(g0, g1, w0, w1, t, n, z, rise, through):
 
 @_compiled
 def _step(g0, g1, s0, s1, w0, w1, t, dt, crown_base, n, z, rise, inside, through, above, below):
-    """All rays to their next crossing."""
+    """Advance all rays to their next crossing."""
     for m in range(n):
         g = w0 * g0[m] + w1 * g1[m]
         s = w0 * s0[m] + w1 * s1[m]
@@ -224,7 +224,7 @@ def _step(g0, g1, s0, s1, w0, w1, t, dt, crown_base, n, z, rise, inside, through
 
 @_compiled
 def _add(work, n, extinction, total, count):
-    """Rays whose end has data."""
+    """Add the rays that end on data."""
     rise, inside, through = work[1], work[2], work[3]
     none = np.float32(_LEAST_NO_DATA)
     for m in range(n):

@@ -1,4 +1,4 @@
-"""Attributes of every pixel that make ground hard to cross or sight hard to keep."""
+"""Attributes of pixels that impede motion or sight."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -10,8 +10,8 @@ from scipy import ndimage
 
 from trustbo.errors import ShapeError, TerrainError, require_whole
 from trustbo.terrain import fan, rays, stencil
-from trustbo.terrain.raster import pixel_size
-from trustbo.terrain.registry import (
+from trustbo.terrain.dataset import pixel_size
+from trustbo.terrain.pixel_feature import (
     FEATURES,
     PixelFeature,
     feature_named,
@@ -94,12 +94,12 @@ def vegetation_density(
     layer: float = 3.0,
     crown_base: float = 0.3,
 ) -> xr.DataArray:
-    """Share of the lowest metres of air that canopy fills, around each pixel.
+    """Share of the lowest metres of air filled by canopy, around each pixel.
 
     Args:
         terrain: DEM and DSM.
-        radius: Half-width of the square around a pixel that counts, m.
-        layer: Height of the air that counts, m: where robots look through.
+        radius: Half-width of the square around a pixel, m.
+        layer: Height of the layer of air that robots see through, m.
         crown_base: Lower edge of the canopy layer as a share of its height.
 
     Returns:
@@ -132,14 +132,14 @@ def openness(
         n_rays: Number of directions.
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Lower edge of the canopy layer as a share of its height.
-        rows: Only these rows of pixels; the others are NaN.
+        rows: Rows of pixels to compute; the others are NaN.
 
     Returns:
-        Dims (y, x), in [0, 1]; rays that end off the raster do not count, and a pixel all of whose
-        rays do so is NaN: keep `reach` below half the terrain's shorter side.
+        Dims (y, x), in [0, 1]; rays that end off the raster do not count, and a pixel without
+        other rays is NaN: keep `reach` below half the terrain's shorter side.
 
     Raises:
-        TrustboError: No direction.
+        TrustboError: `n_rays` is not positive.
     """
     values = fan.openness(
         terrain["dem"].values,
@@ -174,13 +174,13 @@ def exposure(
 
     Args:
         terrain: DEM and DSM.
-        observers: Their positions, shape (observer, 2), x and y in CRS metres.
-        reach: How far they see, m.
-        eye: Their height above ground, m.
-        target: Height above ground of what they look for, m.
+        observers: Positions of the observers, shape (observer, 2), x and y in CRS metres.
+        reach: Range of the observers, m.
+        eye: Height of the observers above ground, m.
+        target: Height of their targets above ground, m.
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Lower edge of the canopy layer as a share of its height.
-        rows: Only these rows of pixels; the others are NaN.
+        rows: Rows of pixels to compute; the others are NaN.
 
     Returns:
         Dims (y, x), in [0, 1].
@@ -207,7 +207,7 @@ def exposure(
 
 
 def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
-    """Positions as an array (observer, 2), all on the terrain.
+    """Check that positions are on the terrain, and return them as an array (observer, 2).
 
     Raises:
         ShapeError: They are no list of positions.
@@ -230,15 +230,15 @@ def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
 
 
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
-"""What traversability (z1) is made of: all of it lowers it."""
+"""Pixel features of traversability (z1); each lowers it."""
 VISIBILITY = ("canopy_height", "canopy_cover", "openness")
-"""What visibility (z2) is made of: canopy lowers it, openness raises it."""
+"""Pixel features of visibility (z2): canopy lowers it, openness raises it."""
 
 
 def pixel_features(
     terrain: xr.Dataset, features: Iterable[str] | Mapping[str, PixelFeature]
 ) -> xr.Dataset:
-    """Several features, as variables of dims (y, x).
+    """Compute several features, as variables of dims (y, x).
 
     Args:
         terrain: DEM and DSM.
@@ -260,13 +260,13 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 
 def _stencil(terrain: xr.Dataset, kernel: Callable, name: str, units: str) -> xr.DataArray:
-    """A 3 x 3 attribute; beyond the raster's edge the ground goes on level."""
+    """Attribute of the 3 x 3 window; beyond the raster's edge the ground is level."""
     values = values_of_kernel(terrain, kernel, slice(None), np.empty)
     return _named(terrain["dem"].copy(deep=False, data=values), name, units)
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:
-    """Mean over squares of half-width `radius` (m), of the pixels that have data."""
+    """Mean over squares of half-width `radius` (m), of the pixels with data."""
     size: Any = [2 * max(1, round(radius / step)) + 1 for step in pixel_size(terrain)]
     valid = np.isfinite(terrain["dem"].values)
     total = ndimage.uniform_filter(np.where(valid, values, 0.0), size, mode="nearest")

@@ -1,4 +1,4 @@
-"""Classified lidar points to a DEM and a DSM on one grid."""
+"""DEM and DSM on one grid from classified lidar points."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,21 +16,21 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree, QhullError
 
 from trustbo.errors import TerrainError, require_positive
-from trustbo.terrain.raster import CLIP_WARNING_SHARE, assemble_terrain
-from trustbo.terrain.source import require_regular
+from trustbo.terrain.dataset import CLIP_WARNING_SHARE, assemble_terrain
+from trustbo.terrain.georeference import require_regular
 
 GROUND_CLASS = 2
 NOISE_CLASSES = (7, 18)  # low and high noise
-NOISE = 0.25  # metres; what the errors of returns and of the triangulation come to
-SPARSE_SHARE = 0.25  # of pixels without a return, beyond which the resolution is too fine
+NOISE = 0.25  # metres; error of returns and of the triangulation together
+SPARSE_SHARE = 0.25  # largest share of pixels without a return before a warning
 MAX_PIXELS = 100_000_000
-_ROUNDING = 1e-6  # pixels: a point this near an edge lies on it, whatever its file's scale
+_ROUNDING = 1e-6  # pixels: a point this near an edge lies on it, for any scale of a file
 _REACH = 1.0 + 1e-9  # a point at the stated distance is still within it
 _REPROJECT = "reproject the points to one UTM zone first, e.g. with PDAL's filters.reprojection"
 
 
 class _Cloud(NamedTuple):
-    """The points of a survey, noise and withheld ones left out."""
+    """Points of a survey, without noise and withheld ones."""
 
     xyz: np.ndarray  # (point, 3), metres
     is_ground: np.ndarray  # (point,)
@@ -39,7 +39,7 @@ class _Cloud(NamedTuple):
 
 
 class _Pixels(NamedTuple):
-    """A regular grid by its pixel centres and the size of a pixel, metres."""
+    """Regular grid: pixel centres and size of a pixel, metres."""
 
     x: np.ndarray  # (col,), eastward
     y: np.ndarray  # (row,), southward
@@ -48,7 +48,7 @@ class _Pixels(NamedTuple):
 
     @property
     def centres(self) -> np.ndarray:
-        """Positions (row x col, 2) relative to the first one, exact in their last digits."""
+        """Positions (row x col, 2) relative to the first one, exact to the last digit."""
         east, south = np.arange(len(self.x)) * self.width, np.arange(len(self.y)) * self.height
         return np.stack(np.meshgrid(east, -south), axis=-1).reshape(-1, 2)
 
@@ -64,25 +64,25 @@ def read_lidar(
 ) -> xr.Dataset:
     """Grid lidar points, ground classified, into ground (DEM) and surface (DSM).
 
-    The ground is the triangulation of the points of class 2, taken at the pixel centres; water
-    (class 9) is no ground. The surface is the highest return of a pixel; a pixel that holds none
-    takes the height above ground of the nearest that does. Noise (classes 7 and 18) and withheld
+    The ground is the triangulation of the points of class 2 at the pixel centres; water (class 9)
+    is no ground. The surface is the highest return of a pixel; a pixel without returns takes the
+    height above ground of the nearest one with returns. Noise (classes 7 and 18) and withheld
     points are left out. A million ground points take about 30 s and 1 GB.
 
     Args:
         points: A LAS or LAZ file, or the files of one survey.
         resolution: Pixel size, metres; pixel edges lie at its multiples. Not used with `like`.
-        crs: Coordinate reference system of files that carry none, e.g. `"EPSG:32633"`.
-        max_gap: How far a return reaches into pixels that hold none, metres from centre to centre;
-            a wider gap stays missing in its middle.
-        ground_gap: How far from a ground point the triangulation is trusted, metres: further, since
-            canopy hides ground. In two forests, holes of 10 m radius cost 0.3 and 0.8 m RMSE.
-        like: A raster on whose grid the result comes out.
+        crs: Coordinate reference system of files without one, e.g. `"EPSG:32633"`.
+        max_gap: Largest distance over which a return fills pixels without one, metres from centre
+            to centre; the middle of a wider gap stays missing.
+        ground_gap: Largest distance of a pixel from a ground point, metres; larger than `max_gap`,
+            as canopy hides ground. In two forests, holes of 10 m radius cost 0.3 and 0.8 m RMSE.
+        like: Raster with the grid of the result.
 
     Returns:
-        Dataset with `dem` and `dsm`, as `read_terrain` gives it; both are missing where one is.
+        Dataset with `dem` and `dsm` as from `read_terrain`; both are missing where one is.
         Attributes: `clipped_share` of the pixels had a surface below the ground, usually by
-        centimetres, and were raised to it; `filled_share` hold no return.
+        centimetres, and were raised to it; `filled_share` have no return.
 
     Raises:
         TerrainError: No laspy; a file absent, unreadable or cut short; no points; ground points
@@ -112,7 +112,7 @@ def read_lidar(
 
 
 def _read(paths: Sequence[str | PathLike[str]], crs: object) -> _Cloud:
-    """All usable points of the files."""
+    """Usable points of all files."""
     if not paths:
         raise TerrainError("read_lidar was given no file; give one LAS or LAZ file or more.")
     names = ", ".join(repr(fspath(path)) for path in paths[:3]) + (", ..." if paths[3:] else "")
@@ -169,12 +169,12 @@ def _read_tile(path: Path, crs: object) -> tuple[np.ndarray, np.ndarray, CRS]:
 
 
 def _crs_of(header: Any, path: str, given: object) -> CRS:
-    """The horizontal CRS of a file, by its header or as given, in metres."""
+    """Horizontal CRS of a file in metres, from its header or as given."""
     try:
         crs = header.parse_crs()
     except CRSError:
         crs = None
-    # Degrees or a local system beside coordinates of a map: the header leaves the projection out.
+    # Degrees or a local system with coordinates of a map: the header lacks the projection.
     on_a_map = np.abs(header.maxs[:2]).max() > 360.0
     if crs is None or (on_a_map and not crs.is_projected and not crs.is_geocentric):
         try:
@@ -186,7 +186,7 @@ def _crs_of(header: Any, path: str, given: object) -> CRS:
 
 
 def _horizontal(crs: pyproj.CRS, name: str) -> CRS:
-    """The horizontal part of a CRS whose axes are all in metres."""
+    """Horizontal part of a CRS; its axes must be in metres."""
     if not crs.is_projected:
         raise TerrainError(f"{name} is in {crs.name}, which is no projected CRS; {_REPROJECT}.")
     for axis in crs.axis_info:
@@ -198,7 +198,7 @@ def _horizontal(crs: pyproj.CRS, name: str) -> CRS:
 
 
 def _pixels_over(cloud: _Cloud, resolution: float) -> _Pixels:
-    """The pixels that hold all points, edges at multiples of the resolution."""
+    """Pixels that cover all points, edges at multiples of the resolution."""
     low, high = (edge / resolution for edge in (cloud.xyz[:, :2].min(0), cloud.xyz[:, :2].max(0)))
     first, end = np.floor(low + _ROUNDING), np.ceil(high - _ROUNDING)
     n_cols, n_rows = (int(n) for n in end - first)
@@ -212,7 +212,7 @@ def _pixels_over(cloud: _Cloud, resolution: float) -> _Pixels:
 
 
 def _pixels_of(like: xr.DataArray | xr.Dataset, crs: CRS) -> _Pixels:
-    """The pixels of a raster in the same CRS."""
+    """Pixels of a raster in the same CRS."""
     if like.rio.crs is None:
         raise TerrainError("like has no CRS; set it, e.g. like.rio.write_crs('EPSG:32633').")
     own = _horizontal(pyproj.CRS.from_wkt(like.rio.crs.to_wkt()), "like")
@@ -253,7 +253,7 @@ def _ground(cloud: _Cloud, pixels: _Pixels, ground_gap: float) -> np.ndarray:
 
 
 def _highest(cloud: _Cloud, pixels: _Pixels) -> np.ndarray:
-    """Highest return in each pixel (row x col,), NaN where there is none."""
+    """Highest return in each pixel (row x col,), NaN without one."""
     shape, steps = np.array([len(pixels.x), len(pixels.y)]), [pixels.width, -pixels.height]
     cell = (cloud.xyz[:, :2] - [pixels.x[0], pixels.y[0]]) / steps + 0.5
     inside = ((cell > -_ROUNDING) & (cell < shape + _ROUNDING)).all(axis=1)
@@ -271,16 +271,16 @@ def _highest(cloud: _Cloud, pixels: _Pixels) -> np.ndarray:
 
 
 def _surface(dem: np.ndarray, top: np.ndarray, pixels: _Pixels, max_gap: float) -> np.ndarray:
-    """The returns, raised to the ground, and the gaps between them filled (row x col,)."""
+    """Returns, raised to the ground, with the gaps between them filled, (row x col,)."""
     surface, gap, centres = np.maximum(top, dem), np.isnan(top), pixels.centres
-    # Not the height itself: on a slope, that would make steps and false canopy of bare ground.
+    # Heights above ground: on a slope, absolute heights would make steps and false canopy.
     canopy = NearestNDInterpolator(centres[~gap], (surface - dem)[~gap])
     surface[gap] = dem[gap] + canopy(centres[gap], distance_upper_bound=max_gap * _REACH)
     return surface
 
 
 def _shares(above: np.ndarray) -> dict[str, float]:
-    """Attributes of the result, from the pixels' highest returns above ground, NaN without one."""
+    """Attributes of the result, from the highest returns above ground, NaN without one."""
     filled, clipped, deep = np.isnan(above).mean(), (above < 0).mean(), (above < -NOISE).mean()
     if filled > SPARSE_SHARE:
         warnings.warn(
@@ -288,7 +288,7 @@ def _shares(above: np.ndarray) -> dict[str, float]:
             "take a coarser resolution.",
             stacklevel=3,
         )
-    # assemble_terrain's warning blames the vertical datums, of which one survey has but one.
+    # The warning of assemble_terrain is about vertical datums; one survey has only one.
     if deep > CLIP_WARNING_SHARE:
         warnings.warn(
             f"on {deep:.1%} of pixels the highest return lies over {NOISE:g} m below the ground, "

@@ -1,242 +1,87 @@
-"""Reading a DEM and a DSM into one aligned, metric dataset."""
+"""Raster that is read window by window, and its lazy array."""
 
-import warnings
-from contextlib import ExitStack
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
+from rasterio import Affine
 from rasterio.crs import CRS
+from rasterio.errors import RasterioError
+from rasterio.transform import array_bounds
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
 from trustbo.errors import TerrainError
-from trustbo.terrain.align import on_one_grid
-from trustbo.terrain.source import (
-    RasterLike,
-    open_raster,
-    require_metric_crs,
-    require_regular,
-)
-
-CLIP_WARNING_SHARE = 0.02
-_ROWS = 256  # looked at together
+from trustbo.terrain.units import METRE, HeightUnit
 
 
-def read_terrain(
-    dem: RasterLike,
-    dsm: RasterLike,
-    *,
-    crs: object = None,
-    resolution: float | None = None,
-    nodata: float | None = None,
-    lazy: bool = False,
-) -> xr.Dataset:
-    """Read a digital elevation model (ground) and a digital surface model (canopy, roofs).
+@dataclass(frozen=True, eq=False)
+class Raster:
+    """Heights on a north-up grid, read window by window.
 
-    Both come out on the DEM's grid, or, where the DEM is in degrees or its projection distorts
-    distances by over 1 % (as web maps' EPSG:3857 does), on a grid of square metres in its UTM zone.
-    The surface is clipped to be nowhere below the ground.
-
-    Args:
-        dem: Heights in metres, first band: a path or an address of anything that GDAL reads
-            (`/vsizip/...`, `https://...`); an open rasterio dataset, which stays open; a DataArray
-            as rioxarray gives it, in memory or lazy; or a Dataset of one such array. Missing are
-            NaN, infinity, what the raster's mask or alpha band hides and its nodata value; scale
-            and offset are applied.
-        dsm: Likewise; any grid that overlaps the DEM's.
-        crs: Coordinate reference system of rasters that carry none, e.g. `"EPSG:32633"`.
-        resolution: Pixel size in metres of rasters that carry no georeference at all.
-        nodata: A further value that means missing, as stored in the rasters.
-        lazy: For rasters larger than the memory: leave the heights in the files. Both variables
-            are then float32 and read when a window of them is loaded, e.g. by
-            `terrain.isel(y=slice(0, 512)).load()`; NaN is not yet in common, nor the surface
-            clipped, which `clean` does to a window. Close the files with `terrain.close()`.
-
-    Returns:
-        Dataset with `dem` and `dsm`, float64 in metres (float32 if lazy), dims (y, x) with north
-        at the top, NaN where either raster has no data; the CRS is in `spatial_ref`.
-
-    Raises:
-        TerrainError: No raster, no CRS, a rotated grid, units other than metres, no overlap, no
-            data at all, or a height of -999 m or beyond +-9000 m: a fill value that no tag
-            declares. With `lazy`, the last two cannot be known before a window is loaded: loading
-            raises for a fill value, and `clean` counts the valid pixels.
+    Attributes:
+        name: Name for messages.
+        crs: Coordinate reference system.
+        transform: Map from (column, row) of a pixel's upper left corner to (x, y) in the CRS.
+        shape: Rows and columns.
+        read: Function of a slice of rows and a slice of columns that returns their heights,
+            float64, NaN where missing.
+        unit: Unit of the stored heights; `read` converts them to metres.
     """
-    with ExitStack() as closing:
-        ground, surface = (
-            open_raster(source, role, closing, crs=crs, resolution=resolution, nodata=nodata)
-            for source, role in ((dem, "dem"), (dsm, "dsm"))
-        )
-        ground, surface = on_one_grid(ground, surface)
-        if lazy:
-            terrain = _dataset(ground.array(np.float32), surface.array(np.float32))
-            terrain.set_close(closing.pop_all().close)
-            return terrain
-        heights = [raster.array(np.float64).load() for raster in (ground, surface)]
-    for raster, array in zip((ground, surface), heights, strict=True):
-        if not np.isfinite(array).any():
-            where = "" if raster is ground else " in the area of the DEM"
-            raise TerrainError(f"{raster.name} is all nodata{where}.")
-    return assemble_terrain(*heights)
 
+    name: str
+    crs: CRS
+    transform: Affine
+    shape: tuple[int, int]
+    read: Callable[[slice, slice], np.ndarray]
+    unit: HeightUnit = METRE
 
-def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
-    """One dataset of two aligned rasters: north up, NaN in common, surface not below ground.
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Left, bottom, right and top in the CRS."""
+        return array_bounds(*self.shape, self.transform)
 
-    Args:
-        dem: Ground heights, dims (y, x), metres, with a metric CRS.
-        dsm: Surface heights on the same grid.
-
-    Raises:
-        TerrainError: No CRS, units other than metres, two different or irregular grids, or no
-            pixel that has both heights.
-    """
-    require_metric_crs(dem.rio.crs, "the terrain")
-    ground, surface = (
-        a.drop_vars("spatial_ref", errors="ignore").transpose("y", "x").astype(float, copy=False)
-        for a in (dem, dsm)
-    )
-    for axis in ("y", "x"):
-        require_regular(ground[axis].values, axis, "the raster")
-    if not _same_coordinates(ground, surface):
-        raise TerrainError(
-            f"dem {ground.shape} and dsm {surface.shape} are not on one grid; align them first, "
-            "e.g. with dsm.rio.reproject_match(dem)."
-        )
-    surface = surface.assign_coords(x=ground["x"], y=ground["y"])
-    terrain = xr.Dataset({"dem": ground, "dsm": surface})
-    terrain, clipped, valid = clean(_north_up(terrain))
-    if not valid:
-        raise TerrainError(
-            "no pixel has both a DEM and a DSM height: one of them is all nodata where they "
-            "overlap. Check the nodata value of the rasters."
-        )
-    warn_if_clipped(clipped, valid, stacklevel=4)
-    terrain.attrs = {"clipped_share": clipped / valid}
-    return _with_crs(terrain, dem.rio.crs)
-
-
-def clean(terrain: xr.Dataset) -> tuple[xr.Dataset, int, int]:
-    """Put NaN in common and raise the surface to the ground: what a lazy window still needs.
-
-    Args:
-        terrain: `dem` and `dsm` over (y, x), metres: of `read_terrain(..., lazy=True)`, or any
-            window of it. It is not changed.
-
-    Returns:
-        The same in memory, in floats; how many pixels were raised; how many have both heights.
-    """
-    ground, surface = (terrain[name].compute() for name in ("dem", "dsm"))
-    valid = np.isfinite(ground) & np.isfinite(surface)
-    clipped = int(((surface < ground) & valid).sum())
-    surface = surface.where(surface > ground, ground)
-    cleaned = terrain.assign(
-        dem=ground.where(valid).assign_attrs(long_name="ground", units="m"),
-        dsm=surface.where(valid).assign_attrs(long_name="surface", units="m"),
-    )
-    return cleaned, clipped, int(valid.sum())
-
-
-def warn_if_clipped(clipped: int, valid: int, stacklevel: int = 2) -> None:
-    """Warn where the DSM lies below the DEM on over 2 % of the valid pixels.
-
-    Args:
-        clipped: Pixels that `clean` raised, summed over windows.
-        valid: Pixels with both heights, likewise.
-        stacklevel: Whose line the warning names, as in `warnings.warn`.
-    """
-    if clipped > CLIP_WARNING_SHARE * valid:
-        warnings.warn(
-            f"the DSM lies below the DEM on {clipped / valid:.1%} of pixels; it is raised to the "
-            "DEM there. Check that both share one vertical datum.",
-            stacklevel=stacklevel,
-        )
-
-
-def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
-    """A user's own dataset in the form that `assemble_terrain` gives.
-
-    Raises:
-        TerrainError: No `dem` or `dsm`, or what `assemble_terrain` refuses.
-    """
-    if not isinstance(terrain, xr.Dataset) or not {"dem", "dsm"} <= set(terrain.data_vars):
-        raise TerrainError(
-            "a terrain is a Dataset with dem and dsm over (y, x), as read_terrain gives it; got "
-            f"{type(terrain).__name__}."
-        )
-    crs = terrain.rio.crs
-    if crs is None:
-        raise TerrainError(
-            "the terrain has no CRS; set it, e.g. terrain.rio.write_crs('EPSG:32633')."
-        )
-    require_metric_crs(crs, "the terrain")
-    if is_lazy(terrain):
-        for axis in ("y", "x"):
-            require_regular(terrain[axis].values, axis, "the raster")
-        return _with_crs(_north_up(terrain.transpose("y", "x")), crs)
-    known = terrain.attrs.get("clipped_share", 0.0)
-    if _is_in_order(terrain):
-        return _with_crs(terrain.copy(), crs)
-    result = assemble_terrain(terrain["dem"].rio.write_crs(crs), terrain["dsm"])
-    result.attrs["clipped_share"] = max(known, result.attrs["clipped_share"])
-    return result
-
-
-def is_lazy(terrain: xr.Dataset) -> bool:
-    """Whether its heights are still to be read."""
-    return not all(terrain[name].variable._in_memory for name in ("dem", "dsm"))
-
-
-def _north_up(terrain: xr.Dataset) -> xr.Dataset:
-    """Rows from north to south, columns from west to east."""
-    turned = {"y": terrain["y"][0] < terrain["y"][-1], "x": terrain["x"][0] > terrain["x"][-1]}
-    return terrain.isel({axis: slice(None, None, -1) for axis, turn in turned.items() if turn})
-
-
-def _is_in_order(terrain: xr.Dataset) -> bool:
-    """Whether a terrain is as `assemble_terrain` would make it: then no copy of it is made."""
-    dem, dsm = terrain["dem"], terrain["dsm"]
-    if not dem.dims == dsm.dims == ("y", "x") or {dem.dtype.kind, dsm.dtype.kind} != {"f"}:
-        return False
-    for axis in ("y", "x"):
-        require_regular(terrain[axis].values, axis, "the raster")
-    if terrain["y"][0] < terrain["y"][-1] or terrain["x"][0] > terrain["x"][-1]:
-        return False
-    known = False
-    for first in range(0, len(dem), _ROWS):
-        g, s = (a.values[first : first + _ROWS] for a in (dem, dsm))
-        valid = np.isfinite(g)
-        if (valid != np.isfinite(s)).any() or (s < g).any() or np.isinf(g).any():
-            return False
-        known |= bool(valid.any())
-    return known
-
-
-def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
-    """Pixel height and width in metres."""
-    y, x = (terrain.variables[axis].values for axis in ("y", "x"))
-    return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
-
-
-def _dataset(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
-    """The lazy dataset, with what `assemble_terrain` says of the arrays and their place."""
-    terrain = xr.Dataset(
-        {
-            "dem": dem.assign_attrs(long_name="ground", units="m"),
-            "dsm": dsm.assign_attrs(long_name="surface", units="m"),
+    def array(self, dtype: type[np.floating]) -> xr.DataArray:
+        """Make the array of heights, dims (y, x), read when a window of it is loaded."""
+        lazy: Any = indexing.LazilyIndexedArray(_Heights(self, dtype))
+        rows, cols = (np.arange(n) + 0.5 for n in self.shape)
+        coords = {
+            "y": self.transform.f + rows * self.transform.e,
+            "x": self.transform.c + cols * self.transform.a,
         }
-    )
-    return _with_crs(terrain, dem.rio.crs)
+        return xr.DataArray(indexing.CopyOnWriteArray(lazy), coords, ("y", "x")).rio.write_crs(
+            self.crs
+        )
 
 
-def _with_crs(terrain: xr.Dataset, crs: CRS) -> xr.Dataset:
-    # In place, as rioxarray would copy the heights.
-    terrain.rio.write_crs(crs, inplace=True)
-    # From the coordinates: a transform stored before the raster was coarsened or cut is stale.
-    return terrain.rio.write_transform(terrain.rio.transform(recalc=True), inplace=True)
+class _Heights(BackendArray):
+    """Interface through which xarray reads windows of a raster."""
 
+    def __init__(self, raster: Raster, dtype: type[np.floating]) -> None:
+        self.raster, self.shape, self.dtype = raster, raster.shape, np.dtype(dtype)
 
-def _same_coordinates(a: xr.DataArray, b: xr.DataArray) -> bool:
-    """Whether two arrays' pixels coincide to a thousandth of a pixel."""
-    return a.shape == b.shape and all(
-        np.allclose(a[axis], b[axis], rtol=0.0, atol=1e-3 * abs(float(a[axis][1] - a[axis][0])))
-        for axis in ("x", "y")
-    )
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        return indexing.explicit_indexing_adapter(
+            key, self.shape, indexing.IndexingSupport.BASIC, self._window
+        )
+
+    def _window(self, key: tuple[int | slice, ...]) -> np.ndarray:
+        spans = [
+            range(n)[k] if isinstance(k, slice) else range(k, k + 1)
+            for k, n in zip(key, self.shape, strict=True)
+        ]
+        if not all(spans):
+            return np.empty(
+                [len(s) for s, k in zip(spans, key, strict=True) if isinstance(k, slice)]
+            )
+        try:
+            window = self.raster.read(*(slice(span[0], span[-1] + 1) for span in spans))
+        except RasterioError as error:
+            raise TerrainError(
+                f"{self.raster.name} could not be read ({error}); it is damaged, out of reach, or "
+                "was closed before it was read."
+            ) from None
+        steps = (slice(None, None, k.step) if isinstance(k, slice) else 0 for k in key)
+        return window[tuple(steps)].astype(self.dtype, copy=False)

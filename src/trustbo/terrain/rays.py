@@ -1,10 +1,10 @@
-"""Rays over a raster: does the ground block them, and how much canopy do they cross?
+"""Transmittance of rays over a raster, blocked by the ground and attenuated by the canopy.
 
 Heights belong to pixel centres. A ray runs between two points given in pixel coordinates (row, col)
-and height. It is blocked if it lies below what blocks it anywhere where it crosses a line through a
+and height. It is blocked if it lies below the blocking surface where it crosses a line through a
 row or a column of pixel centres; heights are interpolated linearly along such lines. Metres inside
-the canopy are taken from the lines it crosses the more of, about one per pixel: between two of
-these everything changes linearly.
+the canopy are integrated over the crossings with rows or with columns, whichever are more, about
+one per pixel: heights are taken as linear between two of them.
 """
 
 import math
@@ -12,18 +12,18 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.terrain.parallel import over_rows
+from trustbo.parallel import over_rows
 
-# A division that checks for 0 would cost as much as the rest.
+# A division that checks for 0 takes as long as the rest.
 _compiled = njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}
 )
-# Handing arrays to a function, which counts references, costs as much as crossing ten lines.
+# Passing arrays to a function, which counts references, takes as long as ten crossings.
 _inlined = njit(cache=True, inline="always", nogil=True, error_model="numpy")
 _CHUNK = 32
 
 BARE, WALL, TRANSMITTANCE = 0, 1, 2
-"""What blocks sight: the ground; the surface, canopy included; or the ground, and canopy partly."""
+"""Modes of sight: the ground blocks; the surface blocks; the ground blocks, canopy attenuates."""
 
 
 @_inlined
@@ -34,12 +34,12 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
         ground: DEM, shape (row, col), m.
         surface: DSM, shape (row, col), m.
         pixel: Pixel height and width, m.
-        start: Row, col (fractions of pixels, centres at integers) and height in m.
-        end: Likewise.
+        start: Row, col (fractions of pixels, centres at integers) and height in m of the start.
+        end: Row, col and height of the end, likewise.
         mode: BARE, WALL or TRANSMITTANCE.
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Height of the canopy's lower edge as a share of its height.
-        work: `work_space()`, to be used again for the next ray.
+        work: Array from `work_space()`, reused by the next ray.
 
     Returns:
         exp(-extinction * metres inside the canopy layer), or 0 where the ray is blocked, leaves the
@@ -63,7 +63,7 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
         return 0.0 if _is_blocked(blocking, most, z0, dz) else 1.0
     g0, s0 = _heights(ground, surface, r0, c0)
     g1, s1 = _heights(ground, surface, r1, c1)
-    # Above the crowns' lower edge, and below their top, at either end.
+    # Heights above the crowns' lower edge, and below their top, at either end.
     start = (z0 - (g0 + crown_base * (s0 - g0)), s0 - z0)
     end = (z1 - (g1 + crown_base * (s1 - g1)), s1 - z1)
     inside = _share_in_canopy(
@@ -77,13 +77,13 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
 
 @_compiled
 def work_space():
-    """Room for the lines that a ray crosses."""
+    """Allocate the work array of a ray."""
     return np.empty((4, _CHUNK + 1))
 
 
 @_compiled
 def _crossings(x0, dx):
-    """The first line that x0 + t dx meets, its t, the way to the next, its t, and how many."""
+    """First line that x0 + t dx meets, its t, step to the next line, its t, and number of lines."""
     if dx == 0.0:
         return 0, 0.0, 0, 0.0, 0
     way = 1 if dx > 0.0 else -1
@@ -104,7 +104,7 @@ def _is_blocked(heights, axis, z0, dz):
         j = int(y)
         part = y - j
         here = np.uint64(base + j * along)
-        # A neighbour without weight is not touched: there may be none.
+        # A neighbour without weight is not read: there may be none.
         beside = here + np.uint64(along if part > 1e-9 else 0)
         h = heights[here] + part * (heights[beside] - heights[here])
         z = z0 + t * dz
@@ -117,10 +117,10 @@ def _is_blocked(heights, axis, z0, dz):
 
 @_compiled
 def _share_in_canopy(ground, surface, axis, z0, dz, crown_base, start, end, work):
-    """Share of the way inside the canopy, seen on the lines of an axis; -1 if blocked there.
+    """Share of the ray inside the canopy, by its crossings along an axis; -1 if blocked.
 
-    Some lines at a time: first their heights, then plain vector operations, of whole vectors, as
-    the rest would take as long as these; what is too much does not count.
+    Lines are taken in chunks: first their heights, then vector operations on whole vectors, as a
+    remainder would take as long; surplus lines do not count.
     """
     across, along, x0, dx, y0, dy = axis
     line, t0, way, step, n = _crossings(x0, dx)
@@ -137,7 +137,7 @@ def _share_in_canopy(ground, surface, axis, z0, dz, crown_base, start, end, work
             j = int(y)
             part = y - j
             here = np.uint64(pixels + j * along)
-            # A neighbour without weight is not touched: there may be none.
+            # A neighbour without weight is not read: there may be none.
             beside = here + np.uint64(along if part > 1e-9 else 0)
             here = beside if part > 1.0 - 1e-9 else here
             g[k] = ground[here] + part * (ground[beside] - ground[here])
@@ -164,11 +164,11 @@ def _share_in_canopy(ground, surface, axis, z0, dz, crown_base, start, end, work
 
 @_compiled
 def _heights(ground, surface, r, c):
-    """Bilinear heights of ground and surface; a neighbour without weight is not touched."""
+    """Bilinear heights of ground and surface; a neighbour without weight is not read."""
     i = min(int(r), ground.shape[0] - 2)
     j = min(int(c), ground.shape[1] - 2)
     fr, fc = r - i, c - j
-    # To the nearer line where that is all there is to it.
+    # Positions within rounding of a line are on it.
     fr = 0.0 if fr < 1e-9 else fr
     fc = 0.0 if fc < 1e-9 else fc
     i, fr = (i + 1, 0.0) if fr > 1.0 - 1e-9 else (i, fr)
@@ -182,8 +182,8 @@ def _heights(ground, surface, r, c):
 
 @_compiled
 def share_inside(a0, a1, b0, b1):
-    """Share of the way on which both a0..a1 and b0..b1 are positive, without branches."""
-    zero = a0 - a0  # of their precision
+    """Share of an interval on which both a0..a1 and b0..b1 are positive, without branches."""
+    zero = a0 - a0  # in their precision
     one = zero + np.float32(1.0)
     ta, tb = a0 / (a0 - a1), b0 / (b0 - b1)
     low_a = (ta if a1 > zero else one) if a0 <= zero else zero
@@ -212,10 +212,10 @@ def exposure(
         surface: DSM, shape (row, col), m.
         pixel: Pixel height and width, m.
         observers: Row and column, fractions of pixels, shape (observer, 2).
-        reach: m.
-        heights: Of the observers and of what they look for, above ground, m.
+        reach: Range of the observers, m.
+        heights: Heights of the observers and of their targets above ground, m.
         canopy: Extinction (1/m) and crown base, see `ray_transmittance`.
-        rows: Of the pixels that are wanted; the others are NaN.
+        rows: Rows of pixels to compute; the others are NaN.
     """
     result = np.full(ground.shape, np.nan)
     top, bottom, _ = rows.indices(len(ground))
@@ -241,7 +241,7 @@ def _exposure(ground, surface, pixel, observers, reach, heights, canopy, result,
                 r, c = observers[k, 0], observers[k, 1]
                 if math.hypot((i - r) * pixel[0], (j - c) * pixel[1]) > reach:
                     continue
-                # The outer half of the raster's edge pixels has the heights of their centres.
+                # The outer half of an edge pixel has the height of its centre.
                 r, c = min(max(r, 0.0), n_rows - 1.0), min(max(c, 0.0), n_cols - 1.0)
                 total += ray_transmittance(
                     ground,

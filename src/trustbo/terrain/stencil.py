@@ -1,15 +1,15 @@
-"""Attributes of the 3 x 3 window around each pixel, one vectorised pass of compiled code each.
+"""Attributes of the 3 x 3 window around each pixel, each in one pass of compiled code.
 
 Each kernel takes heights `z`, padded by one pixel all around, (row + 2, col + 2), and fills `out`,
-(row, col). Arithmetic is that of the heights' own precision: it starts from differences of
-neighbours, which are exact in float32 too. A missing height makes every window it is in missing.
+(row, col). Arithmetic is in the precision of the heights: it starts from differences of
+neighbours, which are exact in float32 too. A missing height makes all its windows missing.
 """
 
 import numpy as np
 from numba import njit
 
-# Vectorised, but with NaN kept: "nnan" would let the compiler drop it. A division that checks for 0
-# would not vectorise.
+# Flags for vectorisation, without "nnan", which lets the compiler drop NaN; a division that checks
+# for 0 would not vectorise.
 _compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 
 
@@ -35,8 +35,8 @@ def gradient(z, pixel, out):
 def slope(z, pixel, out):
     """Angle of the steepest ascent, rad."""
     one, kx, ky = _as(z, 1.0), _as(z, 0.125 / pixel[1]), _as(z, 0.125 / pixel[0])
-    # Cephes' arctangent, without branches, 2e-8 rad off: `hypot` and `atan` do not vectorise, and
-    # would take most of the time.
+    # Cephes' arctangent, without branches, error 2e-8 rad: `hypot` and `atan` do not vectorise,
+    # and would take most of the time.
     low, high = _as(z, 0.414213562373095), _as(z, 2.414213562373095)
     quarter, half = _as(z, 0.785398163397448), _as(z, 1.5707963267948966)
     c9, c7 = _as(z, 8.05374449538e-2), _as(z, -0.138776856032)
@@ -160,5 +160,5 @@ def _missing(up, mid, down, j):
 
 @_compiled
 def _as(z, number):
-    """A number of the heights' precision: a float64 among float32 would halve the speed."""
+    """Number in the precision of the heights: a float64 among float32 would halve the speed."""
     return np.array([number]).astype(z.dtype)[0]

@@ -1,4 +1,4 @@
-"""A raster in horizontal strips with enough around them, so that memory is that of one strip."""
+"""Horizontal strips of a raster with a halo around them, to limit memory."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -6,33 +6,33 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.terrain.raster import clean, is_lazy, pixel_size
+from trustbo.terrain.dataset import clean, is_lazy, pixel_size
 
-_PIXELS = 1 << 19  # of a strip: the few arrays it takes fit in the caches
+_PIXELS = 1 << 19  # per strip: its arrays fit in the caches
 _N_SAMPLED = 32
 
 
 class Strip(NamedTuple):
-    """Some rows of a raster, and those around them."""
+    """Rows of a raster, and those around them."""
 
     window: xr.Dataset
     """The rows and their halo, in memory."""
     rows: slice
-    """Which rows of the raster they are."""
+    """Position of the rows in the raster."""
     core: slice
-    """Where in the window they are."""
+    """Position of the rows in the window."""
     n_clipped: int
-    """Pixels of the window whose surface was raised to the ground."""
+    """Number of pixels of the window with a surface raised to the ground."""
     n_valid: int
-    """Pixels of the window that have both heights."""
+    """Number of pixels of the window with both heights."""
 
 
 def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
-    """Go through a terrain from north to south.
+    """Cut a terrain into strips from north to south.
 
     Args:
-        terrain: In memory, or lazily read.
-        halo: How far around a pixel its features look, m; two pixels are always added.
+        terrain: Terrain, in memory or lazily read.
+        halo: Radius of the surroundings that a pixel's features depend on, m; two pixels are added.
     """
     n_rows, n_cols = terrain["dem"].shape
     around = _halo_rows(terrain, halo)
@@ -42,12 +42,12 @@ def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
 
 
 def sample_strips(terrain: xr.Dataset, halo: float, n_pixels: int) -> Iterator[Strip]:
-    """Some rows spread evenly over a terrain, about `n_pixels` in all.
+    """Sample strips spread evenly over a terrain, about `n_pixels` in all.
 
     Args:
-        terrain: In memory, or lazily read.
+        terrain: Terrain, in memory or lazily read.
         halo: See `strips`.
-        n_pixels: How many are wanted.
+        n_pixels: Number of pixels to sample.
     """
     n_rows, n_cols = terrain["dem"].shape
     around = _halo_rows(terrain, halo)

@@ -1,11 +1,11 @@
-"""Fractal terrain with patches of vegetation, for demonstrations and studies."""
+"""Synthetic terrain with fractal relief and patches of vegetation."""
 
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
 from trustbo.errors import TerrainError, require_positive, require_whole
-from trustbo.terrain.raster import assemble_terrain
+from trustbo.terrain.dataset import assemble_terrain
 
 
 def synthetic_terrain(
@@ -24,16 +24,16 @@ def synthetic_terrain(
     Args:
         size: Height (north-south) and width (east-west), m.
         resolution: Pixel size, m.
-        seed: Same seed, same terrain.
+        seed: Seed of the terrain.
         relief: Highest minus lowest ground, m.
         hurst: Hurst exponent of the relief in (0, 1]; higher is smoother.
         canopy_cover: Share of the area under vegetation.
-        canopy_height: Mean height of the vegetation where there is any, m.
-        crs: Metric CRS written to the result; by default a UTM zone of northern Michigan, on whose
-            Keweenaw peninsula the terrain is put.
+        canopy_height: Mean height of the vegetation, m.
+        crs: Metric CRS written to the result; by default a UTM zone of northern Michigan, with the
+            terrain on the Keweenaw peninsula.
 
     Returns:
-        Dataset as `read_terrain` gives it.
+        Dataset as from `read_terrain`.
 
     Raises:
         TerrainError: A size under 4 pixels, or a parameter out of its range.
@@ -50,7 +50,7 @@ def synthetic_terrain(
         )
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     ground = _fractal(rng, shape, exponent=hurst + 1.0)
-    # Sub-metre ruggedness (ruts, rocks) in clumps, which the relief alone lacks.
+    # Patches of ruggedness below a metre (ruts, rocks), which the relief lacks.
     rough = np.clip(ndimage.gaussian_filter(_fractal(rng, shape, 1.6), 2.0 / resolution), 0.3, 1.0)
     dem = relief * ground + 0.25 * rough * rng.standard_normal(shape)
     dem = ndimage.gaussian_filter(dem, 0.7)
@@ -71,7 +71,7 @@ def synthetic_terrain(
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
     """Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
 
-    Synthesised on twice the size and cropped: the Fourier method makes periodic fields.
+    The field is synthesised on twice the size and cropped, as the Fourier method is periodic.
     """
     rows, cols = 2 * shape[0], 2 * shape[1]
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(cols)[None])

@@ -1,0 +1,489 @@
+"""A campaign: ask for a path, run it by whatever means, tell the mission."""
+
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jax import random
+
+from trustbo.campaign.folder import CampaignFolder
+from trustbo.campaign.history import Entry, History
+from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, again
+from trustbo.campaign.result import Result
+from trustbo.data import Cell, Mission
+from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_whole
+from trustbo.models import TrustModel, diagnostics, params_of
+from trustbo.models.params import Params
+from trustbo.models.record import model_from_record, model_to_record
+from trustbo.planning import Plan, Planner, Policy
+from trustbo.planning.plan import plan_from_record, plan_to_record
+from trustbo.planning.policies import greedy, resolve_policy
+from trustbo.stacking import fill_awareness
+from trustbo.workspace import Workspace
+
+_STREAMS = ("policy", "fit", "mission", "prior", "awareness")
+_N_MAPS = 500
+"""Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
+_N_KEPT = 200
+
+
+class Campaign:
+    """Learns from missions and proposes the next path.
+
+    With a `directory`, every mission is on disk before anything is learned from it, and everything
+    before the next is asked for: `Campaign.load` goes on where the process ended, with identical
+    results.
+
+    Attributes:
+        workspace: Workspace of the paths.
+        options: Options of the campaign.
+        planner: Planner on the workspace's awareness map; see `planner_now`.
+        log: Missions as measured, plans, posteriors and failures (a `History`).
+        pending: Mission that was told and not learned from; see `tell`.
+        belief: Parameter draws that the next plan is made from: the posterior's, or, before the
+            first mission, one from the prior.
+        awareness: Belief about the awareness; None where the map is trusted.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        start: Cell,
+        goal: Cell,
+        *,
+        model: TrustModel | None = None,
+        policy: str | Policy = POLICY,
+        objective: str = OBJECTIVE,
+        sampler: str = SAMPLER,
+        seed: int = 0,
+        directory: str | PathLike[str] | None = None,
+        **options: Any,
+    ) -> None:
+        """Prepare a campaign; nothing is computed yet.
+
+        Args:
+            workspace: Workspace of the paths.
+            start: First cell of every path.
+            goal: Last cell of every path.
+            model: Trust model; by default `PooledTrust()`.
+            policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
+            objective: Objective of the paths; see `Planner`.
+            sampler: Sampler of the posterior; see `trustbo.models.fit`.
+            seed: Seed of everything random.
+            directory: Folder that the campaign is kept in as it goes. No other process may use it
+                until `close`, or the end of this one.
+            **options: Fields of `CampaignOptions`, or a whole one as `options`.
+
+        Raises:
+            TrustboError: Start, goal or a name that does not exist; a sampler that does not suit
+                the model; or a model that cannot be updated so.
+            NoPathError: The goal cannot be reached.
+        """
+        self.options = CampaignOptions.of(options, Campaign.__init__)
+        self._policy = resolve_policy(policy)
+        self.planner = self.options.planner(workspace, start, goal, objective)
+        self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
+        self._learning = self.options.learning(model, sampler)
+        self.model, self.log = self._learning.model, History()
+        self.pending: Mission | None = None
+        self.awareness = self.options.belief(workspace)
+        self._plan: Plan | None = None
+        self._believed: Planner | None = None
+        self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
+        sizes = workspace.awareness.sizes
+        self.belief: Params = self._learning.prior_belief(
+            self.options.initial, sizes["robot"], sizes["feature"], self.seed_of("prior")
+        )
+        own_policy = not isinstance(policy, str)
+        named = {
+            "start": list(self.planner.start),
+            "goal": list(self.planner.goal),
+            "policy": getattr(policy, "__name__", type(policy).__name__) if own_policy else policy,
+            "objective": objective,
+            "sampler": sampler,
+            "seed": self.seed,
+        }
+        record = named | self.options.to_record()
+        self.settings = record | {
+            "model": type(self.model).__name__,
+            "observation": self.model.observation,
+            "response": self.model.response,
+            "max_bounds": self.planner.max_bounds,
+        }
+        self._record = record | {
+            "model": model_to_record(self.model),
+            "own_policy": own_policy,
+            "own_awareness": self.options.own_awareness,
+        }
+        self._folder: CampaignFolder | None = None
+        if directory is not None:
+            self._open(CampaignFolder(directory), overwrite=False)
+
+    @property
+    def missions(self) -> list[Mission]:
+        """Missions learned from so far, their awareness filled in."""
+        return self.log.missions
+
+    @property
+    def posteriors(self) -> list[xr.DataTree]:
+        """Posterior after each mission."""
+        return self.log.posteriors
+
+    @property
+    def plans(self) -> list[Plan]:
+        """Plan of each mission."""
+        return self.log.plans
+
+    @property
+    def posterior(self) -> xr.DataTree | None:
+        """Posterior after the last mission; None before the first."""
+        return self.log.entries[-1].posterior if self.log.entries else None
+
+    # --- ask and tell ---
+
+    def ask(self) -> Plan:
+        """Plan the next path to run; the same one until `tell`, `fail` or `suggest`.
+
+        Raises:
+            TrustboError: The policy returned a path that is broken, or no plan.
+        """
+        if self._plan is None:
+            started = time.perf_counter()
+            key, planner = random.key(self.seed_of("policy")), self.planner_now()
+            plan = self._policy(key, self.belief, planner)
+            name = self.settings["policy"]
+            if not isinstance(plan, Plan):
+                raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")
+            try:
+                planner.require_path(plan.path)
+            except TrustboError as error:
+                raise TrustboError(f"the policy {name!r}: {error}") from None
+            self._plan = self._accept(plan, started)
+        return self._plan
+
+    def suggest(self, path: Sequence[Cell]) -> Plan:
+        """Let the operator choose the next path; `ask` then returns it.
+
+        Args:
+            path: Cells from start to goal.
+
+        Raises:
+            TrustboError: The path is broken, or does not lead from start to goal.
+        """
+        started = time.perf_counter()
+        plan = self.planner_now().evaluate(path, self.belief.mean())
+        self._plan = self._accept(plan, started)
+        self._write_state()
+        return self._plan
+
+    def tell(self, mission: Mission, **extra: float) -> xr.DataTree:
+        """Learn from a mission.
+
+        Awareness that the mission did not measure (NaN) is taken from the map, or from the belief.
+        The mission may have followed another path than the one asked for.
+
+        Args:
+            mission: Mission as measured, whether or not the goal was reached.
+            **extra: More numbers for its row of the history, such as its regret.
+
+        Returns:
+            Posterior given all missions so far.
+
+        Raises:
+            ShapeError: Robots or features differ from the workspace's.
+            TrustboError: The path leaves the grid, or `fit` refuses the mission.
+            PosteriorError: The posterior's diagnostics are bad. The mission is then not among
+                those learned from, but kept as `pending`, and on disk, until the next is told.
+        """
+        _require_mission_of(self.workspace, mission)
+        filled = fill_awareness(mission, self.planner_now().mean_awareness)
+        plan, trust_map = self.ask(), self.trust_map()
+        told = time.perf_counter()
+        if self._folder is not None:
+            self._folder.write_measured([*self.log.measured, mission])
+        missions, last = [*self.missions, filled], self.posterior
+        self.pending = mission
+        posterior = self._learning.posterior(missions, last, self.seed_of("fit"))
+        # Only now, all at once: a failed fit leaves the campaign as it was.
+        before = self.log.entries[-1].plan if self.log.entries else plan
+        row = {
+            "objective": plan.value,
+            "path_changed": plan.path != before.path,
+            "contact_rate": float(np.nanmean(mission.contact_rate)),
+            "status": mission.status,
+            **extra,
+            **diagnostics(posterior),
+            "seconds_plan": self._asked[0],
+            "seconds_run": told - self._asked[1],
+            "seconds_fit": time.perf_counter() - told,
+        }
+        self.log.entries.append(Entry(filled, mission, plan, trust_map, row, posterior))
+        self._learned(mission)
+        self._write()
+        return posterior
+
+    def fail(self, reason: str, mission: Mission | None = None) -> xr.DataTree | None:
+        """Give up the mission that was asked for.
+
+        Args:
+            reason: Reason, for the record.
+            mission: Bounds that were run, to learn from; None if there are none.
+
+        Returns:
+            Posterior, if there was something to learn.
+
+        Raises:
+            TrustboError: The mission is one that `tell` refuses.
+        """
+        posterior = None if mission is None else self.tell(mission)
+        self.log.failures.append((len(self.missions), str(reason)))
+        self._plan = None
+        self._write_state()
+        return posterior
+
+    def recommend(self) -> Plan:
+        """Plan the best path under the mean of the belief, whatever the policy would try next."""
+        return greedy(random.key(0), self.belief, self.planner_now())
+
+    def trust_map(self) -> xr.DataArray:
+        """Compute the team's trust map under the mean of the belief, dims (row, col)."""
+        return self.planner_now().trust_map(self.belief.mean())
+
+    # --- results ---
+
+    @property
+    def history(self) -> xr.Dataset:
+        """Dataset as `Result.history`; empty before the first mission."""
+        return self.log.to_dataset()
+
+    def summary(self) -> pd.DataFrame:
+        """Table with one row for each mission: its plan, status and diagnostics."""
+        return self.log.summary()
+
+    def result(self) -> Result:
+        """Collect everything learned so far, as `iterate` returns it.
+
+        Raises:
+            TrustboError: Nothing was learned yet.
+        """
+        if not self.log.entries:
+            raise TrustboError("the campaign has no mission yet; tell it one first.")
+        best = self.recommend()
+        return Result(
+            self.workspace,
+            self.missions,
+            self.posteriors,
+            list(best.path),
+            best.trust,
+            best.value,
+            self.trust_map(),
+            self.history,
+            {**self.settings, **self.log.notes, "trustbo_version": version("trustbo")},
+            self.log.stop_reason,
+            self._believed_awareness(),
+        )
+
+    # --- the folder ---
+
+    def keep(self, directory: str | PathLike[str]) -> None:
+        """Write everything to a folder, replacing what is there, and keep it up to date from now.
+
+        Raises:
+            TrustboError: Another campaign holds the folder, or its name belongs to a file.
+        """
+        self.close()
+        self._open(CampaignFolder(directory), overwrite=True)
+
+    def save(self, directory: str | PathLike[str]) -> None:
+        """Write everything to a folder that `Campaign.load` reads.
+
+        Another campaign in it is replaced. To keep a campaign as it goes, make it with a
+        `directory`.
+
+        Raises:
+            TrustboError: Another campaign holds the folder, or its name belongs to a file.
+        """
+        own, self._folder = self._folder, None
+        here = own is not None and own.path.resolve() == Path(directory).resolve()
+        folder = own if own is not None and here else CampaignFolder(directory)
+        try:
+            self._open(folder, overwrite=True)
+        finally:
+            self._folder = own
+            if folder is not own:
+                folder.close()
+
+    @classmethod
+    def load(
+        cls,
+        directory: str | PathLike[str],
+        *,
+        model: TrustModel | None = None,
+        policy: Policy | None = None,
+        **own: Any,
+    ) -> Self:
+        """Go on with a campaign where it stopped, in the same folder.
+
+        A mission that was told and not yet learned from is learned from now.
+
+        Args:
+            directory: Folder of its `directory`, or of `save`.
+            model: The same model, if it has priors of your own, or is your own.
+            policy: The same policy, if it is your own.
+            **own: The same `callbacks`, and the same `awareness`, as it was before the first
+                mission, if it is your own.
+
+        Raises:
+            TrustboError: There is no campaign; another process is at work on it; or something of
+                your own is missing.
+        """
+        folder = CampaignFolder(directory, begun=True)
+        try:
+            state, measured, learned = folder.read()
+            record = state["options"]
+            if "replan" in state["notes"]:  # of version 0.1
+                record.setdefault("replan", state["notes"]["replan"])
+            start, goal = (tuple(record.pop(name)) for name in ("start", "goal"))
+            chosen = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
+            learner = model_from_record(record.pop("model"), model)
+            named = {name: record.pop(name) for name in ("objective", "sampler", "seed")}
+            options = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
+            campaign = cls(
+                folder.read_workspace(), start, goal, model=learner, policy=chosen,
+                options=options, **named,
+            )  # fmt: skip
+        except BaseException:
+            folder.close()
+            raise
+        campaign.log = History.from_state(state, measured, learned)
+        if campaign.log.entries:
+            *earlier, latest = campaign.log.measured
+            if campaign.awareness is not None:
+                for mission in earlier:
+                    campaign.awareness.update(mission)
+            campaign._learned(latest)
+        suggested = state["suggested"]
+        campaign._plan = suggested and plan_from_record(suggested)
+        campaign._folder = folder
+        if len(measured) > len(campaign.missions):
+            try:
+                campaign.tell(measured[-1])
+            except PosteriorError as error:
+                warnings.warn(f"the last mission is pending: {error}", stacklevel=2)
+        return campaign
+
+    def stop(self, reason: str) -> Result:
+        """End the campaign, which may still go on later, and return its result.
+
+        Args:
+            reason: Reason, for `Result.stop_reason`.
+        """
+        self.log.stop_reason = reason
+        result = self.result()
+        if self._folder is not None:
+            self._folder.write(self._state(), result)
+        return result
+
+    def close(self) -> None:
+        """Let go of the folder; the campaign is kept there no longer."""
+        if self._folder is not None:
+            self._folder.close()
+            self._folder = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _open(self, folder: CampaignFolder, *, overwrite: bool) -> None:
+        """Write all of it to a folder, and keep it there from now on."""
+        if folder.is_used and not overwrite:
+            folder.close()
+            raise TrustboError(
+                f"{str(folder.path)!r} holds a campaign already: go on with it by "
+                "Campaign.load, or choose another folder."
+            )
+        folder.begin(self.workspace, self.log.measured)
+        self._folder = folder
+        self._write(whole=True)
+
+    def _write(self, *, whole: bool = False) -> None:
+        if self._folder is not None:
+            result = self.result() if self.log.entries else None
+            self._folder.write(self._state(), result, whole=whole)
+
+    def _write_state(self) -> None:
+        if self._folder is not None:
+            self._folder.write(self._state(), None)
+
+    def _state(self) -> dict[str, Any]:
+        plan = None if self._plan is None else plan_to_record(self._plan)
+        return {"options": self._record, "suggested": plan, **self.log.to_state()}
+
+    # --- inside ---
+
+    def _accept(self, plan: Plan, started: float) -> Plan:
+        bands = self.planner_now().bands(plan.path, self.belief)
+        now = time.perf_counter()
+        self._asked = now - started, now
+        return replace(plan, bands=bands)
+
+    def _learned(self, mission: Mission) -> None:
+        """Plan from the last posterior from now on, and update the belief by a mission as told."""
+        self.belief, self.pending = params_of(self.log.entries[-1].posterior), None
+        self._plan = self._believed = None
+        if self.awareness is not None:
+            self.awareness.update(mission)
+
+    def planner_now(self) -> Planner:
+        """Planner with the awareness that is believed in now."""
+        if self.awareness is None:
+            return self.planner
+        if self._believed is None:
+            n_maps = min(_N_MAPS, self.belief.leading[0])
+            maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
+            self._believed = self.planner.with_awareness(maps, self.awareness.mean())
+        return self._believed
+
+    def _believed_awareness(self) -> xr.Dataset | None:
+        """`Result.believed`."""
+        if self.awareness is None:
+            return None
+        like, planner = self.workspace.awareness, self.planner_now()
+        # Single precision: they are written after every mission.
+        maps = planner.awareness[:_N_KEPT].astype(np.float32)
+        draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
+        return xr.Dataset({"mean": like.copy(data=planner.mean_awareness), "draws": draws})
+
+    def seed_of(self, stream: str) -> int:
+        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
+        entropy = [self.seed, _STREAMS.index(stream), len(self.log.entries)]
+        if n_failures := sum(n == len(self.log.entries) for n, _ in self.log.failures):
+            entropy.append(n_failures)  # another try may choose another path
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+
+def _require_mission_of(workspace: Workspace, mission: Mission) -> None:
+    """Refuse a mission of another team, or somewhere else."""
+    if not isinstance(mission, Mission):
+        raise TrustboError(f"tell takes a Mission; got {mission!r}.")
+    for what, names in (("robot", mission.robots), ("feature", mission.features)):
+        expected = tuple(str(name) for name in workspace.awareness[what].values)
+        if names != expected:
+            raise ShapeError(f"the mission has {what}s {names}, the workspace {expected}.")
+    rows, cols = workspace.grid.shape
+    for cell in mission.path:
+        if not (0 <= cell[0] < rows and 0 <= cell[1] < cols):
+            raise TrustboError(
+                f"the mission's path enters {cell}, outside the grid of {rows} rows and {cols} "
+                "columns."
+            )

@@ -1,0 +1,204 @@
+"""Options of a campaign: one frozen object that validates, plans, records and restores.
+
+Importing it loads nothing heavy, for `trustbo --help` is made from its fields.
+"""
+
+import difflib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Self
+
+from trustbo.errors import TrustboError, require_choice
+
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+    from trustbo.campaign.learning import Learning
+    from trustbo.data import Cell, Mission
+    from trustbo.models import TrustModel
+    from trustbo.planning import Planner
+    from trustbo.workspace import AwarenessBelief, Workspace
+
+    Callback = Callable[[Campaign, Mission], None]
+
+POLICY, OBJECTIVE, SAMPLER = "greedy", "terminal", "nuts"
+"""Defaults of keywords that are no options; commands and studies have the same."""
+PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
+_OWN = ("awareness", "callbacks")
+"""Options that a folder cannot hold if they are the user's own."""
+
+
+def _of(part: str, *choices: str) -> dict[str, Any]:
+    return {"part": part, "choices": choices}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignOptions:
+    """Options of a campaign besides its model, policy, objective, sampler and seed.
+
+    `iterate` and `Campaign` take them one by one, or all as `options=CampaignOptions(...)`. The
+    flags of `trustbo run` and the options of studies are made from the fields; the help of a flag
+    is the first sentence of its entry here.
+
+    Attributes:
+        connectivity: Number of directions of a bound: 8, or 4 for no diagonal bounds.
+        max_bounds: Admissible paths: shortest, shortest+2, or the most bounds allowed. See
+            `Planner`, also for the default.
+        team: Trust of the team, the mean or the min of its robots'.
+        length_weight: Cost of a metre of the path, in units of the objective. See `Planner`.
+        initial: Source of the first plan: prior_draw (one random draw of the prior, as in the
+            paper) or prior_mean.
+        update: Missions that a posterior is fitted to: refit (all so far) or, for comparison with
+            the 2023 code, moment_matched (the last). The prior of the latter has the mean and sd of
+            the posterior before, which is not exact.
+        forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
+            environment is followed; for `"refit"` with Gaussian observations.
+        awareness: Trust in the awareness map: map (blind) or belief (missions correct it). Under
+            `"belief"`, or an `AwarenessBelief` of your own, policies draw from it too.
+        replan: Replanning after each mission or after each bound. Under `"bound"` the rest is
+            planned from the trust of now, see `replanning.run_replanning`; for `iterate` and
+            `missions`.
+        callbacks: Functions `callback(campaign, mission)`, called after each mission by `iterate`
+            and `missions`.
+
+    Raises:
+        TrustboError: An unknown name, or a number outside its range.
+    """
+
+    connectivity: int = field(default=8, metadata=_of(PLANNING))
+    max_bounds: int | str | None = field(default=None, metadata=_of(PLANNING))
+    team: str = field(default="mean", metadata=_of(PLANNING, "mean", "min"))
+    length_weight: float = field(default=0.0, metadata=_of(PLANNING))
+    initial: str = field(default="prior_draw", metadata=_of(LEARNING, "prior_draw", "prior_mean"))
+    update: str = field(default="refit", metadata=_of(LEARNING, "refit", "moment_matched"))
+    forgetting: float = field(default=1.0, metadata=_of(LEARNING))
+    awareness: "str | AwarenessBelief" = field(
+        default="map", metadata=_of(LEARNING, "map", "belief")
+    )
+    replan: str = field(default="mission", metadata=_of(RUNNING, "mission", "bound"))
+    callbacks: "Sequence[Callback]" = field(default=(), metadata=_of(RUNNING))
+
+    def __post_init__(self) -> None:
+        from trustbo.models.likelihood.gram import require_forgetting
+
+        for option in fields(self):
+            choices = option.metadata["choices"]
+            if choices and not (option.name == "awareness" and self.own_awareness):
+                require_choice(option.name, getattr(self, option.name), choices)
+        require_forgetting(self.forgetting)
+        object.__setattr__(self, "callbacks", tuple(self.callbacks))
+        for callback in self.callbacks:
+            if not callable(callback):
+                raise TrustboError(f"callbacks must be callables; got {callback!r}.")
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any], call: Callable[..., Any] | None = None) -> Self:
+        """Options given one by one, or as one object by the name `options`.
+
+        Args:
+            given: Keywords of a call besides its own.
+            call: Function that was called; a misspelt option may mean a keyword of it.
+
+        Raises:
+            TrustboError: An unknown option, or some besides the object.
+        """
+        if "options" not in given:
+            names = [option.name for option in fields(cls)]
+            for name in given:
+                if name not in names:
+                    own = getattr(call, "__kwdefaults__", None) or {}
+                    raise unknown("option", name, [*names, *own])
+            return cls(**given)
+        whole, *others = given["options"], *(name for name in given if name != "options")
+        if others or not isinstance(whole, cls):
+            raise TrustboError(
+                "give options=CampaignOptions(...), or options one by one; got options="
+                f"{whole!r}{' and ' if others else ''}{', '.join(others)}."
+            )
+        return whole
+
+    @property
+    def own_awareness(self) -> bool:
+        """Whether the user gave a belief about the awareness."""
+        if isinstance(self.awareness, str):
+            return False
+        from trustbo.workspace import AwarenessBelief
+
+        return isinstance(self.awareness, AwarenessBelief)
+
+    def planner(
+        self, workspace: "Workspace", start: "Cell", goal: "Cell", objective: str
+    ) -> "Planner":
+        """Planner with these options."""
+        from trustbo.planning import Planner
+
+        chosen: dict[str, Any] = {name: getattr(self, name) for name in options_of(PLANNING)}
+        return Planner(workspace, start, goal, objective, **chosen)
+
+    def learning(self, model: "TrustModel | None", sampler: str) -> "Learning":
+        """Learning of a model, by default `PooledTrust()`."""
+        from trustbo.campaign.learning import Learning
+        from trustbo.models import PooledTrust
+
+        return Learning(
+            PooledTrust() if model is None else model, sampler, self.update, self.forgetting
+        )
+
+    def belief(self, workspace: "Workspace") -> "AwarenessBelief | None":
+        """Belief about the awareness; None where the map is trusted."""
+        from trustbo.workspace import AwarenessBelief
+
+        if isinstance(self.awareness, AwarenessBelief):
+            return self.awareness
+        return AwarenessBelief(workspace) if self.awareness == "belief" else None
+
+    def to_record(self) -> dict[str, Any]:
+        """Options as JSON can hold them, callbacks left out."""
+        record = {o.name: getattr(self, o.name) for o in fields(self) if o.name != "callbacks"}
+        return record | ({"awareness": "belief"} if self.own_awareness else {})
+
+    @classmethod
+    def restore(cls, record: Mapping[str, Any], own_awareness: bool, **own: Any) -> Self:
+        """Options of a record.
+
+        Args:
+            record: Record of `to_record`; an option that it lacks has its default.
+            own_awareness: Whether the awareness was the user's own.
+            **own: The user's own awareness and callbacks, given again.
+
+        Raises:
+            TrustboError: An awareness that was not given again, or that was none of the user's own;
+                another option.
+        """
+        for name in own:
+            if name not in _OWN:
+                raise unknown("option of one's own", name, _OWN)
+        awareness = again("awareness", record["awareness"], own.get("awareness"), own_awareness)
+        return cls.of({**record, **own, "awareness": awareness})
+
+
+def options_of(part: str) -> list[str]:
+    """Names of the options of planning, learning or running."""
+    return [o.name for o in fields(CampaignOptions) if o.metadata["part"] == part]
+
+
+def again(name: str, kept: Any, given: Any, was_own: bool) -> Any:
+    """The value that was kept, or, if it was the user's own, the one given again.
+
+    Raises:
+        TrustboError: The user's own is missing, or there was none.
+    """
+    if was_own and given is None:
+        raise TrustboError(
+            f"the campaign's {name} was your own ({kept!r}); give it again with {name}=."
+        )
+    if given is not None and not was_own:
+        raise TrustboError(f"the campaign's {name} is {kept!r}, none of your own; leave {name}=.")
+    return kept if given is None else given
+
+
+def unknown(what: str, name: str, known: Iterable[str]) -> TrustboError:
+    """Error for an unknown name, with those that may be meant."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(known)}."
+    return TrustboError(f"unknown {what} {name!r}; {advice}")

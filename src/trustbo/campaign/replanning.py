@@ -1,0 +1,117 @@
+"""A mission whose path is planned again after each bound."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError
+from trustbo.models import TrustFilter
+from trustbo.models.params import Params
+from trustbo.planning import Plan, Planner
+from trustbo.stacking import fill_awareness
+
+THRESHOLD = 0.01
+"""Least gain in the objective's value for which another continuation is taken."""
+
+
+def require_bounds(simulator: Any) -> None:
+    """Refuse a simulator that cannot run one bound after the other.
+
+    Raises:
+        TrustboError: It has no `reset` or `run_bound`.
+    """
+    missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
+    if missing:
+        raise TrustboError(
+            f'replan="bound" needs a simulator with reset(start, seed) and run_bound(k, cell); '
+            f"{type(simulator).__name__} has no {' and no '.join(missing)}."
+        )
+
+
+def run_replanning(
+    campaign: Campaign, simulator: Any, plan: Plan, *, threshold: float = THRESHOLD, **start: Any
+) -> Mission:
+    """Run a plan bound by bound; a continuation that has become better is taken.
+
+    After each bound, a `TrustFilter` gives the trust of now and a weight of each posterior draw.
+    The rest of the path is planned again from there, among the admissible paths that are left, and
+    taken if it is worth more than the old rest by the threshold.
+
+    Args:
+        campaign: Campaign with its posterior; before its first mission there is none, and the plan
+            is run unchanged.
+        simulator: Simulator with `reset`, `run_bound`, and maybe `close`.
+        plan: Plan to begin with.
+        threshold: Difference of values, see `OBJECTIVES`.
+        **start: Arguments of `reset`, such as the seed.
+
+    Returns:
+        Mission along the cells that were chosen.
+    """
+    path, bounds = list(plan.path), []
+    live = None if campaign.posterior is None else TrustFilter(campaign.posterior)
+    if takes(simulator.reset, "next_cell"):
+        start["next_cell"] = path[1]
+    simulator.reset(path[0], **start)
+    k = 1
+    while k < len(path):
+        ahead = path[k + 1] if k + 1 < len(path) else None
+        bound: Bound = _run_bound(simulator, k, path[k], ahead)
+        bounds.append(bound)
+        if bound.status != "ok":
+            break
+        if live is not None and k + 1 < len(path):
+            planner = campaign.planner_now().onward(path[: k + 1])
+            awareness = _known(campaign, bound)
+            live.update(awareness, bound.contact_rate)
+            path = [*path[:k], *better_rest(planner, live, path[k:], threshold)]
+        k += 1
+    getattr(simulator, "close", lambda: None)()
+    names = (
+        tuple(str(n) for n in campaign.workspace.awareness[d].values) for d in ("feature", "robot")
+    )
+    return Mission(tuple(path), tuple(bounds), bounds[-1].status, *names)
+
+
+def better_rest(
+    planner: Planner, live: TrustFilter, rest: Sequence[Cell], threshold: float
+) -> tuple[Cell, ...]:
+    """Plan the rest of a path from the trust of now; the old rest if that is nearly as good.
+
+    Args:
+        planner: Planner of the paths that are left, see `Planner.onward`.
+        live: Filter of trust and parameters after the last bound.
+        rest: Cells planned so far, from the team's on.
+        threshold: Difference of values.
+    """
+    params, now = weighted_mean(live.params, live.weights), live.state.mean
+    old = planner.evaluate(rest, params, x0=now)
+    new = planner.plan(params, x0=now)
+    return new.path if new.value > old.value + threshold else tuple(rest)
+
+
+def weighted_mean(params: Params, weights: np.ndarray) -> Params:
+    """Weighted mean of draws; `weights` (draw,) sum to 1."""
+    flat = params.flat()
+    return type(flat)(*(np.tensordot(weights, value, 1) for value in flat))  # pyright: ignore[reportReturnType]
+
+
+def _run_bound(simulator: Any, k: int, cell: Cell, ahead: Cell | None) -> Bound:
+    """Run a bound; a simulator that takes `next_cell`, which is optional, gets it."""
+    known = {"next_cell": ahead} if takes(simulator.run_bound, "next_cell") else {}
+    return simulator.run_bound(k, cell, **known)
+
+
+def takes(function: Callable[..., object], name: str) -> bool:
+    """Whether a function has a parameter of that name."""
+    return name in inspect.signature(function).parameters
+
+
+def _known(campaign: Campaign, bound: Bound) -> np.ndarray:
+    """Awareness of a bound, filled in by the map or the belief where it was not measured."""
+    one = Mission((bound.cell, bound.cell), (bound,), bound.status)
+    return fill_awareness(one, campaign.planner_now().mean_awareness).awareness[0]

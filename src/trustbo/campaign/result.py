@@ -1,0 +1,248 @@
+"""Result of a campaign, in memory and on disk."""
+
+import json
+from dataclasses import dataclass, replace
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from trustbo.campaign.history import Learned
+from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
+from trustbo.data import Cell, Mission
+from trustbo.errors import TrustboError
+from trustbo.files import require_folder, to_json, write_file, write_text
+from trustbo.logs import netcdf as records
+from trustbo.models import params_of
+from trustbo.planning import Plan, Planner
+from trustbo.workspace import Workspace
+from trustbo.workspace import netcdf as archive
+
+_BELIEVED = "believed.nc"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Result of a campaign.
+
+    Attributes:
+        workspace: Workspace of the campaign.
+        missions: All missions, in order.
+        posteriors: Posterior after each of them (ArviZ DataTrees).
+        path: Path recommended after the last mission: the best under the posterior mean.
+        trust: Expected trust along it, shape (bound, robot).
+        value: Its objective.
+        trust_map: Trust map of the team after the last mission, dims (row, col).
+        history: Dataset over `iteration` (1, 2, ...): the path that was planned (`path`, row and
+            col of each step, -1 after the goal), its `objective` when it was planned, whether it
+            differs from the plan before (`path_changed`), the `trust_map` it was planned on, the
+            mission's mean `contact_rate` and `status`, the posterior's diagnostics (see
+            `models.diagnostics`), and the seconds of planning, running and fitting.
+        settings: Options of the campaign, and the settings of its model and simulator.
+        stop_reason: Reason of the end.
+        believed: Belief about the awareness at the end, for `awareness="belief"`: its `mean`
+            (robot, row, col, feature) and `draws` of it (draw, robot, row, col, feature).
+    """
+
+    workspace: Workspace
+    missions: list[Mission]
+    posteriors: list[xr.DataTree]
+    path: list[Cell]
+    trust: np.ndarray
+    value: float
+    trust_map: xr.DataArray
+    history: xr.Dataset
+    settings: dict[str, Any]
+    stop_reason: str
+    believed: xr.Dataset | None = None
+
+    @property
+    def posterior(self) -> xr.DataTree:
+        """Posterior after the last mission."""
+        return self.posteriors[-1]
+
+    @cached_property
+    def planner(self) -> Planner:
+        """Planner as the campaign's, with the awareness believed in at the end."""
+        names = options_of(PLANNING)
+        missing = [n for n in ("start", "goal", "objective", *names) if n not in self.settings]
+        if missing:
+            raise TrustboError(
+                f"the result's settings lack {', '.join(missing)}: it was made by another version "
+                "or by hand; plan with a Planner of your own."
+            )
+        options = CampaignOptions(**{name: self.settings[name] for name in names})
+        start, goal = (_cell(self.settings[name]) for name in ("start", "goal"))
+        planner = options.planner(self.workspace, start, goal, self.settings["objective"])
+        if self.believed is None:
+            return planner
+        return planner.with_awareness(self.believed["draws"].values, self.believed["mean"].values)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """Recommended path as a `Plan`, with bands over the posterior."""
+        mean = params_of(self.posterior).mean()
+        best = self.planner.plan(mean)
+        if list(best.path) != self.path:  # another version may find one of equal value
+            best = self.planner.evaluate(self.path, mean)
+        return replace(best, bands=self.planner.bands(best.path, self.posterior))
+
+    def maps(self, *, n_draws: int | None = None, seed: int = 0) -> xr.Dataset:
+        """Compute every map of the planning cells after the last mission, for GIS and figures.
+
+        Args:
+            n_draws: Number of draws of the posterior; by default 1000, or 100 where each cell needs
+                a search of its own: `team="min"`, or robots that influence each other.
+            seed: Seed of the choice of draws.
+
+        Returns:
+            Dataset over (row, col) with `trust_mean` and `trust_sd` over the posterior, the mean
+            `cost` 1 - sigma(trust), `path_probability` (of a cell to be on the best path), and
+            each feature's awareness, the mean over robots, by its name, or as `awareness_<name>`
+            where another map or a dim has that name. NaN where no robot can go.
+        """
+        if n_draws is None:
+            mean = params_of(self.posterior).mean()
+            n_draws = 1000 if self.planner.dynamics(mean).is_scalar else 100
+        summary = self.planner.trust_summary(self.posterior, n_draws=n_draws, seed=seed)
+        maps = summary.rename(mean="trust_mean", sd="trust_sd")
+        share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
+        awareness = self.workspace.awareness if self.believed is None else self.believed["mean"]
+        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref"}
+        for name in [str(feature) for feature in awareness["feature"].values]:
+            values = awareness.sel(feature=name, drop=True).mean("robot")
+            own = f"awareness_{name}" if name in taken else name
+            maps[own] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
+        maps["path_probability"] = share
+        return maps.where(self.workspace.passable)
+
+    def plot_maps(self, *, n_columns: int | None = None) -> np.ndarray:
+        """Plot the trust map and path of each iteration, and the last; returns the Axes."""
+        from trustbo import plots  # imports matplotlib
+
+        return plots.trust_maps(
+            self.history, self.trust_map, self.path, self.workspace, n_columns=n_columns
+        )
+
+    def save(self, directory: str | PathLike[str]) -> None:
+        """Write everything to a folder that `load_result` reads.
+
+        Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
+        (the last of them), `missions.nc`, `workspace.nc`, `history.nc`, `history.csv` and
+        `result.json`. Files that another result left there are replaced.
+
+        Raises:
+            TrustboError: The folder's name belongs to a file.
+        """
+        folder = require_folder(directory)
+        (folder / "result.json").unlink(missing_ok=True)  # its other files are replaced now
+        for j, posterior in enumerate(self.posteriors):
+            _write_tree(folder / "posteriors" / _posterior_name(j), posterior)
+        _write_tree(folder / "workspace.nc", archive.workspace_to_tree(self.workspace))
+        self.checkpoint(folder)
+
+    def checkpoint(self, directory: str | PathLike[str]) -> None:
+        """Write the last mission to a folder that holds all before it.
+
+        The workspace and the earlier posteriors never change, and are not written again.
+        """
+        folder = require_folder(directory)
+        last = _posterior_name(len(self.posteriors) - 1)
+        _write_tree(folder / "posteriors" / last, self.posterior)
+        for file in (folder / "posteriors").glob("*.nc"):
+            if file.name > last:
+                file.unlink()
+        _write_tree(folder / "posterior.nc", self.posterior)
+        trees = {
+            "missions.nc": records.missions_to_tree(self.missions),
+            "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
+        }
+        if self.believed is None:
+            (folder / _BELIEVED).unlink(missing_ok=True)
+        else:
+            trees[_BELIEVED] = xr.DataTree(self.believed)
+        for name, tree in trees.items():
+            _write_tree(folder / name, tree)
+        scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
+        table = self.history[scalars].to_dataframe()[scalars]
+        table["path"] = [_path_text(path) for path in self.history["path"].values]
+        write_text(folder / "history.csv", table.to_csv())
+        record = {
+            "n_missions": len(self.missions),
+            "path": self.path,
+            "trust": self.trust.tolist(),
+            "value": self.value,
+            "settings": self.settings,
+            "stop_reason": self.stop_reason,
+        }
+        # Written last: its presence means that the rest is complete.
+        write_text(folder / "result.json", to_json(record))
+
+
+def load_result(directory: str | PathLike[str]) -> Result:
+    """Read a result that `Result.save` wrote.
+
+    Args:
+        directory: Folder that it was written to.
+
+    Raises:
+        TrustboError: The folder holds no result, or a damaged one.
+    """
+    folder = Path(directory)
+    if not (folder / "result.json").exists():
+        raise TrustboError(f"{str(folder)!r} holds no result; give a folder written by save().")
+    try:
+        record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+        n, settings = record["n_missions"], record["settings"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise TrustboError(f"{str(folder / 'result.json')!r} is damaged: {error!r}.") from None
+    # A run killed while it saved may have left one mission more than the record counts.
+    missions, posteriors, history = read_learned(folder, n)
+    believed = None
+    if settings.get("awareness") == "belief":
+        if not (folder / _BELIEVED).exists():
+            raise TrustboError(f"{str(folder / _BELIEVED)!r} is missing: the result is damaged.")
+        believed = records.read_tree(folder / _BELIEVED).to_dataset()
+    return Result(
+        archive.workspace_from_tree(records.read_tree(folder / "workspace.nc")),
+        missions,
+        posteriors,
+        [_cell(cell) for cell in record["path"]],
+        np.array(record["trust"]),
+        record["value"],
+        history["final_trust_map"].rename("trust"),
+        history.drop_vars("final_trust_map"),
+        settings,
+        record["stop_reason"],
+        believed,
+    )
+
+
+def read_learned(folder: Path, n_missions: int) -> Learned:
+    """Read the first missions of a saved result, their posteriors and the history."""
+    history = records.read_tree(folder / "history.nc").to_dataset()
+    return Learned(
+        records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n_missions],
+        [records.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n_missions)],
+        history.isel(iteration=slice(n_missions)),
+    )
+
+
+def _cell(pair: Any) -> Cell:
+    row, col = pair
+    return int(row), int(col)
+
+
+def _posterior_name(j: int) -> str:
+    return f"{j + 1:04d}.nc"
+
+
+def _write_tree(path: Path, tree: xr.DataTree) -> None:
+    write_file(path, tree.to_netcdf)
+
+
+def _path_text(path: np.ndarray) -> str:
+    return " ".join(f"{row},{col}" for row, col in path if row >= 0)

@@ -1,0 +1,116 @@
+"""Rules that end a campaign which has learned enough."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jax import random
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.models import params_of
+from trustbo.planning.policies import greedy
+
+Stop = Callable[[Campaign], str | bool | None]
+"""Rule that is called after each mission; a reason (or True) ends the campaign."""
+
+
+@dataclass(frozen=True)
+class RegretBound:
+    """Stop when the recommended path is nearly the best, with high probability, twice in a row.
+
+    Under each of `n_draws` posterior draws the best path is planned exactly; the regret of the
+    recommended path is the value it lacks under that draw, relative to the best. Stop when
+    P(regret <= eps) >= 1 - delta after each of the last `patience` missions. ("The path did not
+    change" would be the wrong test: near-ties change for ever.)
+
+    Attributes:
+        eps: Regret that is good enough, as a share of the best path's value.
+        delta: Probability of a larger regret.
+        patience: Number of missions in a row after which it has to hold.
+        min_missions: Least number of missions.
+        n_draws: Number of draws to plan under.
+
+    Raises:
+        TrustboError: A share outside (0, 1), or a number that is not whole.
+    """
+
+    eps: float = 0.05
+    delta: float = 0.1
+    patience: int = 2
+    min_missions: int = 3
+    n_draws: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("eps", "delta"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise TrustboError(
+                    f"RegretBound.{name} must be in (0, 1); got {getattr(self, name)!r}."
+                )
+        for name in ("patience", "min_missions", "n_draws"):
+            require_whole(f"RegretBound.{name}", getattr(self, name), 1)
+
+    def __call__(self, campaign: Campaign) -> str | None:
+        """Reason to stop, or None."""
+        n = len(campaign.missions)
+        if n < max(self.min_missions, self.patience):
+            return None
+        sure = [self.probability(campaign, n - i) for i in range(self.patience)]
+        if min(sure) < 1.0 - self.delta:
+            return None
+        return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
+
+    def probability(self, campaign: Campaign, n_missions: int) -> float:
+        """P(regret of the recommended path <= eps) after the first `n_missions`."""
+        planner, draws = campaign.planner_now(), params_of(campaign.posteriors[n_missions - 1])
+        path = greedy(random.key(0), draws, planner).path
+        drawn = planner.plan_draws(draws, n_draws=self.n_draws)
+        return float(np.mean(drawn.regret(path) <= self.eps * np.abs(drawn.values)))
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Stop after a number of seconds from now, once the mission under way is done.
+
+    Attributes:
+        limit: Seconds.
+
+    Raises:
+        TrustboError: The limit is not positive.
+    """
+
+    limit: float
+    _start: float = field(default_factory=time.monotonic, repr=False)
+
+    def __post_init__(self) -> None:
+        require_positive("Seconds.limit", self.limit)
+
+    def __call__(self, campaign: Campaign) -> str | None:
+        """Reason to stop, or None."""
+        return f"seconds: {self.limit:g}" if time.monotonic() - self._start > self.limit else None
+
+
+def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
+    """List the rules.
+
+    Raises:
+        TrustboError: One of them is not callable.
+    """
+    rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
+    for rule in rules:
+        if not callable(rule):
+            raise TrustboError(
+                f"stop must be callables stop(campaign) -> reason or None; got {rule!r}."
+            )
+    return rules
+
+
+def reason_to_stop(rules: Sequence[Stop], campaign: Campaign) -> str | None:
+    """Reason of the first rule that ends the campaign, or None."""
+    for rule in rules:
+        verdict = rule(campaign)
+        if verdict:
+            own = getattr(rule, "__name__", type(rule).__name__)
+            return verdict if isinstance(verdict, str) else own
+    return None

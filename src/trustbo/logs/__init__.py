@@ -1,0 +1,8 @@
+"""Missions in files: netCDF, tables and ROS bags (README.md: which file holds what)."""
+
+from trustbo.logs.bag import read_bag, write_bag
+from trustbo.logs.messages import Topics
+from trustbo.logs.netcdf import STATES
+from trustbo.logs.table import read_table, write_table
+
+__all__ = ["STATES", "Topics", "read_bag", "read_table", "write_bag", "write_table"]

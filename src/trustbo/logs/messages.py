@@ -1,0 +1,196 @@
+"""ROS messages of standard types: topics, writers and readers."""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from trustbo.errors import TrustboError, require_pair, require_whole
+
+TEXT = "std_msgs/msg/String"
+FLAG = "std_msgs/msg/Bool"
+NUMBERS = "std_msgs/msg/Float64MultiArray"
+POSE = "geometry_msgs/msg/PoseStamped"
+GRID = "nav_msgs/msg/OccupancyGrid"
+PATH = "nav_msgs/msg/Path"
+
+MARKER_TYPES = (TEXT, "std_msgs/msg/Int32MultiArray")
+STATUS_TYPES = (TEXT,)
+CONTACT_TYPES = (FLAG, "std_msgs/msg/Float32", "std_msgs/msg/Float64")
+AWARENESS_TYPES = (NUMBERS, "std_msgs/msg/Float32MultiArray")
+POSE_TYPES = ("nav_msgs/msg/Odometry", POSE, "geometry_msgs/msg/PoseWithCovarianceStamped")
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Names of topics; `{robot}` stands for the name of a robot, or of the lead.
+
+    Attributes:
+        bound: Markers of the starts of bounds.
+        status: Statuses of bounds and missions.
+        contact: Contact of each robot.
+        awareness: Awareness of each robot.
+        pose: Pose of each robot and the lead.
+        state: State of each robot.
+        lead: Name of the lead.
+
+    Raises:
+        TrustboError: A topic of each robot without `{robot}`.
+    """
+
+    bound: str = "/mission/bound"
+    status: str = "/mission/status"
+    contact: str = "/{robot}/contact"
+    awareness: str = "/{robot}/awareness"
+    pose: str = "/{robot}/odom"
+    lead: str = "lead"
+    state: str = "/{robot}/state"
+
+    def __post_init__(self) -> None:
+        for name in ("contact", "awareness", "pose", "state"):
+            if getattr(self, name).count("{robot}") != 1:
+                raise TrustboError(
+                    f"Topics.{name} must name the robot's place, e.g. '/{{robot}}/{name}'; got "
+                    f"{getattr(self, name)!r}."
+                )
+
+    def of(self, kind: str, robots: Sequence[str]) -> list[str]:
+        """Topics of one kind, e.g. "contact", of several robots."""
+        return [getattr(self, kind).replace("{robot}", robot) for robot in robots]
+
+
+class Messages:
+    """Factory of messages of one version of ROS."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        """Hold the message classes by name, as rosbags has them."""
+        self._types = types
+
+    def text(self, text: str) -> Any:
+        """Make a string."""
+        return self._types[TEXT](data=text)
+
+    def flag(self, value: bool) -> Any:
+        """Make a truth value."""
+        return self._types[FLAG](data=bool(value))
+
+    def numbers(self, values: np.ndarray, names: Sequence[str]) -> Any:
+        """Make a vector; the label of its axis holds the names of the entries."""
+        axis = self._types["std_msgs/msg/MultiArrayDimension"](
+            label=",".join(names), size=len(values), stride=len(values)
+        )
+        layout = self._types["std_msgs/msg/MultiArrayLayout"](dim=[axis], data_offset=0)
+        return self._types[NUMBERS](layout=layout, data=np.asarray(values, dtype=np.float64))
+
+    def pose(self, time: int, pose: np.ndarray) -> Any:
+        """Make a pose (x, y, heading) at a time in ns, in the frame `map`."""
+        return self._types[POSE](header=self._header(time), pose=self._pose(pose))
+
+    def path(self, time: int, poses: np.ndarray) -> Any:
+        """Make a path through poses, shape (pose, 3), in the frame `map`."""
+        stamped = [self.pose(time, pose) for pose in poses]
+        return self._types[PATH](header=self._header(time), poses=stamped)
+
+    def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
+        """Make a map in the frame `map`.
+
+        Args:
+            time: Time, ns.
+            values: Shape (row, col), int8, the southern row first.
+            resolution: Side of a pixel, m.
+            corner: Pose of the lower left corner.
+        """
+        height, width = values.shape
+        info = self._types["nav_msgs/msg/MapMetaData"](
+            map_load_time=self._stamp(time),
+            resolution=resolution,
+            width=width,
+            height=height,
+            origin=self._pose(corner),
+        )
+        data = np.ascontiguousarray(values, dtype=np.int8).ravel()
+        return self._types[GRID](header=self._header(time), info=info, data=data)
+
+    def _stamp(self, time: int) -> Any:
+        return self._types["builtin_interfaces/msg/Time"](
+            sec=time // 1_000_000_000, nanosec=time % 1_000_000_000
+        )
+
+    def _header(self, time: int) -> Any:
+        head = self._types["std_msgs/msg/Header"]
+        number = {"seq": 0} if "seq" in head.__dataclass_fields__ else {}  # of ROS 1 alone
+        return head(stamp=self._stamp(time), frame_id="map", **number)
+
+    def _pose(self, pose: np.ndarray) -> Any:
+        x, y, heading = (float(value) for value in pose)
+        turn = self._types["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=0.0, z=math.sin(heading / 2.0), w=math.cos(heading / 2.0)
+        )
+        place = self._types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0)
+        return self._types["geometry_msgs/msg/Pose"](position=place, orientation=turn)
+
+
+def read_marker(message: Any) -> dict[str, Any]:
+    """Read a marker: `bound`, `cell`, and `path`, `robots`, `features`, empty if not given.
+
+    Raises:
+        TrustboError: It is neither JSON with a bound and a cell, nor [bound, row, col].
+    """
+    try:
+        if isinstance(message.data, str):
+            said = json.loads(message.data)
+        else:
+            bound, *cell = message.data.tolist()
+            said = {"bound": bound, "cell": cell}
+        return {
+            "bound": require_whole("bound", said["bound"], 0),
+            "cell": require_pair("cell", said["cell"]),
+            "path": tuple(require_pair("path", cell) for cell in said.get("path", ())),
+            "robots": tuple(map(str, said.get("robots", ()))),
+            "features": tuple(map(str, said.get("features", ()))),
+        }
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise TrustboError(
+            "a marker must be JSON with a bound and a cell, or [bound, row, col]; got "
+            f"{message.data!r}."
+        ) from None
+
+
+def read_numbers(message: Any) -> tuple[tuple[str, ...], np.ndarray]:
+    """Read the names, if any, and values of a vector.
+
+    Raises:
+        TrustboError: Unequal numbers of names and values.
+    """
+    values = np.asarray(message.data, dtype=float)
+    label = message.layout.dim[0].label if len(message.layout.dim) else ""
+    names = tuple(name.strip() for name in label.split(",")) if label.strip() else ()
+    if names and len(names) != len(values):
+        raise TrustboError(f"it has {len(values)} values named {label!r}.")
+    return names, values
+
+
+def read_pose(message: Any) -> np.ndarray:
+    """Position x and y, and heading in rad from the x axis, in [-pi, pi]; shape (3,)."""
+    pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+    p, q = pose.position, pose.orientation
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
+    return np.array([p.x, p.y, yaw])
+
+
+def stamp_of(message: Any) -> int:
+    """Time in the header of a message, ns."""
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+
+
+READERS: dict[tuple[str, ...], Callable[[Any], Any]] = {
+    MARKER_TYPES: read_marker,
+    STATUS_TYPES: lambda message: str(message.data),
+    CONTACT_TYPES: lambda message: bool(message.data > 0.5),
+    AWARENESS_TYPES: read_numbers,
+    POSE_TYPES: read_pose,
+}
+"""Readers of messages by their types."""

@@ -1,0 +1,208 @@
+"""Missions as a table in long form: one row per mission, bound and robot.
+
+Columns: `mission` (a label), `bound` (a number), `robot` (a name), `row` and `col` of the cell
+entered, or a position in it, `contact_rate` (or `contact_time` and `duration`, s), and one for each
+awareness feature that was measured. Optional: `duration` (s), `n_ticks`, `t0` (s), `status` of the
+bound and `mission_status`. A blank means "not measured". Bound 0 is the start cell, without
+measurements; bounds after the last one with a measurement were planned, not run: rows of either
+need no robot. A feature with the name of one of these columns takes the prefix `awareness_`, e.g.
+`awareness_status`; so does `exposure`, which was the name of `n_ticks` in version 0.1 and is still
+read as such.
+"""
+
+import csv
+import math
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError, require_pair
+from trustbo.files import write_file
+from trustbo.logs.rows import KEYS, Row, column_of, features_of, parse_rows, read_columns
+from trustbo.stacking import require_same_team
+from trustbo.workspace import Workspace
+
+
+def read_table(
+    table: Any,
+    workspace: Workspace | None = None,
+    *,
+    start: Cell | None = None,
+    features: Sequence[str] | None = None,
+    robots: Sequence[str] | None = None,
+    ignore: Sequence[str] = (),
+) -> list[Mission]:
+    """Read missions from a table in long form (see this module).
+
+    Args:
+        table: Path of a CSV file with a header, separated by commas, semicolons or tabs, or a
+            DataFrame (or a mapping of columns).
+        workspace: Workspace with the robots and features to read, in its order, and the grid of
+            columns `x` and `y` (CRS metres) or `lon` and `lat` (degrees) instead of row and col.
+        start: Start cell of missions without a row of bound 0.
+        features: Names of the awareness features, NaN for those without a column; by default the
+            workspace's, else all columns without another meaning, else traversability and
+            visibility.
+        robots: Names of the robots in order; by default the workspace's, else those of the rows.
+        ignore: Columns to leave out, such as `("timestamp", "battery")`.
+
+    Returns:
+        Missions in the order of the table, without ticks (poses and contacts).
+
+    Raises:
+        TrustboError: A missing file, column, bound or robot; a repeated row; a value of the wrong
+            kind; a position off the grid; time that goes backwards; rows of one bound that
+            disagree; or what `Mission` refuses.
+    """
+    columns = read_columns(table, ignore)
+    if workspace is not None:
+        features = workspace.awareness["feature"].values.tolist() if features is None else features
+        robots = workspace.team.names if robots is None else robots
+    names = features_of(columns) if features is None else tuple(features)
+    rows = parse_rows(columns, names, None if workspace is None else workspace.grid)
+    team = tuple(dict.fromkeys(r.robot for r in rows if r.robot)) if robots is None else robots
+    missions: dict[str, dict[int, dict[str, Row]]] = {}
+    for row in rows:
+        if row.robot and row.robot not in team:
+            raise TrustboError(f"row {row.line}: robot {row.robot!r} is not one of {tuple(team)}.")
+        of_bound = missions.setdefault(row.mission, {}).setdefault(row.bound, {})
+        if row.robot in of_bound:
+            raise TrustboError(
+                f"mission {row.mission}, bound {row.bound}, robot {row.robot!r} is there twice, in "
+                f"rows {of_bound[row.robot].line} and {row.line}."
+            )
+        of_bound[row.robot] = row
+    return [_mission(label, own, start, names, tuple(team)) for label, own in missions.items()]
+
+
+def write_table(missions: Sequence[Mission], path: str | PathLike[str]) -> None:
+    """Write missions, without their ticks, as a CSV file that `read_table` reads back.
+
+    Args:
+        missions: Missions with the same robots and features.
+        path: File; written whole or not at all.
+
+    Raises:
+        ShapeError: No missions, or missions that disagree on robots or features.
+    """
+    require_same_team(missions)
+    features = [column_of(name) for name in missions[0].features]
+    measured = ["contact_rate", "duration", "n_ticks", "t0", "status", "mission_status", *features]
+    lines: list[list[object]] = [[*KEYS, *measured]]
+    for j, mission in enumerate(missions):
+        for k, cell in enumerate(mission.path):
+            bound = mission.bounds[k - 1] if 1 <= k <= len(mission.bounds) else None
+            for i, robot in enumerate(mission.robots):
+                own: list[object] = [""] * len(measured)
+                if bound is not None:
+                    rates = (bound.contact_rate[i], bound.duration[i], bound.n_ticks[i], bound.t0)
+                    own = [*map(_text, rates), bound.status, mission.status]
+                    own += map(_text, bound.awareness[i])
+                lines.append([j, k, robot, *cell, *own])
+
+    def write(file: Path) -> None:
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream, lineterminator="\n").writerows(lines)
+
+    write_file(path, write)
+
+
+def _mission(
+    label: str,
+    rows: dict[int, dict[str, Row]],
+    start: Cell | None,
+    features: tuple[str, ...],
+    team: tuple[str, ...],
+) -> Mission:
+    """Make one mission from its rows, by bound and robot."""
+    cells = _cells(label, rows, start)
+    run = [k for k in rows if k and not all(row.is_blank for row in rows[k].values())]
+    if not run:
+        raise TrustboError(f"mission {label} measured nothing: no bound of it has a value.")
+    bounds: list[Bound] = []
+    for k in range(1, max(run) + 1):
+        t0 = bounds[-1].t1 if bounds else 0.0
+        bound = _bound(f"mission {label}, bound {k}", cells[k], rows[k], team, t0)
+        if bounds and bound.t0 < bounds[-1].t0:
+            raise TrustboError(
+                f"mission {label}, bound {k}: time goes backwards, t0 = {bound.t0:.9g} s after "
+                f"{bounds[-1].t0:.9g} s; number the bounds in the order they were run."
+            )
+        bounds.append(bound)
+    said = [row.mission_status for own in rows.values() for row in own.values()]
+    status = _agreed(f"mission {label}", "mission_status", said) or bounds[-1].status
+    try:
+        return Mission(cells, tuple(bounds), status, features, team)
+    except TrustboError as error:
+        raise TrustboError(f"mission {label}: {error}") from None
+
+
+def _cells(label: str, rows: dict[int, dict[str, Row]], start: Cell | None) -> tuple[Cell, ...]:
+    """Path of a mission from its rows."""
+    if 0 not in rows and start is None:
+        raise TrustboError(
+            f"mission {label} has no row of bound 0, its start cell; add one, or give start."
+        )
+    for row in rows.get(0, {}).values():
+        if not (math.isnan(row.numbers["contact_rate"]) and math.isnan(row.numbers["duration"])):
+            raise TrustboError(
+                f"row {row.line}: bound 0 is the start cell and measures nothing; number the "
+                "bounds from 1."
+            )
+    cells = [] if 0 in rows else [require_pair("start", start)]
+    for k in range(len(cells), max(rows) + 1):
+        if k not in rows:
+            raise TrustboError(f"mission {label} has bounds {sorted(rows)}, but no bound {k}.")
+        of_bound = [row.cell for row in rows[k].values()]
+        cells.append(_agreed(f"mission {label}, bound {k}", "cell", of_bound))
+    return tuple(cells)
+
+
+def _bound(where: str, cell: Cell, rows: dict[str, Row], team: tuple[str, ...], t0: float) -> Bound:
+    """Make one bound from its rows, by robot; `t0` is for rows without a start time."""
+    for robot in team:
+        if robot not in rows:
+            raise TrustboError(f"{where} has no row for robot {robot!r}.")
+    own = [rows[robot] for robot in team]
+    said = [row.numbers["t0"] for row in own if not math.isnan(row.numbers["t0"])]
+    began = _agreed(where, "t0", said) if said else t0
+    status = _agreed(where, "status", [row.status for row in own]) or "ok"
+    awareness = np.array([row.awareness for row in own])
+    duration, n_ticks = (np.array([row.numbers[n] for row in own]) for n in ("duration", "n_ticks"))
+    try:
+        rate = np.array([_rate(row) for row in own])
+        return Bound(cell, awareness, rate, duration, status, began, n_ticks=n_ticks)
+    except TrustboError as error:
+        raise TrustboError(f"{where}: {error}") from None
+
+
+def _rate(row: Row) -> float:
+    """Contact rate, which may be given as a time; both must agree."""
+    rate, time, total = (row.numbers[n] for n in ("contact_rate", "contact_time", "duration"))
+    if time > total:
+        raise TrustboError(f"contact_time = {time:g} s exceeds duration = {total:g} s.")
+    if rate > 1.0:
+        raise TrustboError(f"contact_rate = {rate:g} is outside [0, 1]; divide percentages by 100.")
+    if math.isnan(rate):
+        return time / total if total else math.nan  # Bound refuses a duration of 0
+    if abs(rate * total - time) > 1e-6 * total:
+        raise TrustboError(
+            f"contact_rate = {rate:g} of {total:g} s is not contact_time = {time:g} s; give one."
+        )
+    return rate
+
+
+def _agreed(where: str, what: str, values: Sequence[Any]) -> Any:
+    """Common value of all rows that are not blank; "" if all are."""
+    distinct = list(dict.fromkeys(value for value in values if value != ""))
+    if len(distinct) > 1:
+        raise TrustboError(f"{where}: rows disagree on {what}: {distinct[0]} and {distinct[1]}.")
+    return distinct[0] if distinct else ""
+
+
+def _text(number: float) -> str:
+    return "" if math.isnan(number) else repr(float(number))

@@ -1,0 +1,1 @@
+"""Likelihoods of contact rates, latent trust integrated out."""

@@ -1,0 +1,117 @@
+"""The joint distribution of contact rates for numpyro, and compiled functions of it."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jax import Array, lax
+from numpyro.distributions import constraints
+
+from trustbo.models.likelihood.families import FAMILIES, Family, Observed
+from trustbo.models.params import Params
+
+
+class ContactRate(dist.Distribution):
+    """Joint distribution of a batch of missions' contact rates.
+
+    Batch shape (mission,), event shape (bound, robot). A rate that is NaN counts as not measured.
+    Latent trust is integrated out where its family allows; else `log_prob` is a weight that depends
+    on `innovations` and averages to the density (see `families.family`).
+    """
+
+    support = constraints.independent(constraints.real, 2)  # pyright: ignore
+    pytree_data_fields = ("params", "awareness", "n_ticks", "innovations")
+    pytree_aux_fields = ("observation", "lag")
+
+    def __init__(
+        self,
+        params: Params,
+        awareness: Array,
+        *,
+        n_ticks: Array | None = None,
+        innovations: Array | None = None,
+        observation: str = "gaussian",
+        lag: float = 0.0,
+    ) -> None:
+        """Take parameters and awareness.
+
+        Args:
+            params: Parameters without leading axes.
+            awareness: Shape (mission, bound, robot, feature).
+            n_ticks: Ticks, shape (mission, bound, robot); the beta-binomial family needs them.
+            innovations: Standard normal numbers that latent trust is a function of where it does
+                not integrate out, shape (bound, mission, robot); 0 by default.
+            observation: Name of the family, such as `"gaussian"`.
+            lag: 0 where rates measure trust, 1 where they measure its change.
+        """
+        self.params, self.awareness, self.n_ticks = params, awareness, n_ticks
+        self.innovations, self.observation, self.lag = innovations, observation, lag
+        super().__init__(awareness.shape[:1], awareness.shape[1:3])
+
+    @property
+    def family(self) -> Family:
+        """The family of observations."""
+        return FAMILIES[self.observation]
+
+    def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Log density in nats, shape (mission,)."""
+        observed = Observed.of(value, self.n_ticks)
+        innovations = self.innovations
+        innovations = jnp.zeros_like(observed.y) if innovations is None else innovations
+        ssm = self.params.ssm(self.awareness, self.lag)
+        return self.family.log_density(ssm, observed, innovations).sum(1)
+
+    def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, key: Array, sample_shape: tuple[int, ...] = ()
+    ) -> Array:
+        """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
+        keys = jax.random.split(key, sample_shape)
+        args = (self.family, self.lag, self.params, self.awareness, self.n_ticks)
+
+        def one(key: Array) -> Array:
+            return jnp.swapaxes(draw_missions(*args, key)[1], 0, 1)
+
+        for _ in sample_shape:
+            one = jax.vmap(one)
+        return one(keys)
+
+
+class TrustSample(NamedTuple):
+    """Draws of latent trust and contact rate, each of shape (mission, bound, robot)."""
+
+    trust: np.ndarray
+    contact_rate: np.ndarray
+
+
+@partial(jax.jit, static_argnames=("family", "lag"))
+def mission_log_likelihood(
+    family: Family,
+    lag: float,
+    params: Params,
+    awareness: Array,
+    contact_rate: Array,
+    n_ticks: Array,
+    key: Array,
+) -> Array:
+    """Log p(contact rates of each mission | draw), latent trust integrated out; (draw, mission)."""
+
+    def one(p: Params) -> Array:
+        observed = Observed.of(contact_rate, n_ticks)
+        # The same innovations for every draw: comparisons do not differ by luck.
+        return family.marginal_log_likelihood(p.ssm(awareness, lag), observed, key)
+
+    return lax.map(one, params, batch_size=256)
+
+
+def draw_missions(
+    family: Family, lag: float, params: Params, awareness: Array, n_ticks: Array | None, key: Array
+) -> tuple[Array, Array]:
+    """Latent trust and contact rates drawn from the model, each (bound, mission, robot)."""
+    like = awareness[..., 0] if n_ticks is None else n_ticks
+    return family.simulate(params.ssm(awareness, lag), jnp.swapaxes(like, 0, 1), key)
+
+
+simulate_missions = jax.jit(draw_missions, static_argnames=("family", "lag"))

@@ -1,0 +1,46 @@
+"""Censored rates (Tobit): y = x + v cut to [0, 1], so rates of 0 and 1 are known as limits only.
+
+Trust is Gaussian given the censored rates, which are drawn beyond their limits bound by bound from
+the filter's predictions (GHK), as functions of the innovations.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from trustbo.models.likelihood.families.family import SSM, Observed
+from trustbo.models.likelihood.families.gaussian import Gaussian
+from trustbo.models.likelihood.scalar import Censoring, Filtered
+
+
+@dataclass(frozen=True)
+class Censored(Gaussian):
+    """Gaussian rates that pile up at 0 and 1."""
+
+    name: ClassVar[str] = "censored"
+    integrates_out: ClassVar[bool] = False
+
+    def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
+        """See `Family.log_density`."""
+        filtered = self.filter(ssm, observed, e, complete)
+        return ssm.per_sequence(filtered.log_likelihood)
+
+    def filter(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Filtered:
+        """Moments of trust given the rates so far, the censored ones drawn."""
+        side = jnp.where(observed.y >= 1.0, 1.0, jnp.where(observed.y <= 0.0, -1.0, 0.0))
+        return ssm.filter(observed.y, complete=complete, censoring=Censoring(side, e))
+
+    def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
+        """See `Family.measure`: `y` cut to [0, 1]."""
+        return jnp.clip(y, 0.0, 1.0)
+
+    def is_density(self, y: np.ndarray) -> np.ndarray:
+        """See `Family.is_density`: rates of 0 and 1 have a probability."""
+        return (y > 0.0) & (y < 1.0)
+
+    def bounded_at(self, rate: float) -> bool:
+        """See `Family.bounded_at`: a probability is at most 1."""
+        return not 0.0 < rate < 1.0

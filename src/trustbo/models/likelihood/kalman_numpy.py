@@ -1,0 +1,195 @@
+"""The recursions of `scalar` in NumPy, under many draws at once: latent trust at the end of a fit.
+
+Compiling them would take longer than running them. Sequences of one length share their variances,
+which depend on the draw alone; draws are the last, contiguous axis.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.models.likelihood.gram import lengths
+from trustbo.models.likelihood.kalman import innovation, look_back, update
+from trustbo.models.params import Params
+from trustbo.stacking import MissionBatch
+
+_CELLS = 1 << 18  # numbers per array and chunk of draws: what the cache holds
+_LEAST_VARIANCE = 1e-300
+
+
+class TrustSummary(NamedTuple):
+    """Latent trust over all draws, and the likelihood of each."""
+
+    mean: np.ndarray  # (mission, bound, robot)
+    sd: np.ndarray  # (mission, bound, robot)
+    log_likelihood: np.ndarray  # (draw, mission)
+
+
+def summarize(params: Params, lag: float, batch: MissionBatch) -> TrustSummary:
+    """Mean and sd of latent trust over all draws, and each mission's log-likelihood per draw.
+
+    Args:
+        params: Draws with leading axis (draw,).
+        lag: 0 where rates measure trust, 1 where they measure its change.
+        batch: Missions, padded with NaN.
+    """
+    n = len(params.b)
+    shape = batch.contact_rate.shape
+    total, squares = np.zeros(shape), np.zeros(shape)
+    log_likelihood = np.zeros((n, shape[0]))
+    for group in _groups(params, batch):
+        step = max(1, _CELLS // group.y.size)
+        for start in range(0, n, step):
+            draws = slice(start, start + step)
+            p = _Draws(*(column[..., draws] for column in group.draws))
+            f = _filter(p, lag, group)
+            np.add.at(log_likelihood[draws].T, group.mission, f.log_likelihood)
+            m, P = f.mean[-1], f.var[-1]
+            for k in range(len(group.y) - 1, -1, -1):
+                if k < len(group.y) - 1:
+                    A, a, V = _backward(p, lag, group, f, k)
+                    m, P = A * m + a, V + A**2 * P
+                total[group.mission, k, group.robot] += m.sum(-1)
+                spread = np.broadcast_to(P, m.shape)
+                squares[group.mission, k, group.robot] += (spread + m**2).sum(-1)
+    mean = total / n
+    return TrustSummary(mean, np.sqrt(np.maximum(squares / n - mean**2, 0.0)), log_likelihood)
+
+
+def sample(params: Params, lag: float, batch: MissionBatch, rng: np.random.Generator) -> np.ndarray:
+    """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
+    trust = np.zeros((len(params.b), *batch.contact_rate.shape))
+    for group in _groups(params, batch):
+        p, e = group.draws, rng.standard_normal((*group.y.shape, len(params.b)))
+        f = _filter(p, lag, group)
+        x = f.mean[-1] + np.sqrt(f.var[-1]) * e[-1]
+        for k in range(len(group.y) - 1, -1, -1):
+            if k < len(group.y) - 1:
+                A, a, V = _backward(p, lag, group, f, k)
+                x = A * x + a + np.sqrt(V) * e[k]
+            trust[:, group.mission, k, group.robot] = x.T
+    return trust
+
+
+def simulate(
+    params: Params, lag: float, awareness: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Gaussian contact rates of new missions, one set per draw: (draw, mission, bound, robot).
+
+    Args:
+        params: Draws with leading axis (draw,).
+        lag: 0 where rates measure trust, 1 where they measure its change.
+        awareness: Shape (mission, bound, robot, feature).
+        rng: Random number generator.
+    """
+    n, shape = len(params.b), awareness.shape[:3]
+    batch = MissionBatch(awareness, np.zeros(shape), np.full(shape, np.nan))
+    rates = np.zeros((n, *shape))
+    for group in _groups(params, batch):
+        p = group.draws
+        w, v = rng.standard_normal((2, *group.y.shape, n))
+        x = p.x0_mean + p.x0_sd * rng.standard_normal((len(group.mission), n))
+        for k in range(len(group.y)):
+            before = x
+            x = p.beta0 * x + group.z[k] @ p.beta + p.b + p.delta_w * w[k]
+            y = x - lag * before + p.delta_v * v[k]
+            rates[:, group.mission, k, group.robot] = y.T
+    return rates
+
+
+class _Draws(NamedTuple):
+    """Parameters of one robot or of all, draws last."""
+
+    beta0: np.ndarray
+    beta: np.ndarray  # (feature, draw)
+    b: np.ndarray
+    delta_w: np.ndarray
+    delta_v: np.ndarray
+    x0_mean: np.ndarray
+    x0_sd: np.ndarray
+
+
+class _Group(NamedTuple):
+    """Sequences side by side that share their pattern of missing rates, or each have their own."""
+
+    draws: _Draws
+    mission: np.ndarray  # (sequence,)
+    robot: np.ndarray  # (sequence,)
+    y: np.ndarray  # (bound, sequence), 0 where missing
+    z: np.ndarray  # (bound, sequence, feature)
+    seen: np.ndarray  # (bound, sequence, 1), or (bound, 1, 1) where all share it
+
+
+class _Filtered(NamedTuple):
+    mean: list[np.ndarray]  # per bound, (sequence, draw)
+    var: list[np.ndarray]  # per bound, (sequence or 1, draw)
+    drift: list[np.ndarray]  # per bound, (sequence, draw)
+    log_likelihood: np.ndarray  # (sequence, draw)
+
+
+def _groups(params: Params, batch: MissionBatch) -> Iterator[_Group]:
+    n_missions, _, n_robots = batch.contact_rate.shape
+    for members in params.alike(n_robots):
+        draws = _draws_last(params.of_robot(members[0]))
+        mission, robot = (a.ravel() for a in np.meshgrid(range(n_missions), members, indexing="ij"))
+        y = batch.contact_rate[mission, :, robot].T
+        seen = ~np.isnan(y)
+        length, complete = lengths(seen.T)
+        for n in np.unique(length[length > 0]):
+            for shared in (True, False):
+                rows = np.flatnonzero((length == n) & (complete == shared))
+                if not len(rows):
+                    continue
+                here = seen[:n, rows, None]
+                yield _Group(
+                    draws,
+                    mission[rows],
+                    robot[rows],
+                    np.where(seen, y, 0.0)[:n, rows],
+                    np.swapaxes(batch.awareness[mission[rows], :n, robot[rows]], 0, 1),
+                    here[:, :1] if shared else here,
+                )
+
+
+def _draws_last(params: Params) -> _Draws:
+    n = len(params.b)
+
+    def column(value: np.ndarray) -> np.ndarray:
+        value = np.broadcast_to(np.asarray(value, dtype=float), (n, *np.shape(value)[1:]))
+        return np.ascontiguousarray(value.T)
+
+    return _Draws(*(column(value) for value in params))
+
+
+def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
+    h, Q, R = p.beta0 - lag, p.delta_w**2, p.delta_v**2
+    m = np.broadcast_to(p.x0_mean, (len(group.mission), p.b.shape[0]))
+    P = np.broadcast_to(p.x0_sd**2, (group.seen.shape[1], p.b.shape[0]))
+    means, variances, drifts = [], [], []
+    log_likelihood = np.zeros(m.shape)
+    for y, z, seen in zip(group.y, group.z, group.seen, strict=True):
+        drift = z @ p.beta + p.b
+        S, C = innovation(p.beta0, h, Q, R, P)
+        gain = np.where(seen, C / S, 0.0)
+        e = y[:, None] - h * m - drift
+        m = p.beta0 * m + drift + gain * e
+        P = update(p.beta0, Q, P, gain, S)
+        log_likelihood -= np.where(seen, 0.5 / S, 0.0) * e**2
+        log_likelihood -= np.where(seen, 0.5 * np.log(2.0 * np.pi * S), 0.0)
+        means.append(m)
+        variances.append(P)
+        drifts.append(drift)
+    return _Filtered(means, variances, drifts, log_likelihood)
+
+
+def _backward(p: _Draws, lag: float, group: _Group, f: _Filtered, k: int):
+    """A, a, V with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V), see `kalman.look_back`."""
+    # A far draw's process noise may be so small that its square is 0, where Q would divide.
+    Q, P = np.maximum(p.delta_w**2, _LEAST_VARIANCE), np.maximum(f.var[k], _LEAST_VARIANCE)
+    of_rate = np.where(group.seen[k + 1], lag / p.delta_v**2, 0.0)
+    A, V = look_back(p.beta0, Q, P, lag, of_rate)
+    a = V / P * f.mean[k] - V * p.beta0 / Q * f.drift[k + 1]
+    if lag:
+        a = a - V * of_rate * group.y[k + 1][:, None]
+    return A, a, V

@@ -1,0 +1,81 @@
+"""Latent trust and predicted contact rates under posterior draws, compiled for all models."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax, random
+
+from trustbo.models.likelihood.contact_rate import draw_missions
+from trustbo.models.likelihood.families import Family, Observed
+from trustbo.models.params import Params
+from trustbo.stacking import MissionBatch
+
+
+class Latents(NamedTuple):
+    """Parts of latent trust that were sampled with the parameters, if it does not integrate out."""
+
+    innovations: Array | np.ndarray | None = None
+    """Standard normal numbers, (draw, bound, mission, robot)."""
+    linearisation: Array | None = None
+    """Linearisation point of the weights, see `families.family.Observed`."""
+
+
+class TrustMoments(NamedTuple):
+    """Posterior mean and standard deviation of latent trust, (mission, bound, robot)."""
+
+    mean: Array
+    sd: Array
+
+
+@partial(jax.jit, static_argnames=("family", "lag"))
+def trust_draws(
+    family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch, key: Array
+) -> Array:
+    """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
+    observed = Observed.of(batch.contact_rate, batch.n_ticks, latents.linearisation)  # pyright: ignore
+
+    def one(inputs):
+        p, e, key = inputs
+        e = jnp.zeros_like(observed.y) if e is None else e
+        ssm = p.ssm(batch.awareness, lag)
+        return jnp.swapaxes(family.draw_trust(ssm, observed, e, key), 0, 1)
+
+    keys = random.split(key, len(params.b))
+    return lax.map(one, (params, latents.innovations, keys), batch_size=64)
+
+
+@partial(jax.jit, static_argnames=("family", "lag"))
+def trust_moments(
+    family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch
+) -> TrustMoments:
+    """Moments of latent trust over all draws, by the law of total variance."""
+    observed = Observed.of(batch.contact_rate, batch.n_ticks, latents.linearisation)  # pyright: ignore
+
+    def add(carry, inputs):
+        p, e = inputs
+        e = jnp.zeros_like(observed.y) if e is None else e
+        mean, var = family.trust_moments(p.ssm(batch.awareness, lag), observed, e)
+        return (carry[0] + mean, carry[1] + var + mean**2), None
+
+    zero = jnp.zeros_like(observed.y)
+    (total, total_squares), _ = lax.scan(add, (zero, zero), (params, latents.innovations))
+    mean, mean_square = total / len(params.b), total_squares / len(params.b)
+    sd = jnp.sqrt(jnp.maximum(mean_square - mean**2, 0.0))
+    return TrustMoments(jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1))
+
+
+@partial(jax.jit, static_argnames=("family", "lag"))
+def predictive(
+    family: Family, lag: float, params: Params, batch: MissionBatch, key: Array
+) -> Array:
+    """Contact rates of replicated missions, one set per draw: (draw, mission, bound, robot)."""
+
+    def one(inputs):
+        p, key = inputs
+        _, rates = draw_missions(family, lag, p, batch.awareness, batch.n_ticks, key)  # pyright: ignore
+        return jnp.swapaxes(rates, 0, 1)
+
+    return lax.map(one, (params, random.split(key, len(params.b))), batch_size=64)

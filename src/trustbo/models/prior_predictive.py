@@ -1,0 +1,118 @@
+"""Draws of parameters, and of contact rates, from the priors alone."""
+
+from collections.abc import Iterable
+
+import jax
+import numpy as np
+import xarray as xr
+from jax import Array, random
+from numpy.typing import ArrayLike
+from numpyro import handlers
+
+from trustbo.data import default_features
+from trustbo.errors import ShapeError, require_whole
+from trustbo.models.model import TrustModel
+from trustbo.models.params import Params, assemble_params
+from trustbo.models.samplers.priors_numpy import draw
+from trustbo.models.ticks import broadcast_ticks
+
+
+def prior_predictive(
+    model: TrustModel,
+    awareness: ArrayLike,
+    *,
+    n_ticks: ArrayLike | None = None,
+    n_draws: int = 500,
+    seed: int = 0,
+) -> xr.DataTree:
+    """Draw parameters and contact rates from the priors alone.
+
+    Args:
+        model: Trust model.
+        awareness: Shape (mission, bound, robot, feature).
+        n_ticks: Ticks, broadcast to (mission, bound, robot); the beta-binomial family needs
+            them.
+        n_draws: Number of draws.
+        seed: Seed; the same seed gives the same draws.
+
+    Returns:
+        ArviZ DataTree with the groups `prior` and `prior_predictive` (contact_rate[chain, draw,
+        mission, bound, robot]).
+
+    Raises:
+        ShapeError: Awareness has other axes.
+        TrustboError: The family needs n_ticks.
+    """
+    z = np.asarray(awareness, dtype=float)
+    if z.ndim != 4:
+        raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
+    ticks = broadcast_ticks(model.family, n_ticks, z.shape[:3])
+    require_whole("n_draws", n_draws, 1)
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(seed), n_draws)
+        drawn = {k: np.asarray(v)[None] for k, v in prior_draws(model, z, ticks, keys).items()}
+    dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
+    robots = [f"r{i + 1}" for i in range(z.shape[2])]
+    coords = {
+        "mission": np.arange(z.shape[0]),
+        "bound": np.arange(1, z.shape[1] + 1),
+        "robot": robots,
+        "robot_": robots,
+        "feature": list(default_features(z.shape[3])),
+    }
+
+    def group(names: Iterable[str]) -> xr.Dataset:
+        variables = {n: (("chain", "draw", *dims[n]), drawn[n]) for n in names}
+        used = {d for axes, _ in variables.values() for d in axes} & set(coords)
+        index = {"chain": [0], "draw": np.arange(n_draws)}
+        return xr.Dataset(variables, {d: coords[d] for d in coords if d in used} | index)
+
+    groups = {"prior": group(model.dims), "prior_predictive": group(["contact_rate"])}
+    return xr.DataTree.from_dict(groups)
+
+
+def sample_prior(
+    model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
+) -> Params:
+    """Draws of the parameters from the prior, leading axis (draw,).
+
+    Args:
+        model: Trust model.
+        n_features: Number of features.
+        n_draws: Number of draws.
+        seed: Seed; the same seed gives the same draws.
+        n_robots: Number of robots, for models whose robots have parameters of their own.
+    """
+    return assemble_params(draw_sites(model, (n_robots, n_features), n_draws, seed), model.x0)
+
+
+def draw_sites(
+    model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
+) -> dict[str, np.ndarray]:
+    """Draws of the parameters from the prior for (robots, features), by name."""
+    if model.priors_are_independent:
+        rng, priors = np.random.default_rng(seed), model.priors
+        sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
+        return {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
+    with jax.enable_x64(True):
+        keys = random.split(random.key(seed), n_draws)
+        drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)
+        return {name: np.asarray(drawn[name]) for name in model.dims}
+
+
+@jax.jit
+def prior_draws(
+    model: TrustModel, awareness: Array, n_ticks: Array, keys: Array
+) -> dict[str, Array]:
+    """Parameters and contact rates drawn from the prior, one set per key."""
+
+    def program() -> None:
+        params = model.sample_params(*awareness.shape[2:])
+        model.sample_rates(params, awareness, n_ticks=n_ticks)
+
+    def one(key: Array) -> dict[str, Array]:
+        trace = handlers.trace(handlers.seed(program, key)).get_trace()
+        names = (*model.dims, "contact_rate")
+        return {name: trace[name]["value"] for name in names}
+
+    return jax.vmap(one)(keys)

@@ -1,0 +1,1 @@
+"""Samplers of a trust model's posterior."""

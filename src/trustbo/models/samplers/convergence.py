@@ -1,0 +1,42 @@
+"""Convergence diagnostics of a posterior, and the limits beyond which it is refused."""
+
+import arviz as az
+import numpy as np
+import xarray as xr
+
+MAX_RHAT, MIN_ESS = 1.01, 400.0
+"""Largest rank-normalised R-hat, and least bulk effective sample size, of NUTS."""
+GOOD_KHAT, MAX_KHAT = 0.5, 0.7
+"""Pareto shape of the exact sampler's weights: good below the first, refused above the second."""
+
+
+def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
+    """Convergence diagnostics of a posterior.
+
+    Returns:
+        `r_hat` and `ess_bulk`, the worst over all parameters, and `divergences` for NUTS. `k_hat`
+        (good below 0.5) and `kish`, the effective number of points, for the exact sampler, whose
+        draws are nearly independent.
+    """
+    if posterior.attrs["sampler"] == "exact":
+        return {name: posterior.attrs[name] for name in ("k_hat", "kish")}
+    by_site = convergence(posterior["posterior"].to_dataset())
+    return {
+        "r_hat": max(rhat for rhat, _ in by_site.values()),
+        "ess_bulk": min(ess for _, ess in by_site.values()),
+        "divergences": int(posterior["sample_stats"].to_dataset()["diverging"].sum()),
+    }
+
+
+def convergence(sites: xr.Dataset) -> dict[str, tuple[float, float]]:
+    """The worst R-hat and the least bulk ESS of each parameter."""
+    with np.errstate(invalid="ignore"):
+        rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+    found = {}
+    for name, draws in sites.data_vars.items():
+        # A value that never moves is a constant of the model, such as an absent correlation.
+        free = np.ptp(draws.values, axis=(0, 1)) > 0.0
+        if free.any():
+            worst = float(rhat[name].values[free].max())
+            found[str(name)] = (worst, float(ess[name].values[free].min()))
+    return found

@@ -1,0 +1,300 @@
+"""Near-independent draws from the pooled model's posterior, without Markov chains.
+
+Method: collapsed importance sampling. Latent trust and the linear coefficients c = (beta, b)
+integrate out in closed form (`gram`: generalised least squares under normal priors), which leaves
+the density of z = (beta0 on the real line, t, r), t = log hypot(delta_w, delta_v), r = log(delta_w
+/ delta_v), in three dimensions.
+
+1. Newton's search from the best point of a coarse grid finds the mode (`laplace`).
+2. Some 1000 weighted points around it give the mean and covariance of a heavy-tailed proposal; the
+   posterior is skewed, and its curvature at the mode alone makes a far worse one (`proposal`).
+3. 4096 scrambled Sobol points of the proposal get Pareto-smoothed importance weights (Vehtari,
+   Simpson, Gelman, Yao and Gabry 2024). Where k-hat says that they are uneven, a mixture along the
+   ridge of r takes the proposal's place: the data determine the noises' ratio badly.
+4. Systematic resampling makes the points equally weighted; c is drawn from its normal conditional.
+
+State: weighted points with the conditional moments of c at each. Invariant: whatever the proposal,
+weights are target over proposal density, so averages converge to the posterior's; k-hat measures
+how fast. It is exact but for the number of points and the smoothing of the largest weights. Above
+`MAX_KHAT` the caller falls back on NUTS. Derivation: docs/derivations/exact-sampler.md.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import numpyro.distributions as dist
+from arviz_stats.base.array import array_stats
+from numpyro.distributions import constraints
+from scipy import special
+from threadpoolctl import ThreadpoolController
+
+from trustbo.errors import TrustboError
+from trustbo.models.likelihood.gram import SufficientStatistics
+from trustbo.models.priors import Priors
+from trustbo.models.samplers.convergence import GOOD_KHAT
+from trustbo.models.samplers.laplace import laplace
+from trustbo.models.samplers.priors_numpy import log_prob, numbers
+from trustbo.models.samplers.proposal import Mixture
+
+_LOG2_POINTS, _LOG2_AROUND = 12, 10
+_RIDGE_STEPS, _RIDGE_DROP = 12, 8.0  # largest number of components a side, and drop in nats
+_CHUNK = 1024  # parameter values evaluated at once: bounds the memory of long missions
+
+
+class ExactDraws(NamedTuple):
+    """Equally weighted draws and their importance-sampling diagnostics."""
+
+    params: dict[str, np.ndarray]  # (draw, ...)
+    log_weight: np.ndarray  # (draw,), of the point each draw was resampled from, normalised
+    lp: np.ndarray  # (draw,), log posterior density of (beta0, t, r), coefficients integrated out
+    khat: float
+    kish: float
+    """Effective number of points, (sum w)^2 / sum w^2."""
+    log_evidence: float
+
+
+class _Target(NamedTuple):
+    """The collapsed posterior of z = (beta0 on the real line, t, r)."""
+
+    statistics: SufficientStatistics
+    priors: Priors
+    mean: np.ndarray  # (coefficient,), prior of (beta, b)
+    precision: np.ndarray  # (coefficient,)
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Unnormalised log posterior density of z (point, 3), shape (point,)."""
+        return self.evaluate(z)[0]
+
+    def evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Log density at each z; there the mean of (beta, b) and its precision's Cholesky factor.
+
+        The last two are laid out for `_cholesky`, the point last.
+        """
+        parts = [z[i : i + _CHUNK] for i in range(0, len(z), _CHUNK)]
+        # Far out the noises underflow: such a point has no density, and is no reason to warn.
+        with np.errstate(all="ignore"):
+            done = [self._evaluate(part) for part in parts]
+        log_density, mean, factor = (np.concatenate(of, axis=-1) for of in zip(*done, strict=True))
+        return log_density, mean, factor
+
+    def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        beta0, delta_w, delta_v, log_jacobian = self.constrain(z)
+        theta = np.stack([beta0, delta_w**2, delta_v**2], axis=1)
+        quadratic = self.statistics.evaluate(theta, self.priors.x0_sd)
+        factor = _cholesky((quadratic.P + np.diag(self.precision)).transpose(1, 2, 0))
+        half = _forward(factor, (quadratic.h + self.precision * self.mean).T)
+        misfit = quadratic.alpha + self.precision @ self.mean**2 - (half**2).sum(0)
+        log_det = 2.0 * np.log(np.einsum("ccn->cn", factor)).sum(0)
+        log_likelihood = -0.5 * (
+            misfit
+            + quadratic.log_det
+            + self.statistics.n_measured * np.log(2.0 * np.pi)
+            + log_det
+            - np.log(self.precision).sum()
+        )
+        log_prior = (
+            log_prob(self.priors.beta0, beta0)
+            + log_prob(self.priors.delta_w, delta_w)
+            + log_prob(self.priors.delta_v, delta_v)
+        )
+        return log_likelihood + log_jacobian + log_prior, _backward(factor, half), factor
+
+    def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """beta0, delta_w, delta_v, and the log Jacobian of the way there."""
+        x, t, r = z.T
+        log_w = t - 0.5 * np.logaddexp(0.0, -2.0 * r)
+        log_v = t - 0.5 * np.logaddexp(0.0, 2.0 * r)
+        log_jacobian = log_w + log_v  # of exp; (t, r) -> (log_w, log_v) has Jacobian 1
+        if self.priors.beta0.support is constraints.unit_interval:
+            log_jacobian = log_jacobian - np.logaddexp(0.0, x) - np.logaddexp(0.0, -x)
+            x = special.expit(x)
+        return x, np.exp(log_w), np.exp(log_v), log_jacobian
+
+
+class _Weighted(NamedTuple):
+    """Weighted points."""
+
+    z: np.ndarray  # (point, 3)
+    log_p: np.ndarray  # (point,)
+    log_w: np.ndarray  # (point,), smoothed and normalised
+    mean: np.ndarray  # (coefficient, point), of (beta, b)
+    factor: np.ndarray  # (coefficient, coefficient, point), Cholesky's, of their precision
+    khat: float
+    log_evidence: float
+
+
+def sample_exact(
+    statistics: SufficientStatistics, priors: Priors, n_draws: int, seed: int
+) -> ExactDraws:
+    """Draw from the posterior of robots that share their parameters.
+
+    Args:
+        statistics: Statistics of all missions.
+        priors: Priors, normal for beta and b, on (0, 1) or the real line for beta0, on (0, inf)
+            for the noises.
+        n_draws: Number of equally weighted draws.
+        seed: Seed; the same seed gives the same draws.
+
+    Raises:
+        TrustboError: A prior is of another kind; NUTS takes any.
+    """
+    _require_conjugate(priors)
+    # Matrices are small: a second BLAS thread costs more than it brings.
+    with _blas().limit(limits=1, user_api="blas"):
+        target = _target(statistics, priors)
+        mode, scale = laplace(target.log_density, _start(target))
+        points = _weigh(target, _matched(target, mode, scale, seed), seed)
+        if not points.khat < GOOD_KHAT:
+            ridge = _weigh(target, _along_the_ridge(target, mode, scale), seed)
+            if ridge.khat < points.khat or not np.isfinite(points.khat):
+                points = ridge
+    rng = np.random.default_rng(seed)
+    weights = np.exp(points.log_w)
+    chosen = rng.permutation(_systematic(weights, n_draws, rng))
+    beta0, delta_w, delta_v, _ = target.constrain(points.z[chosen])
+    mean, factor = points.mean[:, chosen], points.factor[..., chosen]
+    coefficients = mean + _backward(factor, rng.standard_normal(mean.shape))
+    params = {
+        "beta0": beta0,
+        "beta": coefficients[:-1].T,
+        "b": coefficients[-1],
+        "delta_w": delta_w,
+        "delta_v": delta_v,
+    }
+    kish = float(1.0 / (weights**2).sum())
+    log_w, log_p = points.log_w[chosen], points.log_p[chosen]
+    return ExactDraws(params, log_w, log_p, points.khat, kish, points.log_evidence)
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """Loaded BLAS libraries: the search for them takes a fifth as long as the sampling."""
+    return ThreadpoolController()
+
+
+def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
+    n_features = statistics.n_features
+
+    def each(name: str) -> np.ndarray:
+        return np.append(np.broadcast_to(numbers(priors.beta, name), n_features),
+                         numbers(priors.b, name))  # fmt: skip
+
+    return _Target(statistics, priors, each("loc"), each("scale") ** -2.0)
+
+
+def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) -> Mixture:
+    """Proposal with the mean and covariance of weighted points around the mode."""
+    around = Mixture(mode[None], 1.3 * scale[None], np.ones(1))
+    z, _, log_w, *_ = _weigh(target, around, seed, _LOG2_AROUND)
+    weights = np.exp(log_w)
+    mean = weights @ z
+    covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
+    return Mixture(mean[None], np.linalg.cholesky(covariance)[None], np.ones(1))
+
+
+def _weigh(
+    target: _Target, proposal: Mixture, seed: int, log2_points: int = _LOG2_POINTS
+) -> _Weighted:
+    """Points of the proposal with Pareto-smoothed importance weights."""
+    z = proposal.draw(2**log2_points, seed)
+    log_p, mean, factor = target.evaluate(z)
+    log_p = np.where(np.isfinite(log_p), log_p, -np.inf)
+    raw = log_p - proposal.log_density(z)
+    finite = np.where(np.isfinite(raw), raw, raw[np.isfinite(raw)].min() - 100.0)
+    smoothed, khat = array_stats.psislw(-finite)  # takes minus the log weights
+    log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
+    log_w = smoothed - np.logaddexp.reduce(smoothed)
+    return _Weighted(z, log_p, log_w, mean, factor, float(khat), log_evidence)
+
+
+def _start(target: _Target) -> np.ndarray:
+    """The best point of a coarse grid around the scatter of the rates."""
+    unit = target.priors.beta0.support is constraints.unit_interval
+    x = np.array([-3.0, -1.0, 0.0, 1.0, 2.0]) if unit else np.linspace(-0.5, 1.1, 5)
+    t = np.log(max(target.statistics.spread, 1e-3)) + np.linspace(-2.5, 0.5, 5)
+    grid = np.stack(np.meshgrid(x, t, [-2.0, 0.0, 2.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid[np.nanargmax(target.log_density(grid))]
+
+
+def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> Mixture:
+    """Mixture along r, each component at the mode of (beta0, t) given its r."""
+    spacing = float(np.clip(np.sqrt((scale @ scale.T)[2, 2]), 0.4, 1.0))
+    centers, scales, log_mass = [], [], []
+
+    def add(r: float, start: np.ndarray) -> np.ndarray:
+        def given_r(xt: np.ndarray) -> np.ndarray:
+            return target.log_density(np.column_stack([xt, np.full(len(xt), r)]))
+
+        center, factor = laplace(given_r, start)
+        full = np.zeros((3, 3))
+        full[:2, :2], full[2, 2] = factor, spacing
+        centers.append([*center, r])
+        scales.append(1.2 * full)
+        log_mass.append(float(given_r(center[None])[0]) + np.log(np.diag(factor)).sum())
+        return center
+
+    middle = add(mode[2], mode[:2])
+    for direction in (-1.0, 1.0):
+        start = middle
+        for step in range(1, _RIDGE_STEPS + 1):
+            start = add(mode[2] + direction * step * spacing, start)
+            if log_mass[-1] < max(log_mass) - _RIDGE_DROP:
+                break
+    weights = np.exp(np.array(log_mass) - np.max(log_mass))
+    weights = 0.9 * weights / weights.sum() + 0.1 / len(weights)
+    return Mixture(np.array(centers), np.array(scales), weights)
+
+
+def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of n equally weighted draws, by systematic resampling."""
+    points = (rng.random() + np.arange(n)) / n
+    return np.searchsorted(np.cumsum(weights)[:-1] / weights.sum(), points)
+
+
+def _cholesky(A: np.ndarray) -> np.ndarray:
+    """Lower factors of many small matrices, (row, column, point); NaN where one is not positive.
+
+    NumPy's takes the point first, one matrix at a time, and raises for all if one is not positive.
+    """
+    L = np.zeros_like(A)
+    for j in range(len(A)):
+        L[j, j] = np.sqrt(A[j, j] - (L[j, :j] ** 2).sum(0))
+        for i in range(j + 1, len(A)):
+            L[i, j] = (A[i, j] - (L[i, :j] * L[j, :j]).sum(0)) / L[j, j]
+    return L
+
+
+def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """L^-1 b for factors (row, column, point) and vectors (row, point)."""
+    x = np.empty_like(b)
+    for i in range(len(b)):
+        x[i] = (b[i] - (L[i, :i] * x[:i]).sum(0)) / L[i, i]
+    return x
+
+
+def _backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """L'^-1 b for factors (row, column, point) and vectors (row, point)."""
+    x = np.empty_like(b)
+    for i in reversed(range(len(b))):
+        x[i] = (b[i] - (L[i + 1 :, i] * x[i + 1 :]).sum(0)) / L[i, i]
+    return x
+
+
+def _require_conjugate(priors: Priors) -> None:
+    for name, allowed, kind in (
+        ("beta", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),
+        ("b", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),
+        ("beta0", lambda p: p.support in _LINES, "on (0, 1) or the real line"),
+        ("delta_w", lambda p: p.support is constraints.positive, "on (0, inf)"),
+        ("delta_v", lambda p: p.support is constraints.positive, "on (0, inf)"),
+    ):
+        prior = getattr(priors, name)
+        if not allowed(prior):
+            raise TrustboError(
+                f'sampler "exact" needs the prior of {name} to be {kind}; got {prior!r}. Use '
+                'sampler="nuts", which takes any.'
+            )
+
+
+_LINES = (constraints.unit_interval, constraints.real)

@@ -1,0 +1,167 @@
+"""Reparametrisation of a posterior for NUTS: coordinates in which it is close to a sphere.
+
+Method: a deterministic change of variables theta -> sites, with its Jacobian, before Laplace's
+scaling (`nuts`). Each step gives a badly determined direction of its own axis:
+
+- noises: the data fix delta_w^2 + delta_v^2 well and their ratio badly. t = log hypot(delta_w,
+  delta_v) and r = log(delta_w / delta_v) stand in the places of log delta_w and log delta_v;
+- level: the data fix the average level of trust, y = beta0 y + beta . z + b, better than its parts.
+  b + beta0 mean(y) + beta . mean(z) stands in the place of b. Both steps have Jacobian 1;
+- collapse: the pooled model's (beta, b) are normal given all else (generalised least squares,
+  `gram_jax.coefficients`). If asked for, their innovations stand in their places (Gelfand, Sahu and
+  Carlin 1995), and few data round a perfect fit make no funnel;
+- robots: coefficients that vary by robot are partially non-centred, see `partial_centring`.
+
+State: one flat real vector theta, its start being the priors' means. Invariant: `potential(theta)`
+is minus the log posterior density of the sites less the log Jacobian of theta -> sites, so that
+`constrain` of a draw of theta is a draw of the posterior; the linearisation point and the robots'
+fits, found at a first mode, are constants and change the coordinates or the weights, never the
+posterior.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+from jax import Array
+from jax.scipy.linalg import solve_triangular
+
+from trustbo.models.likelihood.gram_jax import Spectrum, coefficients
+from trustbo.models.model import TrustModel
+from trustbo.models.params import TrustParams
+from trustbo.models.samplers.laplace import newton
+from trustbo.models.samplers.partial_centring import RobotFit, centre, fit_robots
+from trustbo.models.samplers.target import NutsData, Sites, Target, innovations_shape
+
+
+class Reparametrisation(NamedTuple):
+    """A posterior in the coordinates that NUTS samples."""
+
+    start: Array
+    """Flat real vector to start the search of the mode from."""
+    constrain: Callable[[Array], Sites]
+    """Parameters by name, from such a vector."""
+    potential: Callable[[Sites], Array]
+    """Minus the log density of {"theta", "innovations"}."""
+    profile: Callable[[Array], Array]
+    """Potential of theta at innovations 0, for the search of the mode.
+
+    As the noises go to 0 around a perfect fit, a density of few data grows without bound, but holds
+    no mass: each location parameter takes a power of the noise away. That is added, as in REML.
+    """
+    linearisation: Array | None
+
+
+def reparametrise(
+    model: TrustModel, data: NutsData, *, complete: bool = False, collapse: bool = False
+) -> Reparametrisation:
+    """Change variables so that the posterior is close to a sphere.
+
+    Args:
+        model: Trust model.
+        data: Missions.
+        complete: Whether no rate is missing before the last of a mission.
+        collapse: Whether to put innovations in the places of weights and intercept.
+    """
+    space = Coordinates(model, data, complete=complete, collapse=collapse)
+    target, robots, pooling = space.target, None, model.partial_pooling
+    joint = not model.family.integrates_out
+    zeros = {"innovations": jnp.zeros(innovations_shape(data))} if joint else {}
+    if pooling is not None or model.family.linearises:
+        mode, _ = newton(lambda theta: space.potential({"theta": theta, **zeros}), target.start)
+        if model.family.linearises:
+            target.linearise(space.to_sites(mode)[0])
+        if pooling is not None:
+            robots = fit_robots(target, pooling, space.to_sites(mode)[0])
+
+    def constrain(theta: Array) -> Sites:
+        return target.constrain(space.to_sites(theta, robots)[0])
+
+    def potential(z: Sites) -> Array:
+        return space.potential(z, robots)
+
+    def profile(theta: Array) -> Array:
+        energy = potential({"theta": theta, **zeros})
+        if space.collapsed:
+            return energy
+        total = target.unravel(theta)["delta_w"]  # t, the log of all noise
+        n_locations = len(theta) - 2 * total.size
+        return energy - n_locations * total.mean()
+
+    return Reparametrisation(target.start, constrain, potential, profile, target.linearisation)
+
+
+class Coordinates:
+    """The change of variables between a flat vector and a target's sites."""
+
+    def __init__(
+        self, model: TrustModel, data: NutsData, *, complete: bool = False, collapse: bool = False
+    ) -> None:
+        """Take the data's means; see `reparametrise`."""
+        self.model, self.target = model, Target(model, data, complete=complete)
+        self.means = _average(model, data)
+        normal = all(isinstance(p, dist.Normal) for p in (model.priors.beta, model.priors.b))
+        self.collapsed = collapse and data.spectrum is not None and normal
+
+    def to_sites(self, theta: Array, robots: RobotFit | None = None) -> tuple[Sites, Array]:
+        """Sites on their own real lines, and the log Jacobian of the way there."""
+        site, log_jacobian = self.target.unravel(theta), jnp.zeros(())
+        t, r = site["delta_w"], site["delta_v"]
+        site = site | {
+            "delta_w": t + 0.5 * jax.nn.log_sigmoid(2.0 * r),
+            "delta_v": t + 0.5 * jax.nn.log_sigmoid(-2.0 * r) - self.means.log_unit,
+        }
+        if self.collapsed:
+            return self._collapse(site)
+        if robots is not None and (pooling := self.model.partial_pooling) is not None:
+            return centre(self.target, pooling, site, robots)
+        shifts = self.model.level(self.target.values(site), self.means.y, self.means.z)
+        site = site | {name: site[name] - shift for name, shift in shifts.items()}
+        return site, log_jacobian
+
+    def potential(self, z: Sites, robots: RobotFit | None = None) -> Array:
+        """Minus the log density of z, "theta" and if need be "innovations"."""
+        site, log_jacobian = self.to_sites(z["theta"], robots)
+        full = site | {name: z[name] for name in z if name != "theta"}
+        return self.target.potential(full) - log_jacobian
+
+    def _collapse(self, site: Sites) -> tuple[Sites, Array]:
+        """Weights and intercept as functions of all else and of standard normal innovations."""
+        priors, inverse = self.model.priors, self.target.inverse
+        e = jnp.append(site["beta"], site["b"])
+        others = {name: inverse[name](site[name]) for name in ("beta0", "delta_w", "delta_v")}
+        x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
+        params = TrustParams(**others, beta=site["beta"], b=site["b"], **x0)
+
+        def each(name: str) -> Array:
+            of_beta = jnp.broadcast_to(getattr(priors.beta, name), site["beta"].shape)
+            return jnp.append(of_beta, getattr(priors.b, name))
+
+        sums: Spectrum = self.target.data.spectrum  # pyright: ignore[reportAssignmentType]
+        mean, L = coefficients(params, sums, self.model.lag, each("loc"), each("scale") ** -2.0)
+        c = mean + solve_triangular(L, e, trans=1, lower=True)
+        return site | {"beta": c[:-1], "b": c[-1]}, -jnp.log(jnp.diagonal(L)).sum()
+
+
+class _Means(NamedTuple):
+    """Averages of the data."""
+
+    y: Array
+    """Trust that the mean rate stands for."""
+    z: Array  # (feature,)
+    log_unit: Array
+    """Log of the noise of trust that an observation noise of 1 is worth."""
+
+
+def _average(model: TrustModel, data: NutsData) -> _Means:
+    if data.means is not None:
+        y, z = data.means
+        return _Means(jnp.asarray(y), jnp.asarray(z), jnp.zeros(()))
+    measured = ~jnp.isnan(data.contact_rate)
+    n = jnp.maximum(measured.sum(), 1)
+    y = jnp.where(measured, data.contact_rate, 0.0).sum() / n
+    z = jnp.where(measured[..., None], data.awareness, 0.0).sum((0, 1, 2)) / n
+    y, log_unit = model.family.mean_level(y)
+    return _Means(y, z, log_unit)

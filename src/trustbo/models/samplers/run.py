@@ -1,0 +1,187 @@
+"""Draws from a model's posterior by the chosen sampler, and the checks of their diagnostics."""
+
+import warnings
+from typing import NamedTuple
+
+import arviz as az
+import jax
+import numpy as np
+from jax import Array, random
+
+from trustbo.errors import TrustboError
+from trustbo.models.likelihood.gram_jax import spectrum
+from trustbo.models.likelihood.latent import Latents
+from trustbo.models.model import TrustModel
+from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
+from trustbo.models.samplers.exact import ExactDraws, sample_exact
+from trustbo.models.samplers.nuts import NutsSettings, run_nuts
+from trustbo.models.samplers.target import NutsData
+from trustbo.stacking import MissionBatch
+
+SAMPLERS = ("nuts", "exact", "joint")
+
+
+class Draws(NamedTuple):
+    """Draws and statistics with leading axes (chain, draw), and a summary of all."""
+
+    params: dict[str, np.ndarray]
+    stats: dict[str, np.ndarray]
+    summary: dict[str, float]
+    sampler: str
+    latents: Latents = Latents()
+    """Innovations of latent trust, with the same leading axes, if it was sampled."""
+
+
+def draw_posterior(
+    model: TrustModel,
+    sampler: str,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray | None = None,
+    *,
+    check: bool,
+) -> tuple[Draws, list[str]]:
+    """Draws given a batch, and complaints about them.
+
+    Args:
+        model: Trust model.
+        sampler: `"nuts"`, `"exact"` or `"joint"`.
+        settings: Length of the run.
+        seed: Seed; the same seed gives the same draws.
+        batch: Missions, padded.
+        weight: Weight of each mission, shape (mission,); 1 by default.
+        check: Whether to check the diagnostics, and try again for longer if they are bad.
+    """
+    if sampler == "exact" and (exact := _sample_exact(model, settings, seed, batch, weight)):
+        return exact, []
+    weight = np.ones(len(batch.contact_rate)) if weight is None else weight
+    data = nuts_data(model, batch, weight)
+    with jax.enable_x64(True):
+        return _sample_nuts(model, settings, random.key(seed), data, check=check)
+
+
+def nuts_data(model: TrustModel, batch: MissionBatch, weight: np.ndarray) -> NutsData:
+    """Data for NUTS: sums alone for the pooled Gaussian model without gaps."""
+    if model.robot_sets == "all" and model.family.integrates_out:
+        (statistics,) = model.gather(batch, weight)
+        if not statistics.gaps:
+            seen = ~np.isnan(batch.contact_rate)
+            means = (np.asarray(batch.contact_rate[seen].mean()), batch.awareness[seen].mean(0))
+            # One bound and robot that measured nothing: the shape tells the number of features.
+            nothing = np.full((1, 1, 1), np.nan)
+            awareness = np.zeros((1, 1, 1, batch.awareness.shape[3]))
+            return NutsData(awareness, nothing, nothing, np.ones(1), spectrum(statistics), means)
+    return NutsData(*batch, weight)
+
+
+def require_sampler(model: TrustModel, sampler: str) -> None:
+    """Refuse a sampler that cannot treat the model.
+
+    Raises:
+        TrustboError: The sampler is `"exact"`, and observations are not Gaussian, or robots share
+            some parameters only or influence each other; or it is `"joint"`, and trust integrates
+            out.
+    """
+    if sampler == "exact":
+        model.require_exact()
+    if sampler == "joint" and model.family.integrates_out:
+        raise TrustboError(
+            'sampler "joint" is for observations that trust does not integrate out of; with '
+            'Gaussian ones use "nuts" or "exact".'
+        )
+
+
+def _sample_exact(
+    model: TrustModel,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray | None,
+) -> Draws | None:
+    """Draws by importance sampling, or None, with a warning, where its weights are too uneven."""
+    shape = (settings.n_chains, settings.n_draws)
+    each = [
+        sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
+        for i, statistics in enumerate(model.gather(batch, weight))
+    ]
+    khat = max(exact.khat for exact in each)
+    if not all(exact.khat <= MAX_KHAT for exact in each):
+        warnings.warn(
+            f"the exact sampler's k-hat is {khat:.2f} (limit {MAX_KHAT}): its weights are "
+            "too uneven here, so NUTS is used instead.",
+            stacklevel=4,
+        )
+        return None
+    summary = {
+        "k_hat": khat,
+        "kish": min(exact.kish for exact in each),
+        "log_evidence": sum(exact.log_evidence for exact in each),
+    }
+    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
+    return Draws(params, stats, summary, "exact")
+
+
+def _join(each: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
+    """Draws of all robots side by side; their weights multiply."""
+
+    def join(columns: list[np.ndarray]) -> np.ndarray:
+        joined = np.stack(columns, axis=1) if per_robot else columns[0]
+        return joined.reshape(*shape, *joined.shape[1:])
+
+    params = {name: join([e.params[name] for e in each]) for name in each[0].params}
+    stats = {
+        "lp": np.sum([e.lp for e in each], axis=0).reshape(shape),
+        "log_weight": np.sum([e.log_weight for e in each], axis=0).reshape(shape),
+    }
+    return params, stats
+
+
+def _sample_nuts(
+    model: TrustModel,
+    settings: NutsSettings,
+    key: Array,
+    data: NutsData,
+    *,
+    check: bool,
+) -> tuple[Draws, list[str]]:
+    """Draws by NUTS, longer ones if the first are bad, and complaints about the last."""
+    longer = NutsSettings(
+        2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98, collapse=True
+    )
+    complete = _is_complete(np.asarray(data.contact_rate))
+    name = "nuts" if model.family.integrates_out else "joint"
+
+    def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
+        raw = run_nuts(tried, random.fold_in(key, retries), model, data, complete=complete)
+        params, stats = ({k: np.asarray(v) for k, v in g.items()} for g in (raw.params, raw.stats))
+        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
+        innovations = None if raw.innovations is None else np.asarray(raw.innovations)
+        latents = Latents(innovations, raw.linearisation)
+        draws = Draws(params, stats, {"retries": retries}, name, latents)
+        return draws, _complaints(draws) if check else []
+
+    draws, complaints = attempt(settings, 0)
+    return attempt(longer, 1) if complaints else (draws, complaints)
+
+
+def _is_complete(contact_rate: np.ndarray) -> bool:
+    """Whether no rate is missing before the last of a mission, the same bound for all robots."""
+    seen = ~np.isnan(contact_rate)
+    together = (seen.any(2) == seen.all(2)).all()
+    return bool(together and (np.diff(seen.any(2).astype(int), axis=1) <= 0).all())
+
+
+def _complaints(draws: Draws) -> list[str]:
+    """Limits that the draws exceed, parameter by parameter; empty if none."""
+    sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
+    found = []
+    for name, (worst, fewest) in convergence(sites).items():
+        if not worst <= MAX_RHAT:  # NaN is a complaint too
+            found.append(f"R-hat of {name} is {worst:.3f} (limit {MAX_RHAT})")
+        if not fewest >= MIN_ESS:
+            found.append(f"bulk ESS of {name} is {fewest:.0f} (at least {MIN_ESS:.0f})")
+    n_divergences = int(draws.stats["diverging"].sum())
+    if n_divergences:
+        found.append(f"{n_divergences} divergences")
+    return found

@@ -1,0 +1,45 @@
+"""Work distributed over cores by threads: compiled code releases the GIL."""
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+
+_BLOCK = 64  # rows per call: few enough for the caches
+_here = threading.local()
+
+
+def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:
+    """Call `work(first, last)` on blocks of rows, on all cores unless this is a worker already."""
+    blocks = [(first, min(first + _BLOCK, n_rows)) for first in range(0, n_rows, _BLOCK)]
+    work(0, 0)  # compiles in one thread
+    if len(blocks) == 1 or getattr(_here, "is_worker", False):
+        for block in blocks:
+            work(*block)
+        return
+    with ThreadPoolExecutor(n_cores()) as pool:
+        list(pool.map(lambda block: work(*block), blocks))
+
+
+def in_order[T, R](work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Results in the order of the items; at most as many are in memory as there are cores."""
+
+    def alone(item: T) -> R:
+        _here.is_worker = True
+        return work(item)
+
+    pending: deque[Future[R]] = deque()
+    with ThreadPoolExecutor(n_cores()) as pool:
+        for item in items:
+            pending.append(pool.submit(alone, item))
+            del item
+            if len(pending) >= n_cores():
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+
+
+def n_cores() -> int:
+    """Number of cores that this process may use, which the machine may exceed."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

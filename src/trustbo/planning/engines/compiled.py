@@ -1,0 +1,174 @@
+"""The compiled engine: dispatch of each objective to its kernel."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.errors import TrustboError
+from trustbo.parallel import over_rows
+from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.engines.buckets import best_stationary
+from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
+from trustbo.planning.engines.labels import MODES, LabelSearch, search
+from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
+from trustbo.planning.objectives import LABELLED, Objective
+from trustbo.planning.paths import AdmissiblePaths
+
+_TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
+_MAX_LABELS = 300_000  # per search
+
+
+class BestPaths(NamedTuple):
+    """Best path of each draw.
+
+    Fields: paths (draw, length), flat indices of cells, filled with -1; gap (draw,), optimality gap
+    in sums of softplus for `success`, in trust elsewhere.
+    """
+
+    paths: np.ndarray
+    gap: np.ndarray
+
+
+def plan_compiled(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
+) -> BestPaths:
+    """Find the best path of every draw; `dynamics` with a leading axis (draw,)."""
+    length_cost = objective.length_weight * admissible.lengths
+    if objective.name in LABELLED or (objective.name != "stationary" and len(dynamics.views) > 1):
+        return _labelled(admissible, dynamics, objective, length_cost)
+    if objective.name == "stationary":
+        _, paths = best_stationary(
+            lambda part: dynamics.take(part).steady_state(),
+            len(dynamics.start),
+            admissible.passable,
+            length_cost,
+            admissible.steps,
+            admissible.flat(admissible.start),
+            admissible.flat(admissible.goal),
+        )
+    else:
+        weights = additive_weights(dynamics, dynamics.views[0], objective.name, admissible.longest)
+        drift = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
+        paths = _best_of_lengths(admissible, drift, weights, length_cost)
+    return BestPaths(paths, np.zeros(len(paths)))
+
+
+def expected_path(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
+) -> np.ndarray:
+    """Find the path with the best *expectation* over draws of terminal trust, or of mean trust.
+
+    Both are linear in u with weights that do not depend on the path, so the expectation of weight
+    times u, per cell and bounds left, replaces them: exact, with no assumption on the posterior.
+
+    Returns:
+        Flat indices of cells, filled with -1.
+    """
+    weights = additive_weights(dynamics, dynamics.views[0], objective.name, admissible.longest)
+    u = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
+    # E[w_j . u(c)] for every number of bounds left j and cell c: one state for every j.
+    gain = np.einsum("djs,dsc->jc", weights.per_bound, np.nan_to_num(u)) / len(u)
+    pick = np.eye(admissible.longest + 1)[None]
+    averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
+    length_cost = objective.length_weight * admissible.lengths
+    return _best_of_lengths(admissible, gain[None], averaged, length_cost)[0]
+
+
+def _best_of_lengths(
+    admissible: AdmissiblePaths, drift: np.ndarray, weights: Weights, length_cost: np.ndarray
+) -> np.ndarray:
+    lengths = np.arange(admissible.shortest, admissible.longest + 1)
+    if not length_cost.any() or (weights.scale == 1.0).all():
+        return best_additive(admissible.layers, drift, weights, length_cost, lengths)[1]
+    # A mean divides by the number of bounds, so its length cost is scaled for each of them.
+    tries = [
+        best_additive(admissible.layers, drift, weights, n * length_cost, lengths[i : i + 1])
+        for i, n in enumerate(lengths)
+    ]
+    best = np.argmax([scores for scores, _ in tries], axis=0)
+    return np.stack([tries[i][1][d] for d, i in enumerate(best)])
+
+
+def _labelled(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
+) -> BestPaths:
+    n_draws = len(dynamics.start)
+    found: list[tuple[np.ndarray, float]] = [(np.empty(0), np.nan)] * n_draws
+
+    def work(first: int, last: int) -> None:
+        for d in range(first, last):
+            found[d] = _label_one(admissible, dynamics.draw(d), objective, length_cost)
+
+    work(0, n_draws) if n_draws == 1 else over_rows(work, n_draws)
+    paths = np.full((n_draws, max(len(path) for path, _ in found)), -1, np.int64)
+    for d, (path, _) in enumerate(found):
+        paths[d, : len(path)] = path
+    return BestPaths(paths, np.array([gap for _, gap in found]))
+
+
+def _label_one(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Find the best path of one draw and its optimality gap."""
+    lengths = [admissible.longest]
+    if objective.name not in LABELLED:
+        lengths = list(range(admissible.shortest, admissible.longest + 1))
+    best, best_score, best_bound = np.empty(0, np.int64), -np.inf, -np.inf
+    for n_bounds in lengths:
+        scale = n_bounds if objective.name == "mean" else 1
+        problem = _label_search(admissible, dynamics, objective, n_bounds, scale * length_cost)
+        path, cost, bound = _search_within_limit(problem)
+        if len(path) and -cost / scale > best_score:
+            best, best_score = path, -cost / scale
+        best_bound = max(best_bound, -bound / scale)
+    return best, best_bound - best_score
+
+
+def _label_search(
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    n_bounds: int,
+    length_cost: np.ndarray,
+) -> LabelSearch:
+    goal = admissible.flat(admissible.goal)
+    at_goal = objective.name == "terminal"
+    return LabelSearch(
+        MODES[objective.name],
+        np.ascontiguousarray(dynamics.transition),
+        dynamics.drift.reshape(len(dynamics.start), -1),
+        np.ascontiguousarray(dynamics.start),
+        dynamics.views,
+        dominance_tests(dynamics, n_bounds),
+        build_heuristic(dynamics, n_bounds, admissible.neighbours, goal, at_goal=at_goal),
+        admissible.neighbours,
+        length_cost,
+        admissible.bounds_to_goal.ravel(),
+        admissible.flat(admissible.start),
+        goal,
+        n_bounds,
+        admissible.u_turns,
+        admissible.revisit or objective.name not in LABELLED,
+    )
+
+
+def _search_within_limit(problem: LabelSearch) -> tuple[np.ndarray, float, float]:
+    """Search exactly, or with the least tolerance that stays within the limit on labels."""
+    if not len(problem.heuristic.powers) and problem.mode not in (MODES[name] for name in LABELLED):
+        raise TrustboError(
+            f"a team's least trust over {problem.max_bounds} bounds on {len(problem.to_goal)} "
+            "cells is too much for 'terminal' and 'mean'; use larger cells, or team='mean'."
+        )
+    if not problem.revisit:
+        # If the best walk of all enters no cell twice, it is the best simple path too.
+        free = search(problem._replace(revisit=True), 0.0, _MAX_LABELS)
+        if free.path is not None and len(set(free.path.tolist())) == len(free.path):
+            return free.path, free.cost, free.bound
+    for tolerance in _TOLERANCES:
+        found = search(problem, tolerance, _MAX_LABELS)
+        if found.path is not None:
+            return found.path, found.cost, found.bound
+    raise TrustboError(
+        f"more than {_MAX_LABELS} partial paths are worth keeping; lower max_bounds = "
+        f"{problem.max_bounds}, use larger cells, or team='mean'."
+    )

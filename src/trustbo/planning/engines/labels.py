@@ -1,0 +1,212 @@
+"""Label setting with dominance and a heuristic: objectives that depend on the whole history.
+
+Method: best-first label setting for multi-criteria shortest paths, in the order of an A* estimate
+(Martins 1984; Mandow and Perez de la Cruz 2010, NAMOA*).
+
+State of a label: cell, number of bounds, expected trust x of all states, cost so far, parent; the
+last move where U-turns are forbidden; the set of cells entered where revisits are forbidden.
+
+Cost, to be minimised: `success` sum of softplus(-trust), `bottleneck` max of -trust, `terminal`
+last -trust, `mean` sum of -trust; the latter two over paths of exactly `max_bounds` bounds, with
+length costs added. None of them rises if trust rises at some bound.
+
+Invariant: a label leaves the queue in the order of a lower bound on the cost of its completions
+(`Heuristic`). It is expanded unless an expanded label of the same cell dominates it (see
+`dominance`): fewer or as many bounds, no higher cost, and at least as much trust at every bound
+still to come, whatever cells follow. Every completion of the dominated label is then a completion
+of the other, at no higher cost, so the first label that leaves the queue at the goal is optimal.
+
+With a tolerance, labels are dropped too that another dominates up to that amount (Warburton 1987).
+The least estimate among those dropped is kept: no path costs less than the smaller of it and the
+cost found, so the result is exact whenever these agree.
+"""
+
+import heapq
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from trustbo.planning.engines.dominance import Heuristic
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
+SUCCESS, BOTTLENECK, TERMINAL, MEAN = range(4)
+MODES = {"success": SUCCESS, "bottleneck": BOTTLENECK, "terminal": TERMINAL, "mean": MEAN}
+
+
+class LabelSearch(NamedTuple):
+    """Data of one search, for one draw."""
+
+    mode: int
+    transition: np.ndarray  # (state, state)
+    drift: np.ndarray  # (state, cell)
+    start_state: np.ndarray  # (state,)
+    views: np.ndarray  # (view, state)
+    tests: np.ndarray  # (test, state)
+    heuristic: Heuristic
+    neighbours: np.ndarray  # (cell, move), -1 where none
+    length_cost: np.ndarray  # (move,)
+    to_goal: np.ndarray  # (cell,), -1 where there is no way
+    start: int
+    goal: int
+    max_bounds: int  # for TERMINAL and MEAN, the exact number
+    u_turns: bool
+    revisit: bool
+
+
+class SearchResult(NamedTuple):
+    """Best label at the goal; `path` is None beyond the limit on labels, empty without a path."""
+
+    path: np.ndarray | None  # flat indices of cells
+    cost: float
+    bound: float
+    """Lower bound on the cost of every path."""
+
+
+def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchResult:
+    """Find the path of least cost.
+
+    Args:
+        problem: Data of the search.
+        tolerance: Amount by which a dropped label may be better than the label that replaces it; 0
+            for an exact search.
+        max_labels: Limit on the number of labels.
+    """
+    path, cost, bound, complete = _search(problem, tolerance, max_labels)
+    return SearchResult(path if complete else None, cost, bound)
+
+
+@_compiled
+def _search(problem, tolerance, max_labels):
+    mode, u_turns, revisit, most = (
+        problem.mode, problem.u_turns, problem.revisit, problem.max_bounds,
+    )  # fmt: skip
+    neighbours, to_goal, goal = problem.neighbours, problem.to_goal, problem.goal
+    n_cells, n_moves = neighbours.shape
+    fixed, n_before = mode >= TERMINAL, 1 if u_turns else n_moves + 1
+    heads = np.full(n_cells * n_before * (most + 1 if fixed else 1), -1, np.int64)
+    size = min(max_labels, 1024)
+    labels, cost = np.empty((size, 5), np.int64), np.empty(size)  # cell, bounds, parent, move, next
+    state, tested = np.empty((size, len(problem.start_state))), np.empty((size, len(problem.tests)))
+    seen = np.zeros((size, 1 if revisit else n_cells // 64 + 1), np.uint64)
+    labels[0] = (problem.start, 0, -1, -1, -1)
+    cost[0], state[0] = -np.inf if mode == BOTTLENECK else 0.0, problem.start_state
+    n, least_dropped = 1, np.inf
+    queue = [(-np.inf, np.int64(0))]
+    while queue:
+        estimate, label = heapq.heappop(queue)
+        cell, n_bounds, _, by, _ = labels[label]
+        if cell == goal:
+            return _path_of(labels, label), estimate, min(estimate, least_dropped), True
+        if not revisit:
+            seen[label, cell // 64] |= np.uint64(1) << np.uint64(cell % 64)
+        tested[label] = problem.tests @ state[label]
+        key = (cell * n_before + (0 if u_turns else by + 1)) + (
+            n_bounds * n_cells * n_before if fixed else 0
+        )
+        verdict = _dominance(label, heads[key], labels, cost, tested, seen, tolerance, revisit)
+        if verdict == 2:
+            least_dropped = min(least_dropped, estimate)
+        if verdict:
+            continue
+        labels[label, 4], heads[key] = heads[key], label
+        for m in range(n_moves):
+            other = neighbours[cell, m]
+            if other < 0 or (not u_turns and by >= 0 and m == n_moves - 1 - by):
+                continue
+            if to_goal[other] < 0 or n_bounds + 1 + to_goal[other] > most:
+                continue
+            if fixed and (other == goal) != (n_bounds + 1 == most):
+                continue
+            if not revisit and seen[label, other // 64] >> np.uint64(other % 64) & np.uint64(1):
+                continue
+            if n == len(cost):
+                if n >= max_labels:
+                    return np.empty(0, np.int64), np.inf, -np.inf, False
+                labels, cost = np.concatenate((labels, labels)), np.concatenate((cost, cost))
+                state, tested = np.concatenate((state, state)), np.concatenate((tested, tested))
+                seen = np.concatenate((seen, seen))
+            x = problem.transition @ state[label] + problem.drift[:, other]
+            total = _add_cost(mode, cost[label], (problem.views @ x).min(), problem.length_cost[m])
+            left = most - n_bounds - 1 if fixed else to_goal[other]
+            reach = _estimate(mode, problem.heuristic, x, total, other, left)
+            if reach < np.inf:
+                labels[n] = (other, n_bounds + 1, label, m, -1)
+                cost[n], state[n], seen[n] = total, x, seen[label]
+                heapq.heappush(queue, (reach, np.int64(n)))
+                n += 1
+    return np.empty(0, np.int64), np.inf, least_dropped, True
+
+
+@_compiled
+def _add_cost(mode, cost, trust, length_cost):
+    """Cost of a label after one more bound."""
+    if mode == SUCCESS:
+        return cost + _softplus(-trust)
+    if mode == BOTTLENECK:
+        return max(cost, -trust)
+    return cost + length_cost - (trust if mode == MEAN else 0.0)
+
+
+@_compiled
+def _estimate(mode, heuristic, x, cost, cell, left):
+    """Lower bound on the cost of a label's completions."""
+    if mode == TERMINAL:
+        return cost - _max_trust(heuristic, x, left, cell)
+    if len(heuristic.powers) == 0:
+        return cost
+    for j in range(1, left + 1):
+        trust = _max_trust(heuristic, x, j, cell)
+        cost = _add_cost(mode, cost, trust, 0.0)
+    return cost
+
+
+@_compiled
+def _max_trust(heuristic, x, j, cell):
+    """Upper bound on the team's trust after j more bounds."""
+    powers, gains = heuristic.powers, heuristic.gains
+    least = np.inf
+    for view in range(len(powers)):
+        total = gains[view, j, cell]
+        for s in range(len(x)):
+            total += powers[view, j, s] * x[s]
+        least = min(least, total)
+    return least
+
+
+@_compiled
+def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
+    """1 if an expanded label dominates, 2 if one does up to the tolerance, 0 if none does."""
+    verdict = 0
+    while other >= 0:
+        if labels[other, 1] <= labels[label, 1] and cost[other] <= cost[label] + tolerance:
+            shortfall = 0.0
+            for k in range(tested.shape[1]):
+                shortfall = max(shortfall, tested[label, k] - tested[other, k])
+            if shortfall <= tolerance:
+                same = shortfall == 0.0 and cost[other] <= cost[label]
+                if same and not revisit:
+                    for w in range(seen.shape[1]):
+                        same = same and (seen[other, w] & ~seen[label, w]) == 0
+                if same:
+                    return 1
+                if tolerance > 0.0:
+                    verdict = 2
+        other = labels[other, 4]
+    return verdict
+
+
+@_compiled
+def _softplus(x):
+    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
+
+
+@_compiled
+def _path_of(labels, label):
+    n = labels[label, 1] + 1
+    path = np.empty(n, np.int64)
+    for k in range(n - 1, -1, -1):
+        path[k] = labels[label, 0]
+        label = labels[label, 2]
+    return path

@@ -1,0 +1,273 @@
+"""Longest path in a layered DAG: `terminal` and `mean` of a scalar view of trust.
+
+Method: dynamic programming backwards over the time-expanded graph (Bellman 1958; Ahuja, Magnanti
+and Orlin 1993, chapter 4), for all admissible lengths in one pass.
+
+Unrolled, x^K = B0^K x^0 + sum_k B0^{K-k} u(path[k]). With j = K - k bounds left after cell c is
+entered, c adds w_j . u(c) to the value, w_j = view . B0^j for `terminal` and the sum of these up to
+j for `mean`: a weight that depends on j alone, not on the path nor on its length K.
+
+State: node (j, c), if the goal can be reached from c in j bounds and c from the start in at most
+`longest` - j. Edges lead from (j, c) to (j - 1, c') for each move c -> c'. The goal is node j = 0.
+
+Invariant: nodes are processed in the order of j, so the best sums of all heads of a node's edges
+are final. Where U-turns are forbidden, each node holds the best sum and the best by another first
+move: a predecessor excludes one first move at most, the one back to its own cell.
+
+Exact because the value is a sum of edge weights in a DAG, whatever their signs. The length K is
+then chosen by the start's nodes: (constant_K + sum) / scale_K.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from trustbo.parallel import over_rows
+from trustbo.planning.dynamics import Dynamics
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+
+class Layers(NamedTuple):
+    """Nodes in the order of the bounds left, and the edges from each."""
+
+    cell: np.ndarray  # (node,), flat index
+    left: np.ndarray  # (node,), bounds left
+    first: np.ndarray  # (node + 1,), index of its first edge
+    head: np.ndarray  # (edge,), node that it leads to
+    move: np.ndarray  # (edge,), index in `MOVES`
+    starts: np.ndarray  # (length,), node of the start with that many bounds left, or -1
+    n_moves: int
+    u_turns: bool
+
+
+def build_layers(
+    to_goal: np.ndarray,
+    from_start: np.ndarray,
+    steps: np.ndarray,
+    longest: int,
+    *,
+    u_turns: bool,
+) -> Layers:
+    """Unroll a grid over the bounds left.
+
+    Args:
+        to_goal: Fewest bounds to the goal, shape (row, col); -1 where there is no way.
+        from_start: Fewest bounds from the start, likewise.
+        steps: Moves, shape (move, 2), each the reverse of the one as far from the other end.
+        longest: Largest number of bounds of a path.
+        u_turns: True if a bound may lead back to the cell that the last one left.
+    """
+    return _build(to_goal, from_start, steps, longest, u_turns)
+
+
+@_compiled
+def _build(to_goal, from_start, steps, longest, u_turns):
+    rows, cols = to_goal.shape
+    # base: number of nodes of earlier cells; the goal is entered by the last bound only.
+    base = np.empty(rows * cols + 1, np.int64)
+    base[0] = 0
+    per_layer = np.zeros(longest + 2, np.int64)
+    for c in range(rows * cols):
+        i, j = c // cols, c % cols
+        near, far = to_goal[i, j], from_start[i, j]
+        n = 0
+        if near >= 0 and far >= 0:
+            n = 1 if near == 0 else max(0, longest - far - near + 1)
+        base[c + 1] = base[c] + n
+        for k in range(n):
+            per_layer[near + k + 1] += 1
+    place = np.cumsum(per_layer)
+    n_nodes = base[rows * cols]
+    node_of = np.empty(n_nodes, np.int32)  # in the order of cells, then of bounds left
+    cell, left = np.empty(n_nodes, np.int32), np.empty(n_nodes, np.int32)
+    start = 0
+    for c in range(rows * cols):
+        near = to_goal[c // cols, c % cols]
+        if from_start[c // cols, c % cols] == 0:
+            start = c
+        for k in range(base[c + 1] - base[c]):
+            node = place[near + k]
+            place[near + k] += 1
+            node_of[base[c] + k] = node
+            cell[node], left[node] = c, near + k
+    first = np.empty(n_nodes + 1, np.int64)
+    head, move = np.empty(0, np.int32), np.empty(0, np.int8)
+    for fill in range(2):  # first count, then write
+        if fill == 1:
+            head, move = np.empty(first[n_nodes], np.int32), np.empty(first[n_nodes], np.int8)
+        n = 0
+        for node in range(n_nodes):
+            first[node] = n
+            c = cell[node]
+            if left[node] > 0:
+                for m in range(len(steps)):
+                    i, j = c // cols + steps[m, 0], c % cols + steps[m, 1]
+                    if not (0 <= i < rows and 0 <= j < cols):
+                        continue
+                    b = i * cols + j
+                    k = left[node] - 1 - to_goal[i, j]
+                    if to_goal[i, j] >= 0 and 0 <= k < base[b + 1] - base[b]:
+                        if fill == 1:
+                            head[n], move[n] = node_of[base[b] + k], m
+                        n += 1
+        first[n_nodes] = n
+    starts = np.full(longest + 1, -1, np.int64)
+    near = to_goal[start // cols, start % cols]
+    for k in range(base[start + 1] - base[start]):
+        starts[near + k] = node_of[base[start] + k]
+    return Layers(cell, left, first, head, move, starts, len(steps), u_turns)
+
+
+class Weights(NamedTuple):
+    """Weights of u in a path's score by the bounds left; leading axis (draw,)."""
+
+    per_bound: np.ndarray  # (draw, left, state)
+    constant: np.ndarray  # (draw, length)
+    scale: np.ndarray  # (length,), divisor of a path's sum
+
+
+def additive_weights(dynamics: Dynamics, view: np.ndarray, objective: str, longest: int) -> Weights:
+    """Compute the weights of `terminal` or `mean` for one view of the states.
+
+    terminal: view . x^K = view . B0^K x0 + sum_j (view . B0^j) . u, with j bounds left. mean: the
+    average of view . x^k over k = 1..K.
+
+    Args:
+        dynamics: Recursion of expected trust with a leading axis (draw,).
+        view: Weights of the states in trust of the team, shape (state,).
+        objective: `"terminal"` or `"mean"`.
+        longest: Largest number of bounds of a path.
+    """
+    n_draws, n_states = dynamics.start.shape
+    powers = np.empty((n_draws, longest + 1, n_states))
+    powers[:, 0] = view
+    for j in range(longest):
+        powers[:, j + 1] = (powers[:, j, None, :] @ dynamics.transition)[:, 0]
+    constant = (powers @ dynamics.start[..., None])[..., 0]
+    scale = np.ones(longest + 1)
+    if objective == "mean":
+        constant[:, 0] = 0.0
+        constant = constant.cumsum(1)
+        powers = powers.cumsum(1)
+        scale = np.maximum(1.0, np.arange(longest + 1.0))
+    return Weights(powers, constant, scale)
+
+
+def best_additive(
+    layers: Layers,
+    drift: np.ndarray,
+    weights: Weights,
+    length_cost: np.ndarray,
+    lengths: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the best path of every draw.
+
+    Args:
+        layers: Grid unrolled over the bounds left.
+        drift: u, shape (draw, state, cell).
+        weights: Weights of u.
+        length_cost: Cost of each move, shape (move,).
+        lengths: Admissible numbers of bounds.
+
+    Returns:
+        Scores, shape (draw,); -inf where there is no path; and paths, flat indices of cells, shape
+        (draw, length), filled with -1.
+    """
+    n_draws = len(drift)
+    scores = np.full(n_draws, -np.inf)
+    paths = np.full((n_draws, len(layers.starts)), -1, np.int32)
+    drift, lengths = np.ascontiguousarray(drift), np.asarray(lengths)
+
+    def work(first: int, last: int) -> None:
+        _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, first, last)
+
+    over_rows(work, n_draws) if n_draws > 1 else work(0, n_draws)
+    return scores, paths
+
+
+class _Best(NamedTuple):
+    """Best sum from each node to the goal, shape (node,)."""
+
+    best: np.ndarray
+    second: np.ndarray  # best by another first move than that of `best`
+    edge: np.ndarray  # first edge of `best`, -1 at the goal
+    by: np.ndarray  # its move
+
+
+@_compiled
+def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, begin, end):
+    n_nodes, n_states = len(layers.cell), drift.shape[1]
+    left, cell, per_bound = layers.left, layers.cell, weights.per_bound
+    gain, costly = np.empty(n_nodes), length_cost.max() > 0.0
+    found = _Best(
+        np.empty(n_nodes),
+        np.empty(n_nodes),
+        np.empty(n_nodes, np.int64),
+        np.empty(n_nodes, np.int8),
+    )
+    for d in range(begin, end):
+        for n in range(n_nodes):
+            total = 0.0
+            for s in range(n_states):
+                total += per_bound[d, left[n], s] * drift[d, s, cell[n]]
+            gain[n] = total
+        _pass_back(layers, gain, length_cost, costly, found)
+        chosen = -1
+        for length in lengths:
+            node = layers.starts[length]
+            if node >= 0 and found.best[node] > -np.inf:
+                score = (weights.constant[d, length] + found.best[node]) / weights.scale[length]
+                if score > scores[d]:
+                    scores[d], chosen = score, length
+        if chosen >= 0:
+            _trace(layers, gain, length_cost, found, layers.starts[chosen], paths[d])
+
+
+@_compiled
+def _pass_back(layers, gain, length_cost, costly, found):
+    """Compute the best and second-best sum of every node, in the order of the bounds left."""
+    left, first, head, move = layers.left, layers.first, layers.head, layers.move
+    n_moves, u_turns = layers.n_moves, layers.u_turns
+    best, second, edge, by = found
+    for n in range(len(left)):
+        if left[n] == 0:
+            best[n], second[n], edge[n], by[n] = 0.0, 0.0, -1, -1
+            continue
+        high, next_high, at, m_high = -np.inf, -np.inf, -1, -1
+        for e in range(first[n], first[n + 1]):
+            b, m = head[e], move[e]
+            on = best[b] if u_turns or by[b] != n_moves - 1 - m else second[b]
+            value = gain[b] + on
+            if costly:
+                value -= length_cost[m]
+            if value > high:
+                next_high = high
+                high, at, m_high = value, e, m
+            elif value > next_high:
+                next_high = value
+        best[n], second[n], edge[n], by[n] = high, next_high, at, m_high
+
+
+@_compiled
+def _trace(layers, gain, length_cost, found, node, path):
+    """Write down the path from a start node; second-best edges are searched again."""
+    cell, first, head, move = layers.cell, layers.first, layers.head, layers.move
+    best, second, edge, by = found
+    k, came = 0, -1
+    path[0] = cell[node]
+    while edge[node] >= 0:
+        e = edge[node]
+        if not layers.u_turns and came >= 0 and by[node] == layers.n_moves - 1 - came:
+            high = -np.inf
+            for x in range(first[node], first[node + 1]):
+                b, m = head[x], move[x]
+                if m == by[node]:
+                    continue
+                on = best[b] if by[b] != layers.n_moves - 1 - m else second[b]
+                if gain[b] + on - length_cost[m] > high:
+                    high, e = gain[b] + on - length_cost[m], x
+        node, came = head[e], move[e]
+        k += 1
+        path[k] = cell[node]

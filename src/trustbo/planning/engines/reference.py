@@ -1,0 +1,230 @@
+"""The reference engine: exact search on a networkx graph, one algorithm per family of objectives.
+
+A path ends when it first enters the goal. Dijkstra with "trust on arrival" as the label is wrong
+for every history-dependent objective: the best label of a cell need not extend to the best path.
+"""
+
+import heapq
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import networkx as nx
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError
+from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.engines.dominance import dominance_tests
+from trustbo.planning.engines.layers import additive_weights
+from trustbo.planning.objectives import LABELLED, Objective, softplus
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.values import entry_cost, path_length, trust_along
+
+Path = tuple[Cell, ...]
+_dijkstra: Any = nx.dijkstra_path  # annotations of networkx exclude `backend=None`
+
+
+def plan_networkx(
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    backend: str | None = None,
+) -> Path:
+    """Find the best path of one draw.
+
+    Args:
+        admissible: Admissible paths.
+        dynamics: Recursion of expected trust without leading axes.
+        objective: Objective and length weight.
+        backend: networkx backend for shortest paths.
+    """
+    if objective.name == "stationary":
+        cost = entry_cost(admissible.passable, dynamics)
+        return best_stationary(admissible, cost, objective.length_weight, backend)
+    if objective.name in LABELLED:
+        return best_labelled(admissible, dynamics, objective.name)
+    paths = []
+    weights = additive_weights(
+        dynamics.stacked(), dynamics.views[0], objective.name, admissible.longest
+    )
+    gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, row, col)
+    for n_bounds in range(admissible.shortest, admissible.longest + 1):
+        if len(dynamics.views) > 1:  # the least of several views is no sum of weights
+            path = best_layered(admissible, dynamics, objective, n_bounds)
+        else:
+
+            def gain(k: int, cell: Cell, n: int = n_bounds) -> float:
+                return float(gains[n - k, *cell] / weights.scale[n])
+
+            path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
+        if path is not None:
+            paths.append(path)
+    return max(paths, key=lambda path: _score(dynamics, objective, admissible, path))
+
+
+def _score(
+    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
+) -> float:
+    """Score of a path for `terminal` or `mean` in trust, as its sigma rounds to 1 beyond 40."""
+    trust = trust_along(dynamics, path)
+    score = float(trust[-1] if objective.name == "terminal" else trust.mean())
+    return score - objective.length_weight * path_length(admissible, path)
+
+
+def best_additive(
+    admissible: AdmissiblePaths,
+    gain: Callable[[int, Cell], float],
+    n_bounds: int,
+    length_weight: float = 0.0,
+    backend: str | None = None,
+) -> Path | None:
+    """Find the path of exactly `n_bounds` bounds that maximises the sum of gain(k, path[k]).
+
+    The cells are unrolled over the bounds into a layered DAG. All paths through it are equally
+    long, so each layer's weights may be shifted to be non-negative: Dijkstra then applies, whatever
+    the signs of the gains.
+
+    Args:
+        admissible: Admissible paths.
+        gain: Gain of entering a cell by bound k.
+        n_bounds: Number of bounds of the path.
+        length_weight: Cost of a metre.
+        backend: networkx backend to dispatch to.
+
+    Returns:
+        Path, or None if none has that many bounds.
+    """
+    graph, dag = admissible.graph, nx.DiGraph()
+    source, sink = (0, None, admissible.start), "goal"
+    dag.add_node(source)
+    layer = [source]
+    for k in range(1, n_bounds + 1):
+        entered = {}
+        for node in layer:
+            _, before, cell = node
+            for other in graph.successors(cell):
+                if not _on_time(admissible, other, n_bounds - k):
+                    continue
+                if not admissible.u_turns and other == before:
+                    continue
+                target = (k, None if admissible.u_turns else cell, other)
+                entered.setdefault(target, []).append(node)
+        if not entered:
+            return None
+        gains = {target: gain(k, target[2]) for target in entered}
+        most = max(gains.values())
+        for target, sources in entered.items():
+            for node in sources:
+                length = graph.edges[node[2], target[2]]["length"]
+                dag.add_edge(node, target, weight=most - gains[target] + length_weight * length)
+        layer = list(entered)
+    for node in layer:
+        dag.add_edge(node, sink, weight=0.0)
+    nodes: list[Any] = _dijkstra(dag, source, sink, weight="weight", backend=backend)
+    return tuple(node[2] for node in nodes[:-1])
+
+
+def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: str) -> Path:
+    """Find the walk with the best `success` or `bottleneck`.
+
+    Label setting: labels leave the queue in the order of their cost, which never falls along a
+    walk. A later label at a cell is settled only if no earlier one dominates it (see `dominance`)
+    with as few bounds and, without revisits, with a subset of its cells.
+
+    Raises:
+        TrustboError: No walk is short enough.
+    """
+    combine: Callable[[float, float], float] = (
+        (lambda cost, x: cost + float(softplus(-x)))
+        if objective == "success"
+        else (lambda cost, x: max(cost, -x))
+    )
+    graph, to_goal, max_bounds = admissible.graph, admissible.to_goal, admissible.longest
+    tests, u_turns = dominance_tests(dynamics, max_bounds), admissible.u_turns
+    bit = {cell: 1 << i for i, cell in enumerate(graph)} if not admissible.revisit else {}
+    settled: dict[object, list[tuple[np.ndarray, int, int]]] = {}
+    order = itertools.count()  # equal costs leave in the order of entry: deterministic
+    first = -np.inf if objective == "bottleneck" else 0.0
+    queue: list[Any] = [(first, 0, next(order), dynamics.start, (admissible.start,), 0)]
+    while queue:
+        cost, n_bounds, _, x, path, seen = heapq.heappop(queue)
+        cell, before = path[-1], path[-2] if len(path) > 1 and not u_turns else None
+        if cell == admissible.goal:
+            return path
+        seen |= bit.get(cell, 0)
+        known, tested = settled.setdefault((before, cell), []), tests @ x
+        if any((q >= tested).all() and n <= n_bounds and s & ~seen == 0 for q, n, s in known):
+            continue
+        known.append((tested, n_bounds, seen))
+        for other in graph.successors(cell):
+            if n_bounds + 1 + to_goal.get(other, np.inf) > max_bounds or seen & bit.get(other, 0):
+                continue
+            if other == before:
+                continue
+            reached = dynamics.transition @ x + dynamics.drift[:, *other]
+            trust = float((dynamics.views @ reached).min())
+            label = (combine(cost, trust), n_bounds + 1, next(order), reached)
+            heapq.heappush(queue, (*label, (*path, other), seen))
+    raise TrustboError(f"no path has at most {max_bounds} bounds.")
+
+
+def best_layered(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, n_bounds: int
+) -> Path | None:
+    """Find the path of `n_bounds` bounds with the best `terminal` or `mean` for `team="min"`.
+
+    Bound by bound, with all labels at each cell that no other dominates. Scores of `mean` are sums,
+    divided by the number of bounds at the end, so each length costs as many times as much.
+    """
+    graph, tests = admissible.graph, dominance_tests(dynamics, n_bounds)
+    per_metre = objective.length_weight * (n_bounds if objective.name == "mean" else 1)
+    labels: dict[object, list[tuple[np.ndarray, float, np.ndarray, Path]]] = {
+        (None, admissible.start): [
+            (tests @ dynamics.start, 0.0, dynamics.start, (admissible.start,))
+        ]
+    }
+    for k in range(1, n_bounds + 1):
+        new: dict[object, list[tuple[np.ndarray, float, np.ndarray, Path]]] = {}
+        for (before, cell), here in labels.items():  # pyright: ignore[reportGeneralTypeIssues]
+            for other in graph.successors(cell):
+                if not _on_time(admissible, other, n_bounds - k) or other == before:
+                    continue
+                length_cost = per_metre * graph.edges[cell, other]["length"]
+                at = new.setdefault((None if admissible.u_turns else cell, other), [])
+                for _, score, x, path in here:
+                    reached = dynamics.transition @ x + dynamics.drift[:, *other]
+                    trust = float((dynamics.views @ reached).min())
+                    gained = trust if objective.name == "mean" or k == n_bounds else 0.0
+                    score_now = score + gained - length_cost
+                    _keep(at, (tests @ reached, score_now, reached, (*path, other)))
+        labels = new
+    ends = [label for at in labels.values() for label in at]
+    return max(ends, key=lambda label: label[1])[3] if ends else None
+
+
+def _on_time(admissible: AdmissiblePaths, cell: Cell, left: int) -> bool:
+    """True if a path may enter a cell with so many bounds left; the goal only by the last."""
+    return admissible.to_goal.get(cell, np.inf) <= left and (cell == admissible.goal) == (left == 0)
+
+
+def _keep(at: list[Any], label: Any) -> None:
+    """Add a label unless another dominates it; drop those that it dominates."""
+    tested, score = label[:2]
+    if any(s >= score and (q >= tested).all() for q, s, *_ in at):
+        return
+    at[:] = [old for old in at if not (score >= old[1] and (tested >= old[0]).all())]
+    at.append(label)
+
+
+def best_stationary(
+    admissible: AdmissiblePaths, cost: np.ndarray, length_weight: float, backend: str | None
+) -> Path:
+    """Find the simple path with the least cost of its cells, shape (row, col), and its metres."""
+    weighted = nx.DiGraph()
+    weighted.add_weighted_edges_from(
+        (a, b, float(cost[b]) + length_weight * length)
+        for a, b, length in admissible.graph.edges(data="length")
+    )
+    ends = admissible.start, admissible.goal
+    return tuple(_dijkstra(weighted, *ends, weight="weight", backend=backend))

@@ -1,0 +1,195 @@
+"""Admissible paths from one start to one goal."""
+
+import itertools
+import operator
+from collections.abc import Sequence
+from functools import cached_property
+
+import networkx as nx
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
+from trustbo.planning.engines.layers import Layers, build_layers
+from trustbo.planning.graph import (
+    MOVES,
+    NoPathError,
+    cell_graph,
+    fewest_bounds,
+    move_lengths,
+    require_connectivity,
+    require_way,
+)
+from trustbo.workspace import Workspace
+
+DEFAULT_EXTRA = 8
+"""Bounds beyond the fewest possible that `success` and `bottleneck` may take by default."""
+
+SIMPLE = ("shortest", "shortest+1", "shortest+2")
+"""Values of `max_bounds` that forbid U-turns; their paths enter no cell twice."""
+
+
+class AdmissiblePaths:
+    """Start, goal and the admissible paths between them, with the tables that engines need.
+
+    Attributes:
+        start: First cell.
+        goal: Last cell; a path ends on entering it.
+        shortest: Fewest bounds from start to goal.
+        longest: Largest number of bounds of an admissible path.
+        max_bounds: Limit on the number of bounds, as `Planner` takes it.
+        u_turns: True if a bound may lead back to the cell that the last one left.
+        revisit: True if a path may enter a cell twice.
+        connectivity: 4 or 8.
+        steps: Moves to neighbouring cells, shape (move, 2).
+        lengths: Length of each move in metres, shape (move,).
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        start: Cell,
+        goal: Cell,
+        connectivity: int,
+        max_bounds: int | str | None,
+        revisit: bool,
+    ) -> None:
+        """Prepare the tables; see `Planner`. `max_bounds` None: shortest + `DEFAULT_EXTRA`."""
+        self.workspace, self.connectivity = workspace, require_connectivity(connectivity)
+        self.start = workspace.require_cell("start", start)
+        self.goal = workspace.require_cell("goal", goal)
+        if self.start == self.goal:
+            raise TrustboError(f"start and goal are the same cell {self.start}; choose two.")
+        self.passable = workspace.passable.values
+        self.steps = np.array(MOVES[connectivity])
+        self.lengths = move_lengths(workspace, connectivity)
+        self.bounds_to_goal = fewest_bounds(self.passable, self.goal, connectivity)
+        require_way(self.passable, self.bounds_to_goal, self.start, self.goal, connectivity)
+        self.shortest = int(self.bounds_to_goal[self.start])
+        self.longest = self._most_bounds(max_bounds)
+        self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest
+        self.u_turns = not isinstance(max_bounds, str)
+        self.revisit = revisit
+
+    @cached_property
+    def graph(self) -> nx.DiGraph:
+        """Graph of passable cells (see `cell_graph`)."""
+        return cell_graph(self.workspace, self.connectivity)
+
+    @cached_property
+    def to_goal(self) -> dict[Cell, int]:
+        """Fewest bounds to the goal by cell, for cells that can reach it."""
+        return _by_cell(self.bounds_to_goal)
+
+    @cached_property
+    def bounds_from_start(self) -> np.ndarray:
+        """Fewest bounds from the start, shape (row, col); -1 where there is no way."""
+        return fewest_bounds(self.passable, self.start, self.connectivity)
+
+    @cached_property
+    def layers(self) -> Layers:
+        """Layered DAG: the grid unrolled over the bounds that are left."""
+        return build_layers(
+            self.bounds_to_goal,
+            self.bounds_from_start,
+            self.steps,
+            self.longest,
+            u_turns=self.u_turns,
+        )
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """Cells that can be entered from each, flat indices, shape (cell, move); -1 where none."""
+        rows, cols = self.passable.shape
+        row, col = np.divmod(np.arange(rows * cols)[:, None], cols)
+        i, j = row + self.steps[:, 0], col + self.steps[:, 1]
+        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
+        other = np.where(inside, i * cols + j, 0)
+        both = self.passable.ravel()[other] & self.passable.ravel()[:, None]
+        return np.where(inside & both, other, -1)
+
+    def onward(self, done: Sequence[Cell]) -> "AdmissiblePaths":
+        """Restrict to the rest of a mission.
+
+        Args:
+            done: Cells entered so far, start first.
+
+        Raises:
+            TrustboError: They begin at another cell, or end at the goal.
+            NoPathError: Too few bounds are left to reach the goal.
+        """
+        here = self.workspace.require_cell("done[-1]", done[-1])
+        if done[0] != self.start:
+            raise TrustboError(f"the mission began at {done[0]}; the paths at {self.start}.")
+        left = self.longest - (len(done) - 1)
+        fewest = int(self.bounds_to_goal[here])
+        if here != self.goal and not 0 < fewest <= left:
+            raise NoPathError(
+                f"from {here} to {self.goal} it takes {fewest} bounds, but {left} are left."
+            )
+        max_bounds = left
+        if not self.u_turns:
+            max_bounds = SIMPLE[min(left - fewest, len(SIMPLE) - 1)]
+        return AdmissiblePaths(
+            self.workspace, here, self.goal, self.connectivity, max_bounds, revisit=self.revisit
+        )
+
+    def flat(self, cell: Cell) -> int:
+        """Index of a cell in row-major order."""
+        return cell[0] * self.passable.shape[1] + cell[1]
+
+    def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
+        """Cells of flat indices, up to the first that is negative."""
+        rows, cols = np.divmod(flat[flat >= 0], self.passable.shape[1])
+        return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
+
+    def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
+        """Return a path as a tuple of cells if every bound is possible.
+
+        Raises:
+            TrustboError: The path is broken, or does not lead from start to goal.
+        """
+        try:
+            flat = list(map(operator.index, itertools.chain.from_iterable(path)))
+            where = np.array(flat).reshape(len(path), 2)
+            cells = tuple(zip(flat[::2], flat[1::2], strict=True))
+        except (TypeError, ValueError):  # find the faulty cell
+            cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
+            where = np.array(cells)
+        if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:
+            raise TrustboError(
+                f"a path must lead from {self.start} to {self.goal}; got {_shortened(cells)}."
+            )
+        step = np.diff(where, axis=0)
+        inside = ((where[1:] >= 0) & (where[1:] < self.passable.shape)).all(1)
+        far = np.abs(step).sum(1) if self.connectivity == 4 else np.abs(step).max(1)
+        there = np.where(inside[:, None], where[1:], 0)
+        broken = (far != 1) | ~inside | ~self.passable[*there.T]
+        if broken.any():
+            k = int(np.argmax(broken))
+            raise TrustboError(
+                f"the path is broken: no bound leads from {cells[k]} to {cells[k + 1]}."
+            )
+        return cells
+
+    def _most_bounds(self, max_bounds: int | str | None) -> int:
+        if max_bounds is None:
+            return self.shortest + DEFAULT_EXTRA
+        named = {name: self.shortest + extra for extra, name in enumerate(SIMPLE)}
+        if isinstance(max_bounds, str):
+            return named[require_choice("max_bounds", max_bounds, named)]
+        if require_whole("max_bounds", max_bounds, 1) < self.shortest:
+            raise TrustboError(
+                f"max_bounds = {max_bounds} is below the fewest possible from {self.start} to "
+                f"{self.goal}, which is {self.shortest}."
+            )
+        return int(max_bounds)
+
+
+def _by_cell(bounds: np.ndarray) -> dict[Cell, int]:
+    cells = np.argwhere(bounds >= 0)
+    return {(r, c): int(bounds[r, c]) for r, c in cells.tolist()}
+
+
+def _shortened(cells: tuple[Cell, ...]) -> str:
+    return str(cells) if len(cells) <= 10 else f"{len(cells)} cells from {cells[0]} to {cells[-1]}"

@@ -1,0 +1,139 @@
+"""Search for the best path: validity of the objective, choice of the engine, optimality gap."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import expit, logit
+
+from trustbo.data import Cell
+from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models.params import Params
+from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.engines.compiled import expected_path, plan_compiled
+from trustbo.planning.engines.reference import plan_networkx
+from trustbo.planning.objectives import LABELLED
+from trustbo.planning.problem import PlanningProblem
+
+ENGINES = ("auto", "networkx", "numba")
+LARGEST_FOR_NETWORKX = 2500
+"""Number of cells up to which `auto` plans single paths with networkx."""
+LARGEST_FOR_LABELS = 100
+"""The same where partial paths are labels: success, bottleneck, and least trust of a team."""
+EXACT = 1e-12
+"""Largest optimality gap, in trust or log probability, of a path that counts as exact."""
+
+
+class Engine(NamedTuple):
+    """An engine by name, and the backend that networkx dispatches to."""
+
+    name: str = "auto"
+    backend: str | None = None
+
+    def choose(self, n_cells: int, n_draws: int, *, labels: bool = False) -> str:
+        """Resolve the name; `auto` goes by the number of cells and draws, and the kind of search.
+
+        The reference engine has no heuristic for labels: 41 s for `success` on 30 x 30 cells.
+        """
+        if require_choice("engine", self.name, ENGINES) != "auto":
+            return self.name
+        most = LARGEST_FOR_LABELS if labels else LARGEST_FOR_NETWORKX
+        return "networkx" if n_draws == 1 and n_cells <= most else "numba"
+
+
+class FoundPath(NamedTuple):
+    """A best path, its optimality gap and the name of the engine."""
+
+    path: tuple[Cell, ...]
+    gap: float
+    engine: str
+
+
+def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> FoundPath:
+    """Find the best path under one draw, `dynamics` without leading axes."""
+    paths, objective = problem.paths, problem.objective
+    require_valid(dynamics, objective.name)
+    name = engine.choose(paths.passable.size, 1, labels=_has_labels(problem))
+    if name == "networkx":
+        return FoundPath(plan_networkx(paths, dynamics, objective, engine.backend), 0.0, name)
+    best = plan_compiled(paths, dynamics.stacked(), objective)
+    return FoundPath(paths.cells(best.paths[0]), float(best.gap[0]), name)
+
+
+def _has_labels(problem: PlanningProblem) -> bool:
+    name = problem.objective.name
+    return name in LABELLED or (problem.team == "min" and name != "stationary")
+
+
+def find_paths(
+    problem: PlanningProblem, dynamics: Dynamics, engine: Engine
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the best path under every draw: flat indices (draw, length), padded by -1; and gaps."""
+    paths, objective, n_draws = problem.paths, problem.objective, len(dynamics.start)
+    require_valid(dynamics, objective.name)
+    if engine.choose(paths.passable.size, n_draws, labels=_has_labels(problem)) == "numba":
+        return plan_compiled(paths, dynamics, objective)
+    found = [
+        plan_networkx(paths, dynamics.draw(d), objective, engine.backend) for d in range(n_draws)
+    ]
+    padded = np.full((n_draws, max(map(len, found))), -1)
+    for flat, path in zip(padded, found, strict=True):
+        flat[: len(path)] = [paths.flat(cell) for cell in path]
+    return padded, np.zeros(n_draws)
+
+
+def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, ...]:
+    """Find the path with the best expectation over draws of the objective.
+
+    Raises:
+        TrustboError: Another objective than terminal or mean, or `team="min"`.
+    """
+    paths, objective = problem.paths, problem.objective
+    if objective.name not in ("terminal", "mean") or len(dynamics.views) > 1:
+        raise TrustboError(
+            "an expectation over draws is planned exactly for 'terminal' and 'mean' of a "
+            f"team's mean trust; got {objective.name!r} with team={problem.team!r}."
+        )
+    return paths.cells(expected_path(paths, dynamics, objective))
+
+
+def require_one_draw(params: Params) -> None:
+    """Refuse parameters with leading axes.
+
+    Raises:
+        ShapeError: Parameters have leading axes.
+    """
+    if params.leading:
+        raise ShapeError(
+            f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
+            "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
+        )
+
+
+def require_valid(dynamics: Dynamics, objective: str) -> None:
+    """Refuse dynamics for which an objective is undefined or not planned exactly.
+
+    Raises:
+        TrustboError: success or bottleneck with beta0 < 0; stationary with abs(beta0) >= 1.
+    """
+    own = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
+    if objective in LABELLED and (own < 0.0).any():
+        raise TrustboError(
+            f"objective {objective!r} needs beta0 >= 0; got {own.min():g}. Use 'terminal' or "
+            "'mean'."
+        )
+    if objective == "stationary":
+        radius = np.abs(np.linalg.eigvals(dynamics.transition))
+        if (radius >= 1.0).any():
+            raise TrustboError(
+                f"objective 'stationary' needs abs(beta0) < 1; got {radius.max():g}. Use "
+                "'terminal' or 'mean'."
+            )
+
+
+def value_bound(objective: str, value: float, gap: float) -> float:
+    """Upper bound on the value of every admissible path from a path's value and gap."""
+    if gap <= EXACT:
+        return value
+    if objective == "terminal":
+        return float(expit(logit(value) + gap))
+    return value * float(np.exp(gap)) if objective == "success" else value + gap

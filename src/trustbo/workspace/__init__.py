@@ -1,0 +1,8 @@
+"""Planning grid: awareness, passability, positions, routes and sight of every cell."""
+
+from trustbo.workspace.belief import AwarenessBelief
+from trustbo.workspace.grid import Grid
+from trustbo.workspace.sight import SIGHT_MODES, Sight
+from trustbo.workspace.workspace import Workspace
+
+__all__ = ["SIGHT_MODES", "AwarenessBelief", "Grid", "Sight", "Workspace"]

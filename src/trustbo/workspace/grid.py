@@ -1,0 +1,238 @@
+"""Planning grid: cells of positions and of pixels, means and quantiles over cells."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numba import njit
+from numpy.typing import ArrayLike
+from rasterio.crs import CRS
+from rasterio.warp import transform as transform_points
+
+from trustbo.data import Cell
+from trustbo.errors import TerrainError, TrustboError, require_pair
+
+Sums = tuple[np.ndarray, np.ndarray]
+"""Sum over each cell's pixels with data, and their number, each of shape (row, col)."""
+WGS84 = CRS.from_epsg(4326)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid of cells; row 0 at the top (north).
+
+    Attributes:
+        shape: Number of rows and columns.
+        left: x of the left edge, CRS metres.
+        top: y of the top edge, CRS metres.
+        cell_height: North-south size of a cell, m.
+        cell_width: East-west size of a cell, m.
+        crs: Coordinate reference system, as WKT; None without a terrain.
+    """
+
+    shape: tuple[int, int]
+    left: float
+    top: float
+    cell_height: float
+    cell_width: float
+    crs: str | None = None
+
+    @classmethod
+    def over(cls, terrain: xr.Dataset, shape: tuple[int, int]) -> "Grid":
+        """Make the grid of a given shape that covers a terrain.
+
+        Raises:
+            TerrainError: Fewer than 2 cells, or cells smaller than 2 pixels.
+        """
+        rows, cols = require_pair("shape", shape)
+        pixels = terrain["dem"].shape
+        if min(rows, cols) < 1 or rows * cols < 2:
+            raise TerrainError(f"shape must be (rows, cols) with at least two cells; got {shape}.")
+        if pixels[0] < 2 * rows or pixels[1] < 2 * cols:
+            raise TerrainError(
+                f"a grid of {rows} x {cols} cells needs at least 2 x 2 pixels per cell; the "
+                f"terrain has {pixels[0]} x {pixels[1]} pixels. Take a smaller shape or a finer "
+                "raster."
+            )
+        left, bottom, right, top = terrain.rio.bounds(recalc=True)
+        crs = terrain.rio.crs
+        return cls(
+            (rows, cols),
+            left,
+            top,
+            (top - bottom) / rows,
+            (right - left) / cols,
+            None if crs is None else crs.to_wkt(),
+        )
+
+    def center(self, cell: Cell) -> tuple[float, float]:
+        """X and y of a cell's centre, CRS metres."""
+        row, col = cell
+        x = self.left + (col + 0.5) * self.cell_width
+        return x, self.top - (row + 0.5) * self.cell_height
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """X and y of the lower left corner, CRS metres."""
+        return self.left, self.top - self.shape[0] * self.cell_height
+
+    @property
+    def x(self) -> np.ndarray:
+        """X of the columns' centres, CRS metres, shape (col,)."""
+        return self.left + (np.arange(self.shape[1]) + 0.5) * self.cell_width
+
+    @property
+    def y(self) -> np.ndarray:
+        """Y of the rows' centres, CRS metres, shape (row,)."""
+        return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
+
+    def cell_at(self, x: float, y: float) -> Cell:
+        """Cell at a position in CRS metres.
+
+        Raises:
+            TrustboError: The position is off the grid.
+        """
+        row = int(np.floor((self.top - y) / self.cell_height))
+        col = int(np.floor((x - self.left) / self.cell_width))
+        if not (0 <= row < self.shape[0] and 0 <= col < self.shape[1]):
+            raise TrustboError(f"position ({x:g}, {y:g}) is off the grid.")
+        return row, col
+
+    def lonlat(self, cell: Cell) -> tuple[float, float]:
+        """Longitude and latitude of a cell's centre, degrees (WGS 84).
+
+        Raises:
+            TrustboError: The grid has no CRS.
+        """
+        x, y = self.center(cell)
+        lon, lat = transform_points(self._crs(), WGS84, [x], [y])[:2]
+        return lon[0], lat[0]
+
+    def cell_at_lonlat(self, lon: float, lat: float) -> Cell:
+        """Cell at a position in degrees (WGS 84).
+
+        Raises:
+            TrustboError: The position is off the grid, or the grid has no CRS.
+        """
+        x, y = transform_points(WGS84, self._crs(), [lon], [lat])[:2]
+        return self.cell_at(x[0], y[0])
+
+    def cell_means(self, values: xr.DataArray) -> np.ndarray:
+        """Mean over each cell's pixels with data.
+
+        Args:
+            values: Dims (y, x), on a raster that the grid covers.
+
+        Returns:
+            Shape (row, col); NaN where a cell has no data.
+        """
+        sums = CellMeans(self, values)
+        sums.add(values.transpose("y", "x").values)
+        return sums.cells
+
+    def cell_share(self, condition: xr.DataArray) -> np.ndarray:
+        """Share of each cell's pixels where a condition holds, shape (row, col)."""
+        return self.cell_means(condition.astype(float))
+
+    def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of the cells of pixels at `y`, and columns of those at `x`."""
+        rows, cols = self.shape
+        row = ((self.top - np.asarray(y)) / self.cell_height).astype(int)
+        col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
+        return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
+
+    def _crs(self) -> CRS:
+        if self.crs is None:
+            raise TrustboError(
+                "this grid has no coordinate reference system: its workspace was not made from a "
+                "terrain. Use cell_at and center, in metres."
+            )
+        return CRS.from_user_input(self.crs)
+
+
+class CellMeans:
+    """Means over each cell's pixels with data, from rows of pixels added north to south."""
+
+    def __init__(self, grid: Grid, like: xr.DataArray) -> None:
+        """Start without pixels.
+
+        Args:
+            grid: Planning grid.
+            like: A raster of the whole terrain, dims (y, x).
+        """
+        self._row, self._edges = _ownership(grid, like)
+        self._total, self._count = np.zeros(grid.shape), np.zeros(grid.shape)
+
+    def add(self, values: np.ndarray, first: int = 0) -> None:
+        """Add rows of pixels, shape (row, col), the first of them row `first` of the raster."""
+        self.merge(self.sums(values, first))
+
+    def sums(self, values: np.ndarray, first: int = 0) -> Sums:
+        """Sums for `merge`, of the arguments of `add`; threads may compute them."""
+        row = self._row[first : first + len(values)]
+        values = values.view(np.uint8) if values.dtype == bool else values
+        total, count = np.zeros_like(self._total), np.zeros_like(self._count)
+        _add_rows(np.ascontiguousarray(values), row, self._edges, total, count)
+        return total, count
+
+    def merge(self, sums: Sums) -> None:
+        """Add sums of pixels."""
+        self._total += sums[0]
+        self._count += sums[1]
+
+    @property
+    def cells(self) -> np.ndarray:
+        """Means, shape (row, col); NaN where a cell has no data."""
+        with np.errstate(invalid="ignore"):
+            return self._total / self._count
+
+
+class CellQuantiles:
+    """Quantiles, like `CellMeans`; pixels of one row of cells are in memory."""
+
+    def __init__(self, grid: Grid, like: xr.DataArray, q: float) -> None:
+        """Start without pixels; `q` is in [0, 1]."""
+        self._row, self._edges = _ownership(grid, like)
+        self._q = q
+        self._pending: list[np.ndarray] = []
+        self.cells = np.full(grid.shape, np.nan)
+        """Quantiles, shape (row, col); NaN where a cell has no data, or lacks pixels yet."""
+
+    def add(self, values: np.ndarray, first: int = 0) -> None:
+        """Add rows of pixels, see `CellMeans.add`."""
+        row = self._row[first : first + len(values)]
+        for cell in np.unique(row):
+            self._pending.append(values[row == cell])
+            if first + np.searchsorted(row, cell, "right") == np.searchsorted(
+                self._row, cell, "right"
+            ):
+                self._finish(cell)
+
+    def _finish(self, row: int) -> None:
+        values = np.concatenate(self._pending)
+        self._pending = []
+        for col, (left, right) in enumerate(itertools.pairwise(self._edges)):
+            cell = values[:, left:right]
+            if np.isfinite(cell).any():
+                self.cells[row, col] = np.nanquantile(cell, self._q)
+
+
+def _ownership(grid: Grid, like: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
+    """Row of cells of each row of pixels; first column of pixels of each column of cells."""
+    row, col = grid.cells_along(like["y"].values, like["x"].values)
+    return row, np.searchsorted(col, np.arange(grid.shape[1] + 1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+def _add_rows(values, row, edges, total, count):
+    for i in range(len(values)):
+        of_row = values[i]
+        for cell in range(len(edges) - 1):
+            s, n_missing = 0.0, 0
+            for j in range(edges[cell], edges[cell + 1]):
+                v = of_row[j]
+                s += v if v == v else 0.0
+                n_missing += v != v
+            total[row[i], cell] += s
+            count[row[i], cell] += edges[cell + 1] - edges[cell] - n_missing

@@ -1,0 +1,50 @@
+"""Workspaces as trees of arrays, for files."""
+
+import json
+from dataclasses import asdict
+
+import xarray as xr
+
+from trustbo.data import Robot, Team
+from trustbo.files import to_json
+from trustbo.terrain import CompositeIndex
+from trustbo.workspace.grid import Grid
+from trustbo.workspace.workspace import Workspace
+
+
+def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
+    """Convert a workspace to a tree."""
+    cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
+    tree = {"cells": cells}
+    tree |= {f"composites/{n}": index.to_dataset() for n, index in workspace.composites.items()}
+    if workspace.terrain is not None and workspace.pixels is not None:
+        tree |= {"terrain": workspace.terrain, "pixels": workspace.pixels.drop_vars("spatial_ref")}
+    result = xr.DataTree.from_dict(tree)
+    result.attrs = {
+        "grid": to_json(asdict(workspace.grid)),
+        "team": to_json(asdict(workspace.team)),
+    }
+    return result
+
+
+def workspace_from_tree(tree: xr.DataTree) -> Workspace:
+    """Convert a tree of `workspace_to_tree` back."""
+    cells = tree["cells"].to_dataset()
+    grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
+    has_terrain = "terrain" in tree
+    return Workspace(
+        cells["awareness"],
+        cells["passable"],
+        Grid(**grid | {"shape": tuple(grid["shape"])}),
+        Team(
+            robots=tuple(Robot(**robot) for robot in team["robots"]),
+            lead=Robot(**team["lead"]),
+            names=tuple(team["names"]),
+        ),
+        tree["terrain"].to_dataset().set_coords("spatial_ref") if has_terrain else None,
+        tree["pixels"].to_dataset() if has_terrain else None,
+        {
+            name: CompositeIndex.from_dataset(node.to_dataset())
+            for name, node in (tree["composites"].children if "composites" in tree else {}).items()
+        },
+    )

@@ -1,0 +1,136 @@
+"""Fastest routes over passable pixels."""
+
+import heapq
+import math
+
+import numpy as np
+from numba import njit
+
+from trustbo.data import Robot
+from trustbo.workspace.sight import Surface
+
+SLOWEST = 0.1
+"""Share of its speed that a robot keeps at its slope limit."""
+_compiled = njit(cache=True, error_model="numpy")
+
+
+class Routes:
+    """Fastest routes over passable pixels, by A*, cached.
+
+    Robots with one slope limit share them, and missions over one path need few.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        """Prepare the slope, with which a robot's speed falls."""
+        self._surface = surface
+        self._slope = np.arctan(np.hypot(*surface.gradient))
+        self._paces: dict[float, np.ndarray] = {}
+        self._known: dict[tuple[object, ...], np.ndarray] = {}
+
+    def find(
+        self,
+        robot: Robot,
+        start: np.ndarray,
+        goal: np.ndarray,
+        window: tuple[int, int, int, int],
+    ) -> np.ndarray | None:
+        """Find the fastest route between two positions.
+
+        Args:
+            robot: Robot that drives.
+            start: x and y, CRS metres.
+            goal: x and y, CRS metres.
+            window: Pixels that the route may use: first row, end row, first col, end col.
+
+        Returns:
+            Positions from start to goal, shape (point, 2), CRS metres; None if there is no route.
+        """
+        ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
+        key = (*ends, window, robot.max_slope)
+        if key not in self._known:
+            self._known[key] = self._search(ends[0], ends[1], window, robot.max_slope)
+        found = self._known[key]
+        if not len(found):
+            return None
+        if len(found) == 1:  # a single-pixel route still needs two ends
+            return np.stack([start, goal])
+        route = found.copy()
+        route[0], route[-1] = start, goal
+        return route
+
+    def _search(
+        self,
+        start: tuple[int, ...],
+        goal: tuple[int, ...],
+        window: tuple[int, int, int, int],
+        max_slope: float,
+    ) -> np.ndarray:
+        """Positions of the pixels from start to goal; empty if there is no route."""
+        surface = self._surface
+        if max_slope not in self._paces:
+            pace = 1.0 / speed_share(self._slope, max_slope)
+            self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
+        top, bottom, left, right = window
+        cells = _a_star(
+            self._paces[max_slope][top:bottom, left:right],
+            surface.pixel,
+            (start[0] - top, start[1] - left),
+            (goal[0] - top, goal[1] - left),
+        )
+        x = surface.origin[0] + (cells[:, 1] + left) * surface.pixel[1]
+        y = surface.origin[1] - (cells[:, 0] + top) * surface.pixel[0]
+        return np.stack([x, y], axis=1)
+
+
+@_compiled
+def speed_share(tilt, max_slope):
+    """Share of its speed on level ground that a robot keeps at a tilt, rad."""
+    return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
+
+
+@_compiled
+def _a_star(pace, pixel, start, goal):
+    """Pixels of the cheapest route over paces (s/m, inf where impassable); empty if none."""
+    rows, cols = pace.shape
+    known = np.full((rows, cols), np.inf)
+    came = np.full((rows, cols), -1)
+    least = pace.min()
+    for r, c in (start, goal):
+        if not (0 <= r < rows and 0 <= c < cols):
+            return np.empty((0, 2), np.int64)
+    known[start] = 0.0
+    queue = [(0.0, start[0], start[1])]
+    while queue:
+        estimate, r, c = heapq.heappop(queue)
+        if (r, c) == goal:
+            break
+        ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
+        if estimate > known[r, c] + ahead + 1e-9:
+            continue  # a stale entry: the pixel was improved since
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                i, j = r + dr, c + dc
+                if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
+                    continue
+                # No passage between two impassable pixels, nor round the corner of one.
+                if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
+                    continue
+                length = math.hypot(dr * pixel[0], dc * pixel[1])
+                cost = known[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
+                if cost < known[i, j]:
+                    known[i, j] = cost
+                    came[i, j] = r * cols + c
+                    rest = math.hypot((goal[0] - i) * pixel[0], (goal[1] - j) * pixel[1])
+                    heapq.heappush(queue, (cost + rest * least, i, j))
+    if not np.isfinite(known[goal]):
+        return np.empty((0, 2), np.int64)
+    n, cell = 1, goal[0] * cols + goal[1]
+    while came[cell // cols, cell % cols] >= 0:
+        cell = came[cell // cols, cell % cols]
+        n += 1
+    cells = np.empty((n, 2), np.int64)
+    cell = goal[0] * cols + goal[1]
+    for k in range(n - 1, -1, -1):
+        cells[k, 0], cells[k, 1] = cell // cols, cell % cols
+        cell = came[cell // cols, cell % cols]
+    return cells

@@ -1,0 +1,173 @@
+"""Sight between robots: range, field of view, and obstruction by ground and canopy."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from trustbo.data import Robot
+from trustbo.errors import TrustboError, require_choice
+from trustbo.terrain import rays
+
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
+
+SIGHT_MODES = {"bare": rays.BARE, "wall": rays.WALL, "transmittance": rays.TRANSMITTANCE}
+
+
+@dataclass(frozen=True)
+class Sight:
+    """Model of sight through terrain and canopy.
+
+    On real forest the contact rates of the three modes differ by an order of magnitude.
+
+    Attributes:
+        mode: `"bare"`: only the ground blocks. `"wall"`: the surface blocks, canopy included.
+            `"transmittance"`: the ground blocks; the canopy, a layer from `crown_base` times its
+            height to its top, transmits exp(-extinction x metres inside).
+        extinction: Extinction coefficient of the canopy, 1/m.
+        crown_base: Lower edge of the canopy as a share of its height.
+
+    Raises:
+        TrustboError: An unknown mode, a negative extinction, a crown base outside [0, 1].
+    """
+
+    mode: str = "transmittance"
+    extinction: float = 0.1
+    crown_base: float = 0.3
+
+    def __post_init__(self) -> None:
+        require_choice("sight mode", self.mode, SIGHT_MODES)
+        if not self.extinction >= 0.0 or not 0.0 <= self.crown_base <= 1.0:
+            raise TrustboError(
+                "need extinction >= 0 and crown_base in [0, 1]; got "
+                f"{self.extinction} and {self.crown_base}."
+            )
+
+
+class Surface(NamedTuple):
+    """Rasters for sight and motion, and the map from positions to their pixels."""
+
+    ground: np.ndarray  # (row, col), m
+    canopy: np.ndarray  # (row, col), m: the DSM
+    gradient: np.ndarray  # (2, row, col): dz/dx and dz/dy
+    passable: np.ndarray  # (row, col), bool
+    pixel: tuple[float, float]  # height, width of a pixel, m
+    origin: tuple[float, float]  # x, y of the centre of pixel (0, 0)
+
+    def to_pixel(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Fractional row and column of positions in CRS metres."""
+        return (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
+
+    def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of the pixels at positions."""
+        row, col = self.to_pixel(np.asarray(x), np.asarray(y))
+        rows, cols = self.ground.shape
+        return (
+            np.minimum(np.maximum(np.rint(row), 0), rows - 1).astype(int),
+            np.minimum(np.maximum(np.rint(col), 0), cols - 1).astype(int),
+        )
+
+    def pixel_at(self, x: float, y: float) -> tuple[int, int]:
+        """Row and column of the pixel at one position."""
+        rows, cols = self.ground.shape
+        row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
+        return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
+
+
+def optics(watcher: Robot, watched: Robot) -> np.ndarray:
+    """Sensor height (m), target height (m), range (m) and sine of the field of view, shape (4,)."""
+    return np.array([
+        watcher.sensor_height,
+        watched.target_height,
+        watcher.lidar_range,
+        math.sin(watcher.vertical_fov),
+    ])  # fmt: skip
+
+
+def detection_probability(
+    surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, optics: np.ndarray
+) -> np.ndarray:
+    """Probability that an ideal lidar detects a target.
+
+    It is the transmittance along the ray if the target is within the lidar's range and vertical
+    field of view, which tilts with the robot, and else 0.
+
+    Args:
+        surface: Terrain.
+        sight: Model of sight.
+        sensor: Positions, shape (ray, 2), CRS metres.
+        target: Positions, shape (ray, 2), CRS metres.
+        optics: See `optics`, shape (ray, 4) or (4,).
+
+    Returns:
+        Shape (ray,), in [0, 1].
+    """
+    ends = _ends(
+        surface.ground,
+        surface.gradient,
+        surface.pixel,
+        surface.origin,
+        sensor,
+        target,
+        np.broadcast_to(optics, (len(sensor), 4)),
+    )
+    return _transmittances(
+        surface.ground,
+        surface.canopy,
+        surface.pixel,
+        ends,
+        SIGHT_MODES[sight.mode],
+        sight.extinction,
+        sight.crown_base,
+    )
+
+
+@_compiled
+def _ends(ground, gradient, pixel, origin, sensor, target, optics):
+    """Row, col and height of both ends of each ray, shape (ray, 6); NaN where out of view.
+
+    In a separate loop, the memory accesses of many rays overlap.
+    """
+    n_rows, n_cols = ground.shape
+    ends = np.empty((len(sensor), 6))
+    for i in range(len(sensor)):
+        # The outer half of an edge pixel has the height of its centre.
+        r0 = _inward((origin[1] - sensor[i, 1]) / pixel[0], n_rows)
+        c0 = _inward((sensor[i, 0] - origin[0]) / pixel[1], n_cols)
+        r1 = _inward((origin[1] - target[i, 1]) / pixel[0], n_rows)
+        c1 = _inward((target[i, 0] - origin[0]) / pixel[1], n_cols)
+        z0 = rays.ground_height(ground, r0, c0) + optics[i, 0]
+        z1 = rays.ground_height(ground, r1, c1) + optics[i, 1]
+        east, north, up = (c1 - c0) * pixel[1], (r0 - r1) * pixel[0], z1 - z0
+        distance = math.sqrt(east**2 + north**2 + up**2)
+        row = min(max(int(r0 + 0.5), 0), n_rows - 1)
+        col = min(max(int(c0 + 0.5), 0), n_cols - 1)
+        gx, gy = gradient[0, row, col], gradient[1, row, col]
+        # Height above the plane of the body, whose normal is (-gx, -gy, 1).
+        above = abs(up - gx * east - gy * north) / math.sqrt(1.0 + gx * gx + gy * gy)
+        seen = distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)
+        ends[i, 0], ends[i, 1], ends[i, 2] = r0, c0, z0 if seen else math.nan
+        ends[i, 3], ends[i, 4], ends[i, 5] = r1, c1, z1
+    return ends
+
+
+@_compiled
+def _transmittances(ground, canopy, pixel, ends, mode, extinction, crown_base):
+    result, work = np.empty(len(ends)), rays.work_space()
+    for i in range(len(ends)):
+        start = (ends[i, 0], ends[i, 1], ends[i, 2])
+        end = (ends[i, 3], ends[i, 4], ends[i, 5])
+        if math.isnan(start[2]):
+            result[i] = 0.0
+            continue
+        result[i] = rays.ray_transmittance(
+            ground, canopy, pixel, start, end, mode, extinction, crown_base, work
+        )
+    return result
+
+
+@_compiled
+def _inward(x, n):
+    return min(max(x, 0.0), n - 1.0) if -0.5 <= x <= n - 0.5 else x

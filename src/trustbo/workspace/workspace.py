@@ -1,0 +1,267 @@
+"""Workspace of planner and simulator: awareness and passability of every cell."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Self
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from trustbo.data import Cell, Team, default_features
+from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
+from trustbo.terrain.composite import CompositeIndex
+from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
+from trustbo.terrain.features import (
+    TRAVERSABILITY,
+    VISIBILITY,
+    exposure,
+    openness,
+    require_observers,
+)
+from trustbo.terrain.pixel_feature import PixelFeature
+from trustbo.workspace.awareness import FeatureSpec, cell_maps, feature_specs
+from trustbo.workspace.grid import Grid
+
+MAX_MISSING = 0.5
+"""Largest share of missing or too steep pixels in a passable cell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """Planning grid with the situational awareness of each robot in each cell.
+
+    Make it with `from_terrain` or `from_awareness`.
+
+    Attributes:
+        awareness: DataArray (robot, row, col, feature), in [0, 1]; NaN in cells without data.
+        passable: DataArray (row, col), bool.
+        grid: Positions of the cells.
+        team: Lead and robots.
+        terrain: DEM and DSM; None without a terrain.
+        pixels: Dataset (y, x) of traversability, visibility and passable per pixel; None without a
+            terrain in memory.
+        composites: Fitted composites by feature.
+    """
+
+    awareness: xr.DataArray
+    passable: xr.DataArray
+    grid: Grid
+    team: Team
+    terrain: xr.Dataset | None = None
+    pixels: xr.Dataset | None = None
+    composites: dict[str, CompositeIndex] = field(default_factory=dict)
+
+    @classmethod
+    def from_terrain(
+        cls,
+        terrain: xr.Dataset,
+        shape: tuple[int, int] = (10, 10),
+        team: Team | None = None,
+        *,
+        scaling: str = "percentile",
+        features: Mapping[str, object] | None = None,
+        observers: ArrayLike | None = None,
+        aggregate: str | float = "mean",
+    ) -> Self:
+        """Derive traversability and visibility from a DEM and a DSM.
+
+        A cell's awareness is the mean of its pixels' composites, the same for every robot. A cell
+        is impassable if more than half of its pixels are missing or steeper than the slope limit.
+        Openness is measured over the lidar's range, at most the diagonal of a cell: sight beyond
+        one bound does not matter to overwatch.
+
+        Args:
+            terrain: Dataset of `read_terrain` or `synthetic_terrain`; of a lazily read one, only a
+                strip is in memory at a time, and maps of pixels are not kept.
+            shape: Rows and columns of the planning grid.
+            team: Lead and robots; by default a lead and three robots.
+            scaling: See `CompositeIndex`.
+            features: Definitions of the awareness features by name: names of pixel features for a
+                composite (see `terrain.FEATURES`), a mapping of names to `PixelFeature`, or one
+                `PixelFeature` in [0, 1] that is used as it is. By default traversability and
+                visibility, of `terrain.TRAVERSABILITY` and `terrain.VISIBILITY`.
+            observers: Positions of enemies, shape (observer, 2), x and y in CRS metres: the share
+                of them that see a pixel becomes one more feature, `exposure`.
+            aggregate: `"mean"` of a cell's pixels, or a quantile in [0, 1].
+
+        Raises:
+            TerrainError: A grid too fine for the raster, an observer off the terrain, or a dataset
+                that is no terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
+            TrustboError: No cell is passable, or an unknown scaling, feature or aggregate.
+        """
+        terrain = require_terrain(terrain)
+        lazy = is_lazy(terrain)
+        team = Team() if team is None else team
+        grid = Grid.over(terrain, shape)
+        asked = features or {"traversability": TRAVERSABILITY, "visibility": VISIBILITY}
+        chosen = _within_reach(feature_specs(asked), terrain, grid, team)
+        if observers is not None:
+            place = require_observers(terrain, observers)
+            chosen["exposure"] = PixelFeature(
+                partial(exposure, observers=place), 1, np.inf, by_rows=True
+            )
+        maps = cell_maps(
+            terrain,
+            grid,
+            chosen,
+            max_slope=team.max_slope,
+            scaling=scaling,
+            aggregate=aggregate,
+            keep_pixels=not lazy,
+        )
+        passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
+        workspace = cls.from_awareness(
+            np.repeat(maps.awareness[None], len(team.robots), axis=0),
+            passable & np.isfinite(maps.awareness).all(-1),
+            team=team,
+            features=tuple(chosen),
+        )
+        return dataclasses.replace(
+            workspace,
+            awareness=workspace.awareness.assign_coords(_positions(grid)),
+            passable=workspace.passable.assign_coords(_positions(grid)),
+            grid=grid,
+            terrain=terrain,
+            pixels=maps.pixels,
+            composites=maps.composites,
+        )
+
+    @classmethod
+    def from_awareness(
+        cls,
+        awareness: ArrayLike,
+        passable: ArrayLike | None = None,
+        cell_size: float = 50.0,
+        *,
+        team: Team | None = None,
+        features: tuple[str, ...] = (),
+    ) -> Self:
+        """Make a workspace from arrays, without a terrain.
+
+        Args:
+            awareness: Shape (robot, row, col, feature), in [0, 1].
+            passable: Shape (row, col); by default the cells without NaN in `awareness`.
+            cell_size: Side of a cell, m.
+            team: Lead and robots; by default as many robots as `awareness` has rows.
+            features: Names of the features; by default traversability, visibility, z3, ...
+
+        Raises:
+            ShapeError: Axes that do not fit together.
+            TrustboError: A value outside [0, 1], NaN in a passable cell, or no passable cell.
+        """
+        z = np.asarray(awareness, dtype=float)
+        if z.ndim != 4:
+            raise ShapeError(f"awareness must be (robot, row, col, feature); got shape {z.shape}.")
+        team = Team(n_robots=len(z)) if team is None else team
+        if len(team.robots) != len(z):
+            raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
+        known = np.isfinite(z).all((0, 3))
+        free = known if passable is None else np.asarray(passable, dtype=bool)
+        if free.shape != z.shape[1:3]:
+            raise ShapeError(f"passable must be (row, col) = {z.shape[1:3]}; got {free.shape}.")
+        if (free & ~known).any():
+            cell = tuple(int(i) for i in np.argwhere(free & ~known)[0])
+            raise TrustboError(
+                f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
+            )
+        if (bad := (z < 0.0) | (z > 1.0)).any():
+            index = tuple(int(i) for i in np.argwhere(bad)[0])
+            raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")
+        if not free.any():
+            raise TrustboError(
+                "no cell is passable: more than half of every cell is missing or too steep. Use "
+                "other cells, or a team with a larger max_slope."
+            )
+        side = require_positive("cell_size", cell_size)
+        grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
+        names = tuple(features) or default_features(z.shape[3])
+        if len(names) != z.shape[3]:
+            raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
+        coords = {
+            "robot": list(team.names),
+            "row": np.arange(z.shape[1]),
+            "col": np.arange(z.shape[2]),
+            **_positions(grid),
+        }
+        return cls(
+            xr.DataArray(
+                z,
+                coords | {"feature": list(names)},
+                ("robot", "row", "col", "feature"),
+                "awareness",
+            ),
+            xr.DataArray(
+                free, {k: v for k, v in coords.items() if k != "robot"}, ("row", "col"), "passable"
+            ),
+            grid,
+            team,
+        )
+
+    def require_cell(self, what: str, cell: Cell) -> Cell:
+        """Check that a cell is passable, and return it as a pair of ints.
+
+        Raises:
+            TrustboError: It is no pair, off the grid, without data, or impassable.
+        """
+        row, col = require_pair(what, cell)
+        rows, cols = self.grid.shape
+        if not (0 <= row < rows and 0 <= col < cols):
+            raise TrustboError(
+                f"{what} {(row, col)} is outside the grid of {rows} rows and {cols} columns; rows "
+                f"are 0..{rows - 1} from the top, columns 0..{cols - 1}."
+            )
+        if not self.passable.values[row, col]:
+            raise TrustboError(
+                f"{what} {(row, col)} is impassable{self._why_impassable(row, col)}; the nearest "
+                f"passable cell is {self._nearest_passable(row, col)}."
+            )
+        return row, col
+
+    def _why_impassable(self, row: int, col: int) -> str:
+        if self.terrain is None:
+            return ""
+        missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
+        if missing > MAX_MISSING:
+            return f": {missing:.0%} of it has no data"
+        steep = np.rad2deg(self.team.max_slope)
+        return (
+            f": over half of it is missing or steeper than the {steep:.0f} degrees the team stands"
+        )
+
+    def _nearest_passable(self, row: int, col: int) -> Cell:
+        free = np.argwhere(self.passable.values)
+        nearest = free[np.argmin(((free - (row, col)) ** 2).sum(1))]
+        return int(nearest[0]), int(nearest[1])
+
+
+def _within_reach(
+    features: dict[str, FeatureSpec], terrain: xr.Dataset, grid: Grid, team: Team
+) -> dict[str, FeatureSpec]:
+    """Definitions with openness over the lidar's range, limited by a cell and by the terrain."""
+    height, width = pixel_size(terrain)
+    rows, cols = terrain["dem"].shape
+    reach = min(
+        max(robot.lidar_range for robot in team.robots),
+        float(np.hypot(grid.cell_height, grid.cell_width)),
+        0.5 * min(rows * height, cols * width),
+    )
+    eye, target = team.robots[0].sensor_height, team.lead.target_height
+    ours = PixelFeature(
+        partial(openness, reach=reach, eye=eye, target=target), 1, reach, by_rows=True
+    )
+
+    def fitting(part: PixelFeature) -> PixelFeature:
+        return ours._replace(sign=part.sign) if part.compute is openness else part
+
+    return {
+        name: fitting(f) if isinstance(f, PixelFeature) else {n: fitting(p) for n, p in f.items()}
+        for name, f in features.items()
+    }
+
+
+def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:
+    """Cell centres in CRS metres, as coordinates along row and col."""
+    return {"y": ("row", grid.y), "x": ("col", grid.x)}

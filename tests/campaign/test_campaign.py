@@ -1,0 +1,241 @@
+"""Ask and tell: whatever runs the missions."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from simulators import ModelSimulator
+
+from trustbo import (
+    Campaign,
+    Mission,
+    NoPathError,
+    PosteriorError,
+    ShapeError,
+    TrustboError,
+    Workspace,
+)
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, fit, sample_prior
+from trustbo.planning import policies
+
+ENDS = ((3, 0), (0, 3))
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+
+
+def test_ask_is_the_same_until_told(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact", policy="thompson")
+    plan = campaign.ask()
+    assert campaign.ask() is plan
+    assert campaign.posterior is None
+    mission = ModelSimulator(workspace).run(plan.path, seed=0)
+    posterior = campaign.tell(mission)
+    assert campaign.posterior is posterior
+    assert campaign.missions[0].path == plan.path
+    assert campaign.plans == [plan]
+    assert campaign.ask() is not plan
+
+
+def test_the_first_plan_is_from_one_draw_of_the_prior_or_from_its_mean(workspace):
+    first = [Campaign(workspace, *ENDS, seed=s).belief for s in range(2)]
+    assert np.shape(first[0].beta) == (1, 2)
+    assert first[0].beta0[0] != first[1].beta0[0]
+    mean = Campaign(workspace, *ENDS, initial="prior_mean").belief
+    assert mean.beta0.tolist() == [0.5]
+    assert mean.beta.tolist() == [[0.0, 0.0]]
+
+
+def test_the_posterior_is_that_of_all_missions_so_far(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact")
+    simulator = ModelSimulator(workspace)
+    for j in range(2):
+        seed = campaign.seed_of("fit")
+        campaign.tell(simulator.run(campaign.ask().path, seed=j))
+    again = fit(campaign.missions, sampler="exact", seed=seed)
+    np.testing.assert_array_equal(
+        again["posterior"]["beta"].values, campaign.posterior["posterior"]["beta"].values
+    )
+
+
+def test_unmeasured_awareness_comes_from_the_map(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact")
+    campaign.tell(ModelSimulator(workspace, blind=True).run(campaign.ask().path, seed=0))
+    cell = campaign.missions[0].bounds[0].cell
+    np.testing.assert_array_equal(
+        campaign.missions[0].awareness[0], workspace.awareness.values[:, *cell]
+    )
+
+
+def test_another_team_s_mission_is_refused(workspace):
+    campaign = Campaign(workspace, *ENDS)
+    mission = Mission.from_arrays([(3, 0), (2, 1)], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
+    with pytest.raises(ShapeError, match=r"the mission has robots \('r1', 'r2'\), the workspace"):
+        campaign.tell(mission)
+    assert campaign.missions == []
+
+
+def test_a_mission_off_the_grid_is_refused(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact")
+    z = np.full((1, 3, 2), np.nan)
+    mission = Mission.from_arrays([(3, 0), (50, 50)], z, np.full((1, 3), 0.5))
+    with pytest.raises(TrustboError, match=r"path enters \(50, 50\), outside the grid of 4 rows"):
+        campaign.tell(mission)
+    with pytest.raises(TrustboError, match="tell takes a Mission; got 7"):
+        campaign.tell(7)
+
+
+def test_a_refused_posterior_leaves_the_campaign_as_it_was(workspace, monkeypatch):
+    campaign = Campaign(workspace, *ENDS, sampler="exact")
+    plan = campaign.ask()
+
+    def refuse(*args, **kwargs):
+        raise PosteriorError("R-hat of beta0 is 1.5")
+
+    monkeypatch.setattr("trustbo.campaign.learning.fit", refuse)
+    with pytest.raises(PosteriorError):
+        campaign.tell(ModelSimulator(workspace).run(plan.path, seed=0))
+    assert (campaign.missions, campaign.posteriors, campaign.plans) == ([], [], [])
+    assert campaign.ask() is plan
+
+
+def test_a_policy_of_one_s_own(workspace):
+    def along_the_diagonal(key, posterior, planner):
+        return planner.evaluate([(3, 0), (2, 1), (1, 2), (0, 3)], posterior.mean())
+
+    campaign = Campaign(workspace, *ENDS, sampler="exact", policy=along_the_diagonal)
+    assert campaign.ask().path == ((3, 0), (2, 1), (1, 2), (0, 3))
+    assert campaign.settings["policy"] == "along_the_diagonal"
+
+
+def test_a_policy_that_gives_no_plan_is_refused(workspace):
+    campaign = Campaign(workspace, *ENDS, policy=lambda key, posterior, planner: [(3, 0)])
+    with pytest.raises(TrustboError, match=r"'<lambda>' must return a Plan; got \[\(3, 0\)\]"):
+        campaign.ask()
+
+
+def test_a_policy_that_returns_a_broken_path_is_named_with_the_cell(workspace):
+    def leaps(key, posterior, planner):
+        plan = planner.plan(posterior.mean())
+        return replace(plan, path=((3, 0), (1, 1), (0, 3)))
+
+    campaign = Campaign(workspace, *ENDS, policy=leaps)
+    with pytest.raises(
+        TrustboError, match=r"policy 'leaps': the path is broken: .* from \(3, 0\) to \(1, 1\)"
+    ):
+        campaign.ask()
+
+
+def test_recommending_is_greedy_whatever_the_policy(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact", policy="random")
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    best = policies.greedy(None, campaign.belief, campaign.planner)
+    assert campaign.recommend().path == best.path
+
+
+def test_bad_names_and_ends_are_refused_at_once(workspace):
+    for options, message in (
+        ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, optimistic"),
+        ({"objective": "best"}, "unknown objective 'best'"),
+        ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of nuts, exact"),
+        ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_draw, prior_mean"),
+    ):
+        with pytest.raises(TrustboError, match=message):
+            Campaign(workspace, *ENDS, **options)
+    walls = np.ones((4, 4), bool)
+    walls[2] = False
+    closed = Workspace.from_awareness(workspace.awareness.values, walls)
+    with pytest.raises(NoPathError, match="no path from"):
+        Campaign(closed, *ENDS)
+
+
+def test_old_missions_can_be_forgotten(workspace):
+    campaign = Campaign(workspace, *ENDS, sampler="exact", forgetting=0.5)
+    for seed in range(2):
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=seed))
+    weight = campaign.posterior["constant_data"]["weight"]
+    np.testing.assert_allclose(weight, [0.5, 1.0])
+    expected = fit(
+        campaign.missions,
+        sampler="exact",
+        weights=[0.5, 1.0],
+        seed=campaign.posterior.attrs["seed"],
+    )
+    np.testing.assert_array_equal(
+        campaign.posterior["posterior"]["b"].values, expected["posterior"]["b"].values
+    )
+
+
+def test_the_later_code_s_updating_is_offered_with_a_warning(workspace):
+    with pytest.warns(UserWarning, match=r"off by up to 1.15 posterior standard deviations"):
+        campaign = Campaign(workspace, *ENDS, sampler="exact", update="moment_matched")
+    for seed in range(2):
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=seed))
+    assert campaign.posterior.sizes.get("mission", 1) == 1  # the last mission alone
+    assert campaign.posterior.attrs["prior_delta_w"].startswith("LogNormal")
+
+
+def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
+    with pytest.raises(TrustboError, match='"moment_matched" is for PooledTrust; got Coupled'):
+        Campaign(workspace, *ENDS, model=CoupledTrust(), update="moment_matched")
+    with pytest.raises(TrustboError, match="unknown awareness 'guess'; choose one of map, belief"):
+        Campaign(workspace, *ENDS, awareness="guess")
+    with pytest.raises(TrustboError, match="model must be a trust model"):
+        Campaign(workspace, *ENDS, model="pooled")
+    with pytest.raises(TrustboError, match=r"forgetting must be in \(0, 1\]; got 1.5"):
+        Campaign(workspace, *ENDS, forgetting=1.5)
+    censored = PooledTrust(observation="censored")
+    with pytest.raises(TrustboError, match=r'forgetting = 0.9 needs update "refit" and Gaussian'):
+        Campaign(workspace, *ENDS, model=censored, forgetting=0.9)
+    with pytest.raises(TrustboError, match='sampler "exact" needs Gaussian observations'):
+        Campaign(workspace, *ENDS, model=censored, sampler="exact")
+    with pytest.raises(TrustboError, match="unknown update 'online'"):
+        Campaign(workspace, *ENDS, update="online")
+
+
+def test_a_campaign_with_censored_rates(workspace, monkeypatch):
+    # The shortest run shows which sampler is taken.
+    short = partial(fit, n_warmup=60, n_draws=20, n_chains=2, check=False)
+    monkeypatch.setattr("trustbo.campaign.learning.fit", short)
+    campaign = Campaign(workspace, *ENDS, model=PooledTrust(observation="censored"))
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    assert campaign.posterior.attrs["sampler"] == "joint"
+    assert campaign.ask().exact
+
+
+@pytest.mark.parametrize("initial", ["prior_draw", "prior_mean"])
+@pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
+def test_every_model_can_be_planned_with(workspace, model, initial):
+    campaign = Campaign(workspace, *ENDS, model=model, team="min", initial=initial)
+    plan = campaign.ask()
+    assert plan.trust.shape[1] == 3
+    assert plan.value == pytest.approx(1.0 / (1.0 + np.exp(-plan.trust[-1].min())))
+
+
+def test_plans_carry_bands_over_the_draws_they_are_made_from(workspace):
+    campaign = Campaign(workspace, *ENDS, model=HierarchicalTrust())
+    campaign.belief = sample_prior(campaign.model, 2, 50, seed=0, n_robots=3)
+    plan = campaign.ask()
+    assert plan.bands.shape == (4, *plan.trust.shape)
+    assert (plan.bands[-1] > plan.bands[0]).all()
+
+
+def test_a_belief_learns_the_awareness_that_missions_measure(workspace):
+    truth = Workspace.from_awareness(np.clip(workspace.awareness.values + 0.2, 0.0, 1.0))
+    campaign = Campaign(workspace, *ENDS, sampler="exact", awareness="belief")
+    plan = campaign.ask()
+    campaign.tell(ModelSimulator(truth).run(plan.path, seed=0))
+    cell = plan.path[1]
+    before = np.abs(workspace.awareness.values - truth.awareness.values)[:, *cell].mean()
+    believed = campaign.awareness.mean()
+    after = np.abs(believed - truth.awareness.values)[:, *cell].mean()
+    assert after < 0.5 * before
+    assert campaign.ask().path[0] == ENDS[0]
+    assert campaign.settings["awareness"] == "belief"
+    # What was not measured comes from what is believed, not from the map.
+    blind = ModelSimulator(truth, blind=True).run(plan.path, seed=1)
+    campaign.tell(blind)
+    np.testing.assert_allclose(campaign.missions[1].awareness[0], believed[:, *cell])

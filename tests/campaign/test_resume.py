@@ -1,0 +1,326 @@
+"""A campaign on disk: nothing is lost, nobody else interferes, and what was begun goes on."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulators import ModelSimulator
+
+import trustbo as tb
+import trustbo.files
+from trustbo.models import PooledTrust, Priors
+
+ENDS = ((3, 0), (0, 3))
+OPTIONS = {"sampler": "exact", "policy": "thompson", "awareness": "belief", "progress": False}
+N = 6
+
+
+def make_workspace():
+    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+
+
+@pytest.fixture
+def workspace():
+    return make_workspace()
+
+
+def same(a, b):
+    """Posteriors, paths and history, but for the seconds."""
+    assert len(a.missions) == len(b.missions)
+    for one, other in zip(a.posteriors, b.posteriors, strict=True):
+        for group in ("posterior", "log_likelihood"):
+            for name in one[group].data_vars:
+                np.testing.assert_array_equal(one[group][name].values, other[group][name].values)
+    assert a.path == b.path
+    assert a.value == b.value
+    np.testing.assert_array_equal(a.trust_map.values, b.trust_map.values)
+    assert set(a.history.data_vars) == set(b.history.data_vars)
+    for name in a.history.data_vars:
+        if not name.startswith("seconds"):
+            np.testing.assert_array_equal(a.history[name].values, b.history[name].values)
+    for one, other in zip(a.missions, b.missions, strict=True):
+        np.testing.assert_array_equal(one.awareness, other.awareness)
+        np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+
+
+def run(workspace, folder, n=N):
+    return tb.iterate(
+        workspace, *ENDS, n_iterations=n, simulator=ModelSimulator(workspace, blind=True),
+        checkpoint=folder, **OPTIONS,
+    )  # fmt: skip
+
+
+def moments_of(folder, copies, monkeypatch):
+    """Copy the folder just before each file of it appears or goes, as a kill then leaves it.
+
+    A file that is being written has half of its bytes under its temporary name.
+    """
+
+    def watched(change):
+        def changes(file, *target, **options):
+            if folder in Path(file).parents and Path(file).exists():
+                copies.append(copies[0].with_name(f"moment{len(copies)}"))
+                shutil.copytree(folder, copies[-1], ignore=shutil.ignore_patterns(".lock"))
+                if target:
+                    half = Path(file).stat().st_size // 2
+                    os.truncate(copies[-1] / Path(file).relative_to(folder), half)
+            change(file, *target, **options)
+
+        return changes
+
+    monkeypatch.setattr(trustbo.files.os, "replace", watched(os.replace))
+    monkeypatch.setattr(Path, "unlink", watched(Path.unlink))
+
+
+def test_whichever_write_it_dies_at_it_comes_to_the_same(workspace, tmp_path, monkeypatch):
+    """Every state of the folder that a kill can leave, one after the other."""
+    copies = [tmp_path / "moment0"]
+    with monkeypatch.context() as patch:
+        moments_of(tmp_path / "whole", copies, patch)
+        whole = run(workspace, tmp_path / "whole", 2)
+    copies[0].mkdir()  # and when nothing is there yet
+    assert len(copies) > 20
+    for folder in copies:
+        resume_or_begin(workspace, folder, 2)
+        same(tb.load_result(folder), whole)
+
+
+def resume_or_begin(workspace, folder, n):
+    if not (folder / "campaign.json").exists():
+        return run(workspace, folder, n)
+    simulator = ModelSimulator(workspace, blind=True)
+    return tb.resume(folder, simulator=simulator, n_iterations=n, progress=False)
+
+
+PROGRAM = """
+import sys
+sys.path[:0] = [{tests!r}, {here!r}]
+from pathlib import Path
+from test_resume import make_workspace, resume_or_begin
+resume_or_begin(make_workspace(), Path({folder!r}), 8)
+"""
+
+
+def test_killed_twice_it_comes_to_the_same(workspace, tmp_path):
+    whole = run(workspace, tmp_path / "whole", 8)
+    folder, here = tmp_path / "killed", Path(__file__).parent
+    program = PROGRAM.format(tests=str(here.parent), here=str(here), folder=str(folder))
+    command = [sys.executable, "-W", "ignore", "-c", program]
+    for seed in range(3):
+        # Sets of names are in another order in each process.
+        process = subprocess.Popen(command, env=os.environ | {"PYTHONHASHSEED": str(seed)})
+        if seed == 2:
+            assert process.wait(timeout=120) == 0
+            break
+        _wait_for_work(process, folder)
+        time.sleep(random.Random(seed).uniform(0.0, 0.25))
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+    same(tb.load_result(folder), whole)
+
+
+def _wait_for_work(process, folder):
+    """Until it has written: a process that still imports has nothing to lose."""
+
+    def stamp():
+        files = [folder / "measured.nc", folder / "campaign.json"]
+        return [f.stat().st_mtime_ns if f.exists() else 0 for f in files]
+
+    before = stamp()
+    while stamp() == before and process.poll() is None:
+        time.sleep(0.005)
+
+
+def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, tmp_path, monkeypatch):
+    simulator = ModelSimulator(workspace, blind=True)
+    whole = run(workspace, tmp_path / "whole", 2)
+    campaign = tb.Campaign(
+        workspace, *ENDS, sampler="exact", policy="thompson", awareness="belief",
+        directory=tmp_path / "half",
+    )  # fmt: skip
+    campaign.tell(simulator.run(campaign.ask().path, seed=campaign.seed_of("mission")))
+    mission = simulator.run(campaign.ask().path, seed=campaign.seed_of("mission"))
+
+    def die(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("trustbo.campaign.learning.fit", die)
+        with pytest.raises(KeyboardInterrupt):
+            campaign.tell(mission)
+    assert campaign.pending is mission
+    campaign.close()
+    again = tb.Campaign.load(tmp_path / "half")
+    assert len(again.missions) == 2
+    assert again.pending is None
+    np.testing.assert_array_equal(
+        again.posterior["posterior"]["beta"].values, whole.posterior["posterior"]["beta"].values
+    )
+
+
+def test_a_refused_posterior_leaves_its_mission_pending(workspace, tmp_path, monkeypatch):
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", directory=tmp_path)
+    mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
+
+    def refuse(*args, **kwargs):
+        raise tb.PosteriorError("R-hat of beta0 is 1.5")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("trustbo.campaign.learning.fit", refuse)
+        with pytest.raises(tb.PosteriorError):
+            campaign.tell(mission)
+        campaign.close()
+        with pytest.warns(UserWarning, match="the last mission is pending: R-hat of beta0"):
+            again = tb.Campaign.load(tmp_path)
+    assert again.missions == []
+    again.tell(again.pending)
+    assert again.pending is None
+    assert len(again.missions) == 1
+
+
+def test_a_folder_is_for_one_campaign_at_a_time(workspace, tmp_path):
+    with tb.Campaign(workspace, *ENDS, directory=tmp_path):
+        with pytest.raises(tb.TrustboError, match="another campaign is at work in"):
+            tb.Campaign.load(tmp_path)
+        code = f"import trustbo; trustbo.Campaign.load({str(tmp_path)!r})"
+        other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert "another campaign is at work in" in other.stderr
+    with pytest.raises(tb.TrustboError, match="holds a campaign already: go on with it by"):
+        tb.Campaign(workspace, *ENDS, directory=tmp_path)
+    tb.Campaign.load(tmp_path).close()
+    with pytest.raises(tb.TrustboError, match="holds no campaign"):
+        tb.Campaign.load(tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
+
+
+def test_saving_is_a_copy_and_loading_goes_on(workspace, tmp_path):
+    simulator = ModelSimulator(workspace)
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", policy="random", seed=3)
+    campaign.tell(simulator.run(campaign.ask().path, seed=0))
+    campaign.fail("rain")
+    operator = campaign.suggest([(3, 0), (2, 1), (1, 2), (0, 3)])
+    assert campaign.ask().path == operator.path
+    campaign.save(tmp_path)
+    campaign.save(tmp_path)  # again, over itself
+    with tb.Campaign.load(tmp_path) as again:
+        again.save(tmp_path)  # into the folder it is kept in
+        assert again.ask().path == operator.path
+        assert again.log.failures == [(1, "rain")]
+        assert again.settings == campaign.settings
+        assert (
+            again.summary()
+            .drop(columns=[c for c in again.summary() if "seconds" in c])
+            .equals(
+                campaign.summary().drop(columns=[c for c in campaign.summary() if "seconds" in c])
+            )
+        )
+        for each in (campaign, again):
+            each.tell(simulator.run(operator.path, seed=1))
+            each.ask()
+    same(campaign.result(), again.result())
+    assert campaign.ask().path == again.ask().path
+
+
+def test_what_is_your_own_is_asked_for_again(workspace, tmp_path):
+    def straight(key, draws, planner):
+        return planner.evaluate([(3, 0), (2, 1), (1, 2), (0, 3)], draws.mean())
+
+    model = PooledTrust(priors=Priors(x0_mean=0.4))
+    tb.Campaign(workspace, *ENDS, model=model, policy=straight, directory=tmp_path).close()
+    with pytest.raises(tb.TrustboError, match=r"policy was your own .'straight'.; give it again"):
+        tb.Campaign.load(tmp_path, model=model)
+    with pytest.raises(tb.TrustboError, match="has priors of its own, or is your own; give it"):
+        tb.Campaign.load(tmp_path, policy=straight)
+    with pytest.raises(tb.TrustboError, match=r"the campaign's model is .* the one given is"):
+        tb.Campaign.load(tmp_path, policy=straight, model=PooledTrust())
+    with tb.Campaign.load(tmp_path, policy=straight, model=model) as again:
+        assert again.ask().path == ((3, 0), (2, 1), (1, 2), (0, 3))
+
+
+def test_resuming_with_another_simulator_is_refused(workspace, tmp_path):
+    class Other(ModelSimulator):
+        pass
+
+    run(workspace, tmp_path, 2)
+    with pytest.raises(tb.TrustboError, match="begun with simulator = 'ModelSimulator', not 'Ot"):
+        tb.resume(tmp_path, simulator=Other(workspace), progress=False)
+
+
+def test_a_finished_campaign_goes_on_if_asked_to(workspace, tmp_path):
+    run(workspace, tmp_path / "short", 2)
+    simulator = ModelSimulator(workspace, blind=True)
+    longer = tb.resume(tmp_path / "short", simulator=simulator, n_iterations=3, progress=False)
+    same(longer, run(workspace, tmp_path / "long", 3))
+
+
+def test_nothing_half_written_is_read(workspace, tmp_path):
+    """Whatever of the last mission's files is there already, the state decides."""
+    run(workspace, tmp_path, 3)
+    state = json.loads((tmp_path / "campaign.json").read_text())
+    state["n_missions"] = 2
+    for name in ("plans", "rows"):
+        state[name] = state[name][:2]
+    (tmp_path / "campaign.json").write_text(json.dumps(state))
+    whole = run(workspace, tmp_path / "whole", 3)
+    simulator = ModelSimulator(workspace, blind=True)
+    again = tb.resume(tmp_path, simulator=simulator, n_iterations=3, progress=False)
+    same(again, whole)
+
+
+def test_failing_keeps_the_bounds_there_are(workspace):
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", policy="random")
+    first = campaign.ask()
+    assert campaign.fail("the lead lost its map") is None
+    assert campaign.missions == []
+    paths = {first.path}
+    for _ in range(6):
+        paths.add(campaign.ask().path)
+        campaign.fail("again")
+    assert len(paths) > 1  # another try may be another path
+    part = ModelSimulator(workspace, fail_at=2).run(campaign.ask().path, seed=0)
+    posterior = campaign.fail("tipped", replace(part))
+    assert posterior is campaign.posterior
+    assert len(campaign.missions[0].bounds) == 2
+    assert campaign.log.failures[-1] == (1, "tipped")
+
+
+def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):
+    """One mission, by `iterate(replan="bound", team="min", ...)`; its draws are thinned to 100."""
+    shutil.copytree(Path(__file__).parents[1] / "data" / "campaign_0.1", tmp_path / "kept")
+    result = tb.load_result(tmp_path / "kept")
+    assert result.planner.team == "min"
+    assert list(result.plan.path) == result.path
+    with tb.Campaign.load(tmp_path / "kept") as campaign:
+        assert campaign.options == tb.CampaignOptions(
+            team="min", max_bounds="shortest", replan="bound"
+        )
+        assert (campaign.settings["policy"], campaign.seed) == ("thompson", 3)
+        assert [mission.path for mission in campaign.missions] == [tuple(result.path)]
+        assert (campaign.ask().path[0], campaign.ask().path[-1]) == ((2, 0), (0, 2))
+
+
+def test_options_are_checked_recorded_and_given_as_one_object(workspace, tmp_path):
+    with pytest.raises(tb.TrustboError, match="unknown option 'forgeting'; did you mean forge"):
+        tb.iterate(workspace, *ENDS, forgeting=0.5)
+    with pytest.raises(tb.TrustboError, match="unknown option 'polcy'; did you mean policy"):
+        tb.Campaign(workspace, *ENDS, polcy="random")
+    options = tb.CampaignOptions(team="min", forgetting=0.9, connectivity=4)
+    with pytest.raises(tb.TrustboError, match=r"or options one by one; got options=.* and replan"):
+        tb.Campaign(workspace, *ENDS, options=options, replan="bound")
+    with pytest.raises(tb.TrustboError, match="callbacks must be callables; got 3"):
+        tb.CampaignOptions(callbacks=[3])
+    tb.Campaign(workspace, *ENDS, sampler="exact", options=options, directory=tmp_path).close()
+    with pytest.raises(tb.TrustboError, match="unknown option of one's own 'team'"):
+        tb.Campaign.load(tmp_path, team="mean")
+    with tb.Campaign.load(tmp_path, callbacks=[print]) as again:
+        assert again.options == replace(options, callbacks=(print,))
+        assert again.planner.team == again.settings["team"] == "min"

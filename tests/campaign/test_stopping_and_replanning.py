@@ -1,0 +1,202 @@
+"""When a campaign ends early, and how a mission changes its mind."""
+
+import itertools
+import logging
+import time
+
+import numpy as np
+import pytest
+from simulators import TRUTH, ModelSimulator
+
+import trustbo as tb
+from trustbo.campaign.replanning import better_rest, weighted_mean
+from trustbo.campaign.stopping import reason_to_stop
+from trustbo.data import Bound
+from trustbo.models import TrustFilter, sample_prior
+from trustbo.models.params import params_of
+from trustbo.planning import Planner
+
+ENDS = ((3, 0), (0, 3))
+QUIET = {"sampler": "exact", "progress": False}
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+
+
+def iterate(workspace, **options):
+    return tb.iterate(
+        workspace, *ENDS, **{"simulator": ModelSimulator(workspace), **QUIET, **options}
+    )
+
+
+def test_a_campaign_stops_when_the_recommended_path_is_nearly_the_best(workspace):
+    result = iterate(workspace, n_iterations=12, stop=tb.RegretBound(eps=0.2, delta=0.2))
+    assert 3 <= len(result.missions) < 12
+    assert result.stop_reason.startswith("regret_bound: P(regret <= 0.2) = ")
+    # What the rule says, counted by hand: every draw's best of all paths against the recommended.
+    planner = Planner(workspace, *ENDS)
+    draws = params_of(result.posterior)
+    drawn = planner.plan_draws(draws, n_draws=500)
+    shares = []
+    for d in drawn.chosen:
+        best = planner.plan(draws.draw(int(d)))
+        own = planner.evaluate(result.path, draws.draw(int(d))).value
+        shares.append((best.value - own) / best.value <= 0.2)
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    for mission in result.missions:
+        campaign.tell(mission)
+    assert tb.RegretBound(eps=0.2).probability(campaign, len(result.missions)) == np.mean(shares)
+
+
+def test_it_does_not_stop_while_paths_differ_by_more(workspace):
+    result = iterate(workspace, n_iterations=3, stop=tb.RegretBound(eps=1e-6, delta=0.01))
+    assert result.stop_reason == "n_iterations"
+
+
+def test_patience_asks_for_several_missions_in_a_row(workspace):
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    rule = tb.RegretBound(eps=0.9, delta=0.5, patience=2, min_missions=1)
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    assert rule(campaign) is None
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=1))
+    assert rule(campaign).startswith("regret_bound")
+
+
+def test_seconds_and_rules_of_one_s_own_stop_too(workspace):
+    def enough(campaign):
+        return len(campaign.missions) >= 2
+
+    assert iterate(workspace, stop=enough).stop_reason == "enough"
+    limit = tb.Seconds(0.001)
+    time.sleep(0.01)
+    result = iterate(workspace, stop=[lambda campaign: None, limit])
+    assert (len(result.missions), result.stop_reason) == (1, "seconds: 0.001")
+    assert reason_to_stop([lambda campaign: "rain"], None) == "rain"
+
+
+def test_bad_rules_are_refused_before_work(workspace):
+    for options, message in (
+        ({"eps": 0.0}, r"RegretBound.eps must be in \(0, 1\); got 0.0"),
+        ({"delta": 1.0}, r"RegretBound.delta must be in \(0, 1\); got 1.0"),
+        ({"patience": 0}, "RegretBound.patience must be a whole number from 1 on; got 0"),
+    ):
+        with pytest.raises(tb.TrustboError, match=message):
+            tb.RegretBound(**options)
+    with pytest.raises(tb.TrustboError, match=r"Seconds.limit must be positive"):
+        tb.Seconds(-1.0)
+    with pytest.raises(tb.TrustboError, match=r"stop must be callables .* got 7"):
+        iterate(workspace, stop=[7])
+    with pytest.raises(
+        tb.TrustboError, match="unknown replan 'tick'; choose one of mission, bound"
+    ):
+        iterate(workspace, replan="tick")
+    with pytest.raises(tb.TrustboError, match="ModelSimulator has no reset and no run_bound"):
+        iterate(workspace, replan="bound")
+
+
+class BoundByBound:
+    """Answers bound by bound with given rates; knows nothing of what comes next."""
+
+    def __init__(self, workspace, rates):
+        self.workspace, self.rates, self.k = workspace, rates, 0
+
+    def run(self, path, *, seed):
+        self.reset(path[0], seed)
+        bounds = tuple(self.run_bound(k, cell) for k, cell in enumerate(path[1:], start=1))
+        return tb.Mission(tuple(path), bounds)
+
+    def reset(self, start, seed):
+        self.rng = np.random.default_rng(seed)
+
+    def run_bound(self, k, cell):
+        z = self.workspace.awareness.values[:, *cell]
+        y = np.clip(self.rates(k) + 0.01 * self.rng.standard_normal(3), 0.0, 1.0)
+        return Bound(cell, z, y, np.full(3, 30.0))
+
+
+def test_the_rest_is_the_best_rest_under_the_filter(workspace):
+    draws = sample_prior(tb.models.PooledTrust(), 2, 400, seed=0)
+    live = TrustFilter(draws, n_robots=3)
+    planner = Planner(workspace, *ENDS)
+    path = planner.plan(draws.mean()).path
+    z = workspace.awareness.values[:, *path[1]]
+    live.update(z, [0.1, 0.2, 0.1])
+    rest = better_rest(planner.onward(path[:2]), live, path[1:], 0.0)
+    params, now = weighted_mean(live.params, live.weights), live.state.mean
+    np.testing.assert_allclose(params.beta, live.weights @ live.params.beta)
+    onward = planner.onward(path[:2])
+    best = onward.plan(params, x0=now)
+    assert onward.evaluate(rest, params, x0=now).value == pytest.approx(best.value)
+    # Nothing is that much better: the old rest stays.
+    assert better_rest(onward, live, path[1:], 10.0) == tuple(path[1:])
+
+
+def test_missions_are_replanned_between_bounds(workspace):
+    simulator = BoundByBound(workspace, lambda k: 0.9 if k % 2 else 0.1)
+    result = tb.iterate(
+        workspace, *ENDS, n_iterations=3, simulator=simulator, replan="bound", **QUIET
+    )
+    planner = Planner(workspace, *ENDS)
+    for mission in result.missions:
+        assert planner.require_path(mission.path) == mission.path
+    assert result.settings["replan"] == "bound"
+    # Before the first posterior there is nothing to replan with.
+    steps = [tuple(c) for c in result.history["path"].values[0].tolist() if c[0] >= 0]
+    assert tuple(steps) == result.missions[0].path
+
+
+def test_kinematic_missions_can_be_replanned_too():
+    terrain = tb.terrain.synthetic_terrain((120.0, 120.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (4, 4))
+    result = tb.iterate(workspace, *ENDS, n_iterations=2, replan="bound", **QUIET)
+    assert all(mission.status == "ok" for mission in result.missions)
+
+
+def test_the_generator_gives_each_mission_as_it_is_learned(workspace):
+    seen = []
+    campaign = tb.Campaign(
+        workspace, *ENDS, sampler="exact", callbacks=[lambda c, mission: seen.append(mission)]
+    )
+    steps = tb.missions(campaign, ModelSimulator(workspace), n_iterations=5)
+    for plan, mission in itertools.islice(steps, 2):
+        assert mission.path == plan.path
+        assert campaign.missions[-1].path == plan.path
+    assert len(campaign.missions) == len(seen) == 2
+    assert campaign.result().stop_reason == "interrupted"
+    table = campaign.summary()
+    assert list(table.index) == [1, 2]
+    assert table.loc[2, "path"].startswith("3,0 ")
+    assert table.loc[1, "status"] == "ok"
+
+
+def test_regret_is_recorded_where_the_truth_is_known(workspace):
+    class Oracle(ModelSimulator):
+        def regret(self, plan):
+            planner = Planner(self.workspace, *ENDS)
+            best = planner.plan(TRUTH).value
+            return best - planner.evaluate(plan.path, TRUTH).value
+
+    result = iterate(workspace, n_iterations=2, simulator=Oracle(workspace))
+    regret = result.history["regret"].values
+    assert (regret >= -1e-12).all()
+
+
+def test_progress_is_a_line_and_the_log_has_it_too(workspace, capsys, caplog):
+    with caplog.at_level(logging.INFO, logger="trustbo"):
+        iterate(workspace, n_iterations=2)
+    assert capsys.readouterr() == ("", "")
+    assert "mission 2: objective 0." in caplog.text
+    iterate(workspace, n_iterations=2, progress=True)
+    line = capsys.readouterr().err.split("\r")[-1]
+    assert "missions: 100%" in line
+    assert "k-hat" in line
+    assert "ok" in line
+
+
+def test_no_mission_no_result(workspace):
+    campaign = tb.Campaign(workspace, *ENDS)
+    with pytest.raises(tb.TrustboError, match="the campaign has no mission yet"):
+        campaign.result()
+    assert len(campaign.history) == 0

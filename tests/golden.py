@@ -1,0 +1,149 @@
+"""Seeded campaigns whose history, paths and posteriors a change of form must leave as they are.
+
+Run by hand, on one machine, before and after such a change:
+
+    python tests/golden.py write before.json [campaign ...]
+    python tests/golden.py compare before.json [campaign ...]
+
+`compare` prints for each campaign whether all numbers are bit-identical, else the largest relative
+difference. `tests/test_golden.py` compares a few of the exact sampler, which take seconds, with
+`golden.json`, which `python tests/golden.py write tests/golden.json` renews.
+"""
+
+import hashlib
+import json
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+import trustbo as tb
+
+STORED = Path(__file__).parent / "golden.json"
+EXACT = {
+    "pooled exact": {},
+    "pooled exact change": {"model": ("PooledTrust", {"response": "change"})},
+    "apart exact": {"model": ("CoupledTrust", {"inter_robot": "none"})},
+    **{f"policy {name}": {"policy": name} for name in tb.planning.POLICIES},
+    **{f"objective {name}": {"objective": name} for name in tb.planning.OBJECTIVES},
+    "team min": {"team": "min"},
+    "belief": {"awareness": "belief", "policy": "thompson"},
+    "replan": {"replan": "bound"},
+    "forgetting": {"forgetting": 0.8, "update": "refit"},
+    "moment matched": {"update": "moment_matched"},
+    "length": {"length_weight": 1e-4, "connectivity": 4},
+    "prior mean": {"initial": "prior_mean"},
+}
+NUTS = {
+    "pooled nuts": {"sampler": "nuts"},
+    "pooled nuts change": {"sampler": "nuts", "model": ("PooledTrust", {"response": "change"})},
+    "pooled censored": {"model": ("PooledTrust", {"observation": "censored"})},
+    "pooled beta_binomial": {"model": ("PooledTrust", {"observation": "beta_binomial"})},
+    "hierarchical": {"model": ("HierarchicalTrust", {})},
+    "hierarchical beta_binomial": {
+        "model": ("HierarchicalTrust", {"observation": "beta_binomial"})
+    },
+    "coupled full": {"model": ("CoupledTrust", {})},
+    "coupled ordered": {"model": ("CoupledTrust", {"inter_robot": "ordered"})},
+    "apart nuts": {"model": ("CoupledTrust", {"inter_robot": "none"})},
+}
+
+FEW = ("pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan")
+
+
+def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:
+    """Numbers of one seeded campaign."""
+    terrain = tb.terrain.synthetic_terrain(size=(150.0, 150.0), resolution=2.0, seed=3)
+    workspace = tb.Workspace.from_terrain(terrain, shape=(5, 5), team=tb.Team(n_robots=2))
+    options = dict(options)
+    name, fields = options.pop("model", ("PooledTrust", {}))
+    options = {"sampler": sampler, "objective": "mean"} | options
+    result = tb.iterate(
+        workspace,
+        (4, 0),
+        (0, 4),
+        model=getattr(tb.models, name)(**fields),
+        n_iterations=n_iterations,
+        seed=5,
+        progress=False,
+        **options,
+    )
+    history = result.history
+    found = {
+        "path": history["path"].values.tolist(),
+        "recommended": [list(cell) for cell in result.path],
+        "trust_map": np.nan_to_num(history["trust_map"].values, nan=-9.0).tolist(),
+        "final": np.nan_to_num(result.trust_map.values, nan=-9.0).tolist(),
+        "value": float(result.value),
+    }
+    found |= {name: history[name].values.tolist() for name in ("objective", "contact_rate")}
+    for group in ("posterior", "latent", "log_likelihood", "posterior_predictive"):
+        for name, array in sorted(result.posterior[group].to_dataset().data_vars.items()):
+            values = np.ascontiguousarray(np.nan_to_num(array.values, nan=-9.0))
+            found[f"{group} {name}"] = float(values.mean())
+            found[f"{group} {name} bits"] = hashlib.sha256(values.tobytes()).hexdigest()
+    return found
+
+
+def record(name: str) -> dict:
+    """Numbers of the campaign of that name."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if name in EXACT:
+            return campaign(EXACT[name], sampler="exact", n_iterations=3)
+        try:
+            return campaign(NUTS[name], sampler="nuts", n_iterations=2)
+        except tb.PosteriorError as error:
+            return {"refused": str(error)}
+
+
+def record_few() -> dict[str, dict]:
+    """Campaigns of the test; without hashes, since no other machine has the same."""
+    found = {name: record(name) for name in FEW}
+    return {
+        name: {key: value for key, value in each.items() if not key.endswith("bits")}
+        for name, each in found.items()
+    }
+
+
+def largest_difference(one: dict, other: dict) -> float:
+    """Largest relative difference of all numbers; infinite where the shapes or paths differ."""
+    worst = 0.0
+    if one.keys() != other.keys():
+        return np.inf
+    for name, value in one.items():
+        if name.endswith("bits") or isinstance(value, str):
+            continue
+        a, b = np.asarray(value, dtype=float), np.asarray(other[name], dtype=float)
+        if a.shape != b.shape or (name in ("path", "recommended") and (a != b).any()):
+            return np.inf
+        worst = max(worst, float((np.abs(a - b) / np.maximum(np.abs(a), 1.0)).max(initial=0.0)))
+    return worst
+
+
+def main() -> None:
+    """Write or compare a file of golden campaigns."""
+    command, file = sys.argv[1], Path(sys.argv[2])
+    if command == "write" and file.resolve() == STORED:
+        lines = ",\n".join(f"{json.dumps(n)}: {json.dumps(e)}" for n, e in record_few().items())
+        file.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+        return
+    if command == "write":
+        found = {}
+        for name in sys.argv[3:] or [*EXACT, *NUTS]:
+            found[name] = record(name)
+            file.write_text(json.dumps(found, indent=0) + "\n", encoding="utf-8")
+            print(name, flush=True)
+        return
+    for name, expected in json.loads(file.read_text(encoding="utf-8")).items():
+        if sys.argv[3:] and name not in sys.argv[3:]:
+            continue
+        found = record(name)
+        same = found == expected
+        off = 0.0 if same else largest_difference(expected, found)
+        print(f"{name:30s} {'bit-identical' if same else f'differs by {off:.1e}'}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""Censored rates and counts of ticks, against integrals over a grid of trust."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from trustbo.data import Mission
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.models import CoupledParams, CoupledTrust, PooledTrust, TrustParams, fit
+from trustbo.models.likelihood.families import FAMILIES, Observed
+
+N = 20
+PARAMS = {
+    "gaussian": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
+    "censored": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.15, 0.1),
+    "beta_binomial": TrustParams(0.6, np.array([2.0, 1.0]), -0.6, 0.4, 0.25, 0.0, 1.5),
+}
+
+
+def on_a_grid(family, p, z, y, n_points=1201):
+    """p(y) of one robot by filtering point masses of trust: the trapezoid rule, bound by bound."""
+    width = 9.0 if family == "beta_binomial" else 2.5
+    x = np.linspace(0.5 - width, 0.5 + width, n_points)
+    step = x[1] - x[0]
+    likelihood = np.ones(n_points)
+    weights = stats.norm.pdf(x, p.x0_mean, p.x0_sd) * step
+    log_total = 0.0
+    for k in range(len(y)):
+        mean = p.beta0 * x + z[k] @ p.beta + p.b
+        weights = stats.norm.pdf(x[:, None], mean[None], p.delta_w) @ weights * step
+        if np.isnan(y[k]):
+            likelihood = np.ones(n_points)
+        elif family == "beta_binomial":
+            phi = p.delta_v**-2.0
+            share = special.expit(x)
+            likelihood = stats.betabinom.pmf(round(y[k] * N), N, phi * share, phi * (1 - share))
+        elif y[k] <= 0.0:
+            likelihood = stats.norm.cdf(0.0, x, p.delta_v)
+        elif y[k] >= 1.0:
+            likelihood = stats.norm.sf(1.0, x, p.delta_v)
+        else:
+            likelihood = stats.norm.pdf(y[k], x, p.delta_v)
+        weights = weights * likelihood
+        log_total += np.log(weights.sum())
+        weights /= weights.sum()
+    return log_total
+
+
+def sequences(family, seed=0, n=6, low=0.0):
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(size=(n, 5, 1, 2))
+    model = PooledTrust(observation=family)
+    y = model.simulate(jax.random.key(seed), PARAMS[family], z, n_ticks=N).contact_rate
+    y = np.round(np.clip(y, low, 1.0 - low) * N) / N
+    y[0, 2] = np.nan
+    path = [(0, k) for k in range(6)]
+    n_ticks = np.full((5, 1), N)
+    missions = [Mission.from_arrays(path, a, b, n_ticks=n_ticks) for a, b in zip(z, y, strict=True)]
+    return z, y, missions
+
+
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+def test_importance_sampling_finds_the_integral_over_trust(family):
+    z, y, missions = sequences(family)
+    assert ((y == 0.0) | (y == 1.0)).any()
+    model, p = PooledTrust(observation=family), PARAMS[family]
+    expected = [on_a_grid(family, p, z[j, :, 0], y[j, :, 0]) for j in range(len(y))]
+    found = np.array([model.log_likelihood(p, missions, seed=s) for s in range(60)])
+    estimate = special.logsumexp(found, axis=0) - np.log(len(found))
+    # 60 runs of 32: the standard error of the log of their mean, 5 of it, and the grid's error.
+    se = np.exp(found - estimate).std(0) / np.sqrt(len(found))
+    assert (np.abs(estimate - expected) < 5 * se + 1e-3).all()
+    # One run is what LOO sees: good to a few hundredths of a nat.
+    assert np.abs(found - expected).mean() < 0.1
+
+
+def test_a_grid_agrees_with_the_exact_gaussian_likelihood():
+    """The reference of the test above, checked where the answer is known."""
+    z, y, missions = sequences("gaussian", low=0.1)
+    p = PARAMS["gaussian"]._replace(delta_w=0.2, delta_v=0.2)
+    expected = [on_a_grid("gaussian", p, z[j, :, 0], y[j, :, 0]) for j in range(len(y))]
+    np.testing.assert_allclose(PooledTrust().log_likelihood(p, missions), expected, atol=1e-6)
+
+
+def test_rates_that_are_not_at_the_ends_are_not_censored():
+    _, _, missions = sequences("gaussian", low=0.1)
+    np.testing.assert_allclose(
+        PooledTrust(observation="censored").log_likelihood(PARAMS["gaussian"], missions),
+        PooledTrust().log_likelihood(PARAMS["gaussian"], missions),
+        rtol=1e-10,
+    )
+
+
+def test_correlated_censored_rates_of_coupled_robots():
+    """Two robots, one bound: a bivariate normal, its half-lines and its quadrant."""
+    Delta = np.array([[0.04, 0.03], [0.03, 0.05]])
+    p = CoupledParams(0.5 * np.eye(2), np.zeros((1, 2, 2)), np.array([0.1, 0.2]), Delta, Delta)
+    mean = 0.5 * 0.5 + p.b
+    cov = 2.0 * Delta + 0.25 * 0.25 * np.eye(2)
+    model = CoupledTrust(observation="censored")
+    for y in itertools.product((0.0, 0.4, 1.0), repeat=2):
+        mission = Mission.from_arrays([(0, 0), (0, 1)], np.zeros((1, 2, 1)), [y])
+        low = [-np.inf if v == 0 else v for v in y]
+        high = [np.inf if v == 1 else v for v in y]
+        inside = [i for i in range(2) if y[i] == 0.4]
+        law = stats.multivariate_normal(mean, cov)
+        if len(inside) == 2:
+            expected = law.logpdf(y)
+        elif not inside:
+            expected = np.log(law.cdf(high, lower_limit=low))
+        else:
+            (i,), o = inside, 1 - inside[0]
+            slope = cov[o, i] / cov[i, i]
+            given = stats.norm(
+                mean[o] + slope * (y[i] - mean[i]), np.sqrt(cov[o, o] - slope * cov[o, i])
+            )
+            tail = given.logcdf(0.0) if y[o] == 0 else given.logsf(1.0)
+            expected = stats.norm.logpdf(y[i], mean[i], np.sqrt(cov[i, i])) + tail
+        found = [model.log_likelihood(p, [mission], seed=s)[0] for s in range(40)]
+        estimate = special.logsumexp(found) - np.log(len(found))
+        se = np.exp(np.array(found) - estimate).std() / np.sqrt(len(found))
+        assert abs(estimate - expected) < 5 * se + 1e-5, y
+
+
+def test_counts_have_the_beta_binomial_s_moments():
+    """With trust fixed: no process noise, no autoregression."""
+    p = TrustParams(0.0, np.array([1.0]), 0.3, 1e-9, 0.3)
+    n = 20_000
+    z = np.full((n, 1, 1, 1), 0.5)
+    sample = PooledTrust(observation="beta_binomial").simulate(jax.random.key(0), p, z, n_ticks=N)
+    share, phi = special.expit(0.8), 0.3**-2.0
+    law = stats.betabinom(N, phi * share, phi * (1.0 - share))
+    counts = sample.contact_rate.ravel() * N
+    assert abs(counts.mean() - law.mean()) < 5 * law.std() / np.sqrt(n)
+    assert abs(counts.var() / law.var() - 1.0) < 5 * np.sqrt(3.0 / n)
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
+
+
+def test_a_linearisation_point_at_the_mode_evens_the_weights():
+    z, y, _ = sequences("beta_binomial", seed=2)
+    with jax.enable_x64(True):
+        params = TrustParams(*(jnp.asarray(v, dtype=float) for v in PARAMS["beta_binomial"]))
+        family, ssm = FAMILIES["beta_binomial"], params.ssm(jnp.asarray(z))
+        rough = Observed.of(jnp.asarray(y), jnp.full(y.shape, float(N)))
+        fine = family.refine(ssm, rough)
+        innovations = jax.random.normal(jax.random.key(0), (400, *rough.y.shape))
+        spreads = []
+        for observed in (rough, fine):
+
+            def weigh(e, observed=observed):
+                return family.log_density(ssm, observed, e)
+
+            spreads.append(float(np.asarray(jax.vmap(weigh)(innovations)).std(0).mean()))
+    assert spreads[1] < 0.5
+    assert spreads[1] <= spreads[0]
+
+
+def test_the_resolution_of_a_rate_is_one_tick():
+    y = np.array([0.0, 0.5, 1.0, np.nan])
+    ticks = np.full(4, 50.0)
+    log = -np.log(50.0)
+    found = {name: family.log_resolution(y, ticks) for name, family in FAMILIES.items()}
+    np.testing.assert_allclose(found["gaussian"], [log, log, log, 0.0])
+    np.testing.assert_allclose(found["censored"], [0, log, 0, 0])
+    np.testing.assert_allclose(found["beta_binomial"], np.zeros(4))
+    assert np.isnan(FAMILIES["gaussian"].log_resolution(y, ticks * np.nan)[0])
+
+
+def test_families_that_do_not_suit_are_refused():
+    _, _, missions = sequences("gaussian")
+    bare = [Mission.from_arrays(m.path, m.awareness, m.contact_rate) for m in missions]
+    counted = PooledTrust(observation="beta_binomial")
+    expected = "mission 0, bound 1, robot 0 has a contact rate but no n_ticks. .* give n_ticks"
+    with pytest.raises(TrustboError, match=expected):
+        fit(bare, counted)
+    with pytest.raises(TrustboError, match="not a share of ticks"):
+        PooledTrust(observation="beta_binomial", response="change")
+    with pytest.raises(TrustboError, match="unknown observation 'poisson'"):
+        PooledTrust(observation="poisson")
+    with pytest.raises(TrustboError, match=r'needs Gaussian observations.*observation="censored"'):
+        fit(missions, PooledTrust(observation="censored"), sampler="exact")
+    with pytest.raises(TrustboError, match='sampler "joint" is for observations'):
+        fit(missions, sampler="joint")
+    with pytest.raises(TrustboError, match="fractional mission"):
+        fit(missions, PooledTrust(observation="censored"), weights=[0.5] * 6)
+
+
+def test_ticks_are_whole_and_rates_are_shares_of_them():
+    z, path = np.full((1, 1, 1), 0.5), [(0, 0), (0, 1)]
+    with pytest.raises(TrustboError, match=r"n_ticks\[0\] = 10.5 must be a whole number of ticks"):
+        Mission.from_arrays(path, z, [[0.5]], n_ticks=10.5)
+    with pytest.raises(TrustboError, match=r"contact_rate\[0\] = 0.55 is no share of 10 ticks"):
+        Mission.from_arrays(path, z, [[0.55]], n_ticks=10)
+    with pytest.raises(ShapeError, match=r"n_ticks must be \(1, 1\); got \(3, 1\)"):
+        Mission.from_arrays(path, z, [[0.5]], n_ticks=[1, 2, 3])
+    assert Mission.from_arrays(path, z, [[0.5]], n_ticks=10).n_ticks[0, 0] == 10

@@ -1,0 +1,185 @@
+"""The exact sampler: its likelihood, its draws, its evidence, and when it steps aside."""
+
+import importlib
+
+import jax
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from models.conftest import TRUTH, simulate_missions
+from models.likelihood.test_scalar import random_missions, random_params
+from references import dense_log_likelihood, pooled_posterior
+from scipy import stats
+from scipy.interpolate import PchipInterpolator
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
+from trustbo.models.likelihood.gram import sufficient_statistics
+from trustbo.models.samplers.exact import sample_exact
+from trustbo.models.samplers.nuts import NutsSettings, run_nuts
+from trustbo.models.samplers.target import NutsData
+from trustbo.stacking import stack_missions
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_quadratic_form_is_the_dense_joint_normal(seed):
+    """Complete missions by sine transform, those with gaps by the filter, both at once."""
+    rng = np.random.default_rng(seed)
+    missions = random_missions(rng, 4, missing=0.3 * (seed % 2))
+    draws = [random_params(rng)._replace(x0_mean=0.4, x0_sd=0.3 * (seed % 3)) for _ in range(3)]
+    statistics = sufficient_statistics(stack_missions(missions), 0.4)
+    theta = np.array([[p.beta0, p.delta_w**2, p.delta_v**2] for p in draws])
+    q = statistics.evaluate(theta, 0.3 * (seed % 3))
+    for i, p in enumerate(draws):
+        c = np.append(p.beta, p.b)
+        found = -0.5 * (q.alpha[i] - 2 * c @ q.h[i] + c @ q.P[i] @ c + q.log_det[i])
+        found -= 0.5 * statistics.n_measured * np.log(2 * np.pi)
+        expected = sum(
+            dense_log_likelihood(*p, m.awareness[:, r], m.contact_rate[:, r])
+            for m in missions
+            for r in range(3)
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_statistics_of_missions_add_up():
+    missions = simulate_missions(6, lengths=(8,))
+    theta = np.array([[0.5, 0.01, 0.02]])
+    whole = sufficient_statistics(stack_missions(missions), 0.5).evaluate(theta, 0.5)
+    parts = [sufficient_statistics(stack_missions(m), 0.5) for m in (missions[:2], missions[2:])]
+    for a, b in zip(
+        whole, parts[0].evaluate(theta, 0.5) + parts[1].evaluate(theta, 0.5), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_draws_are_those_of_a_quadrature(seed):
+    missions = simulate_missions(6, seed)
+    statistics = sufficient_statistics(stack_missions(missions), 0.5)
+    exact = sample_exact(statistics, Priors(), 4000, seed).params
+    on_grid, (mean, sd, weight) = pooled_posterior(missions)
+    laws = {}
+    for name, (points, share) in zip(("beta0", "delta_w", "delta_v"), on_grid, strict=True):
+        edges = np.r_[0.0, points + points[0]]  # points are midpoints
+        below = np.r_[0.0, np.cumsum(share)]
+        moments = share @ points, np.sqrt(share @ points**2 - (share @ points) ** 2)
+        laws[name] = exact[name], *moments, PchipInterpolator(edges, below)
+    likely = weight > 1e-8
+    for m in range(mean.shape[-1]):
+        draws = np.c_[exact["beta"], exact["b"]][:, m]
+        centre = (weight * mean[..., m]).sum()
+        spread = np.sqrt((weight * (sd[..., m] ** 2 + (mean[..., m] - centre) ** 2)).sum())
+        at = np.linspace(centre - 6.0 * spread, centre + 6.0 * spread, 200)
+        below = stats.norm.cdf(at[:, None], mean[likely, m], sd[likely, m]) @ weight[likely]
+        laws[f"c{m}"] = draws, centre, spread, lambda x, a=at, b=below: np.interp(x, a, b)
+    for name, (ours, centre, spread, cdf) in laws.items():
+        # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %.
+        assert abs(ours.mean() - centre) < 0.05 * spread, name
+        assert abs(np.log(ours.std() / spread)) < 0.03, name
+        assert stats.kstest(ours, cdf).pvalue > 0.01, name
+
+
+@pytest.mark.slow  # a grid, above, says the same
+@pytest.mark.parametrize("seed", range(3))
+def test_exact_draws_and_a_long_nuts_run_agree(seed):
+    missions = simulate_missions(6, seed)
+    batch = stack_missions(missions)
+    exact = sample_exact(sufficient_statistics(batch, 0.5), Priors(), 4000, seed).params
+    with jax.enable_x64(True):
+        settings = NutsSettings(n_draws=20_000)
+        data = NutsData(*batch, np.ones(len(batch.contact_rate)))
+        nuts = run_nuts(settings, jax.random.key(seed), PooledTrust(), data).params
+        nuts = {name: np.asarray(a).reshape(80_000, -1) for name, a in nuts.items()}
+    for name, reference in nuts.items():
+        for ours, theirs in zip(exact[name].reshape(4000, -1).T, reference.T, strict=True):
+            sd = theirs.std()
+            # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %;
+            # NUTS of ESS > 40 000 adds 0.005 sd and 0.4 %.
+            assert abs(ours.mean() - theirs.mean()) < 0.05 * sd, name
+            assert abs(np.log(ours.std() / sd)) < 0.03, name
+            assert stats.ks_2samp(ours, theirs[::4]).pvalue > 0.01, name
+
+
+def test_the_evidence_is_the_prior_mean_of_the_likelihood():
+    (mission,) = simulate_missions(1, lengths=(3,))
+    exact = sample_exact(sufficient_statistics(stack_missions([mission]), 0.5), Priors(), 100, 0)
+    rng = np.random.default_rng(0)
+    n = 200_000
+    draws = TrustParams(
+        rng.beta(2, 2, n),
+        rng.normal(0, 1, (n, 2)),
+        rng.normal(0, 0.5, n),
+        np.abs(rng.normal(0, 0.2, n)),
+        np.abs(rng.normal(0, 0.2, n)),
+        0.5,
+        0.5,
+    )
+    likelihood = np.exp(PooledTrust().log_likelihood(draws, [mission])[:, 0])
+    se = likelihood.std() / np.sqrt(n) / likelihood.mean()
+    # 5 standard errors of the prior average, and 2 % for 4096 Sobol points.
+    assert abs(exact.log_evidence - np.log(likelihood.mean())) < 5 * se + 0.02
+
+
+def test_fit_lays_exact_draws_out_as_it_does_nuts_s(missions, posterior):
+    exact = fit(missions, sampler="exact", seed=1)
+    assert set(exact.children) == set(posterior.children)
+    assert exact["posterior"].sizes == posterior["posterior"].sizes
+    assert exact["latent"]["trust"].dims == posterior["latent"]["trust"].dims
+    assert set(exact["sample_stats"].data_vars) == {"lp", "log_weight"}
+    found = diagnostics(exact)
+    assert found["k_hat"] < 0.7
+    assert found["kish"] > 1000
+    again = fit(missions, sampler="exact", seed=1)
+    np.testing.assert_array_equal(
+        exact["posterior"]["beta"].values, again["posterior"]["beta"].values
+    )
+
+
+def test_gaps_and_single_bounds_are_no_obstacle():
+    missions = simulate_missions(4, lengths=(7, 1))
+    rates = missions[0].contact_rate.copy()
+    rates[2:4, 1] = np.nan
+    gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
+    exact = sample_exact(
+        sufficient_statistics(stack_missions([gap, *missions[1:]]), 0.5), Priors(), 1000, 0
+    )
+    assert exact.khat < 0.7
+    assert np.isfinite(exact.params["beta0"]).all()
+
+
+def test_other_priors_within_reach_move_the_posterior(missions):
+    batch = stack_missions(missions)
+    priors = Priors(
+        beta0=dist.Normal(0.0, 0.05),
+        beta=dist.Normal(0.1, 0.01),
+        delta_v=dist.LogNormal(-3.0, 0.2),
+    )
+    exact = sample_exact(sufficient_statistics(batch, 0.5), priors, 2000, 0)
+    assert exact.khat < 0.7
+    assert abs(exact.params["beta"].mean() - 0.1) < 0.05
+    assert exact.params["beta0"].mean() < 0.5  # against a likelihood around 0.6
+    assert TRUTH.beta0 == 0.6
+
+
+@pytest.mark.parametrize(
+    ("name", "prior", "what"),
+    [
+        ("b", dist.Cauchy(0.0, 1.0), "a Normal distribution"),
+        ("beta0", dist.Uniform(-1.0, 1.0), r"on \(0, 1\) or the real line"),
+        ("delta_w", dist.TruncatedNormal(0.0, 0.2, low=0.01), r"on \(0, inf\)"),
+    ],
+)
+def test_priors_out_of_reach_are_named(missions, name, prior, what):
+    with pytest.raises(TrustboError, match=f"the prior of {name} to be {what}; got"):
+        fit(missions, PooledTrust(Priors(**{name: prior})), sampler="exact")
+
+
+def test_uneven_weights_fall_back_on_nuts_and_say_so(missions, monkeypatch):
+    # By its module: the package's `fit` is the function.
+    monkeypatch.setattr(importlib.import_module("trustbo.models.samplers.run"), "MAX_KHAT", -10.0)
+    with pytest.warns(UserWarning, match=r"k-hat is -?\d.\d\d \(limit -10.0\): .* NUTS is used"):
+        posterior = fit(missions, sampler="exact")
+    assert posterior.attrs["sampler"] == "nuts"
+    assert "r_hat" in diagnostics(posterior)

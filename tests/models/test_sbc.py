@@ -1,0 +1,90 @@
+"""Calibration of the samplers, and of the test itself."""
+
+from importlib import import_module
+
+import arviz as az
+import matplotlib.pyplot as plt
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+
+from trustbo.errors import TrustboError
+from trustbo.models import CoupledTrust, PooledTrust, Priors, sbc
+from trustbo.models.sbc import _uniformity
+
+
+def test_the_exact_sampler_is_calibrated():
+    ranks = sbc(n_datasets=200, shape=(2, 6, 2, 2), progress=False)
+    assert list(ranks["parameter"].values) == [
+        "beta0",
+        "beta[0]",
+        "beta[1]",
+        "b",
+        "delta_w",
+        "delta_v",
+    ]
+    assert ranks["rank"].dims == ("dataset", "parameter")
+    # One chance in a thousand over the six parameters (Bonferroni).
+    assert float(ranks["p_value"].min()) > 0.001 / 6
+
+
+def test_a_posterior_of_another_prior_is_found_out(monkeypatch):
+    calibration = import_module("trustbo.models.sbc")  # the package's `sbc` is the function
+    draw = calibration.draw_posterior
+    wrong = PooledTrust(Priors(delta_v=dist.HalfNormal(0.02)))
+
+    def of_another_prior(model, *args, **options):
+        return draw(wrong, *args, **options)
+
+    monkeypatch.setattr(calibration, "draw_posterior", of_another_prior)
+    ranks = sbc(n_datasets=50, shape=(2, 6, 2, 2), progress=False)
+    assert float(ranks["p_value"].sel(parameter="delta_v")) < 1e-6
+
+
+def test_uniform_ranks_pass_and_others_do_not():
+    rng = np.random.default_rng(0)
+    assert _uniformity(rng.integers(0, 400, 5000), 399) > 0.001
+    assert _uniformity(rng.binomial(399, 0.5, 5000), 399) < 1e-6
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path):
+    file = tmp_path / "ranks.json"
+    options = {"shape": (2, 4, 2, 2), "progress": False, "n_ranked": 40}
+    sbc(n_datasets=3, checkpoint=file, **options)
+    kept = file.read_text()
+    resumed = sbc(n_datasets=6, checkpoint=file, **options)
+    np.testing.assert_array_equal(resumed["rank"], sbc(n_datasets=6, **options)["rank"])
+    assert kept[:-2] in file.read_text()  # the first three were not sampled again
+    with pytest.raises(TrustboError, match="holds ranks of other arguments"):
+        sbc(seed=1, n_datasets=6, checkpoint=file, **options)
+
+
+def test_arviz_draws_the_ranks_and_their_coverage():
+    ranks = sbc(n_datasets=60, shape=(2, 4, 2, 2), progress=False)
+    assert ranks["pit"].dims == ("dataset", "parameter")
+    tree = xr.DataTree.from_dict({"prior_sbc": ranks[["pit"]]})
+    az.plot_ecdf_pit(tree, sample_dims="dataset")
+    plt.close("all")
+    inside = (np.abs(ranks["pit"] - 0.5) < 0.45).mean("dataset")
+    np.testing.assert_allclose(ranks["coverage"].sel(interval=0.9), inside)
+    # 360 intervals of 90 %: 4 standard errors, were they independent.
+    assert abs(float(inside.mean()) - 0.9) < 4 * np.sqrt(0.09 / 360)
+
+
+def test_models_and_families_are_ranked_too():
+    ranks = sbc(
+        CoupledTrust(inter_robot="none"),
+        n_datasets=3,
+        shape=(2, 4, 2, 1),
+        progress=False,
+    )
+    names = list(ranks["parameter"].values)
+    assert names[:4] == ["beta0[0]", "beta0[1]", "beta[0,0]", "beta[1,0]"]
+
+
+def test_bad_input():
+    with pytest.raises(TrustboError, match="unknown sampler 'gibbs'"):
+        sbc(sampler="gibbs")
+    with pytest.raises(TrustboError, match="n_datasets must be a whole number from 1 on; got 0"):
+        sbc(n_datasets=0)

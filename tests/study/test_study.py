@@ -1,0 +1,523 @@
+"""Studies: the same numbers wherever they run, resumed, and refused before work starts."""
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from distributed import Client, LocalCluster
+from typer.testing import CliRunner
+
+import trustbo as tb
+from trustbo import study
+from trustbo.cli import app
+from trustbo.study import executors, workers
+
+TRUTH = {"beta0": 0.6, "beta": [0.3, 0.2], "b": 0.05, "delta_w": 0.05, "delta_v": 0.05}
+CONFIG = {
+    "terrains": {"cells": {"kind": "random", "shape": [5, 5], "seed": "run"}},
+    "simulators": {"truth": {"kind": "model", **TRUTH}},
+    "policies": ["greedy", "random"],
+    "samplers": ["exact"],
+    "seeds": 3,
+    "n_iterations": 2,
+}
+
+
+def run(folder, executor="serial", **changes):
+    return study.run_study(CONFIG | changes, folder, executor, progress=False, n_workers=2)
+
+
+def keys(**changes):
+    return [one.key for one in study.Study.of(CONFIG | changes).runs()]
+
+
+def assert_same(a, b):
+    """All but the clock, to the last bit."""
+    names = [name for name in a if not name.startswith("seconds")]
+    xr.testing.assert_identical(a[names], b[names])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("studies") / "serial"
+
+
+@pytest.fixture(scope="module")
+def serial(folder):
+    return run(folder)
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory):
+    # Locks of cores of their own, and sets of names in another order than here.
+    own = {"TMPDIR": str(tmp_path_factory.mktemp("locks")), "PYTHONHASHSEED": "7"}
+    options = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "env": own}
+    with LocalCluster(dashboard_address=None, **options) as cluster, Client(cluster) as client:
+        yield client
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """The runs that were run here, serially."""
+    seen, execute = [], executors.execute
+
+    def count(one, caller):
+        seen.append(str(one))
+        return execute(one, caller)
+
+    monkeypatch.setattr(executors, "execute", count)
+    return seen
+
+
+# --- the table of runs ---
+
+
+def test_a_key_is_the_same_in_another_process(client):
+    table = f"__import__('trustbo').study.Study.of({CONFIG!r}).runs()"
+    assert client.submit(eval, f"[run.key for run in {table}]").result() == keys()
+    assert len(set(keys())) == 6
+
+
+def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
+    cells, truth = CONFIG["terrains"]["cells"], CONFIG["simulators"]["truth"]
+    same = {
+        "terrains": {"renamed": cells | {"shape": (5, 5), "start": [4, 0], "n_robots": 3}},
+        "simulators": {"renamed": truth | {"x0_mean": 0.5, "n_ticks": None}},
+        "objectives": "terminal",
+        "seeds": [0, 1, 2],
+    }
+    assert keys(**same) == keys()
+    assert keys(seeds=4)[:6] == keys()
+    for change in (
+        {"terrains": {"cells": cells | {"n_robots": 2}}},
+        {"simulators": {"truth": truth | {"b": 0.06}}},
+        {"models": {"pooled": {"response": "change"}}},
+        {"objectives": ["mean"]},
+        {"options": {"connectivity": 4}},
+        {"n_iterations": 3},
+    ):
+        assert not set(keys(**change)) & set(keys())
+
+
+def test_every_option_is_crossed_with_every_other():
+    table = study.Study.of(
+        CONFIG
+        | {
+            "objectives": ["terminal", "mean"],
+            "models": ["pooled", "hierarchical"],
+            "samplers": "nuts",
+            "options": {"forgetting": [1.0, 0.8], "connectivity": 4},
+        }
+    ).runs()
+    assert len(table) == 3 * 2 * 2 * 2 * 2
+    assert len({one.key for one in table}) == len(table)
+    assert {one.labels["forgetting"] for one in table[:16]} == {1.0, 0.8}
+
+
+def test_a_file_s_content_decides_and_not_its_name(tmp_path):
+    terrain = tb.terrain.synthetic_terrain((40.0, 40.0), seed=1)
+    for place in ("a", "b"):
+        (tmp_path / place).mkdir()
+        for name in ("dem", "dsm"):
+            terrain[name].rio.to_raster(tmp_path / place / f"{name}.tif")
+    table = [
+        "terrains:\n  hill: {kind: files, dem: dem.tif, dsm: dsm.tif, shape: [2, 2]}\n",
+        "terrains:\n  hill: {kind: files, dem: dem.tif, dsm: dem.tif, shape: [2, 2]}\n",
+    ]
+    found = []
+    for i, (place, text) in enumerate((("a", table[0]), ("b", table[0]), ("b", table[1]))):
+        file = tmp_path / place / f"{i}.yaml"
+        file.write_text(text)
+        found.append(study.read_study(file).runs()[0].key)
+    assert found[0] == found[1] != found[2]
+
+
+# --- where they run ---
+
+
+def test_loky_gives_the_same_numbers_though_a_worker_dies(serial, tmp_path):
+    with killing_a_worker(tmp_path):
+        assert_same(run(tmp_path, "loky"), serial)
+
+
+def test_dask_gives_the_same_numbers_on_a_core_for_each_worker(serial, client, tmp_path):
+    assert_same(run(tmp_path, client), serial)
+    pinned = [tuple(cores) for cores in client.run(os.sched_getaffinity, 0).values()]
+    if len(os.sched_getaffinity(0)) > 1:
+        assert len(set(pinned)) == 2
+        assert {len(cores) for cores in pinned} == {1}
+
+
+def test_dask_gives_the_same_numbers_though_a_worker_dies(client, tmp_path_factory):
+    calm, hurt = (tmp_path_factory.mktemp(name) for name in ("calm", "hurt"))
+    more = {"seeds": 5, "n_iterations": 3}
+    with killing_a_worker(hurt):
+        result = run(hurt, client.scheduler.address, **more)
+    assert result.attrs == {"n_runs": 10, "n_failed": 0}
+    assert_same(result, run(calm, client, **more))
+
+
+@contextmanager
+def killing_a_worker(folder):
+    """SIGKILL the worker that ended the first run, when that has been written."""
+    killed = []
+
+    def kill():
+        for _ in range(1200):
+            if files := list((folder / "runs").glob("[!.]*.json")):
+                killed.append(json.loads(files[0].read_text())["process"])
+                os.kill(killed[0], signal.SIGKILL)
+                return
+            time.sleep(0.05)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    yield
+    thread.join()
+    assert killed[0] != os.getpid()
+
+
+@pytest.fixture
+def no_cache():
+    """JAX without the cache of compiled programs that the tests share."""
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    before = {name: getattr(jax.config, name) for name in names}
+    jax.config.update(names[0], None)
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+@pytest.mark.usefixtures("no_cache")
+def test_workers_keep_compiled_code_in_the_user_s_cache_unless_told_where(monkeypatch, tmp_path):
+    for own in ("a", "b"):  # the second finds what the first set
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / own))
+        workers.keep_compiled_code()
+        assert jax.config.jax_compilation_cache_dir == str(tmp_path / "a" / "trustbo" / "jax")
+
+
+@pytest.mark.usefixtures("no_cache")
+def test_threads_and_the_caller_s_process_are_left_as_they_are(serial, tmp_path):
+    before = os.sched_getaffinity(0), jax.config.jax_compilation_cache_dir
+    with ThreadPoolExecutor(1) as pool:
+        assert_same(run(tmp_path, pool), serial)
+    assert (os.sched_getaffinity(0), jax.config.jax_compilation_cache_dir) == before
+
+
+def test_runs_of_a_pool_that_is_broken_are_failures(tmp_path):
+    class Broken(ThreadPoolExecutor):
+        def submit(self, *arguments):
+            raise BrokenExecutor
+
+    with (
+        Broken() as pool,
+        pytest.raises(tb.TrustboError, match=r"6 of 6 runs failed.*lost: the wo"),
+    ):
+        run(tmp_path, pool)
+
+
+def test_executors_that_cannot_be_are_refused(tmp_path):
+    with (
+        ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool,
+        pytest.raises(tb.TrustboError, match="the executor forks, which JAX does not survive"),
+    ):
+        run(tmp_path, pool)
+    with pytest.raises(
+        tb.TrustboError, match=r"unknown executor .* 'cluster'; choose one of serial"
+    ):
+        run(tmp_path, "cluster")
+    with pytest.raises(tb.TrustboError, match="executor must be one of serial, loky, dask, an"):
+        run(tmp_path, 3)
+    assert not list(tmp_path.iterdir())
+
+
+# --- resuming, and failing ---
+
+
+def test_a_study_goes_on_where_it_stopped(serial, tmp_path, counted, monkeypatch):
+    class StoppedError(Exception):
+        pass
+
+    counting = executors.execute
+
+    def stop_after_two(one, caller):
+        if len(counted) == 2:
+            raise StoppedError
+        return counting(one, caller)
+
+    monkeypatch.setattr(executors, "execute", stop_after_two)
+    with pytest.raises(StoppedError):
+        run(tmp_path)
+    monkeypatch.setattr(executors, "execute", counting)
+    assert len(counted) == 2
+    partial = study.load_study(tmp_path)
+    assert partial.sizes["run"] == 2
+    assert partial.attrs == {"n_runs": 6, "n_failed": 0}
+    assert_same(run(tmp_path), serial)
+    assert len(counted) == 6
+    assert_same(run(tmp_path), serial)
+    assert len(counted) == 6
+    # More seeds are run by themselves; fewer are read without what is there besides.
+    assert run(tmp_path, seeds=4).sizes["run"] == 8
+    assert len(counted) == 8
+    assert_same(run(tmp_path), serial)
+
+
+def test_a_run_that_fails_does_not_stop_the_others_and_is_tried_again(tmp_path, counted):
+    # Rates that do not vary at all are found out only when they have been measured.
+    flat = {"beta0": 0.5, "beta": [0, 0], "b": 0.25, "delta_w": 0, "delta_v": 0, "x0_sd": 0}
+    simulators = {"flat": {"kind": "model", **flat}, "good": CONFIG["simulators"]["truth"]}
+    changes = {"simulators": simulators, "policies": "greedy", "seeds": 1}
+    with pytest.warns(UserWarning, match=r"1 of 2 runs failed.*simulator=flat.*all .* are 0\.5"):
+        result = run(tmp_path, **changes)
+    assert result["simulator"].values.tolist() == ["good"]
+    assert result.attrs == {"n_runs": 2, "n_failed": 1}
+    failed = study.failures(tmp_path)
+    assert failed["simulator"].tolist() == ["flat"]
+    assert failed["error"].iloc[0].startswith("TrustboError: all ")
+    assert "Traceback" in failed["traceback"].iloc[0]
+    with pytest.warns(UserWarning, match="1 of 2 runs failed"):
+        run(tmp_path, **changes)
+    assert [one.split("simulator=")[1].split(",")[0] for one in counted] == ["flat", "good", "flat"]
+    del simulators["good"]
+    with pytest.raises(tb.TrustboError, match="1 of 1 runs failed, and are run again at the next"):
+        run(tmp_path, **changes)
+
+
+def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
+    def execute(one, caller):
+        return {"missions": [], "versions": {"trustbo": "0.0.7"}}
+
+    monkeypatch.setattr(executors, "execute", execute)
+    with pytest.raises(tb.TrustboError, match=r"the worker has trustbo 0\.0\.7, and the study"):
+        run(tmp_path)
+
+
+# --- what comes out ---
+
+
+def test_regret_is_held_against_the_best_path_under_the_truth(serial):
+    params = tb.models.TrustParams(**TRUTH | {"beta": np.array(TRUTH["beta"])})
+    for i, seed in enumerate(serial["seed"].values):
+        z = np.random.default_rng(seed).uniform(size=(5, 5, 2))
+        workspace = tb.Workspace.from_awareness(np.repeat(z[None], 3, axis=0))
+        planner = tb.planning.Planner(workspace, (4, 0), (0, 4))
+        best = planner.plan(params).value
+        assert serial["oracle"].values[i] == best
+        for j in range(2):
+            for path, name in (("path", "regret_followed"), ("recommended", "regret")):
+                steps = serial[path].values[i, j]
+                value = planner.evaluate(steps[steps[:, 0] >= 0].tolist(), params).value
+                assert serial[name].values[i, j] == best - value >= 0.0
+    assert set(serial["status"].values.ravel()) == {"ok"}
+    assert (serial["k_hat"] < 0.7).all()
+    assert np.isfinite(serial["contact_rate"]).all()
+
+
+def test_kinematic_runs_on_terrain_know_no_regret(tmp_path):
+    hill = {"kind": "synthetic", "size": [90, 90], "relief": 6, "shape": [3, 3], "seed": 5}
+    result = run(
+        tmp_path, terrains={"hill": hill}, simulators="kinematic", seeds=1, policies="greedy"
+    )
+    assert result["regret"].isnull().all()
+    assert result["simulator"].item() == "kinematic"
+    with pytest.raises(tb.TrustboError, match="no regret is known"):
+        tb.plots.regret_curves(result)
+
+
+def test_missions_that_a_rule_spared_are_missing(tmp_path):
+    result = run(
+        tmp_path,
+        seeds=2,
+        policies="greedy",
+        n_iterations=4,
+        options={"stop": {"eps": 0.9, "delta": 0.5, "patience": 1, "min_missions": 1}},
+    )
+    assert result.sizes["mission"] == 1
+
+
+def test_a_study_is_kept_in_files_that_netcdf_and_json_read(serial, folder, tmp_path):
+    assert_same(study.load_study(folder), serial)
+    serial.to_netcdf(tmp_path / "study.nc")
+    one = json.loads((folder / "runs" / f"{serial['key'].values[0]}.json").read_text())
+    assert one["labels"]["policy"] == "greedy"
+    assert one["identity"]["trustbo"] == tb.__version__
+    assert len(one["missions"]) == 2
+    kept = json.loads((folder / "study.json").read_text())
+    assert [r.key for r in study.Study.of(kept["study"]).runs()] == keys()
+    with pytest.raises(tb.TrustboError, match="holds no study"):
+        study.load_study(tmp_path)
+
+
+def test_the_summary_has_median_and_interval_of_each_policy_and_mission(serial):
+    table = study.summary(serial)
+    assert table.index.names == ["policy", "mission"]
+    chosen = serial["regret"].values[serial["policy"].values == "random"][:, 1]
+    row = table.loc[("random", 2)]
+    assert (row["median"], row["n"]) == (np.median(chosen), 3)
+    np.testing.assert_allclose([row["low"], row["high"]], np.quantile(chosen, [0.05, 0.95]))
+    with pytest.raises(tb.TrustboError, match="unknown coordinate 'colour'; choose one of"):
+        study.summary(serial, "colour")
+    with pytest.raises(tb.TrustboError, match="unknown variable 'status'; choose one of"):
+        study.summary(serial, variable="status")
+
+
+def test_regret_curves_show_each_policy_s_median(serial):
+    axes = tb.plots.regret_curves(serial)
+    assert axes.shape == (1,)
+    lines = {line.get_label(): line.get_ydata() for line in axes[0].get_lines()}
+    for policy in ("greedy", "random"):
+        chosen = serial["regret"].values[serial["policy"].values == policy]
+        np.testing.assert_allclose(lines[policy], np.median(chosen, axis=0))
+    assert "3 runs each" in axes[0].get_title(loc="left")
+    assert tb.plots.regret_curves(serial, panels="seed", relative=True).shape == (3,)
+    with pytest.raises(tb.TrustboError, match="unknown coordinate 'colour'; choose one of"):
+        tb.plots.regret_curves(serial, by="colour")
+    plt.close("all")
+
+
+# --- what is refused ---
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"policy": "greedy"}, "unknown setting of a study 'policy'; choose one of terrains, pol"),
+        ({"policies": ["gredy"]}, "unknown policy 'gredy'; choose one of greedy"),
+        ({"policies": ["greedy", "greedy"]}, "policies must be at least one, and distinct"),
+        ({"policies": []}, "policies must be at least one"),
+        ({"objectives": ["best"]}, "unknown objective 'best'; choose one of terminal"),
+        ({"seeds": -1}, "seeds .* must be a whole number from 1 on; got -1"),
+        ({"seeds": [0, "a"]}, "seed must be a whole number from 0 on; got 'a'"),
+        ({"n_iterations": 0}, "n_iterations must be a whole number from 1 on; got 0"),
+        (
+            {"terrains": {"a": {"shape": [5, 5]}}},
+            "unknown kind of terrain 'a'; choose one of synth",
+        ),
+        ({"terrains": {}}, "a study needs at least one terrain"),
+        ({"terrains": 5}, "terrains must be distinct names of kinds"),
+        ({"terrains": {"random": 5}}, "terrain 'random' must be a mapping of settings; got 5"),
+        ({"terrains": {"random": {"size": 3}}}, "unknown setting of terrain 'random' .*'size'; ch"),
+        ({"terrains": {"random": {"shape": 5}}}, r"terrain 'random': shape must be two whole num"),
+        ({"terrains": {"random": {"seed": "each"}}}, "seed .* must be a whole number .*'each'"),
+        ({"terrains": {"files": {"dem": "x.tif"}}}, "terrain 'files' .*: needs dsm; got"),
+        ({"terrains": {"files": {"dem": "x", "dsm": "y"}}}, "dem: there is no file '.*x'"),
+        ({"terrains": {"random": {"shape": [5, 5], "goal": [0, 9]}}}, r"goal \(0, 9\) is outside"),
+        ({"simulators": {"model": {"beta0": 0.5}}}, "needs beta, b, delta_w, delta_v; got"),
+        ({"simulators": {"model": TRUTH | {"beta": [1]}}}, "the run seed=0, terrain=.*feature"),
+        ({"simulators": "kinematic"}, "the run seed=0, terrain=cells.*needs a terrain"),
+        ({"models": {"pooled": {"observation": "odd"}}}, "model 'pooled': unknown observation"),
+        (
+            {"models": {"pooled": {"priors": "mine"}}},
+            "unknown priors 'mine'; choose one of default",
+        ),
+        ({"models": ["coupled"]}, "model 'coupled': sampler \"exact\" needs"),
+        ({"options": {"seed": 3}}, "unknown option 'seed'; choose one of .*initial"),
+        ({"options": {"forgetting": float("nan")}}, "option 'forgetting' must be a number, a name"),
+        ({"options": {"forgetting": 7}}, "the run seed=0.*forgetting"),
+        ({"options": {"replan": "bound"}}, "the run seed=0.*reset"),
+        ({"options": {"stop": {"epsilon": 1}}}, "the run seed=0.*epsilon"),
+    ],
+)
+def test_a_study_that_cannot_be_is_refused_before_anything_is_run(change, message, tmp_path):
+    with pytest.raises(tb.TrustboError, match=message):
+        run(tmp_path, **change)
+    assert not list(tmp_path.iterdir())
+
+
+def test_yaml_that_cannot_be_is_refused(tmp_path):
+    with pytest.raises(tb.TrustboError, match=r"cannot read '.*none.yaml': No such file"):
+        study.read_study(tmp_path / "none.yaml")
+    for text, message in (
+        ("terrains: [", "is no YAML: while parsing"),
+        ("- terrains", "a study is a Study or a mapping"),
+        ("policies: [greedy]", "a study needs terrains"),
+        ("terrains: [random]\npolicies: [gredy]", "odd.yaml: unknown policy 'gredy'"),
+    ):
+        (tmp_path / "odd.yaml").write_text(text)
+        with pytest.raises(tb.TrustboError, match=message):
+            study.read_study(tmp_path / "odd.yaml")
+
+
+# --- the command ---
+
+YAML = """
+terrains:
+  cells: {kind: random, shape: [5, 5], seed: run}
+simulators:
+  truth: {kind: model, beta0: 0.6, beta: [0.3, 0.2], b: 0.05, delta_w: 0.05, delta_v: 0.05}
+policies: [greedy, random]
+samplers: [exact]
+seeds: 3
+n_iterations: 2
+"""
+
+
+def test_the_command_runs_a_study_and_shows_its_regret(serial, tmp_path):
+    (tmp_path / "config.yaml").write_text(YAML)
+    arguments = ["study", str(tmp_path / "config.yaml"), "--executor", "serial"]
+    done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    assert "median regret after each mission" in done.output
+    assert "6/6" in done.output
+    assert_same(study.load_study(tmp_path / "out"), serial)
+    table = pd.read_csv(tmp_path / "out" / "summary.csv")
+    assert list(table) == ["policy", "mission", "median", "low", "high", "n"]
+    assert (tmp_path / "out" / "regret.png").read_bytes().startswith(b"\x89PNG")
+    (tmp_path / "config.yaml").write_text(YAML.replace("greedy", "gredy"))
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 2
+    assert "unknown policy 'gredy'; choose one of" in refused.output
+    plt.close("all")
+
+
+# --- the simulator ---
+
+
+def test_the_model_s_simulator_draws_from_the_model():
+    rng = np.random.default_rng(0)
+    workspace = tb.Workspace.from_awareness(rng.uniform(size=(3, 4, 4, 2)))
+    truth = tb.models.TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
+    simulator = tb.simulation.ModelSimulator(workspace, truth)
+    path = [(3, 0), (2, 1), (1, 2), (0, 3)]
+    rates = np.array([simulator.run(path, seed=s).contact_rate for s in range(400)])
+    z = np.swapaxes(workspace.awareness.values[:, [2, 1, 0], [1, 2, 3]], 0, 1)
+    expected = tb.planning.roll_trust(truth, z)
+    # 5 standard errors of a mean of 400, whose sd is below 0.35; few rates are cut to [0, 1].
+    np.testing.assert_allclose(rates[:, 1:].mean(0), expected[1:], atol=5 * 0.35 / 20)
+    again = simulator.run(path, seed=3)
+    np.testing.assert_array_equal(again.contact_rate, rates[3])
+    np.testing.assert_array_equal(again.awareness, z)
+    assert simulator.describe()["truth"]["beta"] == [0.3, 0.2]
+
+
+def test_the_model_s_simulator_measures_the_true_awareness_and_counts():
+    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.2))
+    truth = tb.models.TrustParams(0.5, np.array([1.0]), 0.0, 0.1, 0.1)
+    model = tb.models.PooledTrust(observation="beta_binomial")
+    simulator = tb.simulation.ModelSimulator(
+        workspace, truth, model, awareness=np.full((2, 3, 3, 1), 0.7), n_ticks=20
+    )
+    mission = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
+    assert (mission.awareness == 0.7).all()
+    assert (mission.n_ticks == 20).all()
+    with pytest.raises(tb.TrustboError, match="counts ticks: give n_ticks"):
+        tb.simulation.ModelSimulator(workspace, truth, model)
+    with pytest.raises(tb.ShapeError, match=r"awareness must be \(2, 3, 3, 1\); got shape \(2,\)"):
+        tb.simulation.ModelSimulator(workspace, truth, awareness=[1.0, 2.0])
+    many = truth._replace(beta=np.ones((4, 1)), beta0=np.full(4, 0.5))
+    with pytest.raises(tb.ShapeError, match="give one draw of params"):
+        tb.simulation.ModelSimulator(workspace, many)
+    with pytest.raises(tb.TrustboError, match=r"path\[1\] \(9, 9\) is outside the grid"):
+        simulator.run([(2, 0), (9, 9)], seed=0)

@@ -1,0 +1,164 @@
+"""The planning grid and the workspace on it."""
+
+import numpy as np
+import pytest
+
+from trustbo.data import Robot, Team
+from trustbo.errors import ShapeError, TerrainError, TrustboError
+from trustbo.terrain import assemble_terrain, pixel_size, read_terrain, synthetic_terrain
+from trustbo.workspace import Grid, Workspace
+
+
+@pytest.fixture(scope="module")
+def terrain():
+    return synthetic_terrain((120.0, 90.0), seed=2, relief=6.0)
+
+
+def test_a_grid_covers_the_terrain(terrain):
+    grid = Grid.over(terrain, (4, 3))
+    left, bottom, right, top = terrain.rio.bounds()
+    assert (grid.left, grid.top) == (left, top)
+    assert grid.cell_height == pytest.approx((top - bottom) / 4)
+    assert grid.cell_width == pytest.approx((right - left) / 3)
+    for cell in ((0, 0), (3, 2), (1, 2)):
+        assert grid.cell_at(*grid.center(cell)) == cell
+    with pytest.raises(TrustboError, match="is off the grid"):
+        grid.cell_at(left - 1.0, top)
+
+
+def test_cell_means_are_means_of_the_pixels_inside(terrain):
+    grid = Grid.over(terrain, (4, 3))
+    dem = terrain["dem"].copy()
+    dem[:10, :10] = np.nan
+    expected = [
+        [np.nanmean(dem.values[30 * r : 30 * (r + 1), 30 * c : 30 * (c + 1)]) for c in range(3)]
+        for r in range(4)
+    ]
+    np.testing.assert_allclose(grid.cell_means(dem), expected)
+    share = grid.cell_share(dem.notnull())
+    assert share[0, 0] == pytest.approx(1 - 100 / 900)
+    assert share[1, 1] == 1.0
+
+
+def test_a_grid_too_fine_or_empty_is_refused(terrain):
+    with pytest.raises(TerrainError, match="needs at least 2 x 2 pixels per cell"):
+        Grid.over(terrain, (100, 3))
+    with pytest.raises(TerrainError, match=r"at least two cells; got \(1, 1\)"):
+        Grid.over(terrain, (1, 1))
+
+
+def test_a_workspace_of_a_terrain(terrain):
+    team = Team(n_robots=2)
+    workspace = Workspace.from_terrain(terrain, (4, 3), team)
+    assert workspace.awareness.dims == ("robot", "row", "col", "feature")
+    assert workspace.awareness.shape == (2, 4, 3, 2)
+    assert list(workspace.awareness["feature"].values) == ["traversability", "visibility"]
+    assert float(workspace.awareness.min()) >= 0.0
+    assert float(workspace.awareness.max()) <= 1.0
+    assert workspace.passable.all()
+    mean = workspace.grid.cell_means(workspace.pixels["visibility"])
+    np.testing.assert_allclose(workspace.awareness.sel(robot="r1", feature="visibility"), mean)
+    assert set(workspace.composites) == {"traversability", "visibility"}
+
+
+def test_steep_cells_are_impassable(terrain):
+    gentle = Workspace.from_terrain(terrain, (4, 3))
+    robot = Robot(max_slope=float(np.deg2rad(6.0)))
+    careful = Workspace.from_terrain(terrain, (4, 3), Team(robots=(robot,) * 3, lead=robot))
+    assert int(careful.passable.sum()) < int(gentle.passable.sum())
+    steep = tuple(int(i) for i in np.argwhere(~careful.passable.values)[0])
+    with pytest.raises(TrustboError, match="steeper than the 6 degrees the team stands"):
+        careful.require_cell("start", steep)
+
+
+def test_a_terrain_nobody_can_stand_on_is_refused(terrain):
+    robot = Robot(max_slope=1e-3)
+    with pytest.raises(TrustboError, match="no cell is passable"):
+        Workspace.from_terrain(terrain, (4, 3), Team(robots=(robot,), lead=robot))
+
+
+def test_a_cell_mostly_without_data_is_impassable_and_named(real_terrain):
+    with pytest.warns(UserWarning, match="against the declared sign"):
+        workspace = Workspace.from_terrain(read_terrain(*real_terrain("bcts")), (40, 16))
+    with pytest.raises(
+        TrustboError, match=r"start \(39, 15\) is impassable: \d+% of it has no data; the nearest"
+    ):
+        workspace.require_cell("start", (39, 15))
+
+
+@pytest.mark.filterwarnings("ignore:openness enters its composite")  # 40 x 30 coarse pixels
+def test_a_dataset_of_one_s_own_is_put_in_order(terrain):
+    """Coarsened, cut or flipped datasets keep a stale transform: the coordinates count."""
+    coarse = terrain.coarsen(x=3, y=3).mean()
+    workspace = Workspace.from_terrain(coarse, (4, 3))
+    left, _, right, top = terrain.rio.bounds()
+    assert (workspace.grid.left, workspace.grid.top) == (left, top)
+    assert workspace.grid.cell_width == pytest.approx((right - left) / 3)
+    assert pixel_size(coarse) == (3.0, 3.0)
+    south_up = Workspace.from_terrain(terrain.sortby("y"), (4, 3))
+    np.testing.assert_array_equal(
+        south_up.awareness, Workspace.from_terrain(terrain, (4, 3)).awareness
+    )
+
+
+def test_datasets_that_are_no_terrain_are_refused(terrain):
+    for bad, message in (
+        (terrain.drop_vars("dsm"), "a Dataset with dem and dsm over"),
+        (terrain["dem"], "as read_terrain gives it; got DataArray"),
+        (terrain.drop_vars("spatial_ref"), "the terrain has no CRS"),
+        (terrain.rio.write_crs("EPSG:4326"), "the terrain is in degrees"),
+        (terrain.isel(x=[0, 1, 2, 4, 7, 8]), "x is not a regular axis"),
+    ):
+        with pytest.raises(TerrainError, match=message):
+            Workspace.from_terrain(bad, (2, 2))
+    shifted = terrain["dsm"].assign_coords(x=terrain["x"] + 0.5)
+    with pytest.raises(TerrainError, match="are not on one grid; align them first"):
+        assemble_terrain(terrain["dem"], shifted)
+    for shape in (10, (3.0, 3.0), (3, 3, 3)):
+        with pytest.raises(TrustboError, match="shape must be two whole numbers"):
+            Workspace.from_terrain(terrain, shape)
+
+
+def test_a_workspace_of_arrays():
+    awareness = np.full((2, 3, 4, 3), 0.5)
+    awareness[:, 1, 2] = np.nan
+    workspace = Workspace.from_awareness(awareness, cell_size=20.0)
+    assert not workspace.passable[1, 2]
+    assert int(workspace.passable.sum()) == 11
+    assert list(workspace.awareness["feature"].values) == ["traversability", "visibility", "z3"]
+    assert workspace.grid.center((2, 0)) == (10.0, 10.0)
+
+
+def test_bad_arrays_are_refused():
+    awareness = np.full((2, 3, 4, 2), 0.5)
+    with pytest.raises(ShapeError, match=r"\(robot, row, col, feature\); got shape \(3, 4, 2\)"):
+        Workspace.from_awareness(awareness[0])
+    with pytest.raises(ShapeError, match=r"passable must be \(row, col\) = \(3, 4\); got \(4, 3\)"):
+        Workspace.from_awareness(awareness, np.ones((4, 3)))
+    with pytest.raises(ShapeError, match="awareness has 2 robots, the team 3"):
+        Workspace.from_awareness(awareness, team=Team(n_robots=3))
+    high = awareness.copy()
+    high[1, 2, 3, 0] = 1.5
+    with pytest.raises(TrustboError, match=r"awareness\[1, 2, 3, 0\] = 1.5 is outside \[0, 1\]"):
+        Workspace.from_awareness(high)
+    hole = awareness.copy()
+    hole[0, 1, 1, 0] = np.nan
+    with pytest.raises(TrustboError, match=r"passable cell \(1, 1\) is NaN"):
+        Workspace.from_awareness(hole, np.ones((3, 4)))
+    with pytest.raises(TrustboError, match="no cell is passable"):
+        Workspace.from_awareness(awareness, np.zeros((3, 4)))
+
+
+def test_cells_off_the_grid_or_impassable_are_named():
+    passable = np.ones((3, 4), bool)
+    passable[1, 1] = False
+    workspace = Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5), passable)
+    assert workspace.require_cell("start", (2, 3)) == (2, 3)
+    with pytest.raises(TrustboError, match=r"goal \(3, 0\) is outside the grid of 3 rows"):
+        workspace.require_cell("goal", (3, 0))
+    with pytest.raises(
+        TrustboError, match=r"start \(1, 1\) is impassable; the nearest passable cell is \(0, 1\)"
+    ):
+        workspace.require_cell("start", (1, 1))
+    with pytest.raises(TrustboError, match=r"start must be two whole numbers \(row, col\); got 7"):
+        workspace.require_cell("start", 7)
