@@ -116,7 +116,11 @@ def test_help_of_export_names_every_format(invoke):
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["run", "--dem", "x.tif"], 2, "error: Missing option '--start'.\nhint: trustbo run --help "),
+        (
+            ["run", "--dem", "x.tif"],
+            2,
+            "error: Missing option '--start'.\nhint: trustbo run --help ",
+        ),
         (["run", "--robots", "two"], 2, "error: Invalid value for '--robots': "),
         (["fly"], 2, "error: No such command 'fly'.\nhint: trustbo --help "),
         (["report", "nowhere"], 2, "error: 'nowhere' holds no result;"),
