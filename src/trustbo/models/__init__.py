@@ -11,6 +11,7 @@ from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
 from trustbo.models.pooled import PooledTrust
+from trustbo.models.posterior_groups import complete
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.convergence import diagnostics
@@ -31,6 +32,7 @@ __all__ = [
     "TrustParams",
     "TrustSample",
     "TrustState",
+    "complete",
     "diagnostics",
     "fit",
     "moment_matched",

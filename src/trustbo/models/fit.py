@@ -12,13 +12,15 @@ from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_choice
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.posterior_groups import describe
+from trustbo.models.posterior_groups import complete
 from trustbo.models.posterior_tree import to_datatree
+from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import SAMPLERS, draw_posterior, require_sampler
 from trustbo.models.ticks import require_ticks
 from trustbo.stacking import MissionBatch, stack_missions
 
+_N_PRIOR = 500
 _FIRM_NOISE = (
     "keep the noise away from 0, e.g. Priors(delta_v=numpyro.distributions.TruncatedNormal(0.0, "
     "0.2, low=0.01))"
@@ -37,6 +39,7 @@ def fit(
     n_chains: int = 4,
     n_trajectories: int = 200,
     check: bool = True,
+    whole: bool = True,
 ) -> xr.DataTree:
     """Posterior of the trust model's parameters, and of latent trust, given missions.
 
@@ -58,6 +61,8 @@ def fit(
             contact rates are kept.
         check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
             run does not cure; `False` returns it unchecked.
+        whole: Whether to add latent trust, log-likelihoods and predictions at once; where trust
+            integrates out, `complete` adds them later.
 
     Returns:
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
@@ -85,8 +90,12 @@ def fit(
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
     draws, complaints = draw_posterior(model, sampler, settings, seed, batch, weight, check=check)
-    groups, of = describe(model, draws, missions, seed, n_trajectories)
-    seconds = time.perf_counter() - started
+    prior = draw_sites(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
+    groups = {
+        "posterior": {name: draws.params[name] for name in model.dims},
+        "sample_stats": draws.stats,
+        "prior": {name: values[None] for name, values in prior.items()},
+    }
     posterior = to_datatree(groups, missions, model.dims)
     posterior.attrs |= {
         "model": type(model).__name__,
@@ -94,8 +103,6 @@ def fit(
         **model.options(),
         "sampler": draws.sampler,
         "seed": seed,
-        "seconds": seconds,
-        "log_likelihood_of": of,
         **draws.summary,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
@@ -105,6 +112,11 @@ def fit(
     if weights is not None:
         counted = xr.DataArray(weight[: len(missions)], dims="mission")
         posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
+    if whole or not model.family.integrates_out:
+        posterior = complete(
+            posterior, missions, n_trajectories=n_trajectories, latents=draws.latents
+        )
+    posterior.attrs["seconds"] = time.perf_counter() - started
     if complaints:
         raise PosteriorError(
             f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions, "

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.contact_rate import (
     ContactRate,
     TrustSample,
@@ -199,7 +200,7 @@ class TrustModel(ABC):
         check_params(params, batch.awareness.shape[2], batch.awareness.shape[3])
         require_ticks(self.family, batch)
         leading = params.leading
-        with jax.enable_x64(True):
+        with own_settings():
             key = jax.random.key(seed)
             data = (batch.awareness, batch.contact_rate, batch.n_ticks)
             values = mission_log_likelihood(self.family, self.lag, params.flat(), *data, key)
@@ -234,7 +235,7 @@ class TrustModel(ABC):
             )
         check_params(params, z.shape[2], z.shape[3])
         ticks = broadcast_ticks(self.family, n_ticks, z.shape[:3])
-        with jax.enable_x64(True):
+        with own_settings():
             params64 = type(params)(*(jnp.asarray(p, dtype=float) for p in params))
             drawn = simulate_missions(self.family, self.lag, params64, z, ticks * 1.0, key)
         return TrustSample(*(np.swapaxes(np.asarray(a), 0, 1) for a in drawn))

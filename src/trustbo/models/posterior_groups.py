@@ -1,61 +1,120 @@
 """Groups of a posterior's DataTree: latent trust, likelihoods and predictions under its draws."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
 
-import jax
 import numpy as np
+import xarray as xr
 from jax import random
 
 from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_whole
+from trustbo.models.backend import own_settings
 from trustbo.models.likelihood import kalman_numpy, latent
 from trustbo.models.likelihood.contact_rate import mission_log_likelihood
-from trustbo.models.model import TrustModel
-from trustbo.models.params import Params, assemble_params
-from trustbo.models.prior_predictive import draw_sites
-from trustbo.models.samplers.run import Draws
+from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.params import Params, assemble_params, params_of
+from trustbo.models.posterior_tree import missions_of, to_datatree
 from trustbo.stacking import MissionBatch, stack_missions
 
-Groups = dict[str, dict[str, Any]]
-_N_PRIOR = 500
+_N_TRAJECTORIES = 200
 
 
-def describe(
-    model: TrustModel, draws: Draws, missions: Sequence[Mission], seed: int, n_trajectories: int
-) -> tuple[Groups, str]:
-    """Arrays of every group of a posterior's DataTree.
+class _Law(NamedTuple):
+    """Law of contact rates given parameters, as a posterior's attributes tell it."""
+
+    family: Family
+    lag: float
+    by_numpy: bool
+    """Whether scalar recursions suffice, which NumPy runs faster than they compile."""
+
+    @classmethod
+    def of(cls, posterior: xr.DataTree) -> Self:
+        family = FAMILIES[posterior.attrs["observation"]]
+        apart = posterior.attrs["inter_robot"] == "none"
+        lag = float(posterior.attrs["response"] == "change")
+        return cls(family, lag, family.integrates_out and apart)
+
+
+def complete(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    *,
+    n_trajectories: int = _N_TRAJECTORIES,
+    latents: latent.Latents | None = None,
+) -> xr.DataTree:
+    """Add latent trust, log-likelihoods and predictions to a posterior of parameters alone.
+
+    A campaign keeps the parameters of its posteriors; these groups grow with the number of
+    missions, and are the same whenever they are computed.
 
     Args:
-        model: Trust model.
-        draws: Draws of its parameters.
-        missions: Missions they were drawn given.
-        seed: Seed of latent trust and predictions.
-        n_trajectories: Number of draws to keep trajectories of.
+        posterior: DataTree from `fit`, or one of `Result.posteriors`.
+        missions: Missions that it was fitted to; needed where it holds no data.
+        n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust and
+            predicted contact rates of.
+        latents: Innovations of latent trust, where they were sampled with the parameters.
 
     Returns:
-        Arrays by group and name with leading axes (chain, draw), padding included; and the data
-        that log-likelihoods are of, `"ticks"` or `"contact_rate"`.
+        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive` and
+        `log_likelihood`; itself, if it has them.
+
+    Raises:
+        TrustboError: The posterior holds no data and no missions are given; or its trust does not
+            integrate out, so that only `fit` can tell.
     """
+    if "latent" in posterior.children:
+        return posterior
+    law = _Law.of(posterior)
+    if missions is None:
+        if "constant_data" not in posterior.children:
+            raise TrustboError(
+                "this posterior holds parameters alone: give the missions it was fitted to, such "
+                "as complete(result.posteriors[j], result.missions[: j + 1])."
+            )
+        missions = missions_of(posterior)
+    if not law.family.integrates_out and latents is None:
+        raise TrustboError(
+            f'trust under observation "{law.family.name}" was sampled with the parameters and not '
+            "kept; fit these missions anew."
+        )
+    n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
+    groups, of = _groups(posterior, law, missions, n_trajectories, latents or latent.Latents())
+    added = to_datatree(groups, missions, {})
+    parts = {**posterior.children, **added.children}
+    whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
+    whole.attrs = posterior.attrs | {"log_likelihood_of": of}
+    return whole
+
+
+def _groups(
+    posterior: xr.DataTree,
+    law: _Law,
+    missions: Sequence[Mission],
+    n_trajectories: int,
+    latents: latent.Latents,
+) -> tuple[dict[str, dict[str, Any]], str]:
+    """Arrays by group and name, (chain, draw) leading, and the data of the log-likelihoods."""
     # NumPy needs no padding.
-    batch = stack_missions(missions, pad=not _by_numpy(model))
-    n_chains, n_draws = draws.stats["lp"].shape
-    every = {name: a.reshape(-1, *a.shape[2:]) for name, a in draws.params.items()}
+    batch = stack_missions(missions, pad=not law.by_numpy)
+    n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
-    few = {k: a[:, kept].reshape(-1, *a.shape[2:]) for k, a in draws.params.items()}
-    all_params, few_params = assemble_params(every, model.x0), assemble_params(few, model.x0)
-    if _by_numpy(model):
-        found = _trust_by_numpy(model, all_params, few_params, batch, seed)
+    every = params_of(posterior).flat()
+    index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
+    few = type(every)(*(values[index] for values in every))
+    seed = posterior.attrs["seed"]
+    if law.by_numpy:
+        found = _trust_by_numpy(law, every, few, batch, seed)
     else:
-        found = _trust_compiled(model, all_params, few_params, draws, kept, batch, seed)
-    prior = draw_sites(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
+        found = _trust_compiled(law, every, few, latents, kept, batch, seed)
+    prior = _prior_of(posterior)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
 
-    groups = {
-        "posterior": {name: draws.params[name] for name in model.dims},
-        "sample_stats": draws.stats,
-        "log_likelihood": {"contact_rate": by_chain(found["log_likelihood"])},
+    likelihood, of = _count_ticks(law.family, batch, found["log_likelihood"], len(missions))
+    return {
+        "log_likelihood": {"contact_rate": by_chain(likelihood)},
         "latent": {
             "trust": by_chain(found["trust"]),
             "trust_mean": found["trust_mean"],
@@ -63,84 +122,72 @@ def describe(
             "draw": kept,
         },
         "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
-        "prior_predictive": {"contact_rate": _predict(model, prior, batch, seed + 3)[None]},
-        "prior": {name: values[None] for name, values in prior.items()},
-    }
-    return groups, _count_ticks(model, batch, groups, len(missions))
+        "prior_predictive": {"contact_rate": _predict(law, prior, batch, seed + 3)[None]},
+    }, of
 
 
-def _by_numpy(model: TrustModel) -> bool:
-    """Whether scalar recursions suffice, which NumPy runs faster than they compile."""
-    return model.family.integrates_out and model.robots_are_apart
+def _prior_of(posterior: xr.DataTree) -> Params:
+    sites = {str(n): a.values[0] for n, a in posterior["prior"].data_vars.items()}
+    return assemble_params(sites, {n: posterior.attrs[n] for n in ("x0_mean", "x0_sd")}).flat()
 
 
 def _trust_by_numpy(
-    model: TrustModel,
-    every: Params,
-    few: Params,
-    batch: MissionBatch,
-    seed: int,
+    law: _Law, every: Params, few: Params, batch: MissionBatch, seed: int
 ) -> dict[str, np.ndarray]:
     """Latent trust, log-likelihood and predictions of robots apart, without compiling."""
     rng = np.random.default_rng([seed, 1])
-    summary = kalman_numpy.summarize(every.flat(), model.lag, batch)
+    summary = kalman_numpy.summarize(every, law.lag, batch)
     return {
         "log_likelihood": summary.log_likelihood,
-        "trust": kalman_numpy.sample(few.flat(), model.lag, batch, rng),
+        "trust": kalman_numpy.sample(few, law.lag, batch, rng),
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
-        "predicted": kalman_numpy.simulate(few.flat(), model.lag, batch.awareness, rng),
+        "predicted": kalman_numpy.simulate(few, law.lag, batch.awareness, rng),
     }
 
 
 def _trust_compiled(
-    model: TrustModel,
+    law: _Law,
     every: Params,
     few: Params,
-    draws: Draws,
+    latents: latent.Latents,
     kept: np.ndarray,
     batch: MissionBatch,
     seed: int,
 ) -> dict[str, np.ndarray]:
     """The same for coupled robots and families that do not integrate out."""
-    law = (model.family, model.lag)
-    every, few = every.flat(), few.flat()
-    latents = few_latents = draws.latents
-    if (innovations := draws.latents.innovations) is not None:
+    few_latents = latents
+    if (innovations := latents.innovations) is not None:
         shape = (-1, *innovations.shape[2:])
         latents = latents._replace(innovations=innovations.reshape(shape))
         few_latents = latents._replace(innovations=innovations[:, kept].reshape(shape))
-    with jax.enable_x64(True):
+    with own_settings():
         keys = random.split(random.fold_in(random.key(seed), 1), 3)
-        moments = latent.trust_moments(*law, every, latents, batch)
+        moments = latent.trust_moments(law.family, law.lag, every, latents, batch)
         found = {
-            "log_likelihood": mission_log_likelihood(*law, every, *batch, keys[0]),
-            "trust": latent.trust_draws(*law, few, few_latents, batch, keys[1]),
+            "log_likelihood": mission_log_likelihood(law.family, law.lag, every, *batch, keys[0]),
+            "trust": latent.trust_draws(law.family, law.lag, few, few_latents, batch, keys[1]),
             "trust_mean": moments.mean,
             "trust_sd": moments.sd,
-            "predicted": latent.predictive(*law, few, batch, keys[2]),
+            "predicted": latent.predictive(law.family, law.lag, few, batch, keys[2]),
         }
         return {name: np.asarray(array) for name, array in found.items()}
 
 
-def _predict(
-    model: TrustModel, draws: Mapping[str, np.ndarray], batch: MissionBatch, seed: int
-) -> np.ndarray:
+def _predict(law: _Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
     """Contact rates of replicated missions, (draw, mission, bound, robot)."""
-    params = assemble_params(draws, model.x0).flat()
-    if _by_numpy(model):
+    if law.by_numpy:
         rng = np.random.default_rng(seed)
-        return kalman_numpy.simulate(params, model.lag, batch.awareness, rng)
-    with jax.enable_x64(True):
-        key = random.key(seed)
-        return np.asarray(latent.predictive(model.family, model.lag, params, batch, key))
+        return kalman_numpy.simulate(params, law.lag, batch.awareness, rng)
+    with own_settings():
+        return np.asarray(latent.predictive(law.family, law.lag, params, batch, random.key(seed)))
 
 
-def _count_ticks(model: TrustModel, batch: MissionBatch, groups: Groups, n_missions: int) -> str:
-    """Turn log-likelihoods into those of counts of ticks, if these are known; name their data."""
-    shift = model.family.log_resolution(batch.contact_rate, batch.n_ticks).sum((1, 2))
+def _count_ticks(
+    family: Family, batch: MissionBatch, likelihood: np.ndarray, n_missions: int
+) -> tuple[np.ndarray, str]:
+    """Log-likelihoods, of counts of ticks where these are known, and the name of their data."""
+    shift = family.log_resolution(batch.contact_rate, batch.n_ticks).sum((1, 2))
     if np.isnan(shift[:n_missions]).any():
-        return "contact_rate"
-    rates = groups["log_likelihood"]["contact_rate"]
-    groups["log_likelihood"]["contact_rate"] = rates + shift
-    return "ticks"
+        return likelihood, "contact_rate"
+    return likelihood + shift, "ticks"

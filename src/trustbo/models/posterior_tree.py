@@ -87,6 +87,27 @@ def _data_groups(
     return rates, constant
 
 
+def missions_of(posterior: xr.DataTree) -> list[Mission]:
+    """Missions that a posterior holds the data of; the first cell of a path is not among these."""
+    data = posterior["constant_data"].to_dataset()
+    data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
+    names = {f"{dim}s": [str(name) for name in data[dim].values] for dim in ("robot", "feature")}
+    found = []
+    for j in range(data.sizes["mission"]):
+        one = data.isel(mission=j)
+        one = one.isel(bound=one["row"].values >= 0)
+        cells = list(zip(one["row"].values, one["col"].values, strict=True))
+        arrays = {
+            name: one[name].values for name in ("awareness", "contact_rate", "duration", "n_ticks")
+        }
+        found.append(
+            Mission.from_arrays(
+                [cells[0], *cells], **arrays, status=str(one["status"].values), **names
+            )
+        )
+    return found
+
+
 def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:
     """Label such as "beta[visibility]", name, index and draws (draw,) of every parameter."""
     for name, array in sites.data_vars.items():

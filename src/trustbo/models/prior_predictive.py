@@ -11,6 +11,7 @@ from numpyro import handlers
 
 from trustbo.data import default_features
 from trustbo.errors import ShapeError, require_whole
+from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.samplers.priors_numpy import draw
@@ -48,7 +49,7 @@ def prior_predictive(
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
     ticks = broadcast_ticks(model.family, n_ticks, z.shape[:3])
     require_whole("n_draws", n_draws, 1)
-    with jax.enable_x64(True):
+    with own_settings():
         keys = jax.random.split(jax.random.key(seed), n_draws)
         drawn = {k: np.asarray(v)[None] for k, v in prior_draws(model, z, ticks, keys).items()}
     dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
@@ -94,7 +95,7 @@ def draw_sites(
         rng, priors = np.random.default_rng(seed), model.priors
         sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
         return {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
-    with jax.enable_x64(True):
+    with own_settings():
         keys = random.split(random.key(seed), n_draws)
         drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)
         return {name: np.asarray(drawn[name]) for name in model.dims}

@@ -11,6 +11,7 @@ from numpyro.distributions import Distribution, constraints
 
 from trustbo import zheng2023
 from trustbo.errors import TrustboError, require_positive
+from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.families import FAMILIES
 
 _SCALES = ("delta_w", "delta_v", "tau")
@@ -56,7 +57,7 @@ class Priors:
     x0_sd: float = 0.5
 
     def __post_init__(self) -> None:
-        with jax.enable_x64(True):
+        with own_settings():
             defaults = {
                 "beta0": dist.Beta(2.0, 2.0),
                 "beta": dist.Normal(0.0, 1.0),

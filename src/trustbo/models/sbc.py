@@ -4,7 +4,6 @@ import json
 from os import PathLike
 from pathlib import Path
 
-import jax
 import numpy as np
 import xarray as xr
 from jax import random
@@ -13,6 +12,7 @@ from tqdm import tqdm
 
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import write_text
+from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.prior_predictive import prior_draws
@@ -78,7 +78,7 @@ def sbc(
     for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
         if j < len(ranks):
             continue
-        with jax.enable_x64(True):
+        with own_settings():
             keys = random.fold_in(random.key(seed), j)[None]
             drawn = prior_draws(model, awareness, ticks, keys)
             simulated = {name: np.asarray(values)[0] for name, values in drawn.items()}

@@ -3,10 +3,10 @@
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from trustbo.errors import require_whole
+from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.gram import Statistics
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, TrustParams, assemble_params
@@ -69,7 +69,7 @@ def moment_matched(params: TrustParams, priors: Priors) -> Priors:
         priors: Priors of that posterior; `x0_mean` and others that are not learned stay.
     """
     flat = params.flat()
-    with jax.enable_x64(True):
+    with own_settings():
         return replace(
             priors,
             beta0=match_moments(flat.beta0, priors.beta0),

@@ -6,6 +6,8 @@ import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 from scipy import special
 
+from trustbo.models.backend import own_settings
+
 
 def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
     """Log density, in closed form for the usual priors, by numpyro for others."""
@@ -19,7 +21,7 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
     if isinstance(prior, dist.LogNormal):
         log_x = np.log(x)
         return _normal(log_x, number(prior, "loc"), number(prior, "scale")) - log_x
-    with jax.enable_x64(True):
+    with own_settings():
         return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
 
 
@@ -35,7 +37,7 @@ def draw(prior: Distribution, shape: tuple[int, ...], rng: np.random.Generator) 
         return rng.beta(numbers(prior, "concentration1"), numbers(prior, "concentration0"), shape)
     if isinstance(prior, dist.Normal):
         return rng.normal(numbers(prior, "loc"), numbers(prior, "scale"), shape)
-    with jax.enable_x64(True):
+    with own_settings():
         key = jax.random.key(int(rng.integers(1 << 31)))
         return np.asarray(prior.expand(shape).sample(key), dtype=float)
 

@@ -4,11 +4,11 @@ import warnings
 from typing import NamedTuple
 
 import arviz as az
-import jax
 import numpy as np
 from jax import Array, random
 
 from trustbo.errors import TrustboError
+from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.gram_jax import spectrum
 from trustbo.models.likelihood.latent import Latents
 from trustbo.models.model import TrustModel
@@ -57,7 +57,7 @@ def draw_posterior(
         return exact, []
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
     data = nuts_data(model, batch, weight)
-    with jax.enable_x64(True):
+    with own_settings():
         return _sample_nuts(model, settings, random.key(seed), data, check=check)
 
 

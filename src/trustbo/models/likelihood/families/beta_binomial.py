@@ -14,6 +14,7 @@ import numpyro.distributions as dist
 from jax import Array, lax, random
 from jax.scipy.special import gammaln
 
+from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.linearised import Data, Linearised
 
@@ -29,7 +30,7 @@ class BetaBinomial(Linearised):
 
     def priors(self) -> dict[str, Any]:
         """See `Family.priors`: trust is a logit, so all are wider."""
-        with jax.enable_x64(True):
+        with own_settings():
             return {
                 "beta": dist.Normal(0.0, 2.0),
                 "b": dist.Normal(0.0, 1.0),

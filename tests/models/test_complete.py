@@ -1,0 +1,63 @@
+"""`complete`: what a posterior of parameters alone lacks, the same whenever it is computed."""
+
+import jax
+import numpy as np
+import pytest
+import xarray as xr
+from models.conftest import simulate_missions
+
+from trustbo.errors import TrustboError
+from trustbo.models import CoupledTrust, PooledTrust, complete, fit
+from trustbo.models.prior_predictive import sample_prior
+
+
+@pytest.fixture(scope="module")
+def missions():
+    return simulate_missions(seed=2, n_missions=3)
+
+
+def same(one, other):
+    assert set(one.children) == set(other.children)
+    for group in one.children:
+        xr.testing.assert_identical(one[group].to_dataset(), other[group].to_dataset())
+
+
+@pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust(inter_robot="none")])
+def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
+    whole = fit(missions, model, "exact", seed=4, n_draws=250)
+    bare = fit(missions, model, "exact", seed=4, n_draws=250, whole=False)
+    assert "latent" not in bare.children
+    assert complete(whole) is whole
+    same(complete(bare), whole)
+    assert complete(bare).attrs.keys() == whole.attrs.keys()
+    bare.to_netcdf(tmp_path / "bare.nc")
+    with xr.open_datatree(tmp_path / "bare.nc") as read:
+        same(complete(read.load()), whole)
+    # As a campaign keeps its earlier ones.
+    alone = xr.DataTree.from_dict(
+        {name: bare[name].to_dataset() for name in ("posterior", "sample_stats", "prior")}
+    )
+    alone.attrs = bare.attrs
+    with pytest.raises(TrustboError, match=r"give the missions it was fitted to, such as complete"):
+        complete(alone)
+    xr.testing.assert_identical(
+        complete(alone, missions)["latent"].to_dataset(), whole["latent"].to_dataset()
+    )
+
+
+def test_trust_that_was_sampled_cannot_be_added_later(missions):
+    bare = fit(missions, sampler="exact", n_draws=100, whole=False)
+    bare.attrs["observation"] = "censored"
+    with pytest.raises(TrustboError, match='under observation "censored" was sampled with'):
+        complete(bare)
+
+
+def test_the_caller_s_jax_flags_do_not_matter(missions):
+    plain = fit(missions, sampler="exact", n_draws=100)
+    shared = CoupledTrust()  # its prior is drawn by JAX
+    drawn = sample_prior(shared, 2, 5, seed=1, n_robots=3)
+    with jax.enable_x64(True), jax.default_prng_impl("rbg"), jax.threefry_partitionable(False):
+        same(fit(missions, sampler="exact", n_draws=100), plain)
+        again = sample_prior(shared, 2, 5, seed=1, n_robots=3)
+    for one, other in zip(drawn, again, strict=True):
+        np.testing.assert_array_equal(one, other)
