@@ -11,7 +11,7 @@ from .campaign import (
     resume,
 )
 from .data import Bound, Mission, Robot, Team
-from .errors import PosteriorError, ShapeError, TerrainError, TrustboError
+from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
 from .planning import NoPathError
 from .workspace import Workspace
 
@@ -19,6 +19,7 @@ __all__ = [
     "Bound",
     "Campaign",
     "CampaignOptions",
+    "DamagedFileError",
     "Mission",
     "NoPathError",
     "PosteriorError",

@@ -1,7 +1,7 @@
 """Robots, teams, and the missions they run, bound by bound."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, Self, get_args
 
@@ -299,6 +299,35 @@ class Mission:
             for k in range(len(y))
         )
         return cls(cells, bounds, status, tuple(features), tuple(robots))
+
+    def in_order(self, robots: Sequence[str], features: Sequence[str]) -> Self:
+        """The mission with its robots and features in the order of these names.
+
+        Raises:
+            ShapeError: It has other robots or features.
+        """
+        if (tuple(robots), tuple(features)) == (self.robots, self.features):
+            return self
+        if (sorted(robots), sorted(features)) != (sorted(self.robots), sorted(self.features)):
+            raise ShapeError(
+                f"the mission has robots {self.robots} and features {self.features}; they cannot "
+                f"be put in the order {tuple(robots)} and {tuple(features)}."
+            )
+        i, m = (
+            [own.index(n) for n in names]
+            for own, names in ((self.robots, robots), (self.features, features))
+        )
+        bounds = []
+        for b in self.bounds:
+            optional = {
+                "poses": None if b.poses is None else b.poses[:, [0, *(1 + j for j in i)]],
+                "contact": None if b.contact is None else b.contact[:, i],
+                "states": None if b.states is None else b.states[:, i],
+            }
+            rates = {n: getattr(b, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
+            bounds.append(replace(b, awareness=b.awareness[np.ix_(i, m)], **rates, **optional))
+        names = {"robots": tuple(robots), "features": tuple(features)}
+        return replace(self, bounds=tuple(bounds), **names)
 
     # Stacked once: every refit reads these of every mission.
 

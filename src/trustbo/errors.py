@@ -17,16 +17,21 @@ class TerrainError(TrustboError):
     """A raster that cannot serve as terrain."""
 
 
+class DamagedFileError(TrustboError):
+    """A file of a campaign or a result that is missing, was changed, or cannot be read."""
+
+
 class PosteriorError(TrustboError):
     """A posterior with diagnostics beyond their limits.
 
     Attributes:
         posterior: Refused posterior (ArviZ DataTree), for inspection.
+        reason: Message without the remedy.
     """
 
-    def __init__(self, message: str, posterior: object = None) -> None:
-        super().__init__(message)
-        self.posterior = posterior
+    def __init__(self, reason: str, posterior: object = None, remedy: str = "") -> None:
+        super().__init__(f"{reason} {remedy}".rstrip())
+        self.posterior, self.reason = posterior, reason.rstrip(".")
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:

@@ -1,28 +1,40 @@
-"""Atomic writes, and errors for names of files that cannot be written or read."""
+"""Atomic writes with checksums, and errors for files that cannot be written or read."""
 
+import errno
+import hashlib
 import json
 import os
+import re
+import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trustbo.errors import TrustboError
+from trustbo.errors import DamagedFileError, TrustboError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_LEAST_FREE = 1 << 20
+"""Bytes; libraries that write files by themselves do not say why they failed."""
 
 
 def write_file(path: str | PathLike[str], write: Callable[[Path], object]) -> None:
     """Write a file atomically: to a temporary name, which is then renamed.
 
-    Ctrl-C takes effect after the write, a second Ctrl-C at once.
+    Ctrl-C and SIGTERM take effect after the write, a second one at once.
 
     Args:
         path: File to write; its folder is made if it does not exist.
         write: Function that writes to the path it is given, which has the same suffix.
+
+    Raises:
+        TrustboError: The disk is full; a file of that name is as it was.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -31,32 +43,112 @@ def write_file(path: str | PathLike[str], write: Callable[[Path], object]) -> No
         with _defer_interrupt():
             write(temporary)
             os.replace(temporary, path)
+    except Exception as error:
+        full = isinstance(error, OSError) and error.errno in _FULL
+        if full or shutil.disk_usage(path.parent).free < _LEAST_FREE:
+            raise TrustboError(
+                f"the disk is full: {str(path)!r} was not written. What was there before is as it "
+                "was; make room and go on, or run the same again."
+            ) from error
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def _defer_interrupt() -> Iterator[None]:
-    """Defer the first Ctrl-C; during a write, it can leave the netCDF library locked for ever."""
-    then = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(then):
-        yield  # Python delivers it to another thread, or it raises nothing
+    """Defer the first Ctrl-C or SIGTERM: it can leave the netCDF library locked for ever."""
+    handlers = {int(n): signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    before = {n: then for n, then in handlers.items() if callable(then)}  # others raise nothing
+    if threading.current_thread() is not threading.main_thread():
+        yield  # Python delivers signals to the main thread
         return
-    presses = 0
+    seen: list[int] = []
 
     def count(number, frame) -> None:
-        nonlocal presses
-        presses += 1
-        if presses > 1:
-            then(number, frame)
+        seen.append(number)
+        if len(seen) > 1:
+            before[number](number, frame)
 
-    signal.signal(signal.SIGINT, count)
+    for number in before:
+        signal.signal(number, count)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, then)
-        if presses == 1:
-            then(signal.SIGINT, None)
+        for number, then in before.items():
+            signal.signal(number, then)
+        if len(seen) == 1:
+            before[seen[0]](seen[0], None)
+
+
+def write_checked(path: str | PathLike[str], content: bytes) -> None:
+    """Write a file atomically and durably, and its SHA-256 to a hidden file beside it.
+
+    The hidden file, which is written first, also keeps the sum of the file before: whichever of
+    the two a process dies between, the pair agrees.
+    """
+    path, digest = Path(path), hashlib.sha256(content).hexdigest()
+    before = _sums(path)[:1] if path.exists() else []
+    _write_bytes(_sum_file(path), "\n".join([digest, *before]).encode())
+    _write_bytes(path, content)
+
+
+def read_checked(path: str | PathLike[str]) -> bytes:
+    """Read a file of `write_checked`, or any other file, which then has no sum to be checked.
+
+    Raises:
+        DamagedFileError: There is no such file, or its bytes are not those that were written.
+    """
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise DamagedFileError(f"{str(path)!r} is missing.") from None
+    except OSError as error:
+        raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
+    sums = _sums(path)
+    if sums and hashlib.sha256(content).hexdigest() not in sums:
+        raise DamagedFileError(
+            f"{str(path)!r} is damaged: its bytes are not those that were written."
+        )
+    return content
+
+
+def checksum(path: Path) -> str | None:
+    """Return the sum that `write_checked` kept of a file; None where there is none."""
+    return next(iter(_sums(path)), None)
+
+
+def remove_checked(path: Path) -> None:
+    """Remove a file and its sum, if they are there."""
+    path.unlink(missing_ok=True)
+    _sum_file(path).unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files that a process which died left; no other may be at work there."""
+    for file in folder.rglob(".*"):
+        if re.fullmatch(r"\..+\.\d+(\.\w+)?", file.name):
+            file.unlink(missing_ok=True)
+
+
+def _write_bytes(path: Path, content: bytes) -> None:
+    def write(file: Path) -> None:
+        with file.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+
+    write_file(path, write)
+
+
+def _sum_file(path: Path) -> Path:
+    return path.with_name(f".{path.name}.sha256")
+
+
+def _sums(path: Path) -> list[str]:
+    file = _sum_file(path)
+    return file.read_text().split() if file.exists() else []
 
 
 def write_text(path: str | PathLike[str], text: str) -> None:
@@ -68,9 +160,15 @@ def to_json(record: object) -> str:
     """Return the JSON of a record; NumPy numbers and arrays as lists, other objects as text."""
 
     def plain(value: Any) -> object:
-        return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        if is_dataclass(value) and not isinstance(value, type):
+            return {"type": type(value).__name__, **asdict(value)}
+        if type(value).__str__ is object.__str__ and type(value).__repr__ is object.__repr__:
+            return type(value).__name__  # else it would be an address
+        return str(value)
 
-    return json.dumps(record, indent=2, default=plain)
+    return json.dumps(record, default=plain)
 
 
 def require_folder(directory: str | PathLike[str]) -> Path:

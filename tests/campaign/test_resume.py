@@ -37,9 +37,13 @@ def same(a, b):
     """Posteriors, paths and history, but for the seconds."""
     assert len(a.missions) == len(b.missions)
     for one, other in zip(a.posteriors, b.posteriors, strict=True):
-        for group in ("posterior", "log_likelihood"):
-            for name in one[group].data_vars:
-                np.testing.assert_array_equal(one[group][name].values, other[group][name].values)
+        for name in one["posterior"].data_vars:
+            np.testing.assert_array_equal(
+                one["posterior"][name].values, other["posterior"][name].values
+            )
+    for group in ("log_likelihood", "latent"):
+        for name, array in a.posterior[group].to_dataset().items():
+            np.testing.assert_array_equal(array.values, b.posterior[group][name].values)
     assert a.path == b.path
     assert a.value == b.value
     np.testing.assert_array_equal(a.trust_map.values, b.trust_map.values)
@@ -157,34 +161,13 @@ def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, tmp_path, mo
         patch.setattr("trustbo.campaign.learning.fit", die)
         with pytest.raises(KeyboardInterrupt):
             campaign.tell(mission)
-    assert campaign.pending is mission
     campaign.close()
     again = tb.Campaign.load(tmp_path / "half")
     assert len(again.missions) == 2
-    assert again.pending is None
+    assert again.waiting == []
     np.testing.assert_array_equal(
         again.posterior["posterior"]["beta"].values, whole.posterior["posterior"]["beta"].values
     )
-
-
-def test_a_refused_posterior_leaves_its_mission_pending(workspace, tmp_path, monkeypatch):
-    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", directory=tmp_path)
-    mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
-
-    def refuse(*args, **kwargs):
-        raise tb.PosteriorError("R-hat of beta0 is 1.5")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("trustbo.campaign.learning.fit", refuse)
-        with pytest.raises(tb.PosteriorError):
-            campaign.tell(mission)
-        campaign.close()
-        with pytest.warns(UserWarning, match="the last mission is pending: R-hat of beta0"):
-            again = tb.Campaign.load(tmp_path)
-    assert again.missions == []
-    again.tell(again.pending)
-    assert again.pending is None
-    assert len(again.missions) == 1
 
 
 def test_a_folder_is_for_one_campaign_at_a_time(workspace, tmp_path):
@@ -267,9 +250,10 @@ def test_nothing_half_written_is_read(workspace, tmp_path):
     run(workspace, tmp_path, 3)
     state = json.loads((tmp_path / "campaign.json").read_text())
     state["n_missions"] = 2
-    for name in ("plans", "rows"):
+    for name in ("plans", "rows", "posterior_after"):
         state[name] = state[name][:2]
     (tmp_path / "campaign.json").write_text(json.dumps(state))
+    (tmp_path / ".campaign.json.sha256").unlink()  # it was changed by hand, and that is noticed
     whole = run(workspace, tmp_path / "whole", 3)
     simulator = ModelSimulator(workspace, blind=True)
     again = tb.resume(tmp_path, simulator=simulator, n_iterations=3, progress=False)
@@ -288,7 +272,7 @@ def test_failing_keeps_the_bounds_there_are(workspace):
     assert len(paths) > 1  # another try may be another path
     part = ModelSimulator(workspace, fail_at=2).run(campaign.ask().path, seed=0)
     posterior = campaign.fail("tipped", replace(part))
-    assert posterior is campaign.posterior
+    np.testing.assert_array_equal(posterior["posterior"]["b"], campaign.posterior["posterior"]["b"])
     assert len(campaign.missions[0].bounds) == 2
     assert campaign.log.failures[-1] == (1, "tipped")
 

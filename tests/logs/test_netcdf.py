@@ -1,20 +1,99 @@
-"""Missions as trees: files of version 0.1 are still read."""
+"""Missions in netCDF files: as they were, also those of version 0.1; damage is an error."""
+
+from dataclasses import replace
 
 import numpy as np
+import pytest
 import xarray as xr
 
+import trustbo as tb
 from trustbo.data import Mission
-from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, read_tree
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.logs import read_missions, write_missions
+from trustbo.logs.netcdf import read_tree, write_tree
 
 
-def test_the_variable_exposure_of_version_0_1_is_read_as_n_ticks(tmp_path):
-    n_ticks = np.array([[7, 7], [3, 3]])
-    path = [(2, 0), (1, 1), (0, 2)]
-    mission = Mission.from_arrays(path, np.full((2, 2, 1), 0.5), 1.0 / n_ticks, n_ticks=n_ticks)
-    tree = missions_to_tree([mission])
-    table = tree["missions"].to_dataset().rename(n_ticks="exposure")
-    old = xr.DataTree.from_dict({"missions": table, "ticks": tree["ticks"].to_dataset()})
-    old.to_netcdf(tmp_path / "missions.nc")
-    (read,) = missions_from_tree(read_tree(tmp_path / "missions.nc"))
-    np.testing.assert_array_equal(read.n_ticks, n_ticks)
-    np.testing.assert_array_equal(read.contact_rate, mission.contact_rate)
+@pytest.fixture(scope="module")
+def driven():
+    """Two missions with ticks, the first with states too, and one of a log without."""
+    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3), tb.Team(n_robots=2))
+    simulators = [
+        tb.simulation.KinematicSimulator(workspace, record_states=keep) for keep in (True, False)
+    ]
+    missions = [s.run([(2, 0), (1, 1)], seed=0) for s in simulators]
+    log = Mission.from_arrays([(2, 0), (1, 1)], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
+    return [*missions, log]
+
+
+def test_ticks_and_states_come_back_as_they_were(driven, tmp_path):
+    write_missions(tmp_path / "missions.nc", driven)
+    assert sorted(f.name for f in (tmp_path / "ticks").glob("*.nc")) == ["0001.nc", "0002.nc"]
+    with xr.open_dataset(tmp_path / "ticks" / "0001.nc") as ticks:
+        assert list(ticks["state"].values) == list(tb.logs.STATES)
+    again = read_missions(tmp_path / "missions.nc")
+    for one, other in zip(again, driven, strict=True):
+        a, b = one.bounds[0], other.bounds[0]
+        for name in ("awareness", "contact_rate", "duration", "n_ticks"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert (a.poses is None) == (b.poses is None)
+        assert (a.states is None) == (b.states is None)
+    for name in ("poses", "contact", "states"):
+        np.testing.assert_array_equal(
+            getattr(again[0].bounds[0], name), getattr(driven[0].bounds[0], name)
+        )
+    # The ticks of those before are not written again; a mission without ticks leaves none.
+    write_missions(tmp_path / "missions.nc", [driven[0], driven[2]], since=1)
+    assert [f.name for f in (tmp_path / "ticks").glob("*.nc")] == ["0001.nc"]
+    (tmp_path / "ticks" / "0001.nc").unlink()  # the rates are known without
+    assert read_missions(tmp_path / "missions.nc")[0].bounds[0].poses is None
+
+
+def test_states_of_another_number_of_ticks_are_refused(driven, tmp_path):
+    short = replace(driven[0].bounds[0], states=driven[0].bounds[0].states[:3])
+    with pytest.raises(TrustboError, match=r"bound 1: states must be .*\(3, 2, 5\)"):
+        write_missions(tmp_path / "missions.nc", [replace(driven[0], bounds=(short,))])
+    assert not list(tmp_path.rglob("*.nc"))
+
+
+def test_a_file_of_version_0_1_is_read(driven, tmp_path):
+    """Ticks of all missions in a group of the same file, and `n_ticks` called `exposure`."""
+    write_missions(tmp_path / "missions.nc", driven)
+    table = read_tree(tmp_path / "missions.nc")["missions"].to_dataset()
+    ticks = [
+        read_tree(tmp_path / "ticks" / f"000{j}.nc")
+        .to_dataset()
+        .drop_vars("states", errors="ignore")
+        for j in (1, 2)
+    ]
+    ticks = [t.assign(mission=("tick", np.full(t.sizes["tick"], j))) for j, t in enumerate(ticks)]
+    old = {
+        "missions": table.rename(n_ticks="exposure"),
+        "ticks": xr.concat([t.drop_vars("state", errors="ignore") for t in ticks], dim="tick"),
+    }
+    xr.DataTree.from_dict(old).to_netcdf(tmp_path / "old.nc")
+    for one, other in zip(read_missions(tmp_path / "old.nc"), driven, strict=True):
+        np.testing.assert_array_equal(one.n_ticks, other.n_ticks)
+        np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+    np.testing.assert_array_equal(
+        read_missions(tmp_path / "old.nc")[1].bounds[0].poses, driven[1].bounds[0].poses
+    )
+
+
+def test_damage_is_named_with_its_file(driven, tmp_path):
+    file = tmp_path / "missions.nc"
+    with pytest.raises(DamagedFileError, match=r"missions.nc' is missing"):
+        read_missions(file)
+    write_missions(file, driven)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1  # one bit
+    file.write_bytes(content)
+    with pytest.raises(DamagedFileError, match=r"missions.nc' is damaged: its bytes are not those"):
+        read_missions(file)
+    other = tmp_path / "other.nc"
+    other.write_bytes(content[:1000])  # written by someone else: it has no checksum
+    with pytest.raises(DamagedFileError, match=r"other.nc' is damaged, or no netCDF"):
+        read_missions(other)
+    write_tree(other, xr.DataTree(xr.Dataset({"x": 1})))
+    with pytest.raises(DamagedFileError, match=r"other.nc' holds no missions: it lacks 'Could not"):
+        read_missions(other)

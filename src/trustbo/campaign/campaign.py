@@ -9,19 +9,31 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
+import jax
 import numpy as np
 import pandas as pd
 import xarray as xr
 from jax import random
 
 from trustbo.campaign.folder import CampaignFolder
-from trustbo.campaign.history import Entry, History
+from trustbo.campaign.history import (
+    LEARNED,
+    SET_ASIDE,
+    TOLD,
+    Entry,
+    History,
+    Posterior,
+    whole_posterior,
+)
+from trustbo.campaign.learning import CannotLearnError
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, again
 from trustbo.campaign.result import Result
+from trustbo.campaign.told import never_to_be_learned, require_extra, require_mission, require_new
 from trustbo.data import Cell, Mission
-from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_whole
+from trustbo.errors import TrustboError, require_whole
 from trustbo.models import TrustModel, diagnostics, params_of
 from trustbo.models.params import Params
+from trustbo.models.posterior_groups import parameters_alone
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -38,16 +50,16 @@ _N_KEPT = 200
 class Campaign:
     """Learns from missions and proposes the next path.
 
-    With a `directory`, every mission is on disk before anything is learned from it, and everything
-    before the next is asked for: `Campaign.load` goes on where the process ended, with identical
-    results.
+    A mission is planned by `ask`, then told, then learned from. One that cannot be learned from yet
+    stays told and is tried with every later one; one that never can be is set aside. With a
+    `directory`, every mission is on disk before anything is learned from it, and everything before
+    the next is asked for: `Campaign.load` goes on where the process ended, with identical results.
 
     Attributes:
         workspace: Workspace of the paths.
         options: Options of the campaign.
         planner: Planner on the workspace's awareness map; see `planner_now`.
-        log: Missions as measured, plans, posteriors and failures (a `History`).
-        pending: Mission that was told and not learned from; see `tell`.
+        log: Missions as measured, their states, plans, posteriors and failures (a `History`).
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
             first mission, one from the prior.
         awareness: Belief about the awareness; None where the map is trusted.
@@ -93,15 +105,16 @@ class Campaign:
         self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self._learning = self.options.learning(model, sampler)
         self.model, self.log = self._learning.model, History()
-        self.pending: Mission | None = None
         self.awareness = self.options.belief(workspace)
         self._plan: Plan | None = None
         self._believed: Planner | None = None
+        self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
         sizes = workspace.awareness.sizes
-        self.belief: Params = self._learning.prior_belief(
+        self._prior: Params = self._learning.prior_belief(
             self.options.initial, sizes["robot"], sizes["feature"], self.seed_of("prior")
         )
+        self.belief = self._prior
         own_policy = not isinstance(policy, str)
         named = {
             "start": list(self.planner.start),
@@ -129,23 +142,33 @@ class Campaign:
 
     @property
     def missions(self) -> list[Mission]:
-        """Missions learned from so far, their awareness filled in."""
+        """Missions told so far, their awareness filled in."""
         return self.log.missions
 
     @property
-    def posteriors(self) -> list[xr.DataTree]:
-        """Posterior after each mission."""
+    def waiting(self) -> list[Mission]:
+        """Missions that were told, and are to be learned from with a later one."""
+        return [self.log.entries[j].measured for j in self.log.numbers(TOLD)]
+
+    @property
+    def posteriors(self) -> Sequence[xr.DataTree]:
+        """Posterior of the parameters after each mission; None where nothing was learned yet."""
         return self.log.posteriors
 
     @property
     def plans(self) -> list[Plan]:
         """Plan of each mission."""
-        return self.log.plans
+        return [entry.plan for entry in self.log.entries]
 
     @property
     def posterior(self) -> xr.DataTree | None:
-        """Posterior after the last mission; None before the first."""
-        return self.log.entries[-1].posterior if self.log.entries else None
+        """Posterior after the last mission, with all groups; None before anything is learned."""
+        last = self.log.last
+        if last is None:
+            return None
+        if self._whole is None or self._whole[0] is not last:
+            self._whole = last, whole_posterior(last(), self.missions)
+        return self._whole[1]
 
     # --- ask and tell ---
 
@@ -157,8 +180,10 @@ class Campaign:
         """
         if self._plan is None:
             started = time.perf_counter()
-            key, planner = random.key(self.seed_of("policy")), self.planner_now()
-            plan = self._policy(key, self.belief, planner)
+            planner = self.planner_now()
+            with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
+                key = random.key(self.seed_of("policy"), impl="threefry2x32")
+                plan = self._policy(key, self.belief, planner)
             name = self.settings["policy"]
             if not isinstance(plan, Plan):
                 raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")
@@ -167,6 +192,7 @@ class Campaign:
             except TrustboError as error:
                 raise TrustboError(f"the policy {name!r}: {error}") from None
             self._plan = self._accept(plan, started)
+            self._write_state()
         return self._plan
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
@@ -184,66 +210,147 @@ class Campaign:
         self._write_state()
         return self._plan
 
-    def tell(self, mission: Mission, **extra: float) -> xr.DataTree:
-        """Learn from a mission.
+    def tell(
+        self, mission: Mission, *, other_path: bool = False, again: bool = False, **extra: float
+    ) -> xr.DataTree | None:
+        """Take a mission, keep it, and learn from it.
 
         Awareness that the mission did not measure (NaN) is taken from the map, or from the belief.
-        The mission may have followed another path than the one asked for.
+        Robots and features may be in any order of their names.
 
         Args:
             mission: Mission as measured, whether or not the goal was reached.
+            other_path: Whether it is known to have followed another path than the one asked for.
+            again: Whether a mission equal to an earlier one in every number is another one.
             **extra: More numbers for its row of the history, such as its regret.
 
         Returns:
-            Posterior given all missions so far.
+            Posterior of the parameters given all missions that can be learned from; with a warning
+            the last one, or None, where this mission cannot be learned from yet, or never.
 
         Raises:
             ShapeError: Robots or features differ from the workspace's.
-            TrustboError: The path leaves the grid, or `fit` refuses the mission.
-            PosteriorError: The posterior's diagnostics are bad. The mission is then not among
-                those learned from, but kept as `pending`, and on disk, until the next is told.
+            TrustboError: The path leaves the grid, jumps or is not the one asked for; the mission
+                was told before; or an extra is no number. Nothing is kept then.
         """
-        _require_mission_of(self.workspace, mission)
+        plan = self.ask()
+        mission = require_mission(self.workspace, mission, plan.path, other_path=other_path)
+        if not again:
+            told = (e.measured for e in self.log.entries if e.state != SET_ASIDE)
+            require_new(mission, list(told))
+        self._take(mission, require_extra(extra))
+        last = self.log.last
+        return None if last is None else last()
+
+    def set_aside(self, reason: str, mission: int | None = None) -> xr.DataTree | None:
+        """Leave a mission out of what is learned from, for good; telling it again takes it back.
+
+        Args:
+            reason: Reason, for the record.
+            mission: Number of the mission, from 1; by default the last.
+
+        Returns:
+            Posterior of the parameters given the others; None if there is nothing to learn from.
+
+        Raises:
+            TrustboError: There is no such mission, or it is set aside already.
+        """
+        n = len(self.log.entries)
+        number = n if mission is None else require_whole("mission", mission, 1)
+        if not 1 <= number <= n or self.log.entries[number - 1].state == SET_ASIDE:
+            raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
+        if self.options.update == "moment_matched":
+            raise TrustboError('update="moment_matched" cannot forget a mission; use "refit".')
+        self.log.entries[number - 1].become(SET_ASIDE, str(reason))
+        self._learn(self.seed_of("fit"))
+        self._plan = self._believed = None
+        self._write()
+        last = self.log.last
+        return None if last is None else last()
+
+    def _take(self, mission: Mission, extra: dict[str, float]) -> None:
+        """Keep a mission on disk, then learn from it."""
+        plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
         filled = fill_awareness(mission, self.planner_now().mean_awareness)
-        plan, trust_map = self.ask(), self.trust_map()
-        told = time.perf_counter()
+        told, entries = time.perf_counter(), self.log.entries
         if self._folder is not None:
-            self._folder.write_measured([*self.log.measured, mission])
-        missions, last = [*self.missions, filled], self.posterior
-        self.pending = mission
-        posterior = self._learning.posterior(missions, last, self.seed_of("fit"))
-        # Only now, all at once: a failed fit leaves the campaign as it was.
-        before = self.log.entries[-1].plan if self.log.entries else plan
-        row = {
+            extras = [*(entry.extra for entry in entries), extra]
+            self._folder.write_measured([*self.log.measured, mission], extras)
+        before = entries[-1].plan if entries else plan
+        rates = mission.contact_rate
+        row: dict[str, Any] = {
             "objective": plan.value,
             "path_changed": plan.path != before.path,
-            "contact_rate": float(np.nanmean(mission.contact_rate)),
+            "contact_rate": float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan,
             "status": mission.status,
+            "state": TOLD,
+            "reason": "",
             **extra,
-            **diagnostics(posterior),
             "seconds_plan": self._asked[0],
             "seconds_run": told - self._asked[1],
-            "seconds_fit": time.perf_counter() - told,
         }
-        self.log.entries.append(Entry(filled, mission, plan, trust_map, row, posterior))
-        self._learned(mission)
+        entries.append(Entry(filled, mission, plan, trust_map, row, self.log.last, extra))
+        if reason := never_to_be_learned(filled):
+            entries[-1].become(SET_ASIDE, reason)
+            warnings.warn(f"mission {len(entries)} is set aside: {reason}", stacklevel=3)
+        else:
+            self._learn(seed)
+        row["seconds_fit"] = time.perf_counter() - told
+        if self.awareness is not None:
+            self.awareness.update(mission)
+        self._plan = self._believed = None
         self._write()
-        return posterior
 
-    def fail(self, reason: str, mission: Mission | None = None) -> xr.DataTree | None:
+    def _learn(self, seed: int) -> None:
+        """Fit the posterior of all missions that are not set aside; if it is refused, go on."""
+        entries, waiting = self.log.entries, self.log.numbers(TOLD)
+        numbers, last = self.log.numbers(TOLD, LEARNED), self.log.last
+        if not numbers:
+            entries[-1].posterior, self.belief = None, self._prior
+            return
+        try:
+            tree = self._learning.learn(
+                [entries[j].mission for j in numbers], len(waiting), last and last(), seed
+            )
+        except CannotLearnError as error:
+            for j in waiting:
+                entries[j].become(TOLD, str(error))
+            known = "the prior" if last is None else "the posterior before"
+            warnings.warn(
+                f"mission {len(entries)} is kept, but cannot be learned from yet: {error} "
+                f"The campaign goes on with {known}, and tries again with the next mission.",
+                stacklevel=4,
+            )
+            return
+        alone = self.options.update == "moment_matched"  # the prior stands for those before
+        tree.attrs["missions"] = waiting if alone else numbers
+        if "latent" not in tree.children:
+            tree = parameters_alone(tree)
+        if last is not None:
+            last.shrink()
+        for j in waiting:
+            entries[j].become(LEARNED)
+        entries[-1].row |= diagnostics(tree)
+        entries[-1].posterior = Posterior(len(entries), tree)
+        self.belief = params_of(tree)
+
+    def fail(
+        self, reason: str, mission: Mission | None = None, *, other_path: bool = False
+    ) -> xr.DataTree | None:
         """Give up the mission that was asked for.
 
         Args:
             reason: Reason, for the record.
             mission: Bounds that were run, to learn from; None if there are none.
+            other_path: Whether it is known to have followed another path, as for `tell`.
 
         Returns:
-            Posterior, if there was something to learn.
+            Posterior of the parameters, if there was something to learn.
 
         Raises:
             TrustboError: The mission is one that `tell` refuses.
         """
-        posterior = None if mission is None else self.tell(mission)
+        posterior = None if mission is None else self.tell(mission, other_path=other_path)
         self.log.failures.append((len(self.missions), str(reason)))
         self._plan = None
         self._write_state()
@@ -251,7 +358,7 @@ class Campaign:
 
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, whatever the policy would try next."""
-        return greedy(random.key(0), self.belief, self.planner_now())
+        return greedy(random.key(0, impl="threefry2x32"), self.belief, self.planner_now())
 
     def trust_map(self) -> xr.DataArray:
         """Compute the team's trust map under the mean of the belief, dims (row, col)."""
@@ -347,7 +454,7 @@ class Campaign:
         """
         folder = CampaignFolder(directory, begun=True)
         try:
-            state, measured, learned = folder.read()
+            state, measured, extras, kept = folder.read()
             record = state["options"]
             if "replan" in state["notes"]:  # of version 0.1
                 record.setdefault("replan", state["notes"]["replan"])
@@ -360,24 +467,20 @@ class Campaign:
                 folder.read_workspace(), start, goal, model=learner, policy=chosen,
                 options=options, **named,
             )  # fmt: skip
+            campaign.log = History.from_state(state, measured, extras, kept)
+            if campaign.awareness is not None:
+                for mission in campaign.log.measured:
+                    campaign.awareness.update(mission)
+            if campaign.log.last is not None:
+                campaign.belief = params_of(campaign.log.last())
         except BaseException:
             folder.close()
             raise
-        campaign.log = History.from_state(state, measured, learned)
-        if campaign.log.entries:
-            *earlier, latest = campaign.log.measured
-            if campaign.awareness is not None:
-                for mission in earlier:
-                    campaign.awareness.update(mission)
-            campaign._learned(latest)
         suggested = state["suggested"]
         campaign._plan = suggested and plan_from_record(suggested)
         campaign._folder = folder
-        if len(measured) > len(campaign.missions):
-            try:
-                campaign.tell(measured[-1])
-            except PosteriorError as error:
-                warnings.warn(f"the last mission is pending: {error}", stacklevel=2)
+        for j in range(len(campaign.missions), len(measured)):
+            campaign._take(measured[j], extras[j])
         return campaign
 
     def stop(self, reason: str) -> Result:
@@ -389,7 +492,7 @@ class Campaign:
         self.log.stop_reason = reason
         result = self.result()
         if self._folder is not None:
-            self._folder.write(self._state(), result)
+            self._folder.write(self._state(), result, ended=True)
         return result
 
     def close(self) -> None:
@@ -412,7 +515,9 @@ class Campaign:
                 f"{str(folder.path)!r} holds a campaign already: go on with it by "
                 "Campaign.load, or choose another folder."
             )
-        folder.begin(self.workspace, self.log.measured)
+        folder.begin(self.workspace)
+        if self.log.entries:
+            folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
         self._folder = folder
         self._write(whole=True)
 
@@ -436,13 +541,6 @@ class Campaign:
         now = time.perf_counter()
         self._asked = now - started, now
         return replace(plan, bands=bands)
-
-    def _learned(self, mission: Mission) -> None:
-        """Plan from the last posterior from now on, and update the belief by a mission as told."""
-        self.belief, self.pending = params_of(self.log.entries[-1].posterior), None
-        self._plan = self._believed = None
-        if self.awareness is not None:
-            self.awareness.update(mission)
 
     def planner_now(self) -> Planner:
         """Planner with the awareness that is believed in now."""
@@ -470,20 +568,3 @@ class Campaign:
         if n_failures := sum(n == len(self.log.entries) for n, _ in self.log.failures):
             entropy.append(n_failures)  # another try may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
-
-
-def _require_mission_of(workspace: Workspace, mission: Mission) -> None:
-    """Refuse a mission of another team, or somewhere else."""
-    if not isinstance(mission, Mission):
-        raise TrustboError(f"tell takes a Mission; got {mission!r}.")
-    for what, names in (("robot", mission.robots), ("feature", mission.features)):
-        expected = tuple(str(name) for name in workspace.awareness[what].values)
-        if names != expected:
-            raise ShapeError(f"the mission has {what}s {names}, the workspace {expected}.")
-    rows, cols = workspace.grid.shape
-    for cell in mission.path:
-        if not (0 <= cell[0] < rows and 0 <= cell[1] < cols):
-            raise TrustboError(
-                f"the mission's path enters {cell}, outside the grid of {rows} rows and {cols} "
-                "columns."
-            )

@@ -1,22 +1,39 @@
-"""Folder of a campaign: one owner at a time, and no file half-written."""
+"""Folder of a campaign: one owner at a time, no file half-written, and every damage noticed."""
 
 import json
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
 
-from trustbo.campaign.history import Learned
-from trustbo.campaign.result import Result, read_learned
+from trustbo.campaign.damage import MEASURED, naming_what_is_left, read_json, salvage
+from trustbo.campaign.history import Kept
+from trustbo.campaign.result import Result, read_kept
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
-from trustbo.files import require_folder, to_json, write_file, write_text
-from trustbo.logs import netcdf as records
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.files import (
+    remove_checked,
+    remove_leftovers,
+    require_folder,
+    to_json,
+    write_checked,
+)
+from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
 
-_STATE, _MEASURED, _WORKSPACE = "campaign.json", "measured.nc", "workspace.nc"
+STATE, WORKSPACE = "campaign.json", "workspace.nc"
+
+
+class Contents(NamedTuple):
+    """State of a campaign, its missions as told, and all that was learned from them."""
+
+    state: dict[str, Any]
+    measured: list[Mission]
+    extras: list[dict[str, float]]
+    kept: Kept | None
 
 
 class CampaignFolder:
@@ -43,9 +60,11 @@ class CampaignFolder:
         """
         self.path = Path(directory)
         if begun and not self.is_used:
-            raise TrustboError(
-                f"{str(directory)!r} holds no campaign; give a folder that one was saved to."
-            )
+            measured = self.path / MEASURED
+            said = f"{str(directory)!r} holds no campaign;"
+            if measured.exists():
+                raise DamagedFileError(f"{said} {STATE!r} is missing. {salvage(measured)}")
+            raise TrustboError(f"{said} give a folder that one was saved to.")
         require_folder(directory).mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self.path / ".lock", timeout=0)
         try:
@@ -55,49 +74,93 @@ class CampaignFolder:
                 f"another campaign is at work in {str(self.path)!r}; close it first, or choose "
                 "another folder."
             ) from None
+        remove_leftovers(self.path)
+        self._n_ticks = 0  # missions whose ticks are in files of their own
 
     @property
     def is_used(self) -> bool:
         """Whether the folder holds a campaign."""
-        return (self.path / _STATE).exists()
+        return (self.path / STATE).exists()
 
     def close(self) -> None:
         """Let go of the folder."""
         self._lock.release()
 
-    def begin(self, workspace: Workspace, measured: list[Mission]) -> None:
-        """Replace what the folder holds by a campaign's workspace and its missions as told."""
-        for name in (_STATE, "result.json", _MEASURED):
-            (self.path / name).unlink(missing_ok=True)
-        write_file(self.path / _WORKSPACE, archive.workspace_to_tree(workspace).to_netcdf)
-        if measured:
-            self.write_measured(measured)
+    def begin(self, workspace: Workspace) -> None:
+        """Replace what the folder holds by a campaign's workspace."""
+        for name in (STATE, "result.json", MEASURED):
+            remove_checked(self.path / name)
+        self._n_ticks = 0
+        write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
 
     def read_workspace(self) -> Workspace:
         """Read the campaign's workspace."""
-        return archive.workspace_from_tree(records.read_tree(self.path / _WORKSPACE))
+        with naming_what_is_left(self.path):
+            return archive.workspace_from_tree(read_tree(self.path / WORKSPACE))
 
-    def write_measured(self, missions: list[Mission]) -> None:
-        """Write missions as they were told."""
-        write_file(self.path / _MEASURED, records.missions_to_tree(missions).to_netcdf)
+    def write_measured(
+        self, missions: Sequence[Mission], extras: Sequence[Mapping[str, float]]
+    ) -> None:
+        """Write missions as they were told, and the numbers that they were told with."""
+        since, self._n_ticks = min(self._n_ticks, len(missions) - 1), len(missions)
+        notes = {"extra": json.dumps(list(extras))}
+        write_missions(self.path / MEASURED, missions, since=since, notes=notes)
 
-    def write(self, state: dict[str, Any], result: Result | None, *, whole: bool = False) -> None:
+    def write(
+        self,
+        state: dict[str, Any],
+        result: Result | None,
+        *,
+        whole: bool = False,
+        ended: bool = False,
+    ) -> None:
         """Write the campaign's state, after its result.
 
         Args:
             state: State that `read` returns.
             result: Result so far; None leaves the one in the folder.
             whole: Whether all of the result is new, or only the last mission.
+            ended: Whether to write `posterior.nc` too, with all groups.
         """
         if result is not None:
             result.save(self.path) if whole else result.checkpoint(self.path)
-        write_text(self.path / _STATE, to_json(state))
+            if ended and result.has_posterior:
+                write_tree(self.path / "posterior.nc", result.posterior)
+        write_checked(self.path / STATE, to_json(state).encode())
 
-    def read(self) -> tuple[dict[str, Any], list[Mission], Learned | None]:
-        """Read the state, the missions as told, and the result of all but maybe the last."""
-        state = json.loads((self.path / _STATE).read_text(encoding="utf-8"))
-        measured: list[Mission] = []
-        if (self.path / _MEASURED).exists():
-            measured = records.missions_from_tree(records.read_tree(self.path / _MEASURED))
-        n = state["n_missions"]
-        return state, measured, read_learned(self.path, n) if n else None
+    def read(self) -> Contents:
+        """Read the state, the missions as told, and what was learned from all but maybe the last.
+
+        Raises:
+            DamagedFileError: A file is missing or damaged; the message says what can be read.
+        """
+        with naming_what_is_left(self.path):
+            state = read_state(self.path)
+            measured: list[Mission] = []
+            extras: list[dict[str, float]] = []
+            n = state["n_missions"]
+            if n or (self.path / MEASURED).exists():
+                measured = read_missions(self.path / MEASURED)
+                extras = _extras(self.path / MEASURED, len(measured))
+            if len(measured) < n:
+                raise DamagedFileError(
+                    f"{str(self.path / MEASURED)!r} holds {len(measured)} missions of {n}."
+                )
+            kept = read_kept(self.path, state) if n else None
+        self._n_ticks = len(measured) if (self.path / "ticks").exists() else 0
+        return Contents(state, measured, extras, kept)
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """Read the state of a campaign.
+
+    Raises:
+        DamagedFileError: The file is missing, damaged, or another's.
+    """
+    return read_json(folder / STATE, "n_missions", "options", "plans", "rows", "notes")
+
+
+def _extras(file: Path, n: int) -> list[dict[str, float]]:
+    """Numbers that missions were told with; none in a file of version 0.1."""
+    text = read_tree(file)["missions"].attrs.get("extra")
+    return [{} for _ in range(n)] if text is None else json.loads(text)

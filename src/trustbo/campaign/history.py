@@ -1,29 +1,116 @@
 """History of a campaign, mission by mission."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from trustbo.campaign.damage import naming_what_is_left
 from trustbo.data import Mission
+from trustbo.errors import DamagedFileError
+from trustbo.files import checksum
+from trustbo.logs.netcdf import read_tree
+from trustbo.models import complete
+from trustbo.models.posterior_groups import parameters_alone
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
 
+TOLD, LEARNED, SET_ASIDE = "told", "learned", "set aside"
+"""States of a mission: on disk, in the posterior, or never to be."""
 
-class Entry(NamedTuple):
-    """One mission that was learned from.
+
+class Posterior:
+    """A posterior in memory, or in a file until it is asked for.
+
+    Attributes:
+        after: Number of missions told when it was fitted; also that of its file.
+        file: File that holds it; None where it is in memory only.
+    """
+
+    def __init__(
+        self, after: int, tree: xr.DataTree | None = None, file: Path | None = None
+    ) -> None:
+        """Hold a tree, or the name of a file of `logs.netcdf.write_tree`."""
+        self.after, self.file, self._tree = after, file, tree
+        self._sum = None if file is None else checksum(file)
+
+    def __call__(self) -> xr.DataTree:
+        """Posterior as it is kept: parameters alone, unless its trust was sampled too.
+
+        Raises:
+            DamagedFileError: Its file is missing, damaged or another's by now.
+        """
+        if self._tree is None:
+            file = Path(self.file or "")
+            with naming_what_is_left(file.parent.parent):
+                if checksum(file) != self._sum:
+                    raise DamagedFileError(f"{str(file)!r} was replaced since it was opened.")
+                self._tree = read_tree(file)
+        return self._tree
+
+    def shrink(self) -> None:
+        """Keep the parameters alone from now on; a later posterior has the rest."""
+        if self._tree is not None and "latent" in self._tree.children:
+            self._tree, self.file = parameters_alone(self._tree), None
+
+
+class Posteriors(Sequence[xr.DataTree]):
+    """Posterior after each mission told; None where nothing could be learned yet."""
+
+    def __init__(self, kept: Iterable[Posterior | None]) -> None:
+        """Take posteriors as they are kept."""
+        self.kept = list(kept)
+
+    def __len__(self) -> int:
+        return len(self.kept)
+
+    def __iter__(self) -> Iterator[xr.DataTree]:
+        return (self[j] for j in range(len(self)))
+
+    def __getitem__(self, j: Any) -> Any:
+        if isinstance(j, slice):
+            return Posteriors(self.kept[j])
+        one = self.kept[j]
+        return None if one is None else one()
+
+
+def whole_posterior(kept: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+    """Posterior with all groups, its missions labelled by their numbers in the campaign, from 0.
+
+    Args:
+        kept: Posterior as a campaign keeps it.
+        missions: All missions told so far, their awareness filled in.
+    """
+    if "missions" not in kept.attrs:  # of version 0.1, whole already
+        return kept
+    numbers = np.atleast_1d(kept.attrs["missions"]).astype(int)
+    whole = complete(kept, [missions[j] for j in numbers])
+    parts = {name: part.to_dataset() for name, part in whole.children.items()}
+    for name, part in parts.items():
+        if "mission" in part.dims:
+            parts[name] = part.assign_coords(mission=numbers)
+    labelled = xr.DataTree.from_dict(parts)
+    labelled.attrs = whole.attrs
+    return labelled
+
+
+@dataclass(eq=False)
+class Entry:
+    """One mission that was told.
 
     Attributes:
         mission: Mission, its awareness filled in where it was not measured.
         measured: The same mission as it was told.
         plan: Plan that it was asked for with.
         trust_map: Trust map that it was planned on, dims (row, col).
-        row: Numbers of the mission, by name.
-        posterior: Posterior after it.
+        row: Numbers of the mission, by name; its `state` and the `reason` of that among them.
+        posterior: Posterior after it; None where nothing could be learned yet.
+        extra: Numbers that it was told with.
     """
 
     mission: Mission
@@ -31,23 +118,33 @@ class Entry(NamedTuple):
     plan: Plan
     trust_map: xr.DataArray
     row: dict[str, Any]
-    posterior: xr.DataTree
+    posterior: Posterior | None
+    extra: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def state(self) -> str:
+        """State of the mission: told, learned or set aside."""
+        return self.row["state"]
+
+    def become(self, state: str, reason: str = "") -> None:
+        """Change the state of the mission."""
+        self.row |= {"state": state, "reason": reason}
 
 
-class Learned(NamedTuple):
+class Kept(NamedTuple):
     """Missions of a saved result, the posterior after each, and `Result.history`."""
 
     missions: list[Mission]
-    posteriors: list[xr.DataTree]
+    posteriors: Posteriors
     history: xr.Dataset
 
 
 @dataclass(eq=False)
 class History:
-    """Missions that a campaign learned from, those that failed, and the reason of its end.
+    """Missions that were told to a campaign, those that failed, and the reason of its end.
 
     Attributes:
-        entries: One for each mission learned from.
+        entries: One for each mission told.
         failures: Missions given up: number of missions before each, and the reason.
         notes: More for `Result.settings`, by the loop.
         stop_reason: Reason of the end.
@@ -60,49 +157,58 @@ class History:
 
     @property
     def missions(self) -> list[Mission]:
-        """Missions learned from, their awareness filled in."""
+        """Missions told, their awareness filled in."""
         return [entry.mission for entry in self.entries]
 
     @property
     def measured(self) -> list[Mission]:
-        """Missions learned from, as they were told."""
+        """Missions as they were told."""
         return [entry.measured for entry in self.entries]
 
     @property
-    def plans(self) -> list[Plan]:
-        """Plan of each mission."""
-        return [entry.plan for entry in self.entries]
+    def posteriors(self) -> Posteriors:
+        """Posterior after each mission."""
+        return Posteriors(entry.posterior for entry in self.entries)
 
     @property
-    def posteriors(self) -> list[xr.DataTree]:
-        """Posterior after each mission."""
-        return [entry.posterior for entry in self.entries]
+    def last(self) -> Posterior | None:
+        """Posterior after the last mission."""
+        return self.entries[-1].posterior if self.entries else None
+
+    def numbers(self, *states: str) -> list[int]:
+        """Numbers, from 0, of the missions in one of these states."""
+        return [j for j, entry in enumerate(self.entries) if entry.state in states]
 
     def to_dataset(self) -> xr.Dataset:
         """`Result.history`; empty before the first mission."""
         if not self.entries:
             return xr.Dataset()
-        plans, rows = self.plans, [entry.row for entry in self.entries]
+        plans, rows = [entry.plan for entry in self.entries], [entry.row for entry in self.entries]
         steps = np.full((len(rows), max(len(plan.path) for plan in plans), 2), -1)
         for i, plan in enumerate(plans):
             steps[i, : len(plan.path)] = plan.path
         # The exact sampler may have fallen back on NUTS, whose diagnostics are others: NaN then.
         names = {name: None for row in rows for name in row}
         scalars = {name: [row.get(name, np.nan) for row in rows] for name in names}
-        iteration = xr.DataArray(np.arange(1, len(rows) + 1), dims="iteration", name="iteration")
-        trust_maps = [entry.trust_map for entry in self.entries]
+        trust_map = self.entries[0].trust_map
+        maps = np.stack([entry.trust_map.transpose("row", "col") for entry in self.entries])
         return xr.Dataset(
             {
                 **{name: ("iteration", values) for name, values in scalars.items()},
                 "path": (("iteration", "step", "axis"), steps),
-                "trust_map": xr.concat(trust_maps, dim=iteration),
+                "trust_map": (("iteration", "row", "col"), maps, trust_map.attrs),
             },
-            {"iteration": iteration, "axis": ["row", "col"]},
+            {
+                "iteration": np.arange(1, len(rows) + 1),
+                "axis": ["row", "col"],
+                **trust_map.coords,
+            },
         )
 
     def summary(self) -> pd.DataFrame:
         """Table with one row for each mission: its plan, status and diagnostics."""
-        paths = [" ".join(f"{r},{c}" for r, c in plan.path) for plan in self.plans]
+        plans = [entry.plan for entry in self.entries]
+        paths = [" ".join(f"{r},{c}" for r, c in plan.path) for plan in plans]
         index = pd.RangeIndex(1, len(self.entries) + 1, name="mission")
         table = pd.DataFrame([entry.row for entry in self.entries], index=index)
         return table.assign(n_bounds=[len(m.bounds) for m in self.missions], path=paths)
@@ -111,8 +217,9 @@ class History:
         """Everything that no file of a `Result` holds, as JSON can hold it."""
         return {
             "n_missions": len(self.entries),
-            "plans": [plan_to_record(plan) for plan in self.plans],
+            "plans": [plan_to_record(entry.plan) for entry in self.entries],
             "rows": [entry.row for entry in self.entries],
+            "posterior_after": [e.posterior and e.posterior.after for e in self.entries],
             "failures": self.failures,
             "notes": self.notes,
             "stop_reason": self.stop_reason,
@@ -121,16 +228,22 @@ class History:
 
     @classmethod
     def from_state(
-        cls, state: dict[str, Any], measured: Sequence[Mission], learned: Learned | None
+        cls,
+        state: dict[str, Any],
+        measured: Sequence[Mission],
+        extras: Sequence[dict[str, float]],
+        kept: Kept | None,
     ) -> Self:
         """History of a state, of missions as they were told, and of a saved result."""
         entries: list[Entry] = []
-        if learned is not None:
+        if kept is not None:
             n = state["n_missions"]
-            maps = [learned.history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
+            maps = [kept.history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
             plans = [plan_from_record(record) for record in state["plans"]]
+            before = {"state": LEARNED, "reason": ""}  # of version 0.1, which had no other
+            rows = [row if "state" in row else row | before for row in state["rows"]]
             columns = (
-                learned.missions, measured[:n], plans, maps, state["rows"], learned.posteriors,
+                kept.missions, measured[:n], plans, maps, rows, kept.posteriors.kept, extras[:n]
             )  # fmt: skip
             entries = [Entry(*values) for values in zip(*columns, strict=True)]
         failures = [(after, reason) for after, reason in state["failures"]]

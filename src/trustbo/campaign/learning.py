@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import PosteriorError, TrustboError, require_choice
 from trustbo.models import (
     TrustModel,
     TrustParams,
@@ -21,6 +21,12 @@ from trustbo.models.model import require_model
 from trustbo.models.params import Params
 from trustbo.models.samplers.run import SAMPLERS, require_sampler
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
+
+_N_DRAWS = 1000
+
+
+class CannotLearnError(TrustboError):
+    """Missions that no sampler gives a posterior of."""
 
 
 @dataclass(frozen=True)
@@ -54,28 +60,55 @@ class Learning:
                 )
             warnings.warn(MOMENT_MATCHED_WARNING, stacklevel=5)
 
-    def posterior(
-        self, missions: list[Mission], last: xr.DataTree | None, seed: int
+    def learn(
+        self, missions: list[Mission], new: int, last: xr.DataTree | None, seed: int
     ) -> xr.DataTree:
-        """Fit the posterior of missions.
+        """Fit the posterior of missions; one that is refused is tried again in other ways.
 
         Args:
-            missions: All missions so far.
-            last: Posterior before the last of them.
+            missions: Missions to learn from, in order.
+            new: Number of the last of them that `last` does not know.
+            last: Posterior of the others.
             seed: Seed of the sampler.
 
+        Returns:
+            Posterior of the parameters, see `models.complete`.
+
         Raises:
-            PosteriorError: Its diagnostics are bad.
+            CannotLearnError: Every attempt failed.
         """
+        model, weights = self.model, None
         if self.update == "moment_matched":
-            priors = self.model.priors
+            priors = model.priors
             if last is not None:
                 priors = moment_matched(cast(TrustParams, params_of(last)), priors)
-            return fit(missions[-1:], replace(self.model, priors=priors), self.sampler, seed=seed)
-        weights = None
+            model, missions = replace(model, priors=priors), missions[-new:]
         if self.forgetting < 1.0:
             weights = self.forgetting ** np.arange(len(missions) - 1, -1, -1)
-        return fit(missions, self.model, self.sampler, weights=weights, seed=seed)
+        reason = ""
+        for sampler, n_draws, shift in self._attempts():
+            try:
+                return fit(
+                    missions, model, sampler, weights=weights, seed=seed + shift, n_draws=n_draws,
+                    whole=False,
+                )  # fmt: skip
+            except PosteriorError as error:
+                reason = error.reason
+            except TrustboError as error:  # no other attempt would take these data
+                raise CannotLearnError(str(error)) from error
+            except Exception as error:  # a defect must not cost a mission that was driven
+                reason = f"{type(error).__name__}: {error}"
+        raise CannotLearnError(reason)
+
+    def _attempts(self) -> list[tuple[str, int, int]]:
+        """Sampler, draws of a chain, and what is added to the seed, for each attempt."""
+        attempts = [(self.sampler, _N_DRAWS, 0), (self.sampler, 2 * _N_DRAWS, 1)]
+        other = "nuts" if self.sampler == "exact" else "exact"
+        try:
+            require_sampler(self.model, other)
+        except TrustboError:
+            return attempts
+        return [*attempts, (other, 2 * _N_DRAWS, 2)]
 
     def prior_belief(self, initial: str, n_robots: int, n_features: int, seed: int) -> Params:
         """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""

@@ -1,6 +1,8 @@
 """The loop: plan, run, learn, and plan again."""
 
+import json
 import logging
+import sys
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from typing import Any
@@ -8,12 +10,20 @@ from typing import Any
 from tqdm import tqdm
 
 from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.history import LEARNED
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.replanning import require_bounds, run_replanning, takes
 from trustbo.campaign.result import Result
-from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops
+from trustbo.campaign.stopping import (
+    Stop,
+    reason_to_stop,
+    require_stops,
+    rules_of,
+    rules_to_record,
+)
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
+from trustbo.files import to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Policy
 from trustbo.simulation import KinematicSimulator, Simulator
@@ -68,7 +78,6 @@ def iterate(
     Raises:
         TrustboError: Bad input, before any work starts.
         NoPathError: The goal cannot be reached.
-        PosteriorError: A posterior's diagnostics are bad.
     """
     n_iterations = require_whole("n_iterations", n_iterations, 1)
     campaign = Campaign(
@@ -104,25 +113,37 @@ def resume(
 ) -> Result:
     """Go on with a campaign that `iterate(checkpoint=directory)` began, with identical results.
 
+    One that its rule has ended gives back its result, unless `stop` or more missions are asked for.
+
     Args:
         directory: Folder of its checkpoint.
         simulator: The same simulator, unless it was the default.
         n_iterations: Number of missions in all; by default as many as it was begun for.
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
-        stop: Rules as in `iterate`; not kept in the folder.
+        stop: Rules in place of those that it was begun with; needed where one was your own.
         progress: Whether to show a progress bar.
         **own: The same `awareness` and `callbacks`; see `Campaign.load`.
 
     Raises:
         TrustboError: There is no campaign; another process is at work on it; or something of your
             own is missing.
+        DamagedFileError: A file of the folder is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy, **own) as campaign:
-        notes = campaign.log.notes
-        total = notes.get("n_iterations", 8) if n_iterations is None else n_iterations
-        steps = missions(campaign, simulator, n_iterations=total, stop=stop, progress=progress)
-        _require_same(notes, campaign.log.notes)
+        log, done = campaign.log, len(campaign.missions)
+        total = log.notes.get("n_iterations", 8) if n_iterations is None else n_iterations
+        ended = log.stop_reason not in ("interrupted", "n_iterations")
+        if ended and stop is None and total <= max(done, log.notes.get("n_iterations", 8)):
+            return campaign.result()
+        rules = rules_of(log.notes.get("stop", [])) if stop is None else require_stops(stop)
+        before = dict(log.notes)
+        steps = missions(campaign, simulator, n_iterations=total, stop=rules, progress=progress)
+        _require_same(before, log.notes)
+        reason = reason_to_stop(rules, campaign) if done and not ended else None
+        if reason is not None:  # the rule's verdict came too late to be written
+            return campaign.stop(reason)
+        log.stop_reason = "interrupted"
         for _ in steps:
             pass
         return campaign.result()
@@ -150,17 +171,18 @@ def missions(
 
     Raises:
         TrustboError: Bad input, before any work starts.
-        PosteriorError: A posterior's diagnostics are bad.
     """
     require_whole("n_iterations", n_iterations, 1)
     runner: Any = KinematicSimulator(campaign.workspace) if simulator is None else simulator
     if not callable(getattr(runner, "run", None)):
         raise TrustboError(f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}.")
     if campaign.options.replan == "bound":
-        require_bounds(runner)
+        require_bounds(runner, campaign.model)
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
-    campaign.log.notes = {**describe(), "n_iterations": n_iterations}
+    # As a file gives them back: tuples are lists there, and arrays too.
+    simulated = json.loads(to_json(describe()))
+    campaign.log.notes = {**simulated, "n_iterations": n_iterations, "stop": rules_to_record(rules)}
     return _missions(campaign, runner, n_iterations, rules, progress)
 
 
@@ -168,15 +190,22 @@ def _missions(
     campaign: Campaign, runner: Any, n_iterations: int, rules: list[Stop], progress: bool
 ) -> Iterator[tuple[Plan, Mission]]:
     done = len(campaign.missions)
-    with tqdm(total=n_iterations, initial=done, desc="missions", disable=not progress) as bar:
+    silent = not progress or not sys.stderr.isatty()  # carriage returns are for a terminal
+    bar = tqdm(total=n_iterations, initial=done, desc="missions", disable=silent)
+    with bar:
         while len(campaign.missions) < n_iterations:
             plan = campaign.ask()
             mission = _run(campaign, runner, plan)
             oracle = getattr(runner, "regret", None)
-            campaign.tell(mission, **({"regret": oracle(plan)} if oracle else {}))
-            bar.set_postfix_str(_report(campaign))
+            extra = {"regret": float(oracle(plan))} if oracle else {}
+            # Another path is the loop's own doing, and so is a simulator that repeats itself.
+            campaign.tell(mission, other_path=True, again=True, **extra)
+            bar.set_postfix_str(_report(campaign), refresh=False)
             bar.update()
             _log.info("mission %d: %s", len(campaign.missions), _report(campaign))
+            if progress and not sys.stderr.isatty():
+                line = f"mission {len(campaign.missions)}/{n_iterations}: {_report(campaign)}"
+                tqdm.write(line, file=sys.stderr)
             for callback in campaign.options.callbacks:
                 callback(campaign, mission)
             yield plan, mission
@@ -201,16 +230,26 @@ def _run(campaign: Campaign, runner: Any, plan: Plan) -> Mission:
 def _report(campaign: Campaign) -> str:
     """Describe the last mission in a line."""
     row = campaign.log.entries[-1].row
-    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
     regret = f", regret {row['regret']:.3f}" if "regret" in row else ""
-    return f"objective {row['objective']:.3f}{regret}, {label} {row[name]:.3f}, {row['status']}"
+    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
+    learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]
+    return f"objective {row['objective']:.3f}{regret}, {learned}, {row['status']}"
+
+
+_RENAMED = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulator"}
+"""Simulators by their names in version 0.1."""
 
 
 def _require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Refuse to go on with another simulator than the one begun with."""
-    for name in now:
-        if name != "n_iterations" and name in before and before[name] != now[name]:
+    for name in now.keys() - {"n_iterations", "stop"}:
+        if name not in before:  # version 0.1 did not record it
+            continue
+        old = _RENAMED.get(str(before[name]), before[name])
+        if isinstance(old, int) and isinstance(now[name], list):  # only counted in version 0.1
+            now = now | {name: len(now[name])}
+        if to_json(old) != to_json(now[name]):  # as text: NaN equals itself
             raise TrustboError(
-                f"the campaign was begun with {name} = {before[name]!r}, not {now[name]!r}; give "
-                "the same simulator again with simulator=."
+                f"the campaign was begun with {name} = {old!r}, not {now[name]!r}; give the same "
+                "simulator again with simulator=."
             )

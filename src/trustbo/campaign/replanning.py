@@ -9,7 +9,7 @@ import numpy as np
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.models import TrustFilter
+from trustbo.models import TrustFilter, TrustModel, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.stacking import fill_awareness
@@ -18,12 +18,17 @@ THRESHOLD = 0.01
 """Least gain in the objective's value for which another continuation is taken."""
 
 
-def require_bounds(simulator: Any) -> None:
-    """Refuse a simulator that cannot run one bound after the other.
+def require_bounds(simulator: Any, model: TrustModel) -> None:
+    """Refuse a simulator that cannot run one bound after the other, or a model without a filter.
 
     Raises:
-        TrustboError: It has no `reset` or `run_bound`.
+        TrustboError: It has no `reset` or `run_bound`; or observations are not Gaussian.
     """
+    if not model.family.integrates_out:
+        raise TrustboError(
+            'replan="bound" follows trust by a filter, which needs observation "gaussian"; the '
+            f'model has "{model.observation}". Use replan="mission".'
+        )
     missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
     if missing:
         raise TrustboError(
@@ -53,7 +58,7 @@ def run_replanning(
         Mission along the cells that were chosen.
     """
     path, bounds = list(plan.path), []
-    live = None if campaign.posterior is None else TrustFilter(campaign.posterior)
+    live = _live(campaign)
     if takes(simulator.reset, "next_cell"):
         start["next_cell"] = path[1]
     simulator.reset(path[0], **start)
@@ -75,6 +80,14 @@ def run_replanning(
         tuple(str(n) for n in campaign.workspace.awareness[d].values) for d in ("feature", "robot")
     )
     return Mission(tuple(path), tuple(bounds), bounds[-1].status, *names)
+
+
+def _live(campaign: Campaign) -> TrustFilter | None:
+    """Filter of the campaign's posterior; None before anything was learned."""
+    last, n_robots = campaign.log.last, campaign.workspace.awareness.sizes["robot"]
+    if last is None:
+        return None
+    return TrustFilter(params_of(last()), n_robots, response=campaign.model.response)
 
 
 def better_rest(

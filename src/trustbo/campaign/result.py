@@ -1,6 +1,6 @@
 """Result of a campaign, in memory and on disk."""
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
@@ -10,12 +10,19 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.history import Learned
+from trustbo.campaign.damage import naming_what_is_left, read_json
+from trustbo.campaign.history import Kept, Posterior, Posteriors, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError
-from trustbo.files import require_folder, to_json, write_file, write_text
-from trustbo.logs import netcdf as records
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.files import (
+    remove_checked,
+    require_folder,
+    to_json,
+    write_checked,
+    write_text,
+)
+from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
 from trustbo.models import params_of
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
@@ -31,7 +38,8 @@ class Result:
     Attributes:
         workspace: Workspace of the campaign.
         missions: All missions, in order.
-        posteriors: Posterior after each of them (ArviZ DataTrees).
+        posteriors: Posterior of the parameters after each of them (ArviZ DataTrees, read from the
+            folder when asked for); None where nothing could be learned yet.
         path: Path recommended after the last mission: the best under the posterior mean.
         trust: Expected trust along it, shape (bound, robot).
         value: Its objective.
@@ -39,8 +47,10 @@ class Result:
         history: Dataset over `iteration` (1, 2, ...): the path that was planned (`path`, row and
             col of each step, -1 after the goal), its `objective` when it was planned, whether it
             differs from the plan before (`path_changed`), the `trust_map` it was planned on, the
-            mission's mean `contact_rate` and `status`, the posterior's diagnostics (see
-            `models.diagnostics`), and the seconds of planning, running and fitting.
+            mission's mean `contact_rate`, its `status`, and its `state` with the `reason` ("told":
+            to be learned from with a later mission; "learned"; "set aside": never), the posterior's
+            diagnostics (see `models.diagnostics`), and the seconds of planning, running and
+            fitting.
         settings: Options of the campaign, and the settings of its model and simulator.
         stop_reason: Reason of the end.
         believed: Belief about the awareness at the end, for `awareness="belief"`: its `mean`
@@ -49,7 +59,7 @@ class Result:
 
     workspace: Workspace
     missions: list[Mission]
-    posteriors: list[xr.DataTree]
+    posteriors: Sequence[xr.DataTree]
     path: list[Cell]
     trust: np.ndarray
     value: float
@@ -60,9 +70,27 @@ class Result:
     believed: xr.Dataset | None = None
 
     @property
+    def has_posterior(self) -> bool:
+        """Whether anything could be learned yet."""
+        return len(self.posteriors) > 0 and self._kept[-1] is not None
+
+    @cached_property
     def posterior(self) -> xr.DataTree:
-        """Posterior after the last mission."""
-        return self.posteriors[-1]
+        """Posterior after the last mission, with all groups, for ArviZ.
+
+        Its missions are labelled by their index in `missions`; see `models.complete` for those
+        before.
+
+        Raises:
+            TrustboError: Nothing could be learned yet.
+        """
+        if not self.has_posterior:
+            reasons = [str(r) for r in self.history.get("reason", xr.DataArray([""])).values]
+            raise TrustboError(
+                f"there is no posterior: none of {len(self.missions)} missions could be learned "
+                f"from yet ({reasons[-1]}). They are kept; go on with more missions."
+            )
+        return whole_posterior(self.posteriors[-1], self.missions)
 
     @cached_property
     def planner(self) -> Planner:
@@ -138,11 +166,14 @@ class Result:
             TrustboError: The folder's name belongs to a file.
         """
         folder = require_folder(directory)
-        (folder / "result.json").unlink(missing_ok=True)  # its other files are replaced now
-        for j, posterior in enumerate(self.posteriors):
-            _write_tree(folder / "posteriors" / _posterior_name(j), posterior)
-        _write_tree(folder / "workspace.nc", archive.workspace_to_tree(self.workspace))
+        remove_checked(folder / "result.json")  # its other files are replaced now
+        for kept in {id(kept): kept for kept in self._kept if kept}.values():
+            write_tree(_posterior_file(folder, kept.after), kept())
+        write_tree(folder / "workspace.nc", archive.workspace_to_tree(self.workspace))
+        write_missions(folder / "missions.nc", self.missions)
         self.checkpoint(folder)
+        if self.has_posterior:
+            write_tree(folder / "posterior.nc", self.posterior)
 
     def checkpoint(self, directory: str | PathLike[str]) -> None:
         """Write the last mission to a folder that holds all before it.
@@ -150,22 +181,21 @@ class Result:
         The workspace and the earlier posteriors never change, and are not written again.
         """
         folder = require_folder(directory)
-        last = _posterior_name(len(self.posteriors) - 1)
-        _write_tree(folder / "posteriors" / last, self.posterior)
+        files = {_posterior_file(folder, kept.after): kept for kept in self._kept if kept}
+        for file, kept in list(files.items())[-2:]:
+            if file != kept.file:
+                write_tree(file, kept())
+                kept.file = file  # it is there from now on
         for file in (folder / "posteriors").glob("*.nc"):
-            if file.name > last:
-                file.unlink()
-        _write_tree(folder / "posterior.nc", self.posterior)
-        trees = {
-            "missions.nc": records.missions_to_tree(self.missions),
-            "history.nc": xr.DataTree(self.history.assign(final_trust_map=self.trust_map)),
-        }
+            if file not in files:
+                remove_checked(file)
+        write_missions(folder / "missions.nc", self.missions, since=len(self.missions))
+        history = self.history.assign(final_trust_map=self.trust_map)
+        write_tree(folder / "history.nc", xr.DataTree(history))
         if self.believed is None:
-            (folder / _BELIEVED).unlink(missing_ok=True)
+            remove_checked(folder / _BELIEVED)
         else:
-            trees[_BELIEVED] = xr.DataTree(self.believed)
-        for name, tree in trees.items():
-            _write_tree(folder / name, tree)
+            write_tree(folder / _BELIEVED, xr.DataTree(self.believed))
         scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
         table = self.history[scalars].to_dataframe()[scalars]
         table["path"] = [_path_text(path) for path in self.history["path"].values]
@@ -177,9 +207,16 @@ class Result:
             "value": self.value,
             "settings": self.settings,
             "stop_reason": self.stop_reason,
+            "posterior_after": [kept and kept.after for kept in self._kept],
         }
         # Written last: its presence means that the rest is complete.
-        write_text(folder / "result.json", to_json(record))
+        write_checked(folder / "result.json", to_json(record).encode())
+
+    @property
+    def _kept(self) -> list[Posterior | None]:
+        if isinstance(self.posteriors, Posteriors):
+            return self.posteriors.kept
+        return [Posterior(j + 1, tree) for j, tree in enumerate(self.posteriors)]
 
 
 def load_result(directory: str | PathLike[str]) -> Result:
@@ -189,45 +226,49 @@ def load_result(directory: str | PathLike[str]) -> Result:
         directory: Folder that it was written to.
 
     Raises:
-        TrustboError: The folder holds no result, or a damaged one.
+        TrustboError: The folder holds no result.
+        DamagedFileError: A file is missing or damaged; the message says what can be read.
     """
     folder = Path(directory)
     if not (folder / "result.json").exists():
         raise TrustboError(f"{str(folder)!r} holds no result; give a folder written by save().")
-    try:
-        record = json.loads((folder / "result.json").read_text(encoding="utf-8"))
-        n, settings = record["n_missions"], record["settings"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise TrustboError(f"{str(folder / 'result.json')!r} is damaged: {error!r}.") from None
-    # A run killed while it saved may have left one mission more than the record counts.
-    missions, posteriors, history = read_learned(folder, n)
-    believed = None
-    if settings.get("awareness") == "belief":
-        if not (folder / _BELIEVED).exists():
-            raise TrustboError(f"{str(folder / _BELIEVED)!r} is missing: the result is damaged.")
-        believed = records.read_tree(folder / _BELIEVED).to_dataset()
-    return Result(
-        archive.workspace_from_tree(records.read_tree(folder / "workspace.nc")),
-        missions,
-        posteriors,
-        [_cell(cell) for cell in record["path"]],
-        np.array(record["trust"]),
-        record["value"],
-        history["final_trust_map"].rename("trust"),
-        history.drop_vars("final_trust_map"),
-        settings,
-        record["stop_reason"],
-        believed,
-    )
+    with naming_what_is_left(folder):
+        record = read_json(folder / "result.json", "n_missions", "settings", "path", "stop_reason")
+        # A run killed while it saved may have left one mission more than the record counts.
+        missions, posteriors, history = read_kept(folder, record)
+        believed = None
+        if record["settings"].get("awareness") == "belief":
+            believed = read_tree(folder / _BELIEVED).to_dataset()
+        return Result(
+            archive.workspace_from_tree(read_tree(folder / "workspace.nc")),
+            missions,
+            posteriors,
+            [_cell(cell) for cell in record["path"]],
+            np.array(record["trust"]),
+            record["value"],
+            history["final_trust_map"].rename("trust"),
+            history.drop_vars("final_trust_map"),
+            record["settings"],
+            record["stop_reason"],
+            believed,
+        )
 
 
-def read_learned(folder: Path, n_missions: int) -> Learned:
-    """Read the first missions of a saved result, their posteriors and the history."""
-    history = records.read_tree(folder / "history.nc").to_dataset()
-    return Learned(
-        records.missions_from_tree(records.read_tree(folder / "missions.nc"))[:n_missions],
-        [records.read_tree(folder / "posteriors" / _posterior_name(j)) for j in range(n_missions)],
-        history.isel(iteration=slice(n_missions)),
+def read_kept(folder: Path, record: dict[str, Any]) -> Kept:
+    """Read the missions that a record counts, their posteriors and the history."""
+    n = record["n_missions"]
+    kept: dict[int, Posterior] = {}
+    for after in {*record.get("posterior_after", range(1, n + 1))} - {None}:
+        file = _posterior_file(folder, after)
+        if not file.exists():
+            raise DamagedFileError(f"{str(file)!r} is missing.")
+        kept[after] = Posterior(after, file=file)
+    order = record.get("posterior_after", range(1, n + 1))
+    history = read_tree(folder / "history.nc").to_dataset()
+    return Kept(
+        read_missions(folder / "missions.nc")[:n],
+        Posteriors(kept.get(after) for after in order),
+        history.isel(iteration=slice(n)),
     )
 
 
@@ -236,12 +277,8 @@ def _cell(pair: Any) -> Cell:
     return int(row), int(col)
 
 
-def _posterior_name(j: int) -> str:
-    return f"{j + 1:04d}.nc"
-
-
-def _write_tree(path: Path, tree: xr.DataTree) -> None:
-    write_file(path, tree.to_netcdf)
+def _posterior_file(folder: Path, after: int) -> Path:
+    return folder / "posteriors" / f"{after:04d}.nc"
 
 
 def _path_text(path: np.ndarray) -> str:

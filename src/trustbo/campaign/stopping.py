@@ -1,8 +1,9 @@
 """Rules that end a campaign which has learned enough."""
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from jax import random
@@ -63,8 +64,11 @@ class RegretBound:
 
     def probability(self, campaign: Campaign, n_missions: int) -> float:
         """P(regret of the recommended path <= eps) after the first `n_missions`."""
-        planner, draws = campaign.planner_now(), params_of(campaign.posteriors[n_missions - 1])
-        path = greedy(random.key(0), draws, planner).path
+        posterior = campaign.posteriors[n_missions - 1]
+        if posterior is None:
+            return 0.0
+        planner, draws = campaign.planner_now(), params_of(posterior)
+        path = greedy(random.key(0, impl="threefry2x32"), draws, planner).path
         drawn = planner.plan_draws(draws, n_draws=self.n_draws)
         return float(np.mean(drawn.regret(path) <= self.eps * np.abs(drawn.values)))
 
@@ -91,6 +95,9 @@ class Seconds:
         return f"seconds: {self.limit:g}" if time.monotonic() - self._start > self.limit else None
 
 
+_OURS = (RegretBound, Seconds)
+
+
 def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
     """List the rules.
 
@@ -103,6 +110,37 @@ def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
             raise TrustboError(
                 f"stop must be callables stop(campaign) -> reason or None; got {rule!r}."
             )
+    return rules
+
+
+def rules_to_record(rules: Sequence[Stop]) -> list[dict[str, Any]]:
+    """Rules as JSON can hold them: ours by value, the user's own by name."""
+    record = []
+    for rule in rules:
+        own, values = True, {}
+        if isinstance(rule, _OURS):
+            own, values = False, {f.name: getattr(rule, f.name) for f in fields(rule) if f.repr}
+        name = getattr(rule, "__name__", type(rule).__name__)
+        record.append({"rule": name, "own": own, **values})
+    return record
+
+
+def rules_of(record: Sequence[Mapping[str, Any]]) -> list[Stop]:
+    """Rules of a record; `Seconds` count from now.
+
+    Raises:
+        TrustboError: A rule is the user's own, and has to be given again.
+    """
+    rules: list[Stop] = []
+    for one in record:
+        values = dict(one)
+        name, own = values.pop("rule"), values.pop("own")
+        if own:
+            raise TrustboError(
+                f"the campaign's rule to stop, {name!r}, was your own; give all rules again with "
+                "stop=, or stop=[] to go on without."
+            )
+        rules.append({kind.__name__: kind for kind in _OURS}[name](**values))
     return rules
 
 

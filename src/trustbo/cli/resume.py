@@ -1,6 +1,5 @@
 """`trustbo resume`: go on with a campaign that was interrupted, or is to be longer."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,8 +24,8 @@ def resume(
     Example: trustbo resume out/demo
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
-    The result is the same as without the interruption. The folder keeps all flags
-    but --stop-regret, which has to be given again.
+    The result is the same as without the interruption. The folder keeps all flags.
+    A campaign that --stop-regret has ended goes on with more --iterations only.
     """
     with one_line_errors(debug, campaign=folder):
         if iterations is not None:
@@ -43,7 +42,7 @@ def resume(
         result = go_on(
             folder,
             simulator=_simulator(folder, state["notes"]),
-            n_iterations=total,
+            n_iterations=iterations,
             stop=stop,
             progress=not quiet,
         )
@@ -52,10 +51,13 @@ def resume(
 
 def _state(folder: Path) -> dict[str, Any]:
     """Read the state of a campaign from its folder."""
-    file = folder / "campaign.json"
-    if not file.exists():
+    if not (folder / "campaign.json").exists():
         raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
-    state = json.loads(file.read_text(encoding="utf-8"))
+    from trustbo.campaign.damage import naming_what_is_left
+    from trustbo.campaign.folder import read_state
+
+    with naming_what_is_left(folder):
+        state = read_state(folder)
     name = state["notes"].get("simulator")
     if name != "KinematicSimulator":
         raise TrustboError(
@@ -67,12 +69,12 @@ def _state(folder: Path) -> dict[str, Any]:
 
 def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
     """Make the simulator that the campaign was begun with."""
-    from trustbo.logs import netcdf as records
+    from trustbo.logs.netcdf import read_tree
     from trustbo.simulation import KinematicSimulator
     from trustbo.workspace import Sight
     from trustbo.workspace import netcdf as archive
 
-    workspace = archive.workspace_from_tree(records.read_tree(folder / "workspace.nc"))
+    workspace = archive.workspace_from_tree(read_tree(folder / "workspace.nc"))
     sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
     return KinematicSimulator(
         workspace, sight=sight, tick=notes["tick"], bounding=notes["bounding"]

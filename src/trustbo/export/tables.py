@@ -30,9 +30,9 @@ def write_csv(path: str | PathLike[str], result: Result) -> None:
     """
     target = require_file(path)
     latent = result.posterior["latent"].to_dataset()
-    trust = {name: latent[name].values for name in _TRUST}
-    # With update="moment_matched" a posterior covers its last mission only.
-    first = len(result.missions) - latent.sizes["mission"]
+    # A posterior need not cover all missions: some are set aside, or wait to be learned from.
+    numbers = [int(j) for j in latent["mission"].values]
+    trust = {name: dict(zip(numbers, latent[name].values, strict=True)) for name in _TRUST}
     rows = []
     for j, mission in enumerate(result.missions):
         for k, bound in enumerate(mission.bounds):
@@ -52,7 +52,7 @@ def write_csv(path: str | PathLike[str], result: Result) -> None:
                         "mission_status": mission.status,
                     }
                     | dict(zip(map(_column, mission.features), bound.awareness[i], strict=True))
-                    | {n: a[j - first, k, i] if j >= first else np.nan for n, a in trust.items()}
+                    | {n: a[j][k, i] if j in a else np.nan for n, a in trust.items()}
                 )
     write_text(target, pd.DataFrame(rows).to_csv(index=False, lineterminator="\n"))
 

@@ -1,6 +1,7 @@
 """Missions as trees of arrays, for netCDF files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -8,30 +9,93 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Bound, Mission
-from trustbo.errors import TrustboError
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.files import read_checked, remove_checked, write_checked
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
 
 
-def read_tree(path: Path) -> xr.DataTree:
+def read_tree(path: str | PathLike[str]) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
 
     Raises:
-        TrustboError: There is no such file.
+        DamagedFileError: There is no such file, it was changed, or it is no netCDF.
     """
-    if not path.exists():
-        raise TrustboError(f"there is no file {str(path)!r}; was it saved by trustbo?")
-    with xr.open_datatree(path, engine="netcdf4") as tree:
-        return tree.load()
+    content = read_checked(path)
+    try:
+        with xr.open_datatree(content, engine="netcdf4") as tree:
+            return tree.load()
+    except (OSError, ValueError, RuntimeError, KeyError):
+        raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
 
 
-def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions to arrays padded with NaN, and their ticks to one long table.
+def write_tree(path: str | PathLike[str], tree: xr.DataTree) -> None:
+    """Write a netCDF file of groups, with its checksum."""
+    write_checked(path, bytes(tree.to_netcdf()))
+
+
+def write_missions(
+    path: str | PathLike[str],
+    missions: Sequence[Mission],
+    *,
+    since: int = 0,
+    notes: Mapping[str, str] | None = None,
+) -> None:
+    """Write missions to a netCDF file, and the ticks of each to a file in `ticks/` beside it.
+
+    Args:
+        path: File of all missions.
+        missions: Missions, at least one.
+        since: Number of first missions whose ticks are there already.
+        notes: Attributes of the table of missions.
 
     Raises:
         TrustboError: States with another shape than (tick, robot, state).
     """
+    for j in range(since, len(missions)):
+        file, recorded = ticks_file(path, j), _ticks(missions[j])
+        if recorded is None:
+            remove_checked(file)
+        else:
+            write_tree(file, xr.DataTree(recorded))
+    table = _table(missions).assign_attrs(notes or {})
+    write_tree(path, xr.DataTree.from_dict({"missions": table}))
+
+
+def ticks_file(path: str | PathLike[str], j: int) -> Path:
+    """Name of the file with the ticks of mission j, from 0, beside a file of missions."""
+    return Path(path).parent / "ticks" / f"{j + 1:04d}.nc"
+
+
+def read_missions(path: str | PathLike[str]) -> list[Mission]:
+    """Read missions from a netCDF file, such as `measured.nc` of a campaign, and their ticks.
+
+    Args:
+        path: File of missions; ticks are read where they are beside it.
+
+    Raises:
+        DamagedFileError: There is no such file, it was changed, or it holds no missions.
+    """
+    tree = read_tree(path)
+    try:
+        table = {str(n): a.values for n, a in tree["missions"].to_dataset().variables.items()}
+        if "exposure" in table:  # its name in version 0.1
+            table["n_ticks"] = table.pop("exposure")
+        old = tree["ticks"].to_dataset() if "ticks" in tree.children else None
+        missions = []
+        for j in range(len(table["status"])):
+            ticks = None if old is None else old.isel(tick=old["mission"].values == j)
+            if ticks is None and (file := ticks_file(path, j)).exists():
+                ticks = read_tree(file).to_dataset()
+            missions.append(_mission(table, j, ticks))
+        return missions
+    except KeyError as error:
+        raise DamagedFileError(f"{str(path)!r} holds no missions: it lacks {error}.") from None
+
+
+def _table(missions: Sequence[Mission]) -> xr.Dataset:
+    """Arrays of missions, padded with NaN."""
     n_steps = max(len(mission.path) for mission in missions)
     shape = (len(missions), n_steps - 1)
     robots, features = missions[0].robots, missions[0].features
@@ -47,7 +111,7 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
         start[j, :n] = [bound.t0 for bound in mission.bounds]
         status[j, :n] = [bound.status for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
-    table = xr.Dataset(
+    return xr.Dataset(
         {
             "path": (("mission", "step", "axis"), path),
             "awareness": ((*dims, "feature"), awareness),
@@ -61,64 +125,56 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
         },
         {"robot": list(robots), "feature": list(features), "axis": ["row", "col"]},
     )
-    return xr.DataTree.from_dict({"missions": table, "ticks": _ticks(missions)})
 
 
-def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
-    """Convert a tree of `missions_to_tree` back."""
-    table, ticks = tree["missions"].to_dataset(), tree["ticks"].to_dataset()
-    if "exposure" in table:  # its name in version 0.1
-        table = table.rename(exposure="n_ticks")
-    robots, features = (tuple(str(n) for n in table[d].values) for d in ("robot", "feature"))
-    missions = []
-    for j in range(table.sizes["mission"]):
-        one = table.isel(mission=j)
-        path = tuple((int(r), int(c)) for r, c in one["path"].values if r >= 0)
-        bounds = []
-        for k in range(int(one["n_bounds"])):
-            row = one.isel(bound=k)
-            mine = (ticks["mission"].values == j) & (ticks["bound"].values == k)
-            bounds.append(
-                Bound(
-                    path[k + 1],
-                    row["awareness"].values,
-                    row["contact_rate"].values,
-                    row["duration"].values,
-                    str(row["bound_status"].values),
-                    float(row["start"]),
-                    ticks["pose"].values[mine] if mine.any() else None,
-                    ticks["contact"].values[mine].astype(bool) if mine.any() else None,
-                    row["n_ticks"].values,
-                    _states_of(ticks, mine),
-                )
-            )
-        missions.append(Mission(path, tuple(bounds), str(one["status"].values), features, robots))
-    return missions
+def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> Mission:
+    """Mission j of a table, with the ticks of its bounds if they were recorded."""
+    robots, features = (tuple(map(str, table[d])) for d in ("robot", "feature"))
+    path = tuple((int(r), int(c)) for r, c in table["path"][j] if r >= 0)
+    bounds = []
+    for k in range(int(table["n_bounds"][j])):
+        z, y, seconds, n = (
+            table[name][j, k] for name in ("awareness", "contact_rate", "duration", "n_ticks")
+        )
+        status, t0 = str(table["bound_status"][j, k]), float(table["start"][j, k])
+        poses, contact, states = _ticks_of(ticks, k)
+        bounds.append(Bound(path[k + 1], z, y, seconds, status, t0, poses, contact, n, states))
+    return Mission(path, tuple(bounds), str(table["status"][j]), features, robots)
 
 
-def _ticks(missions: Sequence[Mission]) -> xr.Dataset:
-    """Poses, contacts and states of all recorded ticks, concatenated."""
-    recorded: list[tuple[int, int, Any]] = [
-        (j, k, bound)
-        for j, mission in enumerate(missions)
+def _ticks_of(ticks: xr.Dataset | None, k: int) -> tuple[np.ndarray | None, ...]:
+    """Poses, contact and states of bound k; None if not recorded."""
+    mine = None if ticks is None else ticks["bound"].values == k
+    if ticks is None or mine is None or not mine.any():
+        return None, None, None
+    states = ticks["states"].values[mine] if "states" in ticks else None
+    if states is not None and np.isnan(states).all():
+        states = None
+    return ticks["pose"].values[mine], ticks["contact"].values[mine].astype(bool), states
+
+
+def _ticks(mission: Mission) -> xr.Dataset | None:
+    """Poses, contacts and states of a mission's recorded ticks, concatenated; None if none are."""
+    recorded: list[tuple[int, Any]] = [
+        (k, bound)
         for k, bound in enumerate(mission.bounds)
         if bound.poses is not None and bound.contact is not None
     ]
-    n_robots = len(missions[0].robots)
-    lengths = [len(bound.poses) for _, _, bound in recorded]
-    # An empty table first: there may be no ticks at all.
-    poses = [np.empty((0, 1 + n_robots, 3)), *(bound.poses for _, _, bound in recorded)]
-    contacts = [np.empty((0, n_robots), bool), *(bound.contact for _, _, bound in recorded)]
+    if not recorded:
+        return None
+    lengths = [len(bound.poses) for _, bound in recorded]
     states = {}
-    if any(bound.states is not None for _, _, bound in recorded):
-        values = [_states(f"mission {j}, bound {k + 1}", bound) for j, k, bound in recorded]
+    if any(bound.states is not None for _, bound in recorded):
+        values = [_states(f"bound {k + 1}", bound) for k, bound in recorded]
         states["states"] = (("tick", "robot", "state"), np.concatenate(values))
     return xr.Dataset(
         {
-            "mission": ("tick", np.repeat([j for j, _, _ in recorded], lengths).astype(int)),
-            "bound": ("tick", np.repeat([k for _, k, _ in recorded], lengths).astype(int)),
-            "pose": (("tick", "member", "component"), np.concatenate(poses)),
-            "contact": (("tick", "robot"), np.concatenate(contacts)),
+            "bound": ("tick", np.repeat([k for k, _ in recorded], lengths).astype(int)),
+            "pose": (
+                ("tick", "member", "component"),
+                np.concatenate([bound.poses for _, bound in recorded]),
+            ),
+            "contact": (("tick", "robot"), np.concatenate([b.contact for _, b in recorded])),
             **states,
         },
         {"component": ["x", "y", "heading"], **({"state": list(STATES)} if states else {})},
@@ -136,11 +192,3 @@ def _states(where: str, bound: Any) -> np.ndarray:
             f"{np.shape(bound.states)}."
         )
     return bound.states
-
-
-def _states_of(ticks: xr.Dataset, mine: np.ndarray) -> np.ndarray | None:
-    """States of several ticks, (tick, robot, state); None if not recorded."""
-    if "states" not in ticks or not mine.any():
-        return None
-    states = ticks["states"].values[mine]
-    return None if np.isnan(states).all() else states

@@ -112,6 +112,7 @@ def fit(
     if weights is not None:
         counted = xr.DataArray(weight[: len(missions)], dims="mission")
         posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
+        posterior.attrs["weights"] = counted.values.tolist()
     if whole or not model.family.integrates_out:
         posterior = complete(
             posterior, missions, n_trajectories=n_trajectories, latents=draws.latents
@@ -119,10 +120,10 @@ def fit(
     posterior.attrs["seconds"] = time.perf_counter() - started
     if complaints:
         raise PosteriorError(
-            f"posterior refused after a longer retry: {'; '.join(complaints)}. Give more missions, "
-            f"or firmer priors (where the rates hardly vary, {_FIRM_NOISE}), or pass check=False "
-            "to have it as it is.",
+            f"posterior refused after a longer retry: {'; '.join(complaints)}.",
             posterior,
+            f"Give more missions, or firmer priors (where the rates hardly vary, {_FIRM_NOISE}), "
+            "or pass check=False to have it as it is.",
         )
     return posterior
 

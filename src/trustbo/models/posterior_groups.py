@@ -20,6 +20,16 @@ from trustbo.stacking import MissionBatch, stack_missions
 _N_TRAJECTORIES = 200
 
 
+_KEPT = ("posterior", "sample_stats", "prior")
+
+
+def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
+    """Posterior without the groups that grow with the number of missions; see `complete`."""
+    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in _KEPT})
+    alone.attrs = posterior.attrs
+    return alone
+
+
 class _Law(NamedTuple):
     """Law of contact rates given parameters, as a posterior's attributes tell it."""
 
@@ -84,6 +94,9 @@ def complete(
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
     whole.attrs = posterior.attrs | {"log_likelihood_of": of}
+    if "weights" in posterior.attrs:
+        weight = xr.DataArray(np.atleast_1d(posterior.attrs["weights"]), dims="mission")
+        whole["constant_data"] = whole["constant_data"].assign(weight=weight)
     return whole
 
 

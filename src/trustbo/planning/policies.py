@@ -34,7 +34,7 @@ def greedy(key: Array, posterior: Params, planner: Planner) -> Plan:
 
 def thompson(key: Array, posterior: Params, planner: Planner) -> Plan:
     """Best path under one posterior draw taken at random (probability matching)."""
-    index = int(jax.random.randint(key, (), 0, posterior.leading[0]))
+    index = int(jax.random.randint(key, (), 0, posterior.leading[0], np.int32))
     plan = planner.of_draw(index).plan(posterior.draw(index))
     return planner.evaluate(plan.path, posterior.mean())
 
@@ -102,7 +102,7 @@ def epsilon_greedy(
 ) -> Plan:
     """Greedy; with probability `epsilon`, a random path."""
     chance, other = jax.random.split(key)
-    explores = float(jax.random.uniform(chance)) < epsilon
+    explores = float(jax.random.uniform(chance, dtype=np.float32)) < epsilon
     return (random if explores else greedy)(other, posterior, planner)
 
 

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 import xarray as xr
@@ -107,8 +108,11 @@ class KinematicSimulator:
             "crown_base": self.sight.crown_base,
             "tick": self.tick,
             "bounding": self.bounding,
-            "threats": len(self.threats),
-            "degradations": len(self.degradations),
+            "formation_radius": self.formation_radius,
+            "bound_timeout": self.bound_timeout,
+            "lost_contact_after": self.lost_contact_after,
+            "threats": [asdict(threat) for threat in self.threats],
+            "degradations": [asdict(degradation) for degradation in self.degradations],
             "realtime": sorted(self.realtime),
         }
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_pair
-from trustbo.logs.netcdf import missions_from_tree, read_tree
+from trustbo.logs.netcdf import read_missions
 from trustbo.logs.table import read_table
 
 ON_MISSING = ("error", "next")
@@ -65,17 +65,11 @@ class ReplaySimulator:
             on_missing: See `ReplaySimulator`.
 
         Raises:
-            TrustboError: There is no such file, or it holds no missions.
+            DamagedFileError: There is no such file, or it holds no missions.
         """
         file = Path(path)
         file = file / "missions.nc" if file.is_dir() else file
-        try:
-            missions = missions_from_tree(read_tree(file))
-        except (OSError, KeyError) as error:
-            raise TrustboError(
-                f"{str(file)!r} holds no missions ({error}); give the missions.nc of a result."
-            ) from None
-        return cls(missions, on_missing=on_missing)
+        return cls(read_missions(file), on_missing=on_missing)
 
     @property
     def remaining(self) -> tuple[Mission, ...]:

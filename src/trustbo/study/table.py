@@ -9,7 +9,7 @@ import xarray as xr
 
 from trustbo.errors import require_choice
 
-_TEXT = ("status",)
+_TEXT = ("status", "state", "reason")
 _PATHS = ("path", "recommended")
 _NOT_AXES = ("key", "seed")
 
@@ -34,7 +34,7 @@ def to_dataset(
         elif name in _TEXT:
             words = np.full(shape, "", dtype=object)
             for i, j, row in cells:
-                words[i, j] = row[name]
+                words[i, j] = row.get(name, "")
             variables[name] = (dims, words.astype(str))
         else:
             numbers = np.full(shape, np.nan)

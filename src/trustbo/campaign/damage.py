@@ -1,0 +1,50 @@
+"""Damaged files of a campaign: what is wrong, and what can still be read."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from trustbo.errors import DamagedFileError
+from trustbo.files import read_checked
+
+MEASURED = "measured.nc"
+
+
+def read_json(file: Path, *fields: str) -> dict[str, Any]:
+    """Read a record with these fields.
+
+    Raises:
+        DamagedFileError: The file is missing or damaged, or a field is.
+    """
+    content = read_checked(file)
+    try:
+        record = json.loads(content)
+        missing = [name for name in fields if name not in record]
+    except (ValueError, TypeError) as error:
+        raise DamagedFileError(f"{str(file)!r} is damaged: no JSON ({error}).") from None
+    if missing:
+        raise DamagedFileError(f"{str(file)!r} is damaged: it lacks {', '.join(missing)}.")
+    return record
+
+
+@contextmanager
+def naming_what_is_left(folder: Path) -> Iterator[None]:
+    """Add to the error of a damaged file that the missions as told can be read, if they can."""
+    try:
+        yield
+    except DamagedFileError as error:
+        measured = folder / MEASURED
+        if str(measured) in str(error) or not measured.exists():
+            raise
+        raise DamagedFileError(f"{error} {salvage(measured)}") from None
+
+
+def salvage(measured: Path) -> str:
+    """Describe the way on where only the missions as told can be read."""
+    return (
+        "All missions as they were told can be read: trustbo.logs.read_missions("
+        f"{str(measured)!r}); tell them, in order, to a new campaign in another folder, with "
+        "other_path=True."
+    )

@@ -1,0 +1,138 @@
+"""Checks of a mission that is told to a campaign, before anything is done with it."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from trustbo.data import Cell, Mission
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.workspace import Workspace
+
+RESERVED = (
+    "objective", "path_changed", "contact_rate", "status", "state", "reason", "path", "trust_map",
+    "seconds_plan", "seconds_run", "seconds_fit",
+)  # fmt: skip
+"""Names of the history's own columns."""
+
+
+def require_mission(
+    workspace: Workspace, mission: Mission, path: Sequence[Cell], *, other_path: bool
+) -> Mission:
+    """Return a mission with its robots and features in the workspace's order.
+
+    Args:
+        workspace: Workspace of the campaign.
+        mission: Mission as it was told.
+        path: Path that was asked for.
+        other_path: Whether the mission is known to have followed another path.
+
+    Raises:
+        ShapeError: Robots or features differ from the workspace's.
+        TrustboError: The path leaves the grid, jumps, or is not the one that was asked for.
+    """
+    if not isinstance(mission, Mission):
+        raise TrustboError(f"tell takes a Mission; got {mission!r}.")
+    names = {d: [str(n) for n in workspace.awareness[d].values] for d in ("robot", "feature")}
+    for what, found in (("robot", mission.robots), ("feature", mission.features)):
+        if sorted(found) != sorted(names[what]):
+            raise ShapeError(
+                f"the mission has {what}s {found}, the workspace {tuple(names[what])}."
+            )
+    _require_path(mission, list(path), workspace.grid.shape, other_path)
+    return mission.in_order(names["robot"], names["feature"])
+
+
+def require_new(mission: Mission, earlier: Sequence[Mission]) -> None:
+    """Refuse a mission that was told before.
+
+    Raises:
+        TrustboError: An earlier mission is the same in every number.
+    """
+    for j, other in enumerate(earlier):
+        if mission is other or _is_same(mission, other):
+            raise TrustboError(
+                f"this mission was told already: it is mission {j + 1}, number by number. If it "
+                "really was run again, tell(mission, again=True)."
+            )
+
+
+def require_extra(extra: Mapping[str, Any]) -> dict[str, float]:
+    """Return more numbers of a mission as floats.
+
+    Raises:
+        TrustboError: Not a number, or a name of the history's own columns.
+    """
+    checked = {}
+    for name, value in extra.items():
+        if name in RESERVED:
+            raise TrustboError(f"{name!r} is a column of the history; give {value!r} another name.")
+        if isinstance(value, bool) or not isinstance(value, Real):
+            raise TrustboError(f"{name} must be a number; got {value!r}.")
+        checked[name] = float(value)
+    return checked
+
+
+def never_to_be_learned(filled: Mission) -> str:
+    """Reason that no later mission can help to learn from a mission, or an empty string."""
+    if not np.isfinite(filled.contact_rate).any():
+        return "no contact rate was measured."
+    if np.isnan(filled.awareness).any():
+        k, i, m = np.argwhere(np.isnan(filled.awareness))[0]
+        return (
+            f"awareness of bound {k + 1}, robot {filled.robots[i]}, feature {filled.features[m]} "
+            f"was not measured, and cell {filled.bounds[k].cell} has none in the map."
+        )
+    return ""
+
+
+def _require_path(
+    mission: Mission, asked: Sequence[Cell], shape: tuple[int, int], other_path: bool
+) -> None:
+    path, (rows, cols) = list(mission.path), shape
+    swapped = [(col, row) for row, col in path]
+    maybe = "; were row and col swapped?" if _starts(swapped, asked) else "."
+    for cell in path:
+        if not (0 <= cell[0] < rows and 0 <= cell[1] < cols):
+            raise TrustboError(
+                f"the mission's path enters {cell}, outside the grid of {rows} rows and {cols} "
+                f"columns{maybe}"
+            )
+    for before, after in pairwise(path):
+        if max(abs(before[0] - after[0]), abs(before[1] - after[1])) > 1:
+            raise TrustboError(
+                f"the mission's path jumps from {before} to {after}, which are no neighbours; "
+                "cells are (row, col), and every cell entered counts."
+            )
+    if path == asked or other_path or (mission.status != "ok" and _starts(path, asked)):
+        return
+    if maybe == "." and path[0] != asked[0]:
+        maybe = f": it starts at {path[0]}, not at {asked[0]}."
+    raise TrustboError(
+        f"the mission followed {_text(path)}, but {_text(asked)} was asked for{maybe} If it really "
+        "went there, tell(mission, other_path=True)."
+    )
+
+
+def _starts(path: Sequence[Cell], whole: Sequence[Cell]) -> bool:
+    return list(path) == list(whole[: len(path)])
+
+
+def _is_same(one: Mission, other: Mission) -> bool:
+    """Whether all numbers agree, and are such that two missions hardly share them."""
+    if one.path != other.path or one.status != other.status:
+        return False
+    names = ("awareness", "contact_rate", "duration", "n_ticks")
+    if not all(np.array_equal(getattr(one, n), getattr(other, n), equal_nan=True) for n in names):
+        return False
+    if any(bound.poses is not None for bound in one.bounds):
+        pairs = zip(one.bounds, other.bounds, strict=True)
+        return all(np.array_equal(a.poses, b.poses) for a, b in pairs)  # pyright: ignore
+    # Perfect contact of the same durations is common; rates in between, to the last bit, are not.
+    return bool(((one.contact_rate > 0.0) & (one.contact_rate < 1.0)).any())
+
+
+def _text(path: Sequence[Cell]) -> str:
+    return " ".join(f"{row},{col}" for row, col in path)

@@ -1,0 +1,495 @@
+"""Missions that are told: none is lost, none is driven twice, and each says what became of it."""
+
+import json
+import re
+import shutil
+import warnings
+
+import jax
+import numpy as np
+import pytest
+from simulators import ModelSimulator
+
+import trustbo as tb
+from trustbo.data import Mission
+from trustbo.models import fit, params_of
+
+ENDS = ((3, 0), (0, 3))
+DIAGONAL = ((3, 0), (2, 1), (1, 2), (0, 3))
+
+
+@pytest.fixture
+def workspace():
+    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+
+
+def begin(workspace, folder=None, **options):
+    return tb.Campaign(
+        workspace, *ENDS, **{"sampler": "exact", "objective": "mean"} | options, directory=folder
+    )
+
+
+def rates(workspace, path, seed=0):
+    return ModelSimulator(workspace, blind=True).run(path, seed=seed)
+
+
+def refuse(*args, **kwargs):
+    raise tb.PosteriorError("R-hat of beta0 is 1.5.", None, "Pass check=False.")
+
+
+def test_a_mission_that_is_refused_stays_told_and_is_learned_with_the_next(
+    workspace, tmp_path, monkeypatch
+):
+    campaign = begin(workspace, tmp_path)
+    first = campaign.ask()
+    tried = []
+
+    def refuse_all(*args, **kwargs):
+        tried.append((args[2], kwargs["seed"], kwargs["n_draws"]))
+        refuse()
+
+    with monkeypatch.context() as patch:
+        patch.setattr("trustbo.campaign.learning.fit", refuse_all)
+        with pytest.warns(UserWarning, match="mission 1 is kept") as said:
+            assert campaign.tell(rates(workspace, first.path)) is None
+        text = str(said[0].message)
+        assert "mission 1 is kept, but cannot be learned from yet: R-hat of beta0 is 1.5" in text
+        assert "goes on with the prior" in text
+        assert "check=False" not in text  # which is no argument here
+    # Another seed and more draws, then the other sampler.
+    assert [(sampler, n) for sampler, _, n in tried] == [
+        ("exact", 1000), ("exact", 2000), ("nuts", 2000)
+    ]  # fmt: skip
+    assert len({seed for _, seed, _ in tried}) == 3
+    assert len(campaign.waiting) == len(campaign.missions) == 1
+    assert campaign.posterior is None
+    assert campaign.history["state"].values.tolist() == ["told"]
+    assert "R-hat" in str(campaign.history["reason"].values[0])
+    campaign.close()
+
+    again = tb.Campaign.load(tmp_path)  # it opens, and fits nothing
+    assert len(again.waiting) == 1
+    again.tell(rates(workspace, again.ask().path, seed=1))
+    assert again.waiting == []
+    assert again.history["state"].values.tolist() == ["learned", "learned"]
+    assert again.posteriors[0] is None
+    assert again.posterior["constant_data"].sizes["mission"] == 2
+    again.close()
+    kept = tb.load_result(tmp_path)
+    assert kept.posteriors[0] is None
+    np.testing.assert_array_equal(
+        kept.posterior["latent"]["trust"], again.posterior["latent"]["trust"]
+    )
+
+
+def test_the_loop_goes_on_and_drives_no_mission_twice(workspace, tmp_path, monkeypatch):
+    driven = []
+
+    class Counts(ModelSimulator):
+        def run(self, path, *, seed):
+            driven.append(seed)
+            return super().run(path, seed=seed)
+
+    def refuse_twice(missions, *args, **kwargs):
+        return refuse() if len(missions) < 3 else fit(missions, *args, **kwargs)
+
+    def options(n):
+        return {"simulator": Counts(workspace, blind=True), "n_iterations": n, "progress": False}
+
+    monkeypatch.setattr("trustbo.campaign.learning.fit", refuse_twice)
+    with pytest.warns(UserWarning, match="cannot be learned from yet"):
+        result = tb.iterate(workspace, *ENDS, sampler="exact", checkpoint=tmp_path, **options(2))
+    assert result.history["state"].values.tolist() == ["told", "told"]
+    with pytest.raises(tb.TrustboError, match=r"there is no posterior: none of 2 missions .*R-hat"):
+        _ = result.posterior
+    longer = tb.resume(tmp_path, **options(3))
+    assert len(driven) == len(set(driven)) == 3
+    assert longer.history["state"].values.tolist() == ["learned"] * 3
+    assert longer.posterior["constant_data"].sizes["mission"] == 3
+
+
+def test_a_defect_of_a_fit_costs_no_mission(workspace, monkeypatch):
+    def break_down(*args, **kwargs):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    campaign = begin(workspace)
+    monkeypatch.setattr("trustbo.campaign.learning.fit", break_down)
+    with pytest.warns(UserWarning, match="LinAlgError: Singular matrix"):
+        campaign.tell(rates(workspace, campaign.ask().path))
+    assert len(campaign.waiting) == 1
+
+
+def test_a_mission_that_measured_nothing_is_set_aside_and_the_folder_opens(workspace, tmp_path):
+    campaign = begin(workspace, tmp_path)
+    path = campaign.ask().path
+    n = len(path) - 1
+    nothing = Mission.from_arrays(path, np.full((n, 3, 2), np.nan), np.full((n, 3), np.nan))
+    with pytest.warns(UserWarning, match="mission 1 is set aside: no contact rate was measured"):
+        assert campaign.tell(nothing) is None
+    campaign.tell(rates(workspace, campaign.ask().path))
+    campaign.close()
+    with tb.Campaign.load(tmp_path) as again:
+        assert again.history["state"].values.tolist() == ["set aside", "learned"]
+        assert again.posterior["constant_data"]["mission"].values.tolist() == [1]
+        assert len(again.missions) == 2
+
+
+def test_a_cell_without_awareness_sets_its_mission_aside(tmp_path):
+    awareness = np.random.default_rng(0).uniform(size=(3, 4, 4, 2))
+    awareness[:, 2, 1] = np.nan
+    workspace = tb.Workspace.from_awareness(awareness)
+    campaign = begin(workspace, tmp_path)
+    blind = Mission.from_arrays(DIAGONAL, np.full((3, 3, 2), np.nan), np.full((3, 3), 0.7))
+    with pytest.warns(
+        UserWarning, match=r"awareness of bound 1, robot r1, .* cell \(2, 1\) has no"
+    ):
+        campaign.tell(blind, other_path=True)
+    campaign.close()
+    tb.Campaign.load(tmp_path).close()
+
+
+def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
+    campaign, only = begin(workspace, seed=1), begin(workspace, seed=1)
+    missions = [rates(workspace, DIAGONAL, seed=j) for j in range(3)]
+    for mission in missions:
+        campaign.tell(mission, other_path=True)
+    campaign.set_aside("the lidar was covered", 2)
+    assert campaign.history["state"].values.tolist() == ["learned", "set aside", "learned"]
+    assert campaign.history["reason"].values[1] == "the lidar was covered"
+    assert campaign.posterior["constant_data"]["mission"].values.tolist() == [0, 2]
+    again = fit(
+        [campaign.missions[j] for j in (0, 2)], sampler="exact", seed=campaign.seed_of("fit")
+    )
+    np.testing.assert_array_equal(
+        again["posterior"]["beta"], campaign.posterior["posterior"]["beta"]
+    )
+    with pytest.raises(tb.TrustboError, match="there is no mission 2 to set aside; 3 were told"):
+        campaign.set_aside("again", 2)
+    campaign.tell(missions[1], other_path=True)
+    assert campaign.posterior["constant_data"].sizes["mission"] == 3
+    only.tell(missions[0], other_path=True)
+    assert only.set_aside("wrong field") is None
+    assert only.posterior is None
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ([(0, 3), (1, 2), (2, 1), (3, 0)], "was asked for; were row and col swapped?"),
+        ([(2, 0), (1, 1), (0, 2), (0, 3)], r"it starts at \(2, 0\), not at \(3, 0\)"),
+        ([(3, 0), (1, 2), (0, 3)], r"jumps from \(3, 0\) to \(1, 2\), which are no neighbours"),
+        ([(3, 0), (2, 0), (1, 1), (0, 2), (0, 3)], r"tell\(mission, other_path=True\)"),
+        ([(3, 0), (2, 1), (9, 9)], r"enters \(9, 9\), outside the grid of 4 rows and 4 columns"),
+    ],
+)
+def test_another_path_than_the_one_asked_for_is_refused_with_the_likely_reason(
+    workspace, tmp_path, path, said
+):
+    campaign = begin(workspace, tmp_path)
+    campaign.suggest(DIAGONAL)
+    n = len(path) - 1
+    mission = Mission.from_arrays(path, np.full((n, 3, 2), 0.5), np.full((n, 3), 0.7))
+    with pytest.raises(tb.TrustboError, match=said):
+        campaign.tell(mission)
+    assert campaign.missions == []
+    assert not (tmp_path / "measured.nc").exists()
+
+
+def test_a_mission_that_failed_on_its_way_is_of_the_path_asked_for(workspace):
+    campaign = begin(workspace)
+    campaign.suggest(DIAGONAL)
+    part = Mission.from_arrays(DIAGONAL[:3], np.full((2, 3, 2), 0.5), np.eye(3)[:2], status="stuck")
+    assert campaign.tell(part) is not None
+
+
+def test_robots_and_features_are_put_in_order_by_their_names(workspace):
+    campaign, shuffled = begin(workspace), begin(workspace)
+    z, y = np.random.default_rng(0).uniform(size=(3, 3, 2)), np.eye(3) * 0.3 + 0.5
+    order = [2, 0, 1]
+    names = ["traversability", "visibility"]
+    other = Mission.from_arrays(
+        DIAGONAL, z[:, order][..., ::-1], y[:, order],
+        duration=(10.0 + np.arange(9).reshape(3, 3))[:, order],
+        features=names[::-1], robots=["r3", "r1", "r2"],
+    )  # fmt: skip
+    one = Mission.from_arrays(DIAGONAL, z, y, duration=10.0 + np.arange(9).reshape(3, 3))
+    campaign.tell(one, other_path=True)
+    shuffled.tell(other, other_path=True)
+    for name in ("awareness", "contact_rate", "duration"):
+        np.testing.assert_array_equal(
+            getattr(shuffled.missions[0], name), getattr(campaign.missions[0], name)
+        )
+    stranger = Mission.from_arrays(DIAGONAL, z, y, robots=["r1", "r2", "r9"])
+    with pytest.raises(tb.ShapeError, match=r"has robots \('r1', 'r2', 'r9'\), the workspace"):
+        campaign.tell(stranger, other_path=True)
+
+
+def test_poses_and_states_follow_their_robots():
+    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3))
+    simulator = tb.simulation.KinematicSimulator(workspace, record_states=True)
+    mission = simulator.run([(2, 0), (1, 1)], seed=0)
+    turned = mission.in_order(["r2", "r3", "r1"], mission.features)
+    a, b = mission.bounds[0], turned.bounds[0]
+    np.testing.assert_array_equal(b.poses[:, 0], a.poses[:, 0])  # the lead
+    np.testing.assert_array_equal(b.poses[:, 1], a.poses[:, 2])
+    np.testing.assert_array_equal(b.contact[:, 2], a.contact[:, 0])
+    np.testing.assert_array_equal(b.states[:, 0], a.states[:, 1])
+    back = turned.in_order(mission.robots, mission.features).bounds[0]
+    np.testing.assert_array_equal(back.poses, a.poses)
+    with pytest.raises(tb.ShapeError, match="they cannot be put in the order"):
+        mission.in_order(["r1", "r2"], mission.features)
+
+
+def test_the_same_mission_told_twice_is_recognised(workspace):
+    campaign = begin(workspace)
+    campaign.suggest(DIAGONAL)
+    mission = rates(workspace, DIAGONAL)
+    campaign.tell(mission)
+    campaign.suggest(DIAGONAL)
+    with pytest.raises(tb.TrustboError, match="told already: it is mission 1, number by number"):
+        campaign.tell(rates(workspace, DIAGONAL))
+    assert len(campaign.missions) == 1
+    campaign.tell(mission, again=True)
+    # Perfect contact twice is no sign of one mission.
+    perfect = [
+        Mission.from_arrays(DIAGONAL, np.full((3, 3, 2), np.nan), np.ones((3, 3)), np.full(3, 30.0))
+        for _ in range(2)
+    ]
+    for one in perfect:
+        campaign.tell(one, other_path=True)
+    assert len(campaign.missions) == 4
+
+
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        ({"regret": "low"}, "regret must be a number; got 'low'"),
+        ({"regret": None}, "regret must be a number; got None"),
+        ({"status": 1.0}, "'status' is a column of the history"),
+    ],
+)
+def test_what_is_told_beside_the_mission_is_checked_before(workspace, tmp_path, extra, said):
+    campaign = begin(workspace, tmp_path)
+    with pytest.raises(tb.TrustboError, match=said):
+        campaign.tell(rates(workspace, campaign.ask().path), **extra)
+    assert not (tmp_path / "measured.nc").exists()
+
+
+def test_replanning_by_bounds_is_refused_with_a_family_it_cannot_follow(workspace):
+    class Bounds(ModelSimulator):
+        reset = run_bound = ModelSimulator.run
+
+    model = tb.models.PooledTrust(observation="censored")
+    with pytest.raises(
+        tb.TrustboError, match=r'replan="bound" follows trust by a filter, which ne'
+    ):
+        tb.iterate(
+            workspace, *ENDS, model=model, replan="bound", simulator=Bounds(workspace),
+            progress=False,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("policy", ["thompson", "epsilon_greedy"])
+def test_the_caller_s_jax_flags_do_not_change_a_campaign(workspace, policy):
+    def paths(*flags):
+        campaign = begin(workspace, policy=policy, seed=3)
+        for j, x64 in enumerate(flags):
+            with jax.enable_x64(x64), jax.threefry_partitionable(not x64):
+                with jax.default_prng_impl("rbg" if x64 else "threefry2x32"):
+                    campaign.tell(rates(workspace, campaign.ask().path, seed=j))
+        return [plan.path for plan in campaign.plans]
+
+    assert paths(False, False, False, False) == paths(True, True, True, True)
+    assert paths(False, False, False, False) == paths(False, True, False, True)
+
+
+# --- damage ---
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    path = tmp_path_factory.mktemp("campaign") / "kept"
+    simulator = ModelSimulator(workspace, blind=True)
+    tb.iterate(
+        workspace, *ENDS, n_iterations=2, sampler="exact", simulator=simulator, checkpoint=path,
+        progress=False,
+    )  # fmt: skip
+    return path
+
+
+FILES = (
+    "campaign.json", "measured.nc", "missions.nc", "history.nc", "workspace.nc", "result.json",
+    "posteriors/0002.nc",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("damage", ["missing", "empty", "noise", "half"])
+def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, name, damage):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    file = copy / name
+    content = file.read_bytes()
+    if damage == "missing":
+        file.unlink()
+    elif damage == "noise":  # 2 kB of it, or less in a small file
+        size = min(2000, len(content) // 4)
+        noise = np.random.default_rng(0).bytes(size)
+        file.write_bytes(content[:size] + noise + content[2 * size :])
+    else:
+        file.write_bytes(content[: len(content) // 2] if damage == "half" else b"")
+    opens = {"result.json": [tb.load_result], "campaign.json": [tb.Campaign.load]}
+    opens |= {"measured.nc": [tb.Campaign.load]}
+    for load in opens.get(name, [tb.Campaign.load, tb.load_result]):
+        with pytest.raises(tb.TrustboError) as error:
+            params_of(load(copy).posterior)
+        if damage == "missing" and name == "result.json":
+            assert re.search("holds no result", str(error.value))
+        else:
+            assert isinstance(error.value, tb.DamagedFileError)
+            assert name in str(error.value)
+        if name != "measured.nc" and not (name == "result.json" and damage == "missing"):
+            assert "trustbo.logs.read_missions(" in str(error.value)
+    if name != "measured.nc":  # which alone rebuilds the campaign
+        old = tb.load_result(folder)
+        again = begin(old.workspace, objective="terminal")
+        for mission in tb.logs.read_missions(copy / "measured.nc"):
+            again.tell(mission, other_path=True)
+        np.testing.assert_array_equal(
+            again.posterior["posterior"]["b"], old.posterior["posterior"]["b"]
+        )
+
+
+def test_leftovers_of_dead_runs_are_removed_and_sums_kept(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    dead = [copy / ".campaign.4711.json", copy / "posteriors" / ".0002.4711.nc"]
+    for file in dead:
+        file.write_text("half")
+    sums = sorted(copy.rglob(".*.sha256"))
+    tb.Campaign.load(copy).close()
+    assert not any(file.exists() for file in dead)
+    assert sorted(copy.rglob(".*.sha256")) == sums
+
+
+# --- resuming means the same ---
+
+
+def test_a_campaign_that_its_rule_has_ended_gives_back_its_result(workspace, tmp_path):
+    rule = tb.RegretBound(eps=0.9, delta=0.9, min_missions=2, patience=1)
+    simulator = ModelSimulator(workspace, blind=True)
+    options = {"simulator": simulator, "progress": False}
+    ended = tb.iterate(
+        workspace, *ENDS, sampler="exact", objective="mean", n_iterations=5, stop=rule,
+        checkpoint=tmp_path, **options,
+    )  # fmt: skip
+    assert (len(ended.missions), ended.stop_reason[:12]) == (2, "regret_bound")
+    again = tb.resume(tmp_path, **options)
+    assert (len(again.missions), again.stop_reason) == (2, ended.stop_reason)
+    assert tb.load_result(tmp_path).stop_reason == ended.stop_reason
+    # Killed before its verdict was written: asked before anything is driven.
+    state = json.loads((tmp_path / "campaign.json").read_text())
+    (tmp_path / "campaign.json").write_text(json.dumps(state | {"stop_reason": "interrupted"}))
+    (tmp_path / ".campaign.json.sha256").unlink()
+    again = tb.resume(tmp_path, **options)
+    assert (len(again.missions), again.stop_reason) == (2, ended.stop_reason)
+    # More is asked for by word.
+    assert len(tb.resume(tmp_path, stop=[], n_iterations=3, **options).missions) == 3
+    assert len(tb.resume(tmp_path, n_iterations=6, **options).missions) > 3
+
+
+def test_a_rule_of_one_s_own_is_asked_for_again(workspace, tmp_path):
+    def never(campaign):
+        return None
+
+    options = {"simulator": ModelSimulator(workspace, blind=True), "progress": False}
+    tb.iterate(workspace, *ENDS, sampler="exact", n_iterations=1, stop=never, checkpoint=tmp_path,
+               **options)  # fmt: skip
+    with pytest.raises(
+        tb.TrustboError, match="rule to stop, 'never', was your own; give all rules"
+    ):
+        tb.resume(tmp_path, n_iterations=2, **options)
+    assert len(tb.resume(tmp_path, n_iterations=2, stop=never, **options).missions) == 2
+
+
+class Described(ModelSimulator):
+    """A simulator whose settings are awkward to keep."""
+
+    def __init__(self, workspace, **settings):
+        super().__init__(workspace, blind=True)
+        self.settings = settings
+
+    def describe(self):
+        return self.settings
+
+
+def test_settings_of_a_simulator_survive_a_file(workspace, tmp_path):
+    def settings(**changed):
+        return {
+            "tuple": (1, 2.5), "array": np.arange(3.0), "nan": float("nan"), "path": tmp_path,
+            "team": tb.Team(2), "object": object(), "number": np.float32(0.1),
+        } | changed  # fmt: skip
+
+    tb.iterate(workspace, *ENDS, sampler="exact", n_iterations=1, checkpoint=tmp_path,
+               simulator=Described(workspace, **settings()), progress=False)  # fmt: skip
+    same, other = (Described(workspace, **settings(**c)) for c in ({}, {"tuple": (1, 2.6)}))
+    with pytest.raises(tb.TrustboError, match=r"begun with tuple = \[1, 2.5\], not \[1, 2.6\]"):
+        tb.resume(tmp_path, simulator=other, n_iterations=2, progress=False)
+    assert len(tb.resume(tmp_path, simulator=same, n_iterations=2, progress=False).missions) == 2
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"formation_radius": 12.0},
+        {"bound_timeout": 99.0},
+        {"lost_contact_after": 40.0},
+        {"threats": [tb.simulation.Threat("jam", (30.0, 30.0), 12.0, strength=0.4)]},
+        {"degradations": [tb.simulation.Degradation("r1", 0.4)]},
+    ],
+)
+def test_the_description_of_the_simulator_is_complete(changed):
+    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3))
+    before = {
+        "threats": [tb.simulation.Threat("jam", (30.0, 30.0), 12.0, strength=0.5)],
+        "degradations": [tb.simulation.Degradation("r1", 0.5)],
+    }
+    one = tb.simulation.KinematicSimulator(workspace, **before).describe()
+    other = tb.simulation.KinematicSimulator(workspace, **before | changed).describe()
+    assert [name for name in one if one[name] != other[name]] == list(changed)
+
+
+def test_a_simulator_of_version_0_1_is_known_by_its_name_then(workspace, tmp_path):
+    class MujocoSimulator(ModelSimulator):
+        pass
+
+    simulator = MujocoSimulator(workspace, blind=True)
+    tb.iterate(workspace, *ENDS, sampler="exact", n_iterations=1, checkpoint=tmp_path,
+               simulator=simulator, progress=False)  # fmt: skip
+    file = tmp_path / "campaign.json"
+    text = file.read_text().replace('"MujocoSimulator"', '"MujocoBackend"')
+    file.write_text(text)
+    (tmp_path / ".campaign.json.sha256").unlink()
+    assert (
+        len(tb.resume(tmp_path, simulator=simulator, n_iterations=2, progress=False).missions) == 2
+    )
+
+
+def test_a_long_campaign_keeps_the_parameters_alone(workspace, tmp_path):
+    simulator = ModelSimulator(workspace, blind=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = tb.iterate(workspace, *ENDS, sampler="exact", n_iterations=4, simulator=simulator,
+                            checkpoint=tmp_path, progress=False)  # fmt: skip
+    sizes = [tree.nbytes for tree in result.posteriors]
+    assert max(sizes) < 0.31e6  # 4000 draws of 6 numbers and 2 statistics, the prior
+    assert max(sizes) == min(sizes)  # they do not grow
+    files = [file.stat().st_size for file in (tmp_path / "posteriors").glob("*.nc")]
+    assert max(files) < 0.5e6
+    assert result.posterior["latent"].sizes["mission"] == 4
+    again = tb.models.complete(result.posteriors[1], result.missions[:2])
+    direct = fit(result.missions[:2], sampler="exact", seed=int(result.posteriors[1].attrs["seed"]))
+    np.testing.assert_array_equal(again["latent"]["trust"], direct["latent"]["trust"])
