@@ -17,5 +17,5 @@ def test_a_seeded_campaign_gives_the_numbers_kept(name):
         if quantity in ("path", "recommended"):
             assert found[quantity] == expected
         else:
-            # Not bit by bit: the linear algebra of another processor rounds in another way.
-            np.testing.assert_allclose(found[quantity], expected, rtol=1e-9, err_msg=quantity)
+            # Not bit by bit: another processor rounds in another way, and a search amplifies it.
+            np.testing.assert_allclose(found[quantity], expected, rtol=1e-7, err_msg=quantity)
