@@ -165,7 +165,7 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
     }[objective]
 
 
-def pooled_posterior(missions, n_points=(60, 30), reach=0.12):
+def pooled_posterior(missions, n_points=(60, 30), reach=0.12, floor=0.0, power=1):
     """Posterior of the pooled model under the default priors, by the midpoint rule.
 
     Given beta0, delta_w and delta_v, rates are jointly normal with a mean linear in (beta, b):
@@ -175,14 +175,18 @@ def pooled_posterior(missions, n_points=(60, 30), reach=0.12):
         missions: Complete missions.
         n_points: Points of the grid for beta0, and for each of the other two.
         reach: Largest standard deviation on the grid, far in the tail.
+        floor: Least delta_v.
+        power: Points are equally spaced in this root, for posteriors close to (0, 0, floor).
 
     Returns:
         For each of (beta0, delta_w, delta_v): its points and their weights; for each of (beta, b):
         means and standard deviations of normals, and their weights.
     """
-    beta0, deltas = ((np.arange(n) + 0.5) / n for n in n_points)
+    units = [(np.arange(n) + 0.5) / n for n in n_points]
+    beta0, deltas = (u**power for u in units)
     deltas *= reach
-    w, v = np.meshgrid(deltas, deltas, indexing="ij")
+    width, widths = ((power - 1) * np.log(u) for u in units)
+    w, v = np.meshgrid(deltas, floor + deltas, indexing="ij")
     n_weights = missions[0].awareness.shape[-1] + 1
     prior_precision = np.diag(1.0 / np.r_[np.ones(n_weights - 1), 0.5] ** 2)
     log_weight = np.empty((len(beta0), *w.shape))
@@ -191,6 +195,7 @@ def pooled_posterior(missions, n_points=(60, 30), reach=0.12):
         precision = np.broadcast_to(prior_precision, (*w.shape, n_weights, n_weights)).copy()
         h = np.zeros((*w.shape, n_weights))
         log_density = np.log(a * (1.0 - a)) - 0.5 * (w**2 + v**2) / 0.2**2
+        log_density += width[i] + widths[:, None] + widths
         noise = {}  # by length of the mission
         for n in {len(mission.contact_rate) for mission in missions}:
             roll = np.linalg.inv(np.eye(n) - a * np.eye(n, k=-1))
@@ -214,4 +219,4 @@ def pooled_posterior(missions, n_points=(60, 30), reach=0.12):
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     marginals = [weight.sum(axes) for axes in ((1, 2), (0, 2), (0, 1))]
-    return list(zip((beta0, deltas, deltas), marginals, strict=True)), (mean, sd, weight)
+    return list(zip((beta0, deltas, floor + deltas), marginals, strict=True)), (mean, sd, weight)

@@ -185,23 +185,6 @@ def test_bad_input_is_refused_before_sampling(missions):
         fit([missions[0], named])
 
 
-def test_rates_without_variation_are_refused_with_their_value(missions):
-    same = [
-        Mission.from_arrays(m.path, m.awareness, np.ones_like(m.contact_rate)) for m in missions
-    ]
-    with pytest.raises(TrustboError, match="all 120 contact rates are 1: without variation"):
-        fit(same)
-    firm = PooledTrust(Priors(delta_v=dist.TruncatedNormal(0.0, 0.2, low=0.01)))
-    posterior = fit(same, firm)
-    assert float(posterior["posterior"]["delta_v"].min()) >= 0.01
-    assert float(posterior["latent"]["trust_mean"].mean()) == pytest.approx(1.0, abs=0.02)
-    unmeasured = Mission.from_arrays(
-        missions[0].path, missions[0].awareness, np.full_like(missions[0].contact_rate, np.nan)
-    )
-    with pytest.raises(TrustboError, match="every contact rate is NaN"):
-        fit([unmeasured])
-
-
 @pytest.mark.parametrize("name", ["beta0", "delta_w"])
 def test_a_prior_must_be_a_scalar_distribution(name):
     for value in (0.5, dist.Normal(np.zeros(2), 1.0)):

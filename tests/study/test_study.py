@@ -274,18 +274,27 @@ def test_a_study_goes_on_where_it_stopped(serial, tmp_path, counted, monkeypatch
     assert_same(run(tmp_path), serial)
 
 
-def test_a_run_that_fails_does_not_stop_the_others_and_is_tried_again(tmp_path, counted):
-    # Rates that do not vary at all are found out only when they have been measured.
-    flat = {"beta0": 0.5, "beta": [0, 0], "b": 0.25, "delta_w": 0, "delta_v": 0, "x0_sd": 0}
-    simulators = {"flat": {"kind": "model", **flat}, "good": CONFIG["simulators"]["truth"]}
+def test_a_run_that_fails_does_not_stop_the_others_and_is_tried_again(
+    tmp_path, counted, monkeypatch
+):
+    drive = tb.simulation.ModelSimulator.run
+
+    def lose_radio(self, path, *, seed):
+        if self.params.b == 0.25:
+            raise OSError("radio lost")
+        return drive(self, path, seed=seed)
+
+    monkeypatch.setattr(tb.simulation.ModelSimulator, "run", lose_radio)
+    flat = CONFIG["simulators"]["truth"] | {"b": 0.25}
+    simulators = {"flat": flat, "good": CONFIG["simulators"]["truth"]}
     changes = {"simulators": simulators, "policies": "greedy", "seeds": 1}
-    with pytest.warns(UserWarning, match=r"1 of 2 runs failed.*simulator=flat.*all .* are 0\.5"):
+    with pytest.warns(UserWarning, match="1 of 2 runs failed.*simulator=flat.*radio lost"):
         result = run(tmp_path, **changes)
     assert result["simulator"].values.tolist() == ["good"]
     assert result.attrs == {"n_runs": 2, "n_failed": 1}
     failed = study.failures(tmp_path)
     assert failed["simulator"].tolist() == ["flat"]
-    assert failed["error"].iloc[0].startswith("TrustboError: all ")
+    assert failed["error"].iloc[0].startswith("OSError: radio lost")
     assert "Traceback" in failed["traceback"].iloc[0]
     with pytest.warns(UserWarning, match="1 of 2 runs failed"):
         run(tmp_path, **changes)

@@ -17,14 +17,10 @@ from trustbo.models.posterior_tree import to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import SAMPLERS, draw_posterior, require_sampler
-from trustbo.models.ticks import require_ticks
+from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
 
 _N_PRIOR = 500
-_FIRM_NOISE = (
-    "keep the noise away from 0, e.g. Priors(delta_v=numpyro.distributions.TruncatedNormal(0.0, "
-    "0.2, low=0.01))"
-)
 
 
 def fit(
@@ -77,7 +73,7 @@ def fit(
     Raises:
         ShapeError: There are no missions, or they disagree on robots or features.
         TrustboError: An awareness value is NaN, the sampler is unknown or does not suit the model,
-            or the contact rates do not vary at all: the Gaussian noise then has no posterior.
+            or no contact rate was measured.
         PosteriorError: The diagnostics are beyond their limits.
     """
     model = PooledTrust() if model is None else model
@@ -85,12 +81,13 @@ def fit(
     require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
     batch = stack_missions(missions)
     require_ticks(model.family, batch)
-    _require_variation(batch, model)
     weight = _weights(weights, model, batch, len(missions))
+    ticks = _weigh_rates(batch, weight)
+    floored = model.at_resolution(ticks)
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
-    draws, complaints = draw_posterior(model, sampler, settings, seed, batch, weight, check=check)
-    prior = draw_sites(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
+    draws, complaints = draw_posterior(floored, sampler, settings, seed, batch, weight, check=check)
+    prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
     groups = {
         "posterior": {name: draws.params[name] for name in model.dims},
         "sample_stats": draws.stats,
@@ -106,6 +103,7 @@ def fit(
         **draws.summary,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
+        "delta_v_floor": resolution(ticks) if model.family.rounds else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
     }
@@ -122,33 +120,24 @@ def fit(
         raise PosteriorError(
             f"posterior refused after a longer retry: {'; '.join(complaints)}.",
             posterior,
-            f"Give more missions, or firmer priors (where the rates hardly vary, {_FIRM_NOISE}), "
-            "or pass check=False to have it as it is.",
+            "Give more missions or firmer priors, or pass check=False to have it as it is.",
         )
     return posterior
 
 
-def _require_variation(batch: MissionBatch, model: TrustModel) -> None:
-    """Refuse rates that are all the same, unless a prior keeps the noise away from 0.
-
-    A density of rates would grow without bound as both noises go to 0, and have no posterior.
-    """
-    rates = batch.contact_rate[~np.isnan(batch.contact_rate)]
-    if not len(rates):
+def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:
+    """Weight of the rates by their ticks; refused where there is nothing to learn from."""
+    ticks = weigh_ticks(batch, weight)
+    if not ticks:
         raise TrustboError(
             "every contact rate is NaN: nothing was measured. Give one rate at least."
         )
-    priors = model.priors
-    bounded = any(
-        getattr(p.support, "lower_bound", 0.0) > 0.0 for p in (priors.delta_w, priors.delta_v)
-    )
-    bounded = bounded or model.family.bounded_at(float(rates[0]))
-    if len(rates) > 1 and np.ptp(rates) == 0.0 and not bounded:
+    if not sum(ticks.values()) > 0.0:
         raise TrustboError(
-            f"all {len(rates)} contact rates are {rates[0]:g}: without variation the model cannot "
-            "learn its noise. Add missions over other ground, use observation "
-            f'"censored" or "beta_binomial", or {_FIRM_NOISE}.'
+            f"only missions of weight 0 have a contact rate: nothing is left to learn from. Give "
+            f"one of them a positive weight; got {weight}."
         )
+    return ticks
 
 
 def _weights(

@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Self
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
 from trustbo.models.params import Params, check_params
 from trustbo.models.priors import Priors
-from trustbo.models.ticks import broadcast_ticks, require_ticks
+from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution
 from trustbo.stacking import MissionBatch, stack_missions
 
 if TYPE_CHECKING:
@@ -113,6 +113,22 @@ class TrustModel(ABC):
     def partial_pooling(self) -> "HierarchicalTrust | None":
         """The model, if its robots' coefficients are drawn from a common distribution."""
         return None
+
+    def at_resolution(self, ticks: Mapping[float, float]) -> Self:
+        """The model whose delta_v is no less than the resolution of rates of so many ticks.
+
+        Without this floor the density of rates that fit perfectly, constant ones among them, would
+        grow without bound as the noises go to 0.
+
+        Args:
+            ticks: Weight of the rates by their number of ticks.
+
+        Raises:
+            TrustboError: The prior of delta_v has next to no mass above the floor.
+        """
+        if not self.family.rounds:
+            return self
+        return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
 
     def options(self) -> dict[str, str]:
         """Options by name, without the priors."""

@@ -15,7 +15,8 @@ from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.samplers.priors_numpy import draw
-from trustbo.models.ticks import broadcast_ticks
+from trustbo.models.ticks import broadcast_ticks, weigh_ticks
+from trustbo.stacking import MissionBatch
 
 
 def prior_predictive(
@@ -49,6 +50,7 @@ def prior_predictive(
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
     ticks = broadcast_ticks(model.family, n_ticks, z.shape[:3])
     require_whole("n_draws", n_draws, 1)
+    model = model.at_resolution(weigh_ticks(MissionBatch(z, np.zeros(z.shape[:3]), ticks)))
     with own_settings():
         keys = jax.random.split(jax.random.key(seed), n_draws)
         drawn = {k: np.asarray(v)[None] for k, v in prior_draws(model, z, ticks, keys).items()}
@@ -84,6 +86,7 @@ def sample_prior(
         seed: Seed; the same seed gives the same draws.
         n_robots: Number of robots, for models whose robots have parameters of their own.
     """
+    model = model.at_resolution({})
     return assemble_params(draw_sites(model, (n_robots, n_features), n_draws, seed), model.x0)
 
 

@@ -1,7 +1,7 @@
 """Priors of the trust models' parameters."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import jax
@@ -12,7 +12,9 @@ from numpyro.distributions import Distribution, constraints
 from trustbo import zheng2023
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
+from trustbo.models.floored import Floored
 from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.samplers.priors_numpy import floored
 
 _SCALES = ("delta_w", "delta_v", "tau")
 
@@ -31,7 +33,8 @@ class Priors:
             distribution of batch shape (feature,) gives each feature its own.
         b: Intercept.
         delta_w: Standard deviation of the process noise.
-        delta_v: Standard deviation of the observation noise; in the beta-binomial family, the
+        delta_v: Standard deviation of the observation noise, cut off below the resolution of the
+            rates; in the beta-binomial family, the
             square root of the ratio of excess to binomial variance (concentration delta_v^-2).
         coupling: Influence of robots on each other: off-diagonals of B0 and B_m, and gamma.
         tau: Spread of the robots' coefficients in the hierarchical model.
@@ -108,6 +111,10 @@ class Priors:
         """
         return cls(**zheng2023.vague_priors())
 
+    def above_resolution(self, resolution: float) -> Self:
+        """The same, delta_v being no less than the resolution of a rate."""
+        return replace(self, delta_v=floored(self.delta_v, resolution))
+
     def mean(self, n_features: int) -> dict[str, np.ndarray]:
         """Prior mean of each parameter; 0 for one without a mean, such as a Cauchy."""
         means = {}
@@ -141,6 +148,8 @@ jax.tree_util.register_pytree_node(Priors, _flatten, _unflatten)
 def _as_text(prior: Distribution | float) -> str:
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
+    if isinstance(prior, Floored):  # the floor is no prior of the user's, but the data's
+        return _as_text(prior.base)
     numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
     return f"{type(prior).__name__}({numbers})"
 
@@ -154,4 +163,4 @@ def _is_positive(prior: Distribution) -> bool:
     support = prior.support
     if support is constraints.positive or support is constraints.unit_interval:
         return True
-    return float(np.min(getattr(support, "lower_bound", -np.inf))) >= 0.0
+    return bool((np.asarray(getattr(support, "lower_bound", -np.inf)) >= 0.0).all())

@@ -47,7 +47,8 @@ def sbc(
         sampler: `"exact"`, `"nuts"` or `"joint"`.
         n_datasets: Number of data sets.
         shape: Missions, bounds, robots and features of each.
-        n_ticks: Ticks per bound, for the beta-binomial family.
+        n_ticks: Ticks per bound: what the beta-binomial family counts, and the resolution that
+            is the least delta_v of the others.
         n_draws: Draws of each of the 4 chains of NUTS.
         n_ranked: Draws each truth is ranked among, a multiple of 4; NUTS is thinned to these.
         seed: Seed; the same seed gives the same ranks.
@@ -75,6 +76,7 @@ def sbc(
     asked = f"{model.describe()}, {model.priors.describe()}, {sampler}, {shape}, {n_ticks}, "
     asked += f"{settings}, {n_ranked}, {seed}"
     ranks = _read(checkpoint, asked)
+    model = model.at_resolution({float(n_ticks): 1.0})
     for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
         if j < len(ranks):
             continue

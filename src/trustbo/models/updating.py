@@ -12,6 +12,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, TrustParams, assemble_params
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.exact import sample_exact
+from trustbo.models.ticks import add_ticks
 from trustbo.zheng2023 import match_moments
 
 
@@ -44,6 +45,7 @@ def sample_statistics(
     """
     model.require_exact()
     require_whole("n_draws", n_draws, 1)
+    model = model.at_resolution(add_ticks([s.ticks for s in statistics]))
     each = [sample_exact(s, model.priors, n_draws, seed + i) for i, s in enumerate(statistics)]
     pooled = model.robot_sets == "all"
     sites = {

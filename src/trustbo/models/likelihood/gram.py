@@ -30,6 +30,7 @@ from trustbo.models.likelihood.toeplitz import (
     sine_basis,
     tridiagonal,
 )
+from trustbo.models.ticks import TickWeights, add_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
 
 
@@ -149,6 +150,8 @@ class SufficientStatistics(NamedTuple):
     """Sums of the rates and of their squares, weighted."""
     x0_mean: float
     lag: float
+    ticks: TickWeights
+    """Weight of the rates by their number of ticks."""
 
     def __add__(self, other: Self) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
         if (self.x0_mean, self.lag) != (other.x0_mean, other.lag):
@@ -171,6 +174,7 @@ class SufficientStatistics(NamedTuple):
             (self.sums[0] + other.sums[0], self.sums[1] + other.sums[1]),
             self.x0_mean,
             self.lag,
+            add_ticks([self.ticks, other.ticks]),
         )
 
     def scaled(self, factor: float) -> Self:
@@ -180,6 +184,7 @@ class SufficientStatistics(NamedTuple):
             gaps=tuple(gap.scaled(factor) for gap in self.gaps),
             n_measured=factor * self.n_measured,
             sums=(factor * self.sums[0], factor * self.sums[1]),
+            ticks=add_ticks([self.ticks], factor),
         )
 
     @property
@@ -251,7 +256,8 @@ def sufficient_statistics(
         gaps = (GapSequences(y[gappy, :n], u[gappy, :n], each[gappy], x0_mean),)
     weights, rates = (seen * each[:, None])[seen], y[seen]
     sums = (float(weights @ rates), float(weights @ rates**2))
-    return SufficientStatistics(grams, gaps, float(weights.sum()), sums, x0_mean, lag)
+    ticks = weigh_ticks(batch, weight)
+    return SufficientStatistics(grams, gaps, float(weights.sum()), sums, x0_mean, lag, ticks)
 
 
 def lengths(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,8 +2,8 @@
 
 Method: collapsed importance sampling. Latent trust and the linear coefficients c = (beta, b)
 integrate out in closed form (`gram`: generalised least squares under normal priors), which leaves
-the density of z = (beta0 on the real line, t, r), t = log hypot(delta_w, delta_v), r = log(delta_w
-/ delta_v), in three dimensions.
+the density of z = (beta0 on the real line, t, r), t = log hypot(delta_w, s), r = log(delta_w / s),
+in three dimensions; s^2 = delta_v^2 - floor^2, so that the floor of delta_v is no boundary.
 
 1. Newton's search from the best point of a coarse grid finds the mode (`laplace`).
 2. Some 1000 weighted points around it give the mean and covariance of a heavy-tailed proposal; the
@@ -30,11 +30,12 @@ from scipy import special
 from threadpoolctl import ThreadpoolController
 
 from trustbo.errors import TrustboError
+from trustbo.models.floored import Floored
 from trustbo.models.likelihood.gram import SufficientStatistics
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.convergence import GOOD_KHAT
 from trustbo.models.samplers.laplace import laplace
-from trustbo.models.samplers.priors_numpy import log_prob, numbers
+from trustbo.models.samplers.priors_numpy import log_prob, number, numbers
 from trustbo.models.samplers.proposal import Mixture
 
 _LOG2_POINTS, _LOG2_AROUND = 12, 10
@@ -61,6 +62,7 @@ class _Target(NamedTuple):
     priors: Priors
     mean: np.ndarray  # (coefficient,), prior of (beta, b)
     precision: np.ndarray  # (coefficient,)
+    floor: float  # of delta_v
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Unnormalised log posterior density of z (point, 3), shape (point,)."""
@@ -104,12 +106,14 @@ class _Target(NamedTuple):
         """beta0, delta_w, delta_v, and the log Jacobian of the way there."""
         x, t, r = z.T
         log_w = t - 0.5 * np.logaddexp(0.0, -2.0 * r)
-        log_v = t - 0.5 * np.logaddexp(0.0, 2.0 * r)
-        log_jacobian = log_w + log_v  # of exp; (t, r) -> (log_w, log_v) has Jacobian 1
+        log_s = t - 0.5 * np.logaddexp(0.0, 2.0 * r)
+        delta_v = np.hypot(self.floor, np.exp(log_s))
+        # Of exp and hypot; (t, r) -> (log_w, log_s) has Jacobian 1.
+        log_jacobian = log_w + 2.0 * log_s - np.log(delta_v)
         if self.priors.beta0.support is constraints.unit_interval:
             log_jacobian = log_jacobian - np.logaddexp(0.0, x) - np.logaddexp(0.0, -x)
             x = special.expit(x)
-        return x, np.exp(log_w), np.exp(log_v), log_jacobian
+        return x, np.exp(log_w), delta_v, log_jacobian
 
 
 class _Weighted(NamedTuple):
@@ -180,7 +184,8 @@ def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
         return np.append(np.broadcast_to(numbers(priors.beta, name), n_features),
                          numbers(priors.b, name))  # fmt: skip
 
-    return _Target(statistics, priors, each("loc"), each("scale") ** -2.0)
+    floor = number(priors.delta_v, "low") if isinstance(priors.delta_v, Floored) else 0.0
+    return _Target(statistics, priors, each("loc"), each("scale") ** -2.0, floor)
 
 
 def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) -> Mixture:
@@ -212,7 +217,7 @@ def _start(target: _Target) -> np.ndarray:
     """The best point of a coarse grid around the scatter of the rates."""
     unit = target.priors.beta0.support is constraints.unit_interval
     x = np.array([-3.0, -1.0, 0.0, 1.0, 2.0]) if unit else np.linspace(-0.5, 1.1, 5)
-    t = np.log(max(target.statistics.spread, 1e-3)) + np.linspace(-2.5, 0.5, 5)
+    t = np.log(max(target.statistics.spread, target.floor, 1e-3)) + np.linspace(-2.5, 0.5, 5)
     grid = np.stack(np.meshgrid(x, t, [-2.0, 0.0, 2.0], indexing="ij"), axis=-1).reshape(-1, 3)
     return grid[np.nanargmax(target.log_density(grid))]
 
@@ -290,6 +295,7 @@ def _require_conjugate(priors: Priors) -> None:
         ("delta_v", lambda p: p.support is constraints.positive, "on (0, inf)"),
     ):
         prior = getattr(priors, name)
+        prior = prior.base if isinstance(prior, Floored) else prior
         if not allowed(prior):
             raise TrustboError(
                 f'sampler "exact" needs the prior of {name} to be {kind}; got {prior!r}. Use '

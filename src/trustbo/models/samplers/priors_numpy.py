@@ -1,4 +1,4 @@
-"""Prior densities and draws in NumPy: compiling them would take longer than using them."""
+"""Prior densities, draws and floors in NumPy: compiling them would take longer than using them."""
 
 import jax
 import numpy as np
@@ -6,11 +6,19 @@ import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 from scipy import special
 
+from trustbo.errors import TrustboError
 from trustbo.models.backend import own_settings
+from trustbo.models.floored import Floored
+
+_LEAST_MASS = 1e-3  # above a floor: with less, rejection would draw for long
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
     """Log density, in closed form for the usual priors, by numpyro for others."""
+    if isinstance(prior, Floored):
+        above = log_prob(prior.base, x) - number(prior, "log_above")
+        return np.where(x < number(prior, "low"), -np.inf, above)
     if isinstance(prior, dist.HalfNormal):
         return np.where(x < 0.0, -np.inf, np.log(2.0) + _normal(x, 0.0, number(prior, "scale")))
     if isinstance(prior, dist.Beta):
@@ -31,6 +39,11 @@ def _normal(x: np.ndarray, loc: float, scale: float) -> np.ndarray:
 
 def draw(prior: Distribution, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """Draws of that shape; the last axis is the prior's own, if it is a vector."""
+    if isinstance(prior, Floored):
+        x, low = draw(prior.base, shape, rng), number(prior, "low")
+        while (below := x < low).any():
+            x = np.where(below, draw(prior.base, shape, rng), x)
+        return x
     if isinstance(prior, dist.HalfNormal):
         return np.abs(rng.normal(0.0, numbers(prior, "scale"), shape))
     if isinstance(prior, dist.Beta):
@@ -40,6 +53,31 @@ def draw(prior: Distribution, shape: tuple[int, ...], rng: np.random.Generator) 
     with own_settings():
         key = jax.random.key(int(rng.integers(1 << 31)))
         return np.asarray(prior.expand(shape).sample(key), dtype=float)
+
+
+def floored(prior: Distribution, low: float) -> Distribution:
+    """Prior of a standard deviation cut off below `low`; as it is, if it starts there or above.
+
+    Raises:
+        TrustboError: It has next to no mass above.
+    """
+    prior = prior.base if isinstance(prior, Floored) else prior
+    start, end = (
+        float(np.asarray(getattr(prior.support, f"{side}_bound", default)))
+        for side, default in (("lower", 0.0), ("upper", np.inf))
+    )
+    if start >= low:
+        return prior
+    half = 0.5 * (min(low, end) - start)
+    x = start + half * (1.0 + _NODES)
+    density = half * _WEIGHTS * np.exp(log_prob(prior, x))
+    above = 1.0 - float(density.sum())
+    if above < _LEAST_MASS:
+        raise TrustboError(
+            f"the prior of delta_v has {max(above, 0.0):.1e} of its mass above {low:g}, the "
+            f"resolution of the contact rates (1 / n_ticks); got {prior!r}. Give a wider one."
+        )
+    return Floored(prior, low, (1.0 - above, float(density @ x)))
 
 
 def number(prior: Distribution, name: str) -> float:

@@ -3,8 +3,9 @@
 Method: a deterministic change of variables theta -> sites, with its Jacobian, before Laplace's
 scaling (`nuts`). Each step gives a badly determined direction of its own axis:
 
-- noises: the data fix delta_w^2 + delta_v^2 well and their ratio badly. t = log hypot(delta_w,
-  delta_v) and r = log(delta_w / delta_v) stand in the places of log delta_w and log delta_v;
+- noises: the data fix delta_w^2 + delta_v^2 well and their ratio badly. t = log hypot(delta_w, s)
+  and r = log(delta_w / s) stand in the places of log delta_w and log s, s^2 = delta_v^2 - floor^2
+  where delta_v has a floor (`floored`);
 - level: the data fix the average level of trust, y = beta0 y + beta . z + b, better than its parts.
   b + beta0 mean(y) + beta . mean(z) stands in the place of b. Both steps have Jacobian 1;
 - collapse: the pooled model's (beta, b) are normal given all else (generalised least squares,

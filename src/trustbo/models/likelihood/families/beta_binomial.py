@@ -26,6 +26,7 @@ class BetaBinomial(Linearised):
     name: ClassVar[str] = "beta_binomial"
     needs_ticks: ClassVar[bool] = True
     allows_change: ClassVar[bool] = False
+    rounds: ClassVar[bool] = False
     correlates: ClassVar[bool] = False
 
     def priors(self) -> dict[str, Any]:
@@ -95,10 +96,6 @@ class BetaBinomial(Linearised):
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: counts have probabilities."""
         return np.zeros(y.shape, dtype=bool)
-
-    def bounded_at(self, rate: float) -> bool:
-        """See `Family.bounded_at`: a probability is at most 1."""
-        return True
 
 
 def _concentration(ssm: SSM) -> Array:

@@ -40,7 +40,3 @@ class Censored(Gaussian):
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: rates of 0 and 1 have a probability."""
         return (y > 0.0) & (y < 1.0)
-
-    def bounded_at(self, rate: float) -> bool:
-        """See `Family.bounded_at`: a probability is at most 1."""
-        return not 0.0 < rate < 1.0

@@ -55,6 +55,8 @@ class Family(ABC):
     """The density is weighted around a linearisation point, found by `refine`."""
     allows_change: ClassVar[bool] = True
     """Rates may measure the change of trust (`response="change"`)."""
+    rounds: ClassVar[bool] = True
+    """delta_v is the sd of a rate, which is known to the resolution of its ticks."""
     correlates: ClassVar[bool] = True
     """Observation noise may be correlated between robots."""
 
@@ -90,10 +92,6 @@ class Family(ABC):
     @abstractmethod
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """Mask of the measured rates that have a density, not a probability."""
-
-    @abstractmethod
-    def bounded_at(self, rate: float) -> bool:
-        """Whether the likelihood of rates that all equal `rate` stays bounded without noise."""
 
     def priors(self) -> dict[str, Any]:
         """Default priors that differ from those of `Priors()`, by name."""

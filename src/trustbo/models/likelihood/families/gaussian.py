@@ -41,7 +41,3 @@ class Gaussian(Family):
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: all have."""
         return np.ones(y.shape, dtype=bool)
-
-    def bounded_at(self, rate: float) -> bool:
-        """See `Family.bounded_at`: no density is, as its noise goes to 0."""
-        return False
