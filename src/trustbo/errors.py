@@ -35,11 +35,7 @@ class PosteriorError(TrustboError):
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
-    """Return `value` if it is one of `choices`.
-
-    Raises:
-        TrustboError: `value` is not among the choices, which the message lists.
-    """
+    """Return `value` if it is among `choices`, which the TrustboError lists if not."""
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
         raise TrustboError(f"unknown {what} {value!r}; choose one of {', '.join(choices)}.")
@@ -47,11 +43,7 @@ def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
 
 
 def require_whole(what: str, value: object, minimum: int) -> int:
-    """Return `value` as an int if it is a whole number of at least `minimum`.
-
-    Raises:
-        TrustboError: `value` is no such number.
-    """
+    """Return `value` as an int; TrustboError unless a whole number of at least `minimum`."""
     try:
         number = operator.index(value)  # pyright: ignore[reportArgumentType]
     except TypeError:
@@ -62,11 +54,7 @@ def require_whole(what: str, value: object, minimum: int) -> int:
 
 
 def require_positive(what: str, value: object) -> float:
-    """Return `value` as a float if it is a positive, finite number.
-
-    Raises:
-        TrustboError: `value` is no such number.
-    """
+    """Return `value` as a float if it is a positive, finite number, else raise TrustboError."""
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError):
@@ -77,11 +65,7 @@ def require_positive(what: str, value: object) -> float:
 
 
 def require_pair(what: str, value: object) -> tuple[int, int]:
-    """Return `value` as two ints if it is a pair of whole numbers, such as a cell (row, col).
-
-    Raises:
-        TrustboError: `value` is no such pair.
-    """
+    """Return a pair of whole numbers, such as a cell (row, col), as ints, or raise TrustboError."""
     try:
         first, second = (operator.index(i) for i in value)  # pyright: ignore[reportGeneralTypeIssues]
     except (TypeError, ValueError):

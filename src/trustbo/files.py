@@ -25,7 +25,7 @@ _LEAST_FREE = 1 << 20
 
 
 def write_file(path: str | PathLike[str], write: Callable[[Path], object]) -> None:
-    """Write a file atomically: to a temporary name, which is then renamed.
+    """Write a file atomically: `write` gets a temporary name of the same suffix, then renamed.
 
     Ctrl-C and SIGTERM take effect after the write, a second one at once.
 
@@ -172,11 +172,7 @@ def to_json(record: object) -> str:
 
 
 def require_folder(directory: str | PathLike[str]) -> Path:
-    """Return a folder, which need not exist yet.
-
-    Raises:
-        TrustboError: The name, or that of a folder above it, belongs to a file.
-    """
+    """Return a folder, which need not exist; TrustboError if it, or one above it, is a file."""
     folder = Path(directory)
     for part in (folder, *folder.parents):
         if part.exists():
@@ -189,12 +185,8 @@ def require_folder(directory: str | PathLike[str]) -> Path:
 def require_file(path: str | PathLike[str], *suffixes: str) -> Path:
     """Return a file to write, which may exist already.
 
-    Args:
-        path: Name of the file.
-        suffixes: Allowed suffixes, in lower case with the dot; none to allow any.
-
-    Raises:
-        TrustboError: The suffix is another, a folder has that name, or a file that of its folder.
+    `suffixes` are in lower case with the dot; none allow any. TrustboError: another suffix, a
+    folder of that name, or a file of that of its folder.
     """
     file = Path(path)
     if suffixes and file.suffix.lower() not in suffixes:
@@ -206,11 +198,7 @@ def require_file(path: str | PathLike[str], *suffixes: str) -> Path:
 
 
 def read_yaml(file: Path) -> Any:
-    """Read a YAML file.
-
-    Raises:
-        TrustboError: There is no such file, or it is not YAML.
-    """
+    """Read a YAML file; TrustboError if there is none, or it is not YAML."""
     import yaml  # loaded only where YAML is read
 
     try:

@@ -26,16 +26,11 @@ class MissionBatch(NamedTuple):
 
 
 def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionBatch:
-    """Stack missions of any length into one batch.
+    """Stack missions of any length, of the same robots and features, into one batch.
 
-    Args:
-        missions: Missions of the same robots and features, at least one.
-        pad: Whether to pad the axes to buckets: bounds to a multiple of 8, missions to a power of
-            two from 8 on. Otherwise bounds are padded to the longest mission.
-
-    Raises:
-        ShapeError: There are no missions, or they disagree on robots or features.
-        TrustboError: An awareness value is NaN; only contact rates may be missing.
+    With `pad`, axes are padded to buckets: bounds to a multiple of 8, missions to a power of two
+    from 8 on; otherwise bounds to the longest mission. ShapeError: no missions, or they disagree on
+    robots or features. TrustboError: an awareness value is NaN; only contact rates may be missing.
     """
     require_same_team(missions)
     first = missions[0]
@@ -59,11 +54,7 @@ def stack_missions(missions: Sequence[Mission], *, pad: bool = True) -> MissionB
 
 
 def require_same_team(missions: Sequence[Mission]) -> None:
-    """Check that there are missions, all with the same robots and features.
-
-    Raises:
-        ShapeError: There are no missions, or they disagree on robots or features.
-    """
+    """Check that there are missions, all with the same robots and features: ShapeError if not."""
     if isinstance(missions, Mission):
         raise ShapeError("missions must be a list of missions; got one. Write [mission].")
     if not missions:
@@ -80,9 +71,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
 def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
     """Fill awareness that a mission did not measure (NaN) with that of a map.
 
-    Args:
-        mission: Mission as it was measured.
-        awareness: Map of shape (robot, row, col, feature), such as `Workspace.awareness`.
+    The map has shape (robot, row, col, feature), such as `Workspace.awareness`.
     """
     if not np.isnan(mission.awareness).any():
         return mission

@@ -27,14 +27,10 @@ def read_config(context: typer.Context, path: Path | None) -> Path | None:
 
 
 def flags_of(path: Path, known: Collection[str]) -> dict[str, str]:
-    """Read flags by name, as they would be typed.
+    """Read flags by name, as they would be typed, from a YAML file with a mapping of long flags.
 
-    Args:
-        path: YAML file, a mapping of long flags (with dashes or underscores) to values.
-        known: Names of all flags, with underscores.
-
-    Raises:
-        TrustboError: No such file, no YAML, an unknown flag, or a value of another type.
+    Dashes or underscores; `known` are the names of all flags, with underscores. TrustboError: no
+    such file, no YAML, an unknown flag, or a value of another type.
     """
     flags: dict[str, str] = {}
     for key, value in _read(path).items():

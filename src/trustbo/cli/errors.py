@@ -17,11 +17,9 @@ FAILED, BAD_INPUT, REFUSED, INTERRUPTED = 1, 2, 3, 130
 
 @contextmanager
 def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]:
-    """Print an error in one line, and the way on; each warning in a line.
+    """Print an error in one line (with `debug`, its traceback), and each warning in a line.
 
-    Args:
-        debug: Whether to show the traceback of an error instead.
-        campaign: Folder of the campaign that is at work, if one is.
+    An error says the way on, too, if the folder of the `campaign` at work is given.
     """
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:

@@ -24,10 +24,7 @@ def _option(panel: str, text: str, *names: str, **more: Any) -> Any:
 
 
 def with_campaign_options[Command: Callable[..., None]](command: Command) -> Command:
-    """Give a command, as its `**options`, a flag for each field of `CampaignOptions`.
-
-    Fields whose default cannot be typed have none.
-    """
+    """Give a command's `**options` a flag for each field of `CampaignOptions` that can be typed."""
     signature = inspect.signature(command)
     parameters = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     entries = re.findall(

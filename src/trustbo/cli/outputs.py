@@ -14,14 +14,9 @@ _FILES = ("report.html", "maps.png", "terrain.png", "maps.tif", "maps.qml", "pat
 def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
     """Refuse a folder that cannot take the results, before any work.
 
-    Args:
-        out: Folder, which need not exist yet.
-        *others: Files to be written there, beside those of `write_outputs`.
-        overwrite: Whether it may hold a campaign already.
-
-    Raises:
-        TrustboError: The folder holds a campaign or a result; its name belongs to a file, or the
-            name of a file to a folder.
+    It need not exist yet; `others` are files written there beside those of `write_outputs`.
+    TrustboError: it holds a campaign or a result, unless `overwrite`; its name belongs to a file,
+    or the name of a file to a folder.
     """
     from trustbo.files import require_file
 
@@ -39,15 +34,10 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
 
 
 def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
-    """Write figures, report and maps beside a result, and print their names.
+    """Write figures, report and maps beside a result kept in `out`, and print their names.
 
-    Args:
-        result: Result, kept in `out` already.
-        out: Folder of the result.
-        table: Whether to print a row for each mission too.
-
-    Raises:
-        TrustboError: The folder's name belongs to a file.
+    With `table`, a row for each mission is printed too. TrustboError: the folder's name belongs to
+    a file.
     """
     use_no_screen()
     from trustbo import plots

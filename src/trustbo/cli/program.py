@@ -63,10 +63,9 @@ def _program(
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the program and exit with its code; misuse is one line and a hint too.
+    """Run the program on the words after `trustbo` in a shell, and exit with its code.
 
-    Args:
-        arguments: Words after `trustbo` in a shell; by default those of this process.
+    By default those of this process; misuse is one line and a hint.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:

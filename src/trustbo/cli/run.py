@@ -96,11 +96,7 @@ def require_names(
     iterations: int,
     seed: int,
 ) -> None:
-    """Refuse bad names and numbers before any raster is read or written.
-
-    Raises:
-        TrustboError: An unknown name, or a number outside its range.
-    """
+    """Refuse unknown names and numbers out of range (TrustboError) before a raster is read."""
     from trustbo.models.samplers.run import SAMPLERS
     from trustbo.planning import OBJECTIVES, POLICIES
     from trustbo.workspace import SIGHT_MODES

@@ -21,11 +21,7 @@ def find_crs(workspace: Workspace) -> CRS | None:
 
 
 def require_crs(workspace: Workspace) -> CRS:
-    """Return the CRS of a workspace's grid.
-
-    Raises:
-        TrustboError: The workspace was not made from a terrain.
-    """
+    """Return the CRS of a workspace's grid; TrustboError if it was not made from a terrain."""
     crs = find_crs(workspace)
     if crs is None:
         raise TrustboError(
@@ -35,11 +31,7 @@ def require_crs(workspace: Workspace) -> CRS:
 
 
 def as_dataset(maps: Maps) -> xr.Dataset:
-    """Return one or more maps as a dataset.
-
-    Raises:
-        ShapeError: There are no maps.
-    """
+    """Return one or more maps as a dataset; ShapeError if there are none."""
     if isinstance(maps, xr.DataArray):
         return maps.to_dataset(name="map" if maps.name is None else maps.name)
     if not maps.data_vars:
@@ -50,9 +42,7 @@ def as_dataset(maps: Maps) -> xr.Dataset:
 def require_maps(maps: Maps, workspace: Workspace) -> xr.Dataset:
     """Return maps of a workspace's cells as floats, dims (row, col), without coordinates.
 
-    Raises:
-        ShapeError: There are no maps, or their dims or number of cells differ.
-        TrustboError: The values are not numbers.
+    ShapeError: no maps, or other dims or another number of cells. TrustboError: no numbers.
     """
     shape, bands = workspace.grid.shape, {}
     for name, values in as_dataset(maps).data_vars.items():
@@ -71,22 +61,14 @@ def require_maps(maps: Maps, workspace: Workspace) -> xr.Dataset:
 
 
 def require_names_for_netcdf(names: Iterable[str]) -> None:
-    """Refuse names that a map in netCDF cannot have.
-
-    Raises:
-        TrustboError: A name contains a slash, or is that of a coordinate.
-    """
+    """Refuse names of maps with a slash, or those of coordinates: TrustboError."""
     for name in names:
         if "/" in name or name in ("x", "y", "spatial_ref"):
             raise TrustboError(f"a map in netCDF cannot be called {name!r}; rename it.")
 
 
 def require_names_for_sql(robots: Sequence[str]) -> None:
-    """Refuse names of robots that a GeoPackage cannot distinguish.
-
-    Raises:
-        TrustboError: Two names differ in capitals only.
-    """
+    """Refuse names of robots that differ in capitals only, for a GeoPackage: TrustboError."""
     if len({name.lower() for name in robots}) < len(robots):
         raise TrustboError(
             "a GeoPackage does not tell capitals from small letters, as the names of these robots "

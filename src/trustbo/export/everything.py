@@ -92,11 +92,7 @@ def export_result(
 
 
 def left_out(result: Result, folder: str | PathLike[str]) -> dict[str, str]:
-    """Return the formats that cannot be written, each with the reason.
-
-    Raises:
-        TrustboError: The name of the folder belongs to a file.
-    """
+    """Return the formats that cannot be written, and why; TrustboError: the folder is a file."""
     target, reasons = require_folder(folder), {}
     for name in _FORMATS:
         try:
@@ -107,11 +103,10 @@ def left_out(result: Result, folder: str | PathLike[str]) -> dict[str, str]:
 
 
 def _require_possible(name: str, result: Result, target: Path) -> None:
-    """Refuse a format that cannot be written.
+    """Refuse a format that cannot be written: TrustboError.
 
-    Raises:
-        TrustboError: The format needs a CRS that the result lacks, or cannot hold one of its names;
-            a bag exists, or rosbags is not installed; or a folder has the name of a file.
+    It needs a CRS that the result lacks, or cannot hold one of its names; a bag exists, or rosbags
+    is not installed; or a folder has the name of a file.
     """
     kind = _FORMATS[name]
     if kind.on_earth:

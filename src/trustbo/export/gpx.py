@@ -13,13 +13,7 @@ _HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
 
 
 def gpx_route(frame: gpd.GeoDataFrame, workspace: Workspace, name: str) -> str:
-    """Return the XML of a route.
-
-    Args:
-        frame: Points of `path_frame`, in degrees on WGS 84.
-        workspace: Workspace of the path.
-        name: Name of the route.
-    """
+    """Return the XML of a route of that name: points of `path_frame`, in degrees on WGS 84."""
     root = ET.Element("gpx", version="1.1", creator="trustbo", xmlns=_NAMESPACE)
     route = ET.SubElement(root, "rte")
     ET.SubElement(route, "name").text = name

@@ -93,9 +93,8 @@ def write_path(
 def plan_of(plan: Plan | Result, workspace: Workspace | None) -> tuple[Plan, Workspace]:
     """Return a plan and its workspace.
 
-    Raises:
-        ShapeError: The plan and the workspace differ in their numbers of robots.
-        TrustboError: No workspace is given, or the path leaves it.
+    ShapeError: they differ in their numbers of robots. TrustboError: no workspace, or the path
+    leaves it.
     """
     if isinstance(plan, Result):
         plan, workspace = plan.plan, workspace or plan.workspace

@@ -43,22 +43,16 @@ class _Raster(NamedTuple):
 def occupancy(
     cost: xr.DataArray, workspace: Workspace, *, resolution: float | None = None
 ) -> np.ndarray:
-    """Return the occupancy grid of a cost map.
+    """Return the occupancy grid of a cost map (row, col) in [0, 1], NaN where unknown.
 
-    Args:
-        cost: Cost map (row, col), in [0, 1], NaN where unknown, e.g. `Result.maps()["cost"]`.
-        workspace: Workspace of the cells.
-        resolution: Side of a pixel, m, by default that of a cell, or a tenth of its shorter side if
-            cells are not square. A pixel has the cost of the cell at its centre.
+    Shape (height, width), int8, the southern row first: 100 times the cost, but at most 98, 100 in
+    impassable cells, -1 where the cost is unknown. A pixel has the cost of the cell at its centre;
+    its side, `resolution` m, is by default that of a cell, or a tenth of its shorter side if cells
+    are not square. Pixels begin at the lower left corner of the grid; those with centres beyond its
+    other edges are -1.
 
-    Returns:
-        Shape (height, width), int8, the southern row first: 100 times the cost, but at most 98,
-        100 in impassable cells, -1 where the cost is unknown. Pixels begin at the lower left corner
-        of the grid; those with centres beyond its other edges are -1.
-
-    Raises:
-        ShapeError: The dims or the number of cells differ.
-        TrustboError: A cost is outside [0, 1], or the resolution is not positive, or far too fine.
+    ShapeError: other dims or another number of cells. TrustboError: a cost outside [0, 1], or a
+    resolution that is not positive, or far too fine.
     """
     (values,) = require_maps(cost.rename("cost"), workspace).data_vars.values()
     known = values.values

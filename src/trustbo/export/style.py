@@ -30,16 +30,9 @@ _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 def write_style(path: str | PathLike[str], maps: Maps, *, band: str | None = None) -> None:
     """Write the style of a raster of `write_geotiff`: viridis over the values of one band.
 
-    QGIS loads the style of the same name beside a raster.
-
-    Args:
-        path: .qml file to write, or to replace.
-        maps: Maps of the raster; NaN is left out of the limits of the colours.
-        band: Name of the map to show; by default the first.
-
-    Raises:
-        ShapeError: There are no maps.
-        TrustboError: The band is unknown, or the file cannot be written.
+    QGIS loads the style of the same name beside a raster. `band` is the map to show, by default the
+    first; NaN is left out of the limits of its colours. ShapeError: no maps. TrustboError: an
+    unknown band, or a file that cannot be written.
     """
     target = require_file(path, ".qml")
     bands = as_dataset(maps)

@@ -38,11 +38,7 @@ class Bag:
         self.types: dict[str, str] = {c.topic: c.msgtype for c in reader.connections}
 
     def require(self, topics: Sequence[str]) -> None:
-        """Check that the bag has topics.
-
-        Raises:
-            TrustboError: It lacks one; the message lists those that it has.
-        """
+        """Check that the bag has topics; the TrustboError lists those that it has."""
         missing = [topic for topic in topics if topic not in self.types]
         if missing:
             there = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self.types.items()))
@@ -60,9 +56,8 @@ class Bag:
     def collect(self, topics: Mapping[str, tuple[str, ...]]) -> dict[str, Series]:
         """Records of several topics, each given with its admissible types.
 
-        Raises:
-            TrustboError: A topic of another type, an invalid message, a damaged bag, or a clock
-                that goes backwards.
+        TrustboError: a topic of another type, an invalid message, a damaged bag, or a clock that
+        goes backwards.
         """
         times: dict[str, list[int]] = {topic: [] for topic in topics}
         values: dict[str, list[Any]] = {topic: [] for topic in topics}
@@ -106,11 +101,7 @@ class Bag:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
-    """Open a bag for reading.
-
-    Raises:
-        TrustboError: No rosbags; no such file or folder; not a bag.
-    """
+    """Open a bag for reading; TrustboError: no rosbags, no such file or folder, or not a bag."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -133,8 +124,7 @@ def opened(path: Path) -> Iterator[Bag]:
 def require_new_bag(path: Path, version: int | None) -> int:
     """Version of ROS of a new bag, by its path: .bag for 1.
 
-    Raises:
-        TrustboError: No rosbags; another version asked for; the path exists.
+    TrustboError: no rosbags; another version asked for; the path exists.
     """
     if importlib.util.find_spec("rosbags") is None:
         raise TrustboError(_NO_ROSBAGS)
@@ -159,17 +149,11 @@ def write_messages(
     *,
     latched: bool = False,
 ) -> None:
-    """Write a bag whole or not at all.
+    """Write a bag whole or not at all; TrustboError without rosbags.
 
-    Args:
-        path: File or folder, which must not exist; its parent is made if need be.
-        version: Version of ROS, 1 or 2.
-        storage: Storage of ROS 2, one of `STORAGES`.
-        records: Function that makes records in order of time with the given `Messages`.
-        latched: Whether late subscribers get the messages played before.
-
-    Raises:
-        TrustboError: No rosbags.
+    The path, a file or folder, must not exist; its parent is made if need be. `version` of ROS is 1
+    or 2, `storage` of ROS 2 one of `STORAGES`. `records` makes records in order of time with the
+    given `Messages`. If `latched`, late subscribers get the messages played before.
     """
     try:
         from rosbags import rosbag1, rosbag2

@@ -95,13 +95,9 @@ class Messages:
         return self._types[PATH](header=self._header(time), poses=stamped)
 
     def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
-        """Make a map in the frame `map`.
+        """Make a map in the frame `map` from int8 values (row, col), the southern row first.
 
-        Args:
-            time: Time, ns.
-            values: Shape (row, col), int8, the southern row first.
-            resolution: Side of a pixel, m.
-            corner: Pose of the lower left corner.
+        Time in ns, side of a pixel in m, and the pose of the lower left corner.
         """
         height, width = values.shape
         info = self._types["nav_msgs/msg/MapMetaData"](
@@ -136,8 +132,7 @@ class Messages:
 def read_marker(message: Any) -> dict[str, Any]:
     """Read a marker: `bound`, `cell`, and `path`, `robots`, `features`, empty if not given.
 
-    Raises:
-        TrustboError: It is neither JSON with a bound and a cell, nor [bound, row, col].
+    TrustboError: neither JSON with a bound and a cell, nor [bound, row, col].
     """
     try:
         if isinstance(message.data, str):
@@ -160,11 +155,7 @@ def read_marker(message: Any) -> dict[str, Any]:
 
 
 def read_numbers(message: Any) -> tuple[tuple[str, ...], np.ndarray]:
-    """Read the names, if any, and values of a vector.
-
-    Raises:
-        TrustboError: Unequal numbers of names and values.
-    """
+    """Read the names, if any, and values of a vector; TrustboError if their numbers differ."""
     values = np.asarray(message.data, dtype=float)
     label = message.layout.dim[0].label if len(message.layout.dim) else ""
     names = tuple(name.strip() for name in label.split(",")) if label.strip() else ()

@@ -50,8 +50,7 @@ def write_missions(
         since: Number of first missions whose ticks are there already.
         notes: Attributes of the table of missions.
 
-    Raises:
-        TrustboError: States with another shape than (tick, robot, state).
+    TrustboError: states with another shape than (tick, robot, state).
     """
     for j in range(since, len(missions)):
         file, recorded = ticks_file(path, j), _ticks(missions[j])

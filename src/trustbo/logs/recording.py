@@ -64,8 +64,7 @@ class Recording:
     def missions(self, features: tuple[str, ...], robots: tuple[str, ...]) -> list[Mission]:
         """Missions of the records; one without bounds is left out.
 
-        Raises:
-            TrustboError: Markers out of order, or what `Mission` refuses.
+        TrustboError: markers out of order, or what `Mission` refuses.
         """
         markers = sorted(self.markers, key=lambda marker: (marker.time, marker.bound))
         starts = [i for i, marker in enumerate(markers) if marker.bound == 0]

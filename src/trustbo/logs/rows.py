@@ -50,14 +50,9 @@ class Row(NamedTuple):
 
 
 def read_columns(table: Any, ignore: Sequence[str] = ()) -> dict[str, list[str]]:
-    """Read the columns of a CSV file, a frame or a mapping as text, "" if blank.
+    """Read the columns of a table (see `read_table`) but `ignore` as text, "" if blank.
 
-    Args:
-        table: See `read_table`.
-        ignore: Columns to leave out.
-
-    Raises:
-        TrustboError: No such file, or no CSV; a missing or repeated column; no rows.
+    TrustboError: no such file, or no CSV; a missing or repeated column; no rows.
     """
     names, values = _from_file(Path(table)) if isinstance(table, str | PathLike) else _of(table)
     columns = {n: [_stripped(v) for v in column] for n, column in zip(names, values, strict=True)}
@@ -82,16 +77,11 @@ def read_columns(table: Any, ignore: Sequence[str] = ()) -> dict[str, list[str]]
 def parse_rows(
     columns: Mapping[str, list[str]], features: Sequence[str], grid: Grid | None = None
 ) -> list[Row]:
-    """Parse the rows of a table.
+    """Parse the rows of a table from the columns of `read_columns`.
 
-    Args:
-        columns: Columns from `read_columns`.
-        features: Names of the awareness features; NaN for those without a column.
-        grid: Grid of the cells, for positions.
-
-    Raises:
-        TrustboError: A feature without a column beside columns without a meaning, positions
-            without a grid, or a value of the wrong kind.
+    Awareness is NaN for features without a column; positions need the grid of the cells.
+    TrustboError: a feature without a column beside columns without a meaning, positions without a
+    grid, or a value of the wrong kind.
     """
     wanted = [column_of(name) for name in features]
     missing = [name for name in wanted if name not in columns]

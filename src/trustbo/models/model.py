@@ -333,10 +333,6 @@ def register[Model: TrustModel](cls: type[Model]) -> type[Model]:
 
 
 def require_model(model: object) -> None:
-    """Refuse anything but a trust model.
-
-    Raises:
-        TrustboError: It is none.
-    """
+    """Refuse anything but a trust model: TrustboError."""
     if not isinstance(model, TrustModel):
         raise TrustboError(f"model must be a trust model, e.g. PooledTrust(); got {model!r}.")

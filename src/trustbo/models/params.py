@@ -203,12 +203,8 @@ def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Number
 
     x_i^k = beta0_i x_i^{k-1} + gamma_i x_{i-1}^k + sum_m beta_{i,m} z_{i,m}^k + b_i + w_i, hence
     x^k = T (diag(beta0) x^{k-1} + ... + w) with T = (I - G)^-1, gamma on G's lower off-diagonal.
-
-    Args:
-        sites: beta0 (..., robot), beta (..., robot, feature), gamma (..., robot - 1), b, delta_w
-            and delta_v (..., robot).
-        x0_mean: Mean of trust before the first bound.
-        x0_sd: Its standard deviation.
+    Sites: beta0 (..., robot), beta (..., robot, feature), gamma (..., robot - 1), b, delta_w and
+    delta_v (..., robot); x0_mean and x0_sd of trust before the first bound.
     """
     xp = np if isinstance(sites["gamma"], np.ndarray) else jnp
     gamma, beta = sites["gamma"], sites["beta"]
@@ -267,9 +263,8 @@ def assemble_params(sites: Mapping[str, np.ndarray], x0: Mapping[str, float]) ->
 def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     """Refuse parameters that do not match the data; `n_robots` None leaves robots unchecked.
 
-    Raises:
-        ShapeError: The number of robots or features differs from that of the data.
-        TrustboError: A covariance is not symmetric and positive definite.
+    ShapeError: another number of robots or features. TrustboError: a covariance that is not
+    symmetric and positive definite.
     """
     name = params.WEIGHTS
     axes, shape = params.AXES[name], np.shape(getattr(params, name))

@@ -20,8 +20,7 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
 def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -> TrustModel:
     """Model of a record; one with priors or a class of the user's own has to be given again.
 
-    Raises:
-        TrustboError: The model has to be given and was not, or another was given.
+    TrustboError: it has to be given and was not, or another was given.
     """
     if given is not None:
         if model_to_record(given) != record:

@@ -34,11 +34,7 @@ def broadcast_ticks(
 
 
 def require_ticks(family: Family, batch: MissionBatch) -> None:
-    """Refuse missions without ticks if the family needs them.
-
-    Raises:
-        TrustboError: A measured rate has no n_ticks.
-    """
+    """Refuse measured rates without n_ticks if the family needs them: TrustboError."""
     if not family.needs_ticks:
         return
     without = ~np.isnan(batch.contact_rate) & ~(batch.n_ticks >= 1.0)

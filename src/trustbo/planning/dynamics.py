@@ -66,16 +66,9 @@ def trust_dynamics(
 ) -> Dynamics:
     """Build the recursion of expected trust under parameters with leading axes (...,).
 
-    Args:
-        params: Parameters of any model.
-        awareness: Shape (robot, row, col, feature), or (draw, robot, row, col, feature) with one
-            map for each draw of the parameters.
-        team: `"mean"` or `"min"`.
-        x0: Expected trust before the first bound, shape () or (robot,), with leading axes or not;
-            by default `params.x0_mean`.
-
-    Raises:
-        ShapeError: The number of robots or features differs from that of the parameters.
+    Awareness has shape (robot, row, col, feature), or (draw, robot, row, col, feature) with one map
+    for each draw. `x0`, expected trust before the first bound, () or (robot,), with leading axes or
+    not, is by default `params.x0_mean`. ShapeError: other numbers of robots or features.
     """
     z = np.asarray(awareness, dtype=float)
     n_robots, leading = z.shape[-4], params.leading
@@ -107,18 +100,10 @@ def transition(params: Params, n_robots: int) -> np.ndarray:
 
 
 def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
-    """Increment of each robot's trust by one bound, u = sum_m beta_m z_m + b.
+    """Increment of trust by one bound, u = sum_m beta_m z_m + b, shape (..., robot, row, col).
 
-    Args:
-        params: Parameters with leading axes (...,).
-        awareness: Shape (robot, row, col, feature), or with a leading axis (draw,) like the
-            parameters'.
-
-    Returns:
-        Shape (..., robot, row, col).
-
-    Raises:
-        ShapeError: The number of robots or features differs from that of the parameters.
+    Awareness (robot, row, col, feature), or with a leading axis (draw,) like the parameters'.
+    ShapeError: other numbers of robots, features or draws than the parameters'.
     """
     z = np.asarray(awareness, dtype=float)
     check_params(params, z.shape[-4], z.shape[-1])

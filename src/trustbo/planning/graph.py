@@ -23,11 +23,7 @@ class NoPathError(TrustboError, nx.NetworkXNoPath):
 
 
 def require_connectivity(connectivity: int) -> int:
-    """Return the connectivity if it is 4 or 8.
-
-    Raises:
-        TrustboError: Another number.
-    """
+    """Return the connectivity if it is 4 or 8, else raise TrustboError."""
     if connectivity not in MOVES:
         raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
     return connectivity
@@ -36,15 +32,8 @@ def require_connectivity(connectivity: int) -> int:
 def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:
     """Build the graph with passable cells `(row, col)` as nodes and possible bounds as edges.
 
-    Args:
-        workspace: Planning grid with its passable cells.
-        connectivity: 4, or 8 to allow diagonal bounds too.
-
-    Returns:
-        A DiGraph with node attributes `x`, `y` (CRS metres) and edge attribute `length` (m).
-
-    Raises:
-        TrustboError: Another connectivity.
+    A DiGraph with node attributes `x`, `y` (CRS metres) and edge attribute `length` (m).
+    TrustboError: a connectivity other than 4, or 8 to allow diagonal bounds too.
     """
     moves = MOVES[require_connectivity(connectivity)]
     grid, passable = workspace.grid, workspace.passable.values
@@ -100,11 +89,7 @@ def _breadth_first(known, start, steps):
 def require_way(
     passable: np.ndarray, to_goal: np.ndarray, start: Cell, goal: Cell, connectivity: int
 ) -> None:
-    """Refuse ends that are not connected.
-
-    Raises:
-        NoPathError: No path; the message counts the cells that can be reached.
-    """
+    """Refuse ends that are not connected: NoPathError, which counts the cells in reach."""
     if to_goal[start] < 0:
         n_reached = int((fewest_bounds(passable, start, connectivity) >= 0).sum())
         n_goal = int((to_goal >= 0).sum())

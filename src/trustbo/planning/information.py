@@ -12,19 +12,12 @@ from trustbo.planning.dynamics import roll_trust, transition
 def information_gain(
     params: Params, awareness: np.ndarray, paths: Sequence[Sequence[Cell]]
 ) -> np.ndarray:
-    """Expected reduction of the parameters' entropy by one mission over each path, in nats.
+    """Expected reduction of the parameters' entropy by a mission over each path, (path,), in nats.
 
     Mutual information of the parameters and the contact rates of a mission, both taken as jointly
-    normal: 1/2 log det(I + N^-1 C), with C the covariance over draws of the expected rates
-    (bound, robot), and N the covariance of the rates' noise at the mean of the draws.
-
-    Args:
-        params: Draws with leading axis (draw,).
-        awareness: Shape (robot, row, col, feature), or with a leading axis (draw,).
-        paths: Paths as cells, start first.
-
-    Returns:
-        Shape (path,).
+    normal: 1/2 log det(I + N^-1 C), with C the covariance over draws of the expected rates (bound,
+    robot), and N the covariance of the rates' noise at the mean of the draws. Params have the axis
+    (draw,), awareness (robot, row, col, feature), or with a leading axis (draw,).
     """
     n_robots = awareness.shape[-4]
     mean = params.mean()
@@ -44,16 +37,7 @@ def information_gain(
 
 
 def rate_noise(params: Params, n_bounds: int, n_robots: int) -> np.ndarray:
-    """Covariance of a mission's contact rates given the parameters.
-
-    Args:
-        params: One draw of the parameters.
-        n_bounds: Number of bounds of the mission.
-        n_robots: Number of robots.
-
-    Returns:
-        Shape (bound * robot, bound * robot), bounds first.
-    """
+    """Covariance of a mission's contact rates given one draw, (bound * robot, bound * robot)."""
     B0 = transition(params, n_robots)
     if isinstance(params, CoupledParams):
         Q, R = np.asarray(params.Delta_w), np.asarray(params.Delta_v)

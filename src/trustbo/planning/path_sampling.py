@@ -55,8 +55,7 @@ class PathSampler:
     def draw(self, rng: np.random.Generator) -> tuple[Cell, ...]:
         """Draw one admissible path, each with equal probability.
 
-        Raises:
-            TrustboError: Revisits are forbidden, and each of 10 000 walks drawn had one.
+        TrustboError: revisits are forbidden, and each of 10 000 walks drawn had one.
         """
         for _ in range(_TRIES):
             path = self._draw_walk(rng)

@@ -109,14 +109,10 @@ class AdmissiblePaths:
         return np.where(inside & both, other, -1)
 
     def onward(self, done: Sequence[Cell]) -> "AdmissiblePaths":
-        """Restrict to the rest of a mission.
+        """Restrict to the rest of a mission that entered the cells `done` so far, start first.
 
-        Args:
-            done: Cells entered so far, start first.
-
-        Raises:
-            TrustboError: They begin at another cell, or end at the goal.
-            NoPathError: Too few bounds are left to reach the goal.
+        TrustboError: they begin at another cell, or end at the goal. NoPathError: too few bounds
+        are left to reach the goal.
         """
         here = self.workspace.require_cell("done[-1]", done[-1])
         if done[0] != self.start:
@@ -146,8 +142,7 @@ class AdmissiblePaths:
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
         """Return a path as a tuple of cells if every bound is possible.
 
-        Raises:
-            TrustboError: The path is broken, or does not lead from start to goal.
+        TrustboError: it is broken, or does not lead from start to goal.
         """
         try:
             flat = list(map(operator.index, itertools.chain.from_iterable(path)))

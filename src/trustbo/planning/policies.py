@@ -134,11 +134,7 @@ POLICIES: Mapping[str, Policy] = {
 
 
 def resolve_policy(policy: str | Policy) -> Policy:
-    """Return the policy of that name, or the callable itself.
-
-    Raises:
-        TrustboError: Neither a known name nor callable.
-    """
+    """Return the policy of that name, or the callable itself; TrustboError if neither."""
     if callable(policy):
         return policy
     if not isinstance(policy, str):

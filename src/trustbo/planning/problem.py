@@ -59,13 +59,9 @@ class PlanningProblem:
     def with_awareness(self, awareness: ArrayLike, mean: ArrayLike | None = None) -> Self:
         """Return the problem with another awareness map, or one map for each draw.
 
-        Args:
-            awareness: Shape (robot, row, col, feature) or (draw, robot, row, col, feature).
-            mean: Map for parameters without draws, (robot, row, col, feature); by default the mean.
-
-        Raises:
-            ShapeError: Other numbers of robots, cells or features than the workspace's.
-            TrustboError: NaN in a passable cell.
+        Shape (robot, row, col, feature) or (draw, robot, row, col, feature); `mean` is the map for
+        parameters without draws, by default the mean. ShapeError: other numbers of robots, cells or
+        features than the workspace's. TrustboError: NaN in a passable cell.
         """
         z = np.asarray(awareness, dtype=float)
         expected = self.workspace.awareness.shape
@@ -81,17 +77,11 @@ class PlanningProblem:
         return replace(self, awareness=z, mean_awareness=mean)
 
     def onward(self, done: Sequence[Cell]) -> Self:
-        """Return the problem of the rest of a mission.
+        """Return the problem of the rest of a mission that entered the cells `done`, start first.
 
         Bounds already made count towards the limit. The value of a plan is that of the rest alone:
-        for `mean`, the mean over the bounds still to come.
-
-        Args:
-            done: Cells entered so far, start first.
-
-        Raises:
-            TrustboError: They begin at another cell, or end at the goal.
-            NoPathError: Too few bounds are left to reach the goal.
+        for `mean`, the mean over the bounds still to come. Raises what `AdmissiblePaths.onward`
+        raises.
         """
         return replace(self, paths=self.paths.onward(done))
 
@@ -109,13 +99,10 @@ class PlanningProblem:
         draws: np.ndarray | None = None,
         team: str | None = None,
     ) -> Dynamics:
-        """Build the recursion of expected trust over the awareness.
+        """Build the recursion of expected trust; params without draws get the mean awareness.
 
-        Args:
-            params: Parameters with leading axes or without; without, awareness is averaged.
-            x0: Expected trust at the start; by default `params.x0_mean`.
-            draws: Indices of the draws in the posterior; by default 0, 1, 2, ...
-            team: Team to use instead of the problem's.
+        `x0` is by default `params.x0_mean`, `draws` (indices in the posterior) 0, 1, 2, ..., and
+        `team` the problem's.
         """
         z = self.awareness
         if z.ndim == 5:

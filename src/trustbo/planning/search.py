@@ -84,8 +84,7 @@ def find_paths(
 def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, ...]:
     """Find the path with the best expectation over draws of the objective.
 
-    Raises:
-        TrustboError: Another objective than terminal or mean, or `team="min"`.
+    TrustboError: another objective than terminal or mean, or `team="min"`.
     """
     paths, objective = problem.paths, problem.objective
     if objective.name not in ("terminal", "mean") or len(dynamics.views) > 1:
@@ -97,11 +96,7 @@ def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, .
 
 
 def require_one_draw(params: Params) -> None:
-    """Refuse parameters with leading axes.
-
-    Raises:
-        ShapeError: Parameters have leading axes.
-    """
+    """Refuse parameters with leading axes: ShapeError."""
     if params.leading:
         raise ShapeError(
             f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
@@ -112,8 +107,7 @@ def require_one_draw(params: Params) -> None:
 def require_valid(dynamics: Dynamics, objective: str) -> None:
     """Refuse dynamics for which an objective is undefined or not planned exactly.
 
-    Raises:
-        TrustboError: success or bottleneck with beta0 < 0; stationary with abs(beta0) >= 1.
+    TrustboError: success or bottleneck with beta0 < 0; stationary with abs(beta0) >= 1.
     """
     own = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
     if objective in LABELLED and (own < 0.0).any():

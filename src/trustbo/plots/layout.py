@@ -18,21 +18,12 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 
 def small_multiples(
     n: int, n_columns: int | None, size: tuple[float, float], margin: float = 0.0, **shared: Any
 ) -> tuple[Figure, np.ndarray, np.ndarray]:
-    """Make a figure of equal panels, row by row.
+    """Make a figure of n equal panels, row by row: `size` is a panel's width and height, inches.
 
-    Args:
-        n: Number of panels.
-        n_columns: Largest number of panels per row; None for three, or two if there are four.
-        size: Width and height of one panel, inches.
-        margin: Width beside the panels, for a colour bar or a legend, inches.
-        shared: Options `sharex` and `sharey` of `plt.subplots`.
-
-    Returns:
-        Figure, all its Axes (row, column), and those of the panels, shape (n,); the others are
-        invisible.
-
-    Raises:
-        TrustboError: `n_columns` is not a whole number from 1 on.
+    At most `n_columns` per row, None for three, or two if there are four; `margin`, inches, is left
+    beside the panels for a colour bar or a legend; `shared` are `sharex` and `sharey` of
+    `plt.subplots`. Returns the figure, all its Axes (row, column), and those of the panels (n,);
+    the others are invisible. TrustboError: `n_columns` is not a whole number from 1 on.
     """
     usual = 2 if n == 4 else 3
     columns = min(usual if n_columns is None else require_whole("n_columns", n_columns, 1), n)

@@ -161,11 +161,7 @@ def draw_hillshade(
 ) -> None:
     """Draw the shadows of the terrain over a map, if the terrain is in memory.
 
-    Args:
-        ax: Axes to draw on.
-        workspace: Workspace of the terrain.
-        heights: `"dem"` for the ground, `"dsm"` for the surface.
-        exaggerate: Factor of the slopes.
+    `heights` is `"dem"` or `"dsm"`, `exaggerate` a factor of the slopes.
     """
     terrain = workspace.terrain
     if terrain is None or workspace.pixels is None:

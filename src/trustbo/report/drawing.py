@@ -35,14 +35,10 @@ Draw = Callable[[int | None], Axes | np.ndarray]
 def picture(
     draw: Draw, alt: str, caption: str, *, phone_columns: int = 1, shrink: bool = False
 ) -> Picture:
-    """Draw a figure twice, for pages and for phones.
+    """Draw a figure twice, for pages and for phones, with so many panels per row there.
 
-    Args:
-        draw: Function that draws the figure.
-        alt: Description for readers who cannot see the figure.
-        caption: Caption.
-        phone_columns: Panels per row on phones.
-        shrink: Whether panels keep their proportions on phones, as maps do.
+    With `shrink`, panels keep their proportions on phones, as maps do. `alt` describes the figure
+    to readers who cannot see it.
     """
     with plt.rc_context(_STYLE):
         wide, narrow = _figure(draw(None)), _figure(draw(phone_columns))

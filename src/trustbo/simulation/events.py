@@ -110,11 +110,7 @@ def is_between(mission: int, first: int, last: int | None) -> bool:
 
 
 def require_missions(first: int, last: int | None) -> None:
-    """Check that two numbers are a range of missions.
-
-    Raises:
-        TrustboError: They are not.
-    """
+    """Check that two numbers are a range of missions: TrustboError if not."""
     require_whole("first_mission", first, 0)
     if last is not None:
         require_whole("last_mission", last, first)

@@ -30,17 +30,9 @@ class Measure:
         tick: float,
         realtime: Mapping[str, CompositeIndex],
     ) -> None:
-        """Prepare the maps of pixels.
+        """Prepare the maps of pixels, for poses `tick` s apart; real-time indices are by feature.
 
-        Args:
-            workspace: Workspace with maps and team.
-            surface: Terrain.
-            sight: Model of sight.
-            tick: Time between two poses, s.
-            realtime: Real-time indices by feature, see `KinematicSimulator`.
-
-        Raises:
-            TrustboError: A real-time index of an unknown feature.
+        TrustboError: a real-time index of an unknown feature.
         """
         self._workspace, self._surface, self._sight, self._tick = workspace, surface, sight, tick
         self._names = [str(name) for name in workspace.awareness["feature"].values]
@@ -54,9 +46,8 @@ class Measure:
     def __call__(self, ways: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> np.ndarray:
         """Mean awareness along tracks, shape (track, robot, feature).
 
-        Args:
-            ways: Poses of each track, shape (tick, robot, 3).
-            states: States of each, shape (tick, robot, state), for real-time indices; else empty.
+        From the poses of each track, shape (tick, robot, 3), and for real-time indices the states
+        of each, shape (tick, robot, state), else empty.
         """
         poses = np.concatenate(ways)
         starts = np.cumsum([0, *(len(way) for way in ways[:-1])])

@@ -32,19 +32,10 @@ def drive(
 
     Speed falls linearly with the larger of pitch and roll, to a tenth at the limit; a pitch beyond
     the limit leaves the robot stuck, a roll beyond it tips it over. Wheel slip scales the speed of
-    each tick by a random factor of some 5 %.
+    each tick, s, by a random factor of some 5 %. The route has shape (point, 2), CRS metres; the
+    initial heading is in rad from east, anticlockwise. After `max_ticks` the status is "timeout".
 
-    Args:
-        surface: Terrain.
-        robot: Robot that drives.
-        route: Positions, shape (point, 2), CRS metres.
-        heading: Initial heading, rad from east, anticlockwise.
-        tick: Length of a tick, s.
-        max_ticks: Number of ticks after which the status is "timeout".
-        rng: Random generator of slip.
-
-    Returns:
-        Poses (x, y, heading) after each tick, shape (tick, 3), and the status.
+    Returns poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
     poses, code = _drive(
         surface.gradient,
@@ -70,19 +61,10 @@ def drive_together(
     max_ticks: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, str]:
-    """Drive several robots at the same time, until all arrive or one fails.
+    """Drive several robots at the same time (see `drive`), until all arrive or one fails.
 
-    Args:
-        surface: Terrain.
-        robots: Robots that drive.
-        routes: Routes of the robots; a robot without one is stuck.
-        poses: Initial poses, shape (robot, 3).
-        tick: See `drive`.
-        max_ticks: See `drive`.
-        rng: See `drive`.
-
-    Returns:
-        Poses after each tick, shape (tick, robot, 3), and the status of the first that fails.
+    A robot without a route is stuck; initial poses (robot, 3). Returns poses after each tick, shape
+    (tick, robot, 3), and the status of the first that fails.
     """
     tracks, failures = [], []
     for pose, robot, route in zip(poses, robots, routes, strict=True):

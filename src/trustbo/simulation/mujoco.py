@@ -147,15 +147,9 @@ class _Convoy:
         self._untouched = np.full(len(legs), np.inf)  # s
 
     def advance(self, slip: np.ndarray, seconds: float, n_steps: int) -> str:
-        """Command the wheels once, let the physics run and return the status.
+        """Command the wheels, let the physics run `n_steps`, and return "underway" or the status.
 
-        Args:
-            slip: Factors on the wheels' speeds, shape (robot, side).
-            seconds: Duration.
-            n_steps: Number of physics steps.
-
-        Returns:
-            "underway", or the final status of the drive.
+        `slip` are factors on the wheels' speeds, shape (robot, side).
         """
         physics, legs, poses = self._physics, self._legs, self._physics.poses
         tilt = np.arccos(np.clip(physics.up[:, 2], -1.0, 1.0))
@@ -233,10 +227,8 @@ class _Leg:
     def steer(self, pose: np.ndarray, tilt: float, others: np.ndarray) -> tuple[float, float]:
         """Speed, m/s, and yaw rate, rad/s, towards a point ahead, round other robots.
 
-        Args:
-            pose: Pose of the robot: x, y and heading.
-            tilt: Angle of the body with the vertical, rad.
-            others: Positions of the other robots, shape (robot, 2), CRS metres.
+        From the pose (x, y, heading), the body's angle with the vertical, rad, and the positions of
+        the other robots, shape (robot, 2), CRS metres.
         """
         robot, left = self._robot, math.dist(pose[:2], self._points[-1])
         ahead = np.searchsorted(self._along, self._along[self._at] + self._reach)
@@ -250,12 +242,10 @@ class _Leg:
 
 
 def _around(bearing: float, left: float, others: np.ndarray) -> float:
-    """Bearing to steer for, corrected to pass other robots with clearance.
+    """Bearing to steer for, rad, corrected to pass other robots with clearance.
 
-    Args:
-        bearing: Bearing of the point steered for, rad.
-        left: Distance to the goal, m.
-        others: Positions of the other robots relative to this one, shape (robot, 2), m.
+    `left` is the distance to the goal, m; others' positions are relative to this one, (robot, 2),
+    m.
     """
     for x, y in others:
         gap = math.hypot(x, y)

@@ -60,13 +60,9 @@ def new_tracks(n_robots: int) -> np.ndarray:
 def contact_of(found: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
     """Contact from looks: a track begins after some detections in a row, and ends after misses.
 
-    Args:
-        found: Whether each look detected its target, shape (tick, robot).
-        watchers: Robots whose lidar looks, one per robot; they give the numbers of looks.
-        tracks: State of the tracks, shape (robot, 2), updated in place.
-
-    Returns:
-        Shape (tick, robot), bool.
+    `found`, shape (tick, robot), says whether each look detected its target; the watchers' lidars,
+    one per robot, give the numbers of looks; the state of the tracks (robot, 2) is updated in
+    place. Returns shape (tick, robot), bool.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(found.shape, bool)

@@ -62,14 +62,9 @@ class Ground(NamedTuple):
 
 
 def crop(surface: Surface, window: tuple[int, int, int, int], margin: float) -> Ground:
-    """Crop a window of pixels and a margin around it.
+    """Crop a window (first row, end row, first col, end col) of pixels and a margin, m, around it.
 
     Missing heights are those of the nearest pixel; beyond the terrain's edge, of the edge.
-
-    Args:
-        surface: Terrain.
-        window: First row, end row, first col, end col.
-        margin: Width of the margin, m.
     """
     (height, width), (rows, cols) = surface.pixel, surface.ground.shape
     more = [math.ceil(margin / size) for size in surface.pixel]
@@ -102,16 +97,9 @@ class Physics:
     def __init__(
         self, ground: Ground, robots: Sequence[Robot], grip: Sequence[float], step: float
     ) -> None:
-        """Build the model.
+        """Build the model of robots, whose `max_slope` sets the centre of mass, for steps in s.
 
-        Args:
-            ground: Ground to drive on.
-            robots: Robots; their `max_slope` sets the centre of mass.
-            grip: Friction coefficient of each robot's wheels.
-            step: Physics step, s.
-
-        Raises:
-            TrustboError: MuJoCo is not installed.
+        `grip` is the friction coefficient of each robot's wheels. TrustboError: no MuJoCo.
         """
         self._mujoco, self._ground, self._step = require_mujoco(), ground, step
         self.model = self._mujoco.MjModel.from_xml_string(_model(ground, robots, grip, step))
@@ -124,10 +112,9 @@ class Physics:
         self._brake = self.model.dof_frictionloss.reshape(len(robots), -1)[:, 7::2]
 
     def place(self, poses: np.ndarray) -> None:
-        """Place the robots parallel to the ground, and wait until they are at rest.
+        """Place robots, poses (robot, 3), parallel to the ground, and wait until they are at rest.
 
-        Args:
-            poses: Shape (robot, 3); robots that would overlap are moved apart.
+        Those that would overlap are moved apart.
         """
         local = poses - [*self._ground.center, 0.0]
         local[:, :2] = _spread(local[:, :2])
@@ -220,11 +207,7 @@ def wheel_speeds(speed: np.ndarray, yaw_rate: np.ndarray) -> np.ndarray:
 
 
 def require_mujoco() -> ModuleType:
-    """The MuJoCo package.
-
-    Raises:
-        TrustboError: It is not installed.
-    """
+    """The MuJoCo package; TrustboError if it is not installed."""
     try:
         import mujoco
     except ImportError:

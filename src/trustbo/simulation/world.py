@@ -38,8 +38,7 @@ class Worlds:
     ) -> None:
         """Prepare a terrain; see `KinematicSimulator` for the arguments.
 
-        Raises:
-            TrustboError: A workspace without a terrain in memory, or a robot not in the team.
+        TrustboError: a workspace without a terrain in memory, or a robot not in the team.
         """
         if workspace.terrain is None or workspace.pixels is None:
             raise TrustboError(

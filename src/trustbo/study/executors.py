@@ -28,15 +28,9 @@ def completed(
 ) -> Iterator[tuple[Run, dict[str, Any]]]:
     """Execute runs; yield each with its record, as they end.
 
-    A run whose worker dies is repeated: by Dask on another worker, else in a new pool.
-
-    Args:
-        runs: Runs to execute.
-        executor: Executor, see `run_study`.
-        n_workers: Processes started for "loky" and "dask"; by default as many as there are cores.
-
-    Raises:
-        TrustboError: An unknown executor, one that forks, or whose package is not installed.
+    A run whose worker dies is repeated: by Dask on another worker, else in a new pool. "loky" and
+    "dask" start `n_workers` processes, by default as many as there are cores. TrustboError: an
+    unknown executor (see `run_study`), one that forks, or whose package is not installed.
     """
     if not runs:
         return
@@ -93,11 +87,7 @@ def _through(
 
 
 def require_executor(executor: object) -> None:
-    """Refuse an executor that cannot run a study.
-
-    Raises:
-        TrustboError: An unknown name, or an executor that forks.
-    """
+    """Refuse an executor that cannot run a study, unknown or one that forks: TrustboError."""
     if executor is None or hasattr(executor, "get_executor"):
         return
     if isinstance(executor, str):

@@ -19,11 +19,7 @@ class Part:
 
     @classmethod
     def of(cls, what: str, settings: Mapping[str, Any]) -> Self:
-        """Part with these settings.
-
-        Raises:
-            TrustboError: An unknown setting, or one that is missing or impossible.
-        """
+        """Part with these settings; TrustboError if one is unknown, missing or impossible."""
         known = {f.name: f for f in fields(cls)}
         for name in settings:
             require_choice(f"setting of {what} ({cls.kind})", name, known)
@@ -44,16 +40,10 @@ class Part:
 
 
 def parts_of[P: Part](what: str, given: object, kinds: Iterable[type[P]]) -> dict[str, P]:
-    """Make parts, by their names in the study.
+    """Make parts of these kinds, by their names in the study; `what` is the noun for messages.
 
-    Args:
-        what: Noun for messages, e.g. "terrain".
-        given: Names of kinds, or a mapping of names to settings. The setting `kind` may be left
-            out where the name is that of a kind.
-        kinds: All kinds.
-
-    Raises:
-        TrustboError: Another type, or an unknown kind or setting.
+    Given are names of kinds, or a mapping of names to settings, whose `kind` may be left out where
+    the name is that of a kind. TrustboError: another type, or an unknown kind or setting.
     """
     by_kind = {kind.kind: kind for kind in kinds}
     if isinstance(given, str):

@@ -75,8 +75,7 @@ class Run:
     def begin(self, *callbacks: Any) -> tuple[Campaign, Iterator[object], Simulator]:
         """Set up the campaign, its missions, of which none has been run yet, and the simulator.
 
-        Raises:
-            TrustboError: Impossible settings.
+        TrustboError: impossible settings.
         """
         options = dict(self.options)
         stop = options.pop("stop", None)
@@ -123,14 +122,9 @@ class _Referee:
 
 
 def execute(run: Run, caller: tuple[str, int]) -> dict[str, Any]:
-    """Execute a run in this process.
+    """Execute a run in this process; `caller` is the host and process that the study was called in.
 
-    Args:
-        run: Run of a study.
-        caller: Host and process that the study was called in.
-
-    Returns:
-        Record of the run and of each mission; or the `error` it failed with.
+    Returns the record of the run and of each mission; or the `error` it failed with.
     """
     workers.prepare(caller)
     started, cpu = time.perf_counter(), time.process_time()

@@ -16,11 +16,7 @@ class Store:
     """Reads and writes a study's folder; each file is written whole or not at all."""
 
     def __init__(self, directory: str | PathLike[str]) -> None:
-        """Use a folder, which need not exist yet.
-
-        Raises:
-            TrustboError: The folder's name belongs to a file.
-        """
+        """Use a folder, which need not exist yet; TrustboError if its name belongs to a file."""
         self.folder = require_folder(directory)
 
     def write_study(self, study: Study, runs: list[Run]) -> None:
@@ -29,11 +25,7 @@ class Store:
         self._write("study.json", {"study": study.settings(), "runs": table})
 
     def table(self) -> dict[str, dict[str, Any]]:
-        """Read the labels of each run of the study, by key.
-
-        Raises:
-            TrustboError: The folder holds no study.
-        """
+        """Read the labels of each run, by key; TrustboError if the folder holds no study."""
         file = self.folder / "study.json"
         if not file.is_file():
             raise TrustboError(

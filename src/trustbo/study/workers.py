@@ -19,11 +19,7 @@ def this_process() -> tuple[str, int]:
 
 
 def prepare(caller: tuple[str, int]) -> None:
-    """Set this process up as a worker, once, before JAX starts; unless it is the caller itself.
-
-    Args:
-        caller: Host and process that the study was called in, which is not changed.
-    """
+    """Set this process up as a worker, once, before JAX starts; unless it is the caller itself."""
     global _ready
     if _ready or this_process() == caller:
         return
@@ -34,14 +30,12 @@ def prepare(caller: tuple[str, int]) -> None:
 
 
 def pin_to_core() -> int | None:
-    """Pin this process to a core that no other worker on this machine has taken.
+    """Pin this process to a core that no other worker on this machine has taken, and return it.
 
     XLA's pool has as many threads as the process may use cores when it starts, whatever the usual
     flags say; two workers of two threads each slow each other down. The core is taken by a lock on
-    a file that stays open, which the system releases when the process ends, however it ends.
-
-    Returns:
-        Core; None if all are taken, or where there is no affinity: nothing is pinned then.
+    a file that stays open, which the system releases when the process ends, however it ends. None
+    if all are taken, or where there is no affinity: nothing is pinned then.
     """
     if not hasattr(os, "sched_setaffinity"):
         return None

@@ -149,12 +149,8 @@ def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
 def clean(terrain: xr.Dataset) -> tuple[xr.Dataset, int, int]:
     """Put NaN in common and raise the surface to the ground, of a lazy terrain or a window of it.
 
-    Args:
-        terrain: `dem` and `dsm` over (y, x), metres, of `read_terrain(..., lazy=True)`. It is not
-            changed.
-
-    Returns:
-        Terrain in memory, in floats; number of raised pixels; number of pixels with both heights.
+    The terrain of `read_terrain(..., lazy=True)` is not changed. Returns a terrain in memory, in
+    floats; the number of raised pixels; the number of pixels with both heights.
     """
     ground, surface = (terrain[name].compute() for name in ("dem", "dsm"))
     valid = np.isfinite(ground) & np.isfinite(surface)
@@ -168,13 +164,7 @@ def clean(terrain: xr.Dataset) -> tuple[xr.Dataset, int, int]:
 
 
 def warn_if_clipped(clipped: int, valid: int, stacklevel: int = 2) -> None:
-    """Warn if the DSM lies below the DEM on over 2 % of the valid pixels.
-
-    Args:
-        clipped: Number of pixels that `clean` raised, summed over windows.
-        valid: Number of pixels with both heights, summed over windows.
-        stacklevel: Stack level of the warning, as in `warnings.warn`.
-    """
+    """Warn if `clean` raised over 2 % of the valid pixels, both numbers summed over windows."""
     if clipped > CLIP_WARNING_SHARE * valid:
         warnings.warn(
             f"the DSM lies below the DEM on {clipped / valid:.1%} of pixels; it is raised to the "
@@ -186,8 +176,7 @@ def warn_if_clipped(clipped: int, valid: int, stacklevel: int = 2) -> None:
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     """Check a user's dataset, and convert it to the form of `assemble_terrain`.
 
-    Raises:
-        TerrainError: No `dem` or `dsm`, or what `assemble_terrain` refuses.
+    TerrainError: no `dem` or `dsm`, or what `assemble_terrain` refuses.
     """
     if not isinstance(terrain, xr.Dataset) or not {"dem", "dsm"} <= set(terrain.data_vars):
         raise TerrainError(

@@ -209,9 +209,7 @@ def exposure(
 def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
     """Check that positions are on the terrain, and return them as an array (observer, 2).
 
-    Raises:
-        ShapeError: They are no list of positions.
-        TerrainError: One is off the terrain.
+    ShapeError: no list of positions. TerrainError: one is off the terrain.
     """
     place = np.asarray(observers, dtype=float)
     if place.ndim != 2 or place.shape[1] != 2 or not len(place):

@@ -90,11 +90,7 @@ def _north_up(raster: Raster) -> Raster:
 
 
 def require_metres(heights: xr.DataArray, name: str) -> None:
-    """Check that heights are in metres, by their attributes and the vertical axis of their CRS.
-
-    Raises:
-        TerrainError: They are not.
-    """
+    """Refuse heights not in metres, by attributes and vertical axis of their CRS: TerrainError."""
     unit = height_unit(name, heights.attrs.get("units"), heights.rio.crs)
     if unit != METRE:
         raise TerrainError(
@@ -104,11 +100,7 @@ def require_metres(heights: xr.DataArray, name: str) -> None:
 
 
 def require_metric_crs(crs: CRS | None, name: str) -> None:
-    """Check that a map's CRS is in metres.
-
-    Raises:
-        TerrainError: There is none, or it is in degrees or another unit.
-    """
+    """Refuse a map without CRS, or with one in another unit than metres: TerrainError."""
     if crs is None:
         raise TerrainError(f"{name} has no CRS; set it, e.g. dem.rio.write_crs('EPSG:32633').")
     if crs.is_geographic:
@@ -131,11 +123,7 @@ def require_metric_crs(crs: CRS | None, name: str) -> None:
 
 
 def require_regular(values: np.ndarray, axis: Hashable, name: str) -> None:
-    """Check that coordinates are evenly spaced.
-
-    Raises:
-        TerrainError: They are not, or fewer than two.
-    """
+    """Refuse coordinates that are fewer than two, or not evenly spaced: TerrainError."""
     steps = np.diff(values)
     if not len(steps) or not np.allclose(steps, steps[0], rtol=1e-3) or steps[0] == 0.0:
         raise TerrainError(

@@ -49,12 +49,8 @@ def decoder(
 ) -> Callable[[np.ndarray, np.ndarray | None, int, int], np.ndarray]:
     """Make the function from stored values to heights in metres, NaN where missing.
 
-    Args:
-        name: Name of the raster for messages.
-        fills: Stored values that mean missing.
-        scale: Factor of the stored values.
-        offset: Number added to the scaled values.
-        unit: Length of the unit of the heights, metres.
+    Stored `fills` mean missing; heights are `scale` * stored + `offset`, in units of `unit` metres.
+    The raster's name is for messages.
     """
 
     def decode(stored: np.ndarray, missing: np.ndarray | None, row: int, column: int) -> np.ndarray:

@@ -54,20 +54,13 @@ def open_raster(
 ) -> Raster:
     """Open a raster, first band, without reading its heights; see `read_terrain`.
 
-    Args:
-        source: Path, whose file `closing` closes, or an open dataset or array, which stays open.
-        role: Name for messages: dem or dsm.
-        closing: Exit stack that closes the file.
-        crs: Coordinate reference system of a raster without one.
-        resolution: Pixel size of a raster without a georeference, m.
-        nodata: Another stored value that means missing.
+    The source is a path, whose file `closing` closes, or an open dataset or array, which stays
+    open; `role`, dem or dsm, is for messages. `crs` is for a raster without one, `resolution` (m)
+    for one without a georeference, `nodata` another stored value that means missing. Returns a
+    raster, north up, in degrees or metres.
 
-    Returns:
-        Raster, north up, in degrees or metres.
-
-    Raises:
-        TerrainError: The source is no raster of heights. Reading raises one if the file is damaged
-            or holds an undeclared fill value.
+    TerrainError: the source is no raster of heights. Reading raises one if the file is damaged or
+    holds an undeclared fill value.
     """
     try:
         fill = [] if nodata is None else [float(nodata)]

@@ -83,11 +83,7 @@ def register_feature(
 
 
 def feature_named(name: str) -> PixelFeature:
-    """Get a registered feature.
-
-    Raises:
-        TrustboError: No feature has that name.
-    """
+    """Get a registered feature; TrustboError if no feature has that name."""
     return FEATURES[require_choice("feature", name, FEATURES)]
 
 

@@ -28,22 +28,15 @@ BARE, WALL, TRANSMITTANCE = 0, 1, 2
 
 @_inlined
 def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crown_base, work):
-    """Share of a beam that passes from `start` to `end`.
+    """Share of a beam from `start` to `end` that passes the canopy, 0 if the ray is blocked.
 
-    Args:
-        ground: DEM, shape (row, col), m.
-        surface: DSM, shape (row, col), m.
-        pixel: Pixel height and width, m.
-        start: Row, col (fractions of pixels, centres at integers) and height in m of the start.
-        end: Row, col and height of the end, likewise.
-        mode: BARE, WALL or TRANSMITTANCE.
-        extinction: Extinction coefficient of the canopy, 1/m.
-        crown_base: Height of the canopy's lower edge as a share of its height.
-        work: Array from `work_space()`, reused by the next ray.
+    DEM `ground` and DSM `surface` (row, col), m; pixel height and width, m; both ends as row, col
+    (fractions of pixels, centres at integers) and height, m; mode BARE, WALL or TRANSMITTANCE;
+    extinction of the canopy, 1/m; `crown_base`, the canopy's lower edge as a share of its height;
+    `work_space()`, reused by the next ray.
 
-    Returns:
-        exp(-extinction * metres inside the canopy layer), or 0 where the ray is blocked, leaves the
-        raster or crosses a pixel without data.
+    Returns exp(-extinction * metres inside the canopy layer), or 0 where the ray is blocked, leaves
+    the raster or crosses a pixel without data.
     """
     r0, c0, z0 = start
     r1, c1, z1 = end

@@ -28,11 +28,10 @@ class Strip(NamedTuple):
 
 
 def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
-    """Cut a terrain into strips from north to south.
+    """Cut a terrain, in memory or lazily read, into strips from north to south.
 
-    Args:
-        terrain: Terrain, in memory or lazily read.
-        halo: Radius of the surroundings that a pixel's features depend on, m; two pixels are added.
+    `halo` is the radius of the surroundings that a pixel's features depend on, m; two pixels are
+    added.
     """
     n_rows, n_cols = terrain["dem"].shape
     around = _halo_rows(terrain, halo)
@@ -42,13 +41,7 @@ def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
 
 
 def sample_strips(terrain: xr.Dataset, halo: float, n_pixels: int) -> Iterator[Strip]:
-    """Sample strips spread evenly over a terrain, about `n_pixels` in all.
-
-    Args:
-        terrain: Terrain, in memory or lazily read.
-        halo: See `strips`.
-        n_pixels: Number of pixels to sample.
-    """
+    """Sample strips (see `strips`) spread evenly over a terrain, about `n_pixels` in all."""
     n_rows, n_cols = terrain["dem"].shape
     around = _halo_rows(terrain, halo)
     wanted = -(-n_pixels // n_cols)

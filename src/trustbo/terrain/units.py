@@ -37,13 +37,8 @@ _LENGTHS = {
 def height_unit(name: str, declared: object, crs: CRS | None) -> HeightUnit:
     """Find the unit of a raster's heights; metres if nothing declares one.
 
-    Args:
-        name: Name of the raster for messages.
-        declared: Unit of the band (of each band, the first counts), or None.
-        crs: Coordinate reference system, whose vertical axis may have a unit.
-
-    Raises:
-        TerrainError: An unknown unit, or a band and a CRS that disagree.
+    `declared` is the unit of the band (of each band, the first counts), or None; the vertical axis
+    of the CRS may have one. TerrainError: an unknown unit, or a band and a CRS that disagree.
     """
     text = str(np.ravel(np.array(declared, object))[0] or "").strip()
     axis = _vertical(crs)

@@ -37,8 +37,7 @@ class CellMaps(NamedTuple):
 def feature_specs(features: Mapping[str, object]) -> dict[str, FeatureSpec]:
     """Definitions of awareness features, given by names of pixel features or as pixel features.
 
-    Raises:
-        TrustboError: An unknown name, or something that is no feature.
+    TrustboError: an unknown name, or something that is no feature.
     """
     return {name: _spec(name, parts) for name, parts in features.items()}
 
@@ -73,24 +72,15 @@ def cell_maps(
     composites: Mapping[str, CompositeIndex] | None = None,
     keep_pixels: bool = True,
 ) -> CellMaps:
-    """Awareness and passability of each cell.
+    """Awareness and passability (slope up to `max_slope`, rad) of each cell.
 
     A composite is fitted on all pixels of a raster of up to a million, on rows spread evenly over a
-    larger one; then each pixel's index is added to its cell, strip by strip, so that no feature of
-    the whole raster is in memory.
+    larger one, unless it is given fitted, by feature; then each pixel's index is added to its cell,
+    strip by strip, so that no feature of the whole raster is in memory, unless `keep_pixels`.
+    `scaling` is `CompositeIndex`'s; `aggregate` the `"mean"` of a cell's pixels, or a quantile in
+    [0, 1].
 
-    Args:
-        terrain: Terrain, in memory or lazily read.
-        grid: Planning grid.
-        features: Definitions of the awareness features.
-        max_slope: Steepest passable ground, rad.
-        scaling: See `CompositeIndex`.
-        aggregate: `"mean"` of a cell's pixels, or a quantile in [0, 1].
-        composites: Fitted composites by feature; the others are fitted.
-        keep_pixels: Keep the indices of all pixels.
-
-    Raises:
-        TrustboError: A quantile outside [0, 1], or a feature that is no composite outside [0, 1].
+    TrustboError: a quantile outside [0, 1], or a feature that is no composite outside [0, 1].
     """
     quantile = _require_aggregate(aggregate)
     parts = [p for f in features.values() for p in _parts(f)]

@@ -155,12 +155,7 @@ class CellMeans:
     """Means over each cell's pixels with data, from rows of pixels added north to south."""
 
     def __init__(self, grid: Grid, like: xr.DataArray) -> None:
-        """Start without pixels.
-
-        Args:
-            grid: Planning grid.
-            like: A raster of the whole terrain, dims (y, x).
-        """
+        """Start without pixels, for a raster of the whole terrain, dims (y, x)."""
         self._row, self._edges = _ownership(grid, like)
         self._total, self._count = np.zeros(grid.shape), np.zeros(grid.shape)
 

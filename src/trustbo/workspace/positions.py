@@ -27,14 +27,9 @@ class Positions:
         traversability: xr.DataArray,
         radius: float,
     ) -> None:
-        """Prepare the maps of pixels.
+        """Prepare the maps of pixels; `traversability` has dims (y, x).
 
-        Args:
-            workspace: Workspace with cells and team.
-            surface: Terrain.
-            sight: Model of sight.
-            traversability: Traversability of each pixel, dims (y, x).
-            radius: Largest distance of T2 from the lead's waypoint, m.
+        `radius` is the largest distance of T2 from the lead's waypoint, m.
         """
         self._workspace, self._surface, self._sight = workspace, surface, sight
         self._traversability = _smoothed(traversability.values, surface.pixel)

@@ -34,16 +34,10 @@ class Routes:
         goal: np.ndarray,
         window: tuple[int, int, int, int],
     ) -> np.ndarray | None:
-        """Find the fastest route between two positions.
+        """Find the fastest route from start to goal, (x, y) in CRS metres; None if there is none.
 
-        Args:
-            robot: Robot that drives.
-            start: x and y, CRS metres.
-            goal: x and y, CRS metres.
-            window: Pixels that the route may use: first row, end row, first col, end col.
-
-        Returns:
-            Positions from start to goal, shape (point, 2), CRS metres; None if there is no route.
+        It stays in the window of pixels (first row, end row, first col, end col). Returns
+        positions, shape (point, 2), CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
         key = (*ends, window, robot.max_slope)

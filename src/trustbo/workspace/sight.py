@@ -89,20 +89,11 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
 def detection_probability(
     surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, optics: np.ndarray
 ) -> np.ndarray:
-    """Probability that an ideal lidar detects a target.
+    """Probability that an ideal lidar detects each target, shape (ray,), in [0, 1].
 
     It is the transmittance along the ray if the target is within the lidar's range and vertical
-    field of view, which tilts with the robot, and else 0.
-
-    Args:
-        surface: Terrain.
-        sight: Model of sight.
-        sensor: Positions, shape (ray, 2), CRS metres.
-        target: Positions, shape (ray, 2), CRS metres.
-        optics: See `optics`, shape (ray, 4) or (4,).
-
-    Returns:
-        Shape (ray,), in [0, 1].
+    field of view, which tilts with the robot, and else 0. Sensors and targets have shape (ray, 2),
+    CRS metres; see `optics`, shape (ray, 4) or (4,).
     """
     ends = _ends(
         surface.ground,

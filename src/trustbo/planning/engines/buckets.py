@@ -43,19 +43,12 @@ def best_stationary(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the path of every draw with the least sum of softplus(-steady_state) over its cells.
 
-    Args:
-        steady_state: Function from a slice of the draws to the team's trust if it stayed in each
-            cell, shape (draw, row, col).
-        n_draws: Number of draws.
-        passable: Cells that can be entered, shape (row, col).
-        length_cost: Cost of each move, added to that of the cell, shape (move,).
-        steps: Moves, shape (move, 2).
-        start: Flat index of the first cell.
-        goal: Flat index of the last cell.
+    `steady_state` maps a slice of the draws to the team's trust if it stayed in each cell, (draw,
+    row, col). A move of `steps` (move, 2) adds its `length_cost` (move,) to that of the cell
+    entered, which must be `passable` (row, col). `start` and `goal` are flat indices.
 
-    Returns:
-        Costs, shape (draw,); inf where there is no path; and paths, flat indices of cells, shape
-        (draw, length), filled with -1.
+    Returns costs (draw,), inf where there is no path; and paths, flat indices of cells, shape
+    (draw, length), filled with -1.
     """
     rows, cols = passable.shape
     # A path may need all cells (a maze); many draws share a shorter table unless one of them does.

@@ -18,9 +18,7 @@ _MAX_ENTRIES = 20_000_000  # of the tables of `Heuristic`
 def dominance_tests(dynamics: Dynamics, longest: int) -> np.ndarray:
     """Rows q such that A dominates B if q . (x_A - x_B) >= 0 for all; shape (test, state).
 
-    Args:
-        dynamics: Recursion of expected trust of one draw.
-        longest: Largest number of bounds of a path.
+    For one draw, and paths of at most `longest` bounds.
     """
     n_states, rows = len(dynamics.start), []
     if (dynamics.transition >= 0.0).all() and (dynamics.views >= 0.0).all():
@@ -51,14 +49,10 @@ class Heuristic(NamedTuple):
 def build_heuristic(
     dynamics: Dynamics, longest: int, neighbours: np.ndarray, goal: int, *, at_goal: bool
 ) -> Heuristic:
-    """Compute the heuristic by dynamic programming over the bounds.
+    """Compute the heuristic of one draw by dynamic programming over up to `longest` bounds.
 
-    Args:
-        dynamics: Recursion of expected trust of one draw.
-        longest: Largest number of bounds of a path.
-        neighbours: Cells that can be entered from each, shape (cell, move), -1 where none.
-        goal: Flat index of the goal.
-        at_goal: True if the last bound, and no other, must enter the goal.
+    `neighbours` (cell, move) are flat indices of cells, -1 where none; `at_goal`: the last bound,
+    and no other, must enter the goal.
     """
     n_states, n_cells = len(dynamics.start), len(neighbours)
     # The mean of the views bounds their least too, and keeps to one path for all of them.

@@ -65,13 +65,9 @@ class SearchResult(NamedTuple):
 
 
 def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchResult:
-    """Find the path of least cost.
+    """Find the path of least cost with at most `max_labels` labels.
 
-    Args:
-        problem: Data of the search.
-        tolerance: Amount by which a dropped label may be better than the label that replaces it; 0
-            for an exact search.
-        max_labels: Limit on the number of labels.
+    A dropped label may be better by `tolerance` than the label that replaces it; 0 is exact.
     """
     path, cost, bound, complete = _search(problem, tolerance, max_labels)
     return SearchResult(path if complete else None, cost, bound)

@@ -50,14 +50,11 @@ def build_layers(
     *,
     u_turns: bool,
 ) -> Layers:
-    """Unroll a grid over the bounds left.
+    """Unroll a grid over the bounds left, for paths of at most `longest` bounds.
 
-    Args:
-        to_goal: Fewest bounds to the goal, shape (row, col); -1 where there is no way.
-        from_start: Fewest bounds from the start, likewise.
-        steps: Moves, shape (move, 2), each the reverse of the one as far from the other end.
-        longest: Largest number of bounds of a path.
-        u_turns: True if a bound may lead back to the cell that the last one left.
+    Fewest bounds `to_goal` and `from_start`, (row, col), -1 where there is no way; moves `steps`
+    (move, 2), each the reverse of the one as far from the other end. With `u_turns` a bound may
+    lead back to the cell that the last one left.
     """
     return _build(to_goal, from_start, steps, longest, u_turns)
 
@@ -129,16 +126,11 @@ class Weights(NamedTuple):
 
 
 def additive_weights(dynamics: Dynamics, view: np.ndarray, objective: str, longest: int) -> Weights:
-    """Compute the weights of `terminal` or `mean` for one view of the states.
+    """Compute the weights of `terminal` or `mean` for one view (state,) of the states.
 
     terminal: view . x^K = view . B0^K x0 + sum_j (view . B0^j) . u, with j bounds left. mean: the
-    average of view . x^k over k = 1..K.
-
-    Args:
-        dynamics: Recursion of expected trust with a leading axis (draw,).
-        view: Weights of the states in trust of the team, shape (state,).
-        objective: `"terminal"` or `"mean"`.
-        longest: Largest number of bounds of a path.
+    average of view . x^k over k = 1..K. For dynamics with a leading axis (draw,), up to `longest`
+    bounds.
     """
     n_draws, n_states = dynamics.start.shape
     powers = np.empty((n_draws, longest + 1, n_states))
@@ -162,18 +154,10 @@ def best_additive(
     length_cost: np.ndarray,
     lengths: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the best path of every draw.
+    """Find the best path of every draw over admissible numbers of bounds, `lengths`.
 
-    Args:
-        layers: Grid unrolled over the bounds left.
-        drift: u, shape (draw, state, cell).
-        weights: Weights of u.
-        length_cost: Cost of each move, shape (move,).
-        lengths: Admissible numbers of bounds.
-
-    Returns:
-        Scores, shape (draw,); -inf where there is no path; and paths, flat indices of cells, shape
-        (draw, length), filled with -1.
+    Drift u (draw, state, cell) and its weights, cost of each move (move,). Returns scores (draw,),
+    -inf where there is no path; and paths, flat indices of cells, (draw, length), filled with -1.
     """
     n_draws = len(drift)
     scores = np.full(n_draws, -np.inf)

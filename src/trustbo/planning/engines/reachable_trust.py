@@ -37,17 +37,10 @@ def best_trust(
 ) -> np.ndarray:
     """Compute the largest expected trust with which each cell can be reached without U-turns.
 
-    Args:
-        u: Drift of each cell, shape (draw, row, col).
-        beta0: Autoregression, shape (draw,).
-        x0: Expected trust at the start, shape (draw,).
-        fewest: Fewest bounds from the start, shape (row, col); -1 where there is no way.
-        steps: Moves to the neighbouring cells, shape (move, 2), each the reverse of the one as far
-            from the other end.
-        extra: Number of bounds beyond the fewest possible, 0 to 2.
-
-    Returns:
-        Shape (draw, row, col); NaN where a cell cannot be reached.
+    Drift u (draw, row, col); beta0 and x0, trust at the start, (draw,); `fewest` bounds from the
+    start (row, col), -1 where there is no way; moves `steps` (move, 2), each the reverse of the one
+    as far from the other end; `extra` bounds beyond the fewest possible, 0 to 2. Returns shape
+    (draw, row, col), NaN where a cell cannot be reached.
     """
     order = np.argsort(fewest, axis=None, kind="stable")
     order = order[np.searchsorted(fewest.ravel()[order], 0) :]

@@ -31,14 +31,7 @@ def plan_networkx(
     objective: Objective,
     backend: str | None = None,
 ) -> Path:
-    """Find the best path of one draw.
-
-    Args:
-        admissible: Admissible paths.
-        dynamics: Recursion of expected trust without leading axes.
-        objective: Objective and length weight.
-        backend: networkx backend for shortest paths.
-    """
+    """Find the best path of one draw, `dynamics` without leading axes; `backend` is networkx's."""
     if objective.name == "stationary":
         cost = entry_cost(admissible.passable, dynamics)
         return best_stationary(admissible, cost, objective.length_weight, backend)
@@ -79,21 +72,11 @@ def best_additive(
     length_weight: float = 0.0,
     backend: str | None = None,
 ) -> Path | None:
-    """Find the path of exactly `n_bounds` bounds that maximises the sum of gain(k, path[k]).
+    """Find the path, if any, of exactly `n_bounds` bounds with the largest sum of gain(k, path[k]).
 
     The cells are unrolled over the bounds into a layered DAG. All paths through it are equally
     long, so each layer's weights may be shifted to be non-negative: Dijkstra then applies, whatever
-    the signs of the gains.
-
-    Args:
-        admissible: Admissible paths.
-        gain: Gain of entering a cell by bound k.
-        n_bounds: Number of bounds of the path.
-        length_weight: Cost of a metre.
-        backend: networkx backend to dispatch to.
-
-    Returns:
-        Path, or None if none has that many bounds.
+    the signs of the gains. `length_weight` is the cost of a metre, `backend` networkx's.
     """
     graph, dag = admissible.graph, nx.DiGraph()
     source, sink = (0, None, admissible.start), "goal"
@@ -126,14 +109,11 @@ def best_additive(
 
 
 def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: str) -> Path:
-    """Find the walk with the best `success` or `bottleneck`.
+    """Find the walk with the best `success` or `bottleneck`; TrustboError if none is short enough.
 
     Label setting: labels leave the queue in the order of their cost, which never falls along a
     walk. A later label at a cell is settled only if no earlier one dominates it (see `dominance`)
     with as few bounds and, without revisits, with a subset of its cells.
-
-    Raises:
-        TrustboError: No walk is short enough.
     """
     combine: Callable[[float, float], float] = (
         (lambda cost, x: cost + float(softplus(-x)))
