@@ -3,24 +3,23 @@
 from pathlib import Path
 
 from trustbo.campaign.options import POLICY, SAMPLER
-from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import require_outputs
 from trustbo.cli.run import require_names, run
 
 
 def demo(
-    policy: options.Policy = POLICY,
-    objective: options.Objective = "mean",
-    model: options.Model = "pooled",
-    sampler: options.Sampler = SAMPLER,
-    iterations: options.Iterations = 8,
-    seed: options.Seed = 0,
-    config: options.Config = None,
-    out: options.Out = Path("out/demo"),
-    overwrite: options.Overwrite = False,
-    quiet: options.Quiet = False,
-    debug: options.Debug = False,
+    policy: str = POLICY,
+    objective: str = "mean",
+    model: str = "pooled",
+    sampler: str = SAMPLER,
+    iterations: int = 8,
+    seed: int = 0,
+    config: Path | None = None,
+    out: Path = Path("out/demo"),
+    overwrite: bool = False,
+    quiet: bool = False,
+    debug: bool = False,
 ) -> None:
     """Run a campaign on a synthetic terrain of 500 m x 500 m, and write its DEM and DSM too.
 

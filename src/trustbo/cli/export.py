@@ -1,18 +1,18 @@
 """`trustbo export`: a result as files for other programs."""
 
 import sys
+from pathlib import Path
 
-from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
 from trustbo.errors import require_choice
 
 
 def export(
-    folder: options.Folder,
-    formats: options.Formats,
-    out: options.OutFolder = None,
-    resolution: options.ExportResolution = None,
-    debug: options.Debug = False,
+    folder: Path,
+    formats: list[str],
+    out: Path | None = None,
+    resolution: float | None = None,
+    debug: bool = False,
 ) -> None:
     """Write a result's maps and path for GIS, GPS units and robots.
 

@@ -9,6 +9,7 @@ import typer
 from trustbo.cli.demo import demo
 from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.export import export
+from trustbo.cli.options import with_flags
 from trustbo.cli.report import report
 from trustbo.cli.resume import resume
 from trustbo.cli.run import run
@@ -20,11 +21,7 @@ unforeseen error (with a traceback); 2 bad input; 3 a posterior was refused,
 measured missions are kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
-_PANELS = (
-    ("Campaigns", (demo, run, resume)),
-    ("Results", (report, export)),
-    ("Studies", (study,)),
-)
+_PANELS = (("Campaigns", (demo, run, resume)), ("Results", (report, export)), ("Studies", (study,)))
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -36,7 +33,7 @@ app = typer.Typer(
 )
 for panel, commands in _PANELS:
     for command in commands:
-        app.command(rich_help_panel=panel, epilog=EPILOG.strip())(command)
+        app.command(rich_help_panel=panel, epilog=EPILOG.strip())(with_flags(command))
 
 
 def _show_version(asked: bool) -> None:

@@ -2,16 +2,15 @@
 
 from pathlib import Path
 
-from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import use_no_screen
 
 
 def report(
-    folder: options.Folder,
-    out: options.OutFile = None,
-    title: options.Title = None,
-    debug: options.Debug = False,
+    folder: Path,
+    out: Path | None = None,
+    title: str | None = None,
+    debug: bool = False,
 ) -> None:
     """Write a result as one HTML page, with all its figures and tables.
 

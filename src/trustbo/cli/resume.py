@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trustbo.cli import options
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.errors import TrustboError, require_whole
@@ -13,11 +12,11 @@ if TYPE_CHECKING:
 
 
 def resume(
-    folder: options.Folder,
-    iterations: options.Total = None,
-    stop_regret: options.StopRegret = None,
-    quiet: options.Quiet = False,
-    debug: options.Debug = False,
+    folder: Path,
+    iterations: int | None = None,
+    stop_regret: float | None = None,
+    quiet: bool = False,
+    debug: bool = False,
 ) -> None:
     """Go on with a campaign that was interrupted, or with more missions.
 

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.cli import options as flags
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.errors import TrustboError, require_choice, require_whole
@@ -13,32 +12,31 @@ if TYPE_CHECKING:
     from trustbo.data import Team
 
 
-@flags.with_campaign_options
 def run(
-    dem: flags.Dem,
-    start: flags.Start,
-    goal: flags.Goal,
-    dsm: flags.Dsm = None,
-    shape: flags.Shape = "10,10",
-    crs: flags.Crs = None,
-    resolution: flags.Resolution = None,
-    robots: flags.Robots = 3,
-    max_slope: flags.MaxSlope = 45.0,
-    lidar_range: flags.LidarRange = 100.0,
-    sight: flags.SightMode = "transmittance",
-    objective: flags.Objective = OBJECTIVE,
-    policy: flags.Policy = POLICY,
-    model: flags.Model = "pooled",
-    observation: flags.Observation = "gaussian",
-    sampler: flags.Sampler = SAMPLER,
-    iterations: flags.Iterations = 8,
-    stop_regret: flags.StopRegret = None,
-    seed: flags.Seed = 0,
-    config: flags.Config = None,
-    out: flags.Out = Path("out"),
-    overwrite: flags.Overwrite = False,
-    quiet: flags.Quiet = False,
-    debug: flags.Debug = False,
+    dem: Path,
+    start: str,
+    goal: str,
+    dsm: Path | None = None,
+    shape: str = "10,10",
+    crs: str | None = None,
+    resolution: float | None = None,
+    robots: int = 3,
+    max_slope: float = 45.0,
+    lidar_range: float = 100.0,
+    sight: str = "transmittance",
+    objective: str = OBJECTIVE,
+    policy: str = POLICY,
+    model: str = "pooled",
+    observation: str = "gaussian",
+    sampler: str = SAMPLER,
+    iterations: int = 8,
+    stop_regret: float | None = None,
+    seed: int = 0,
+    config: Path | None = None,
+    out: Path = Path("out"),
+    overwrite: bool = False,
+    quiet: bool = False,
+    debug: bool = False,
     **options: Any,
 ) -> None:
     """Run a campaign on your own terrain: plan, simulate, learn, and plan again.

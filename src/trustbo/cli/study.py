@@ -4,18 +4,17 @@ from pathlib import Path
 
 import typer
 
-from trustbo.cli import options
 from trustbo.cli.errors import FAILED, one_line_errors
 from trustbo.cli.outputs import use_no_screen, write_figure
 
 
 def study(
-    config: options.StudyConfig,
-    out: options.StudyOut = Path("out/study"),
-    executor: options.Executor = "loky",
-    workers: options.Workers = None,
-    quiet: options.Quiet = False,
-    debug: options.Debug = False,
+    config: Path,
+    out: Path = Path("out/study"),
+    executor: str = "loky",
+    workers: int | None = None,
+    quiet: bool = False,
+    debug: bool = False,
 ) -> None:
     """Run a study: policies x objectives x models x seeds x terrains, on all cores.
 
