@@ -23,8 +23,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LEAST_FREE = 1 << 20
 """Bytes; libraries that write files by themselves do not say why they failed."""
 
+FilePath = str | PathLike[str]
 
-def write_file(path: str | PathLike[str], write: Callable[[Path], object]) -> None:
+
+def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
     """Write a file atomically: `write` gets a temporary name of the same suffix, then renamed.
 
     Ctrl-C and SIGTERM take effect after the write, a second one at once.
@@ -151,7 +153,7 @@ def _sums(path: Path) -> list[str]:
     return file.read_text().split() if file.exists() else []
 
 
-def write_text(path: str | PathLike[str], text: str) -> None:
+def write_text(path: FilePath, text: str) -> None:
     """Write a text file atomically."""
     write_file(path, lambda file: file.write_text(text, encoding="utf-8"))
 
@@ -171,7 +173,7 @@ def to_json(record: object) -> str:
     return json.dumps(record, default=plain)
 
 
-def require_folder(directory: str | PathLike[str]) -> Path:
+def require_folder(directory: FilePath) -> Path:
     """Return a folder, which need not exist; TrustboError if it, or one above it, is a file."""
     folder = Path(directory)
     for part in (folder, *folder.parents):
@@ -182,7 +184,7 @@ def require_folder(directory: str | PathLike[str]) -> Path:
     return folder
 
 
-def require_file(path: str | PathLike[str], *suffixes: str) -> Path:
+def require_file(path: FilePath, *suffixes: str) -> Path:
     """Return a file to write, which may exist already.
 
     `suffixes` are in lower case with the dot; none allow any. TrustboError: another suffix, a

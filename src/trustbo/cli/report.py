@@ -7,10 +7,7 @@ from trustbo.cli.outputs import use_no_screen
 
 
 def report(
-    folder: Path,
-    out: Path | None = None,
-    title: str | None = None,
-    debug: bool = False,
+    folder: Path, out: Path | None = None, title: str | None = None, debug: bool = False
 ) -> None:
     """Write a result as one HTML page, with all its figures and tables.
 

@@ -8,13 +8,6 @@ from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.tables import write_csv
 
 __all__ = [
-    "FORMATS",
-    "export_result",
-    "path_frame",
-    "write_csv",
-    "write_geotiff",
-    "write_netcdf",
-    "write_path",
-    "write_ros_bag",
-    "write_ros_map",
-]
+    "FORMATS", "export_result", "path_frame", "write_csv", "write_geotiff", "write_netcdf",
+    "write_path", "write_ros_bag", "write_ros_map",
+]  # fmt: skip

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from trustbo.export.rasters import write_geotiff
 from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
-from trustbo.files import require_file, require_folder
+from trustbo.files import FilePath, require_file, require_folder
 from trustbo.logs.bagfile import require_new_bag
 
 
@@ -48,7 +47,7 @@ class _Format(NamedTuple):
 
 def export_result(
     result: Result,
-    folder: str | PathLike[str],
+    folder: FilePath,
     formats: Sequence[str] = ("geotiff", "geojson"),
     *,
     resolution: float | None = None,
@@ -91,7 +90,7 @@ def export_result(
     return [target / file for kind in chosen.values() for file in kind.files]
 
 
-def left_out(result: Result, folder: str | PathLike[str]) -> dict[str, str]:
+def left_out(result: Result, folder: FilePath) -> dict[str, str]:
     """Return the formats that cannot be written, and why; TrustboError: the folder is a file."""
     target, reasons = require_folder(folder), {}
     for name in _FORMATS:

@@ -1,16 +1,14 @@
 """Maps as netCDF, after the CF conventions."""
 
-from os import PathLike
-
 import numpy as np
 from rasterio.transform import from_origin
 
 from trustbo.export.checks import Maps, find_crs, require_maps, require_names_for_netcdf
-from trustbo.files import require_file, write_file
+from trustbo.files import FilePath, require_file, write_file
 from trustbo.workspace import Workspace
 
 
-def write_netcdf(path: str | PathLike[str], maps: Maps, workspace: Workspace) -> None:
+def write_netcdf(path: FilePath, maps: Maps, workspace: Workspace) -> None:
     """Write maps of the planning cells as netCDF-4 after CF-1.8, dims (y, x), north first.
 
     Args:

@@ -1,7 +1,6 @@
 """The recommended path as GeoJSON, GPX, GeoPackage or CSV."""
 
 from collections.abc import Callable
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from trustbo.campaign.result import Result
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.export.checks import find_crs, require_crs, require_names_for_sql
 from trustbo.export.gpx import gpx_route
-from trustbo.files import require_file, to_json, write_file, write_text
+from trustbo.files import FilePath, require_file, to_json, write_file, write_text
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
 from trustbo.workspace import Workspace
@@ -58,9 +57,7 @@ def path_frame(
         raise TrustboError(f"unknown crs {crs!r}; give e.g. 'EPSG:4326', or None.") from None
 
 
-def write_path(
-    path: str | PathLike[str], plan: Plan | Result, workspace: Workspace | None = None
-) -> None:
+def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None = None) -> None:
     """Write a path in the format of the suffix.
 
     ======== ========================================================================

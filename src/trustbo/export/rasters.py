@@ -1,6 +1,5 @@
 """Maps as GeoTIFF, one band each."""
 
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +9,12 @@ from rasterio.transform import from_origin
 
 from trustbo.export.checks import Maps, require_crs, require_maps
 from trustbo.export.style import write_style
-from trustbo.files import require_file, write_file
+from trustbo.files import FilePath, require_file, write_file
 from trustbo.workspace import Workspace
 
 
 def write_geotiff(
-    path: str | PathLike[str],
-    maps: Maps,
-    workspace: Workspace,
-    *,
-    cog: bool = False,
-    style: bool = True,
+    path: FilePath, maps: Maps, workspace: Workspace, *, cog: bool = False, style: bool = True
 ) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 

@@ -6,7 +6,6 @@ corner of the grid there instead.
 """
 
 import math
-from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import require_maps
 from trustbo.export.paths import plan_of
-from trustbo.files import require_file, write_file, write_text
+from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.logs.bagfile import STORAGES, Record, require_new_bag, write_messages
 from trustbo.logs.messages import GRID, PATH, Messages
 from trustbo.planning import Plan
@@ -78,7 +77,7 @@ def occupancy(
 
 
 def write_ros_map(
-    path: str | PathLike[str],
+    path: FilePath,
     cost: xr.DataArray,
     workspace: Workspace,
     *,
@@ -126,7 +125,7 @@ def write_ros_map(
 
 
 def write_ros_bag(
-    path: str | PathLike[str],
+    path: FilePath,
     plan: Plan | Result,
     cost: xr.DataArray,
     workspace: Workspace,

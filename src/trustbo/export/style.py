@@ -1,14 +1,13 @@
 """Layer style (.qml) with the colours of a raster in QGIS."""
 
 import math
-from os import PathLike
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from trustbo.errors import require_choice
 from trustbo.export.checks import Maps, as_dataset
-from trustbo.files import require_file, write_text
+from trustbo.files import FilePath, require_file, write_text
 
 _VIRIDIS = (
     (68, 1, 84),
@@ -27,7 +26,7 @@ _VIRIDIS = (
 _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 
 
-def write_style(path: str | PathLike[str], maps: Maps, *, band: str | None = None) -> None:
+def write_style(path: FilePath, maps: Maps, *, band: str | None = None) -> None:
     """Write the style of a raster of `write_geotiff`: viridis over the values of one band.
 
     QGIS loads the style of the same name beside a raster. `band` is the map to show, by default the

@@ -1,18 +1,16 @@
 """Table of measurements and of learned trust, for pandas or R."""
 
-from os import PathLike
-
 import numpy as np
 import pandas as pd
 
 from trustbo.campaign.result import Result
-from trustbo.files import require_file, write_text
+from trustbo.files import FilePath, require_file, write_text
 from trustbo.logs.rows import column_of
 
 _TRUST = ("trust_mean", "trust_sd")
 
 
-def write_csv(path: str | PathLike[str], result: Result) -> None:
+def write_csv(path: FilePath, result: Result) -> None:
     """Write a table with a row for each mission (from 0), bound run (from 1) and robot.
 
     Columns are `mission`, `bound`, `robot`, `row` and `col` of the cell entered, `contact_rate`,

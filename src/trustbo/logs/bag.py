@@ -1,33 +1,7 @@
 """Missions in ROS bags: `.bag` files of ROS 1, folders of ROS 2 (sqlite3 or mcap).
 
-Needs `pip install "trustbo[ros]"`, not ROS itself. All types are standard; topics can be renamed
-(`Topics`). `<robot>` is each robot's name, for poses also `lead`.
-
-==================== ============================== ===============================================
-topic                type                           meaning, and time of publication
-==================== ============================== ===============================================
-/mission/bound       std_msgs/String                JSON `{"bound": k, "cell": [row, col]}` at the
-                                                    start of bound k, into that cell. Bound 0 begins
-                                                    a mission, in its start cell; it may add
-                                                    `"path": [[row, col], ...]`, the plan, and
-                                                    `"robots"` and `"features"`, names.
-                     or std_msgs/Int32MultiArray    `[k, row, col]`, likewise.
-/mission/status      std_msgs/String, optional      Status of a bound (`"ok"`, `"stuck"`, ...) at
-                                                    its end. A second one after the last bound is
-                                                    the status of the mission, if it differs.
-/<robot>/contact     std_msgs/Bool                  Contact with the lead, once per tick.
-                     or std_msgs/Float32, Float64   Contact if over 0.5.
-/<robot>/awareness   std_msgs/Float64MultiArray,    Awareness of a bound, in [0, 1] or NaN, before
-                     Float32MultiArray, optional    the next begins; the last counts. The label of
-                                                    its one axis is the features' names, joined by
-                                                    commas.
-/<robot>/odom        nav_msgs/Odometry, or          Pose, at any time. `write_bag` writes
-                     geometry_msgs/PoseStamped,     PoseStamped: a mission knows no speeds.
-                     PoseWithCovarianceStamped,
-                     optional
-/<robot>/state       as of awareness, optional      `Bound.states` at a tick; the label names
-                                                    entries of `logs.STATES`.
-==================== ============================== ===============================================
+Needs `pip install "trustbo[ros]"`, not ROS itself. All types are standard; topics, their types and
+times of publication are tabulated in docs/howto/your-own-robots.md, and can be renamed (`Topics`).
 
 All times are those of recording, whole nanoseconds. A bound lasts from its marker to its status,
 else to the last contact message before the next marker; a message at the time of the next marker
@@ -41,13 +15,13 @@ from the map.
 import json
 import re
 from collections.abc import Iterator, Sequence
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
 
 from trustbo.data import FEATURES, Mission, default_features
 from trustbo.errors import TrustboError, require_choice
+from trustbo.files import FilePath
 from trustbo.logs.bagfile import STORAGES, Record, opened, require_new_bag, write_messages
 from trustbo.logs.messages import (
     AWARENESS_TYPES,
@@ -71,12 +45,9 @@ _NS = 1_000_000_000  # in a second
 
 
 def read_bag(
-    path: str | PathLike[str],
-    workspace: Workspace | None = None,
-    *,
-    topics: Topics | None = None,
+    path: FilePath, workspace: Workspace | None = None, *, topics: Topics | None = None
 ) -> list[Mission]:
-    """Read the missions of a ROS bag; see this module for its topics.
+    """Read the missions of a ROS bag; see docs/howto/your-own-robots.md for its topics.
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2.
@@ -132,13 +103,13 @@ def read_bag(
 
 def write_bag(
     missions: Sequence[Mission],
-    path: str | PathLike[str],
+    path: FilePath,
     *,
     version: int | None = None,
     storage: str = "sqlite3",
     topics: Topics | None = None,
 ) -> None:
-    """Write missions as a ROS bag that `read_bag` reads back; see this module for its topics.
+    """Write missions as a ROS bag that `read_bag` reads back, on the same topics.
 
     Times are kept to the nanosecond, headings up to whole turns.
 

@@ -13,7 +13,6 @@ read as such.
 import csv
 import math
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
-from trustbo.files import write_file
+from trustbo.files import FilePath, write_file
 from trustbo.logs.rows import KEYS, Row, column_of, features_of, parse_rows, read_columns
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
@@ -79,7 +78,7 @@ def read_table(
     return [_mission(label, own, start, names, tuple(team)) for label, own in missions.items()]
 
 
-def write_table(missions: Sequence[Mission], path: str | PathLike[str]) -> None:
+def write_table(missions: Sequence[Mission], path: FilePath) -> None:
     """Write missions, without their ticks, as a CSV file that `read_table` reads back.
 
     Args:

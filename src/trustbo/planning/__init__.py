@@ -10,15 +10,6 @@ from trustbo.planning.policies import POLICIES, Policy
 from trustbo.planning.posterior import DrawnPaths
 
 __all__ = [
-    "OBJECTIVES",
-    "POLICIES",
-    "QUANTILES",
-    "DrawnPaths",
-    "Dynamics",
-    "NoPathError",
-    "Plan",
-    "Planner",
-    "Policy",
-    "policies",
-    "roll_trust",
-]
+    "OBJECTIVES", "POLICIES", "QUANTILES", "DrawnPaths", "Dynamics", "NoPathError", "Plan",
+    "Planner", "Policy", "policies", "roll_trust",
+]  # fmt: skip

@@ -232,11 +232,7 @@ class Planner:
         return self.evaluate(path, posterior).bands
 
     def trust_map(
-        self,
-        params: Params | xr.DataTree,
-        *,
-        per_robot: bool = False,
-        x0: ArrayLike | None = None,
+        self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
         """Compute the largest expected trust with which each cell can be reached.
 
@@ -257,11 +253,7 @@ class Planner:
         return trust_map(self.problem, draws_of(params), per_robot=per_robot, x0=x0)
 
     def cost_map(
-        self,
-        params: Params | xr.DataTree,
-        *,
-        per_robot: bool = False,
-        x0: ArrayLike | None = None,
+        self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
         """Compute the cost f = 1 - sigma(trust map) of each cell, equation (6); see `trust_map`."""
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))

@@ -143,10 +143,7 @@ def resolve_policy(policy: str | Policy) -> Policy:
 
 
 def _best_candidate(
-    key: Array,
-    posterior: Params,
-    planner: Planner,
-    score: Callable[[np.ndarray], np.ndarray],
+    key: Array, posterior: Params, planner: Planner, score: Callable[[np.ndarray], np.ndarray]
 ) -> Plan:
     """Plan the path with the best score of its values (draw, path) among the draws' best paths."""
     drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=_seed(key))

@@ -16,19 +16,7 @@ from trustbo.plots.regret import regret_curves
 from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
-    "animate_mission",
-    "calibration",
-    "campaign_history",
-    "cell_map",
-    "draw_path",
-    "draw_scale",
-    "loadings",
-    "mission_trust",
-    "parameter_history",
-    "path_posterior",
-    "plan_trust",
-    "regret_curves",
-    "robot_maps",
-    "terrain_maps",
-    "trust_maps",
-]
+    "animate_mission", "calibration", "campaign_history", "cell_map", "draw_path", "draw_scale",
+    "loadings", "mission_trust", "parameter_history", "path_posterior", "plan_trust",
+    "regret_curves", "robot_maps", "terrain_maps", "trust_maps",
+]  # fmt: skip

@@ -1,7 +1,6 @@
 """Animation of a mission: robots over the hillshade, lines of sight to the lead, contact."""
 
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from scipy.ndimage import uniform_filter1d
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.files import write_file
+from trustbo.files import FilePath, write_file
 from trustbo.plots.layout import as_text, extent_of, grid_lines, plain
 from trustbo.plots.maps import draw_hillshade, draw_path, draw_scale, draw_scale_of
 from trustbo.workspace import Workspace
@@ -44,7 +43,7 @@ class Film(NamedTuple):
 def animate_mission(
     mission: Mission,
     workspace: Workspace,
-    path: str | PathLike[str] | None = None,
+    path: FilePath | None = None,
     *,
     speedup: float | None = None,
     fps: int = 8,

@@ -2,20 +2,19 @@
 
 from collections.abc import Iterator
 from importlib.metadata import version
-from os import PathLike
 
 import jinja2
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError
-from trustbo.files import require_file, write_text
+from trustbo.files import FilePath, require_file, write_text
 from trustbo.report import figures, tables
 from trustbo.report.blocks import Picture, Section, Table
 from trustbo.report.numbers import counted
 from trustbo.report.summary import facts_of
 
 
-def write_report(path: str | PathLike[str], result: Result, *, title: str | None = None) -> None:
+def write_report(path: FilePath, result: Result, *, title: str | None = None) -> None:
     """Write a result as one HTML page with its figures; equal results give equal bytes.
 
     Args:

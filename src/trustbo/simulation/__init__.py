@@ -8,12 +8,6 @@ from trustbo.simulation.protocol import BoundSimulator, Simulator
 from trustbo.simulation.replay import ReplaySimulator
 
 __all__ = [
-    "BoundSimulator",
-    "Degradation",
-    "KinematicSimulator",
-    "ModelSimulator",
-    "MujocoSimulator",
-    "ReplaySimulator",
-    "Simulator",
-    "Threat",
-]
+    "BoundSimulator", "Degradation", "KinematicSimulator", "ModelSimulator", "MujocoSimulator",
+    "ReplaySimulator", "Simulator", "Threat",
+]  # fmt: skip

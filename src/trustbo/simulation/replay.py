@@ -1,7 +1,6 @@
 """Simulator that replays recorded missions."""
 
 from collections.abc import Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 

@@ -11,6 +11,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from trustbo.errors import TrustboError
+from trustbo.files import FilePath
 from trustbo.study.configuration import Study, read_study
 from trustbo.study.executors import completed, require_executor
 from trustbo.study.run import Run
@@ -19,8 +20,8 @@ from trustbo.study.table import to_dataset
 
 
 def run_study(
-    study: Study | Mapping[str, Any] | str | PathLike[str],
-    directory: str | PathLike[str],
+    study: Study | Mapping[str, Any] | FilePath,
+    directory: FilePath,
     executor: Any = None,
     *,
     n_workers: int | None = None,
@@ -77,7 +78,7 @@ def run_study(
     return load_study(directory)
 
 
-def load_study(directory: str | PathLike[str]) -> xr.Dataset:
+def load_study(directory: FilePath) -> xr.Dataset:
     """Read the results of a study so far.
 
     Runs in the folder that are of another study, or another version of trustbo, are left out.
@@ -106,7 +107,7 @@ def load_study(directory: str | PathLike[str]) -> xr.Dataset:
     return dataset.assign_attrs(n_runs=len(table), n_failed=n_failed)
 
 
-def failures(directory: str | PathLike[str]) -> pd.DataFrame:
+def failures(directory: FilePath) -> pd.DataFrame:
     """List the runs of a study that failed: labels, error and traceback, by key.
 
     Raises:

@@ -4,13 +4,12 @@ import itertools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.errors import TrustboError, require_choice, require_whole
-from trustbo.files import read_yaml
+from trustbo.files import FilePath, read_yaml
 from trustbo.models.samplers.run import SAMPLERS, require_sampler
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.models import MODELS
@@ -141,7 +140,7 @@ class Study:
         return own
 
 
-def read_study(path: str | PathLike[str]) -> Study:
+def read_study(path: FilePath) -> Study:
     """Read a study from a YAML file; paths of rasters are relative to its folder.
 
     Raises:

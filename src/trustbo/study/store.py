@@ -2,12 +2,11 @@
 
 import json
 import math
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from trustbo.errors import TrustboError
-from trustbo.files import require_folder, write_text
+from trustbo.files import FilePath, require_folder, write_text
 from trustbo.study.configuration import Study
 from trustbo.study.run import Run
 
@@ -15,7 +14,7 @@ from trustbo.study.run import Run
 class Store:
     """Reads and writes a study's folder; each file is written whole or not at all."""
 
-    def __init__(self, directory: str | PathLike[str]) -> None:
+    def __init__(self, directory: FilePath) -> None:
         """Use a folder, which need not exist yet; TrustboError if its name belongs to a file."""
         self.folder = require_folder(directory)
 

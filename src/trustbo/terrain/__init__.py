@@ -19,23 +19,8 @@ from trustbo.terrain.pixel_feature import FEATURES, PixelFeature, register_featu
 from trustbo.terrain.synthetic import synthetic_terrain
 
 __all__ = [
-    "FEATURES",
-    "TRAVERSABILITY",
-    "VISIBILITY",
-    "CompositeIndex",
-    "PixelFeature",
-    "aspect",
-    "assemble_terrain",
-    "canopy_cover",
-    "canopy_height",
-    "exposure",
-    "openness",
-    "pixel_features",
-    "pixel_size",
-    "read_lidar",
-    "read_terrain",
-    "register_feature",
-    "slope",
-    "synthetic_terrain",
+    "FEATURES", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "PixelFeature", "aspect",
+    "assemble_terrain", "canopy_cover", "canopy_height", "exposure", "openness", "pixel_features",
+    "pixel_size", "read_lidar", "read_terrain", "register_feature", "slope", "synthetic_terrain",
     "vegetation_density",
-]
+]  # fmt: skip

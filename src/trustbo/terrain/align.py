@@ -147,10 +147,7 @@ def _scale(
 
 
 def _window_under(
-    raster: Raster,
-    crs: CRS,
-    box: tuple[float, float, float, float],
-    scale: tuple[float, float],
+    raster: Raster, crs: CRS, box: tuple[float, float, float, float], scale: tuple[float, float]
 ) -> tuple[slice, slice] | None:
     """Rows and columns of the raster that a box in another CRS needs, None off the raster."""
     left, bottom, right, top = transform_bounds(crs, raster.crs, *box)

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from typing import Self
 
 import numpy as np
@@ -14,7 +13,7 @@ from sklearn.decomposition import PCA
 
 from trustbo import zheng2023
 from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
-from trustbo.files import write_file
+from trustbo.files import FilePath, write_file
 
 SCALINGS = ("percentile", "minmax", "logistic")
 METHODS = ("pca", "zheng2023")
@@ -221,12 +220,12 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             setattr(index, f"_{name}", float(attrs[name]))
         return index
 
-    def save(self, path: str | PathLike[str]) -> None:
+    def save(self, path: FilePath) -> None:
         """Write a fitted index to a netCDF file."""
         write_file(path, lambda file: self.to_dataset().to_netcdf(file))
 
     @classmethod
-    def load(cls, path: str | PathLike[str]) -> Self:
+    def load(cls, path: FilePath) -> Self:
         """Read an index that `save` wrote."""
         with xr.open_dataset(path) as data:
             return cls.from_dataset(data.load())

@@ -16,6 +16,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree, QhullError
 
 from trustbo.errors import TerrainError, require_positive
+from trustbo.files import FilePath
 from trustbo.terrain.dataset import CLIP_WARNING_SHARE, assemble_terrain
 from trustbo.terrain.georeference import require_regular
 
@@ -54,7 +55,7 @@ class _Pixels(NamedTuple):
 
 
 def read_lidar(
-    points: str | PathLike[str] | Sequence[str | PathLike[str]],
+    points: FilePath | Sequence[FilePath],
     resolution: float = 1.0,
     *,
     crs: object = None,
@@ -111,7 +112,7 @@ def read_lidar(
     return terrain.assign_attrs(_shares((top - dem)[np.isfinite(dsm)]))
 
 
-def _read(paths: Sequence[str | PathLike[str]], crs: object) -> _Cloud:
+def _read(paths: Sequence[FilePath], crs: object) -> _Cloud:
     """Usable points of all files."""
     if not paths:
         raise TerrainError("read_lidar was given no file; give one LAS or LAZ file or more.")

@@ -28,11 +28,7 @@ class Routes:
         self._known: dict[tuple[object, ...], np.ndarray] = {}
 
     def find(
-        self,
-        robot: Robot,
-        start: np.ndarray,
-        goal: np.ndarray,
-        window: tuple[int, int, int, int],
+        self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: tuple[int, int, int, int]
     ) -> np.ndarray | None:
         """Find the fastest route from start to goal, (x, y) in CRS metres; None if there is none.
 

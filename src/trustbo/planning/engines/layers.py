@@ -43,12 +43,7 @@ class Layers(NamedTuple):
 
 
 def build_layers(
-    to_goal: np.ndarray,
-    from_start: np.ndarray,
-    steps: np.ndarray,
-    longest: int,
-    *,
-    u_turns: bool,
+    to_goal: np.ndarray, from_start: np.ndarray, steps: np.ndarray, longest: int, *, u_turns: bool
 ) -> Layers:
     """Unroll a grid over the bounds left, for paths of at most `longest` bounds.
 
