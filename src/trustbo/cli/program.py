@@ -8,9 +8,8 @@ import typer
 
 from trustbo.cli.demo import demo
 from trustbo.cli.errors import BAD_INPUT, complain
-from trustbo.cli.export import export
 from trustbo.cli.options import with_flags
-from trustbo.cli.report import report
+from trustbo.cli.results import export, report
 from trustbo.cli.resume import resume
 from trustbo.cli.run import run
 from trustbo.cli.study import study

@@ -1,9 +1,8 @@
 """Results as files for other programs: GIS, GPS, robots, tables."""
 
 from trustbo.export.everything import FORMATS, export_result
-from trustbo.export.netcdf import write_netcdf
 from trustbo.export.paths import path_frame, write_path
-from trustbo.export.rasters import write_geotiff
+from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.tables import write_csv
 

@@ -11,9 +11,8 @@ import xarray as xr
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import require_crs, require_names_for_netcdf, require_names_for_sql
-from trustbo.export.netcdf import write_netcdf
 from trustbo.export.paths import write_path
-from trustbo.export.rasters import write_geotiff
+from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
@@ -152,9 +151,8 @@ def _write_path(content: _Content, file: Path) -> None:
 
 
 def _require_netcdf(result: Result) -> None:
-    features = result.workspace.awareness["feature"].values
     # Result.maps renames features that have the name of a coordinate.
-    require_names_for_netcdf(str(name) for name in features if "/" in str(name))
+    require_names_for_netcdf(name for name in result.workspace.features if "/" in name)
 
 
 _BAGS = ("ros1_bag", "ros2_bag")

@@ -69,8 +69,7 @@ def read_bag(
         if workspace is None:
             robots, features = first["robots"] or bag.robots(names.contact), first["features"]
         else:
-            robots = workspace.team.names
-            features = tuple(str(f) for f in workspace.awareness["feature"].values)
+            robots, features = workspace.team.names, workspace.features
         contact, awareness = names.of("contact", robots), names.of("awareness", robots)
         bag.require(contact or [names.contact])
         poses = names.of("pose", (names.lead, *robots))

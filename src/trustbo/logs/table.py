@@ -59,7 +59,7 @@ def read_table(
     """
     columns = read_columns(table, ignore)
     if workspace is not None:
-        features = workspace.awareness["feature"].values.tolist() if features is None else features
+        features = workspace.features if features is None else features
         robots = workspace.team.names if robots is None else robots
     names = features_of(columns) if features is None else tuple(features)
     rows = parse_rows(columns, names, None if workspace is None else workspace.grid)

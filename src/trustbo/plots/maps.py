@@ -1,7 +1,6 @@
 """Maps of planning cells over the hillshade, with a path, a scale and a colour bar."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -190,40 +189,26 @@ def draw_scale_of(ax: Axes, width: float) -> None:
     """Draw a scale bar, see `draw_scale`, on Axes `width` metres wide."""
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
-    outline = [patheffects.Stroke(linewidth=4.0, foreground="white"), patheffects.Normal()]
     x, y = 0.96 - length / width, 0.045  # of the axes
-    ax.plot(
-        [x, x + length / width],
-        [y, y],
-        transform=ax.transAxes,
-        color="black",
-        linewidth=2.0,
-        solid_capstyle="butt",
-        path_effects=outline,
-    )
-    ax.text(
-        x,
-        y + 0.02,
-        f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m",
-        transform=ax.transAxes,
-        fontsize=7,
-        path_effects=[patheffects.Stroke(linewidth=2.5, foreground="white"), patheffects.Normal()],
-    )
+    (bar,) = ax.plot([x, x + length / width], [y, y], color="black", transform=ax.transAxes)
+    bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=_outlined(4.0))
+    label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
+    text = ax.text(x, y + 0.02, label, fontsize=7, transform=ax.transAxes)
+    text.set_path_effects(_outlined(2.5))
 
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     """Draw a path over a map, from its start (circle) to its goal (star)."""
     centers = np.array([grid.center(cell) for cell in path]) - grid.corner
-    outline = [patheffects.Stroke(linewidth=3.2, foreground="black"), patheffects.Normal()]
     x, y = centers[:, 0], centers[:, 1]
-    ax.plot(x, y, color="white", linewidth=1.6, path_effects=outline, solid_joinstyle="round")
-    edge: dict[str, Any] = {
-        "markeredgecolor": "black",
-        "markerfacecolor": "white",
-        "linestyle": "none",
-    }
-    ax.plot(x[0], y[0], marker="o", markersize=6, **edge)
-    ax.plot(x[-1], y[-1], marker="*", markersize=11, **edge)
+    (line,) = ax.plot(x, y, color="white", linewidth=1.6, solid_joinstyle="round")
+    line.set_path_effects(_outlined(3.2, "black"))
+    ax.plot(x[0], y[0], "wo", markeredgecolor="black", markersize=6)
+    ax.plot(x[-1], y[-1], "w*", markeredgecolor="black", markersize=11)
+
+
+def _outlined(width: float, colour: str = "white") -> list[patheffects.AbstractPathEffect]:
+    return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 
 def _cells(path: np.ndarray) -> list[Cell]:

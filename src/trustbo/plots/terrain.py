@@ -45,7 +45,7 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
             "terrain_maps needs a workspace made with Workspace.from_terrain of a terrain in "
             "memory; coarsen a lazily read one first."
         )
-    grid, names = workspace.grid, [str(name) for name in workspace.awareness["feature"].values]
+    grid, names = workspace.grid, workspace.features
     n_panels = 1 + len(names)
     figure, axes, panels = map_panels(
         grid, n_panels, n_panels if n_columns is None else n_columns, width=3.3

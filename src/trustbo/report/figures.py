@@ -93,7 +93,7 @@ def robot_costs(result: Result) -> Picture:
 
 def terrain(result: Result) -> Picture:
     """Draw the surface and the index of each feature."""
-    features = joined([str(name) for name in result.workspace.awareness["feature"].values])
+    features = joined(result.workspace.features)
     closed = int((~result.workspace.passable).sum())
     return picture(
         lambda n_columns: plots.terrain_maps(result.workspace, n_columns=n_columns),

@@ -51,10 +51,6 @@ class Threat:
         if not 0.0 < self.strength <= 1.0:
             raise TrustboError(f"strength must be in (0, 1]; got {self.strength!r}.")
 
-    def is_there(self, mission: int) -> bool:
-        """Whether it acts in a mission."""
-        return is_between(mission, self.first_mission, self.last_mission)
-
     def mask(self, surface: Surface) -> np.ndarray:
         """Pixels with centres inside, shape (row, col)."""
         rows, cols = surface.ground.shape
@@ -99,14 +95,11 @@ class Degradation:
         if not 0.0 <= self.detection <= 1.0:
             raise TrustboError(f"detection must be in [0, 1]; got {self.detection!r}.")
 
-    def is_there(self, mission: int) -> bool:
-        """Whether it acts in a mission."""
-        return is_between(mission, self.first_mission, self.last_mission)
 
-
-def is_between(mission: int, first: int, last: int | None) -> bool:
-    """Whether first <= mission <= last; None: no last."""
-    return first <= mission and (last is None or mission <= last)
+def acts_in(event: Threat | Degradation, mission: int) -> bool:
+    """Whether it acts in a mission."""
+    last = event.last_mission
+    return event.first_mission <= mission and (last is None or mission <= last)
 
 
 def require_missions(first: int, last: int | None) -> None:

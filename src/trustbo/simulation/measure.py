@@ -35,7 +35,7 @@ class Measure:
         TrustboError: a real-time index of an unknown feature.
         """
         self._workspace, self._surface, self._sight, self._tick = workspace, surface, sight, tick
-        self._names = [str(name) for name in workspace.awareness["feature"].values]
+        self._names = workspace.features
         for feature in realtime:
             require_choice("awareness feature", feature, self._names)
         self._realtime = realtime

@@ -67,16 +67,9 @@ class ModelSimulator:
         padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
         sample = self.model.simulate(jax.random.key(seed), self.params, padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
-        features, robots = (self.workspace.awareness[n].values for n in ("feature", "robot"))
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
-        return Mission.from_arrays(
-            cells,
-            z,
-            rates,
-            n_ticks=ticks,
-            features=tuple(str(name) for name in features),
-            robots=tuple(str(name) for name in robots),
-        )
+        features, robots = self.workspace.features, self.workspace.team.names
+        return Mission.from_arrays(cells, z, rates, n_ticks=ticks, features=features, robots=robots)
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""

@@ -157,11 +157,8 @@ class KinematicSimulator:
             under_way = [i for i in under_way if bounds[i][-1].status == "ok"]
             if not under_way:
                 break
-        names = tuple(str(f) for f in self.workspace.awareness["feature"].values)
-        return [
-            Mission(tuple(cells), tuple(of), of[-1].status, names, self.workspace.team.names)
-            for of in bounds
-        ]
+        names = self.workspace.features, self.workspace.team.names
+        return [Mission(tuple(cells), tuple(of), of[-1].status, *names) for of in bounds]
 
     def reset(
         self, start: Cell, seed: int, *, next_cell: Cell | None = None, mission: int = 0

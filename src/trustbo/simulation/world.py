@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.simulation.events import Degradation, Threat
+from trustbo.simulation.events import Degradation, Threat, acts_in
 from trustbo.workspace import Workspace
 from trustbo.workspace.positions import Positions, surface_of
 from trustbo.workspace.routes import Routes
@@ -57,8 +57,8 @@ class Worlds:
 
     def at(self, mission: int) -> World:
         """World of a mission, counted from 0."""
-        threats = tuple(t for t in self._threats if t.is_there(mission))
-        worse = tuple(d for d in self._degradations if d.is_there(mission))
+        threats = tuple(t for t in self._threats if acts_in(t, mission))
+        worse = tuple(d for d in self._degradations if acts_in(d, mission))
         key = tuple(map(id, (*threats, *worse)))
         if key not in self._known:
             self._known[key] = self._make(threats, worse)

@@ -20,17 +20,10 @@ class HeightUnit(NamedTuple):
 METRE = HeightUnit("m", 1.0)
 _FOOT, _SURVEY_FOOT = 0.3048, 1200.0 / 3937.0
 # Names without spaces and punctuation.
-_LENGTHS = {
-    "m": 1.0,
-    "metre": 1.0,
-    "metres": 1.0,
-    "foot": _FOOT,
-    "internationalfoot": _FOOT,
-    "footinternational": _FOOT,
-    "ussurveyfoot": _SURVEY_FOOT,
-    "surveyfoot": _SURVEY_FOOT,
-    "usfoot": _SURVEY_FOOT,
-    "footus": _SURVEY_FOOT,
+_LENGTHS: dict[str, float] = {
+    **dict.fromkeys(("m", "metre", "metres"), 1.0),
+    **dict.fromkeys(("foot", "internationalfoot", "footinternational"), _FOOT),
+    **dict.fromkeys(("ussurveyfoot", "surveyfoot", "usfoot", "footus"), _SURVEY_FOOT),
 }
 
 

@@ -200,6 +200,11 @@ class Workspace:
             team,
         )
 
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the awareness features."""
+        return tuple(str(name) for name in self.awareness["feature"].values)
+
     def require_cell(self, what: str, cell: Cell) -> Cell:
         """Check that a cell is passable, and return it as a pair of ints.
 

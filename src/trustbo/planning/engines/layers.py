@@ -42,20 +42,14 @@ class Layers(NamedTuple):
     u_turns: bool
 
 
-def build_layers(
-    to_goal: np.ndarray, from_start: np.ndarray, steps: np.ndarray, longest: int, *, u_turns: bool
-) -> Layers:
+@_compiled
+def build_layers(to_goal, from_start, steps, longest, u_turns) -> Layers:
     """Unroll a grid over the bounds left, for paths of at most `longest` bounds.
 
     Fewest bounds `to_goal` and `from_start`, (row, col), -1 where there is no way; moves `steps`
     (move, 2), each the reverse of the one as far from the other end. With `u_turns` a bound may
     lead back to the cell that the last one left.
     """
-    return _build(to_goal, from_start, steps, longest, u_turns)
-
-
-@_compiled
-def _build(to_goal, from_start, steps, longest, u_turns):
     rows, cols = to_goal.shape
     # base: number of nodes of earlier cells; the goal is entered by the last bound only.
     base = np.empty(rows * cols + 1, np.int64)
