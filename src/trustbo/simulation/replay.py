@@ -6,6 +6,7 @@ from typing import Any, Self
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_pair
+from trustbo.files import FilePath
 from trustbo.logs.netcdf import read_missions
 from trustbo.logs.table import read_table
 
@@ -56,7 +57,7 @@ class ReplaySimulator:
         return cls(read_table(table, **options), on_missing=on_missing)
 
     @classmethod
-    def from_netcdf(cls, path: str | PathLike[str], *, on_missing: str = "error") -> Self:
+    def from_netcdf(cls, path: FilePath, *, on_missing: str = "error") -> Self:
         """Replay the `missions.nc` that `Result.save` wrote, ticks included.
 
         Args:
