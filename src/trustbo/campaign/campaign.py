@@ -473,14 +473,14 @@ class Campaign:
                     campaign.awareness.update(mission)
             if campaign.log.last is not None:
                 campaign.belief = params_of(campaign.log.last())
+            suggested = state["suggested"]
+            campaign._plan = suggested and plan_from_record(suggested)
+            campaign._folder = folder
+            for j in range(len(campaign.missions), len(measured)):
+                campaign._take(measured[j], extras[j])
         except BaseException:
             folder.close()
             raise
-        suggested = state["suggested"]
-        campaign._plan = suggested and plan_from_record(suggested)
-        campaign._folder = folder
-        for j in range(len(campaign.missions), len(measured)):
-            campaign._take(measured[j], extras[j])
         return campaign
 
     def stop(self, reason: str) -> Result:
@@ -515,9 +515,13 @@ class Campaign:
                 f"{str(folder.path)!r} holds a campaign already: go on with it by "
                 "Campaign.load, or choose another folder."
             )
-        folder.begin(self.workspace)
-        if self.log.entries:
-            folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
+        try:
+            folder.begin(self.workspace)
+            if self.log.entries:
+                folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
+        except BaseException:
+            folder.close()
+            raise
         self._folder = folder
         self._write(whole=True)
 

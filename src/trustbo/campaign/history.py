@@ -191,7 +191,7 @@ class History:
         names = {name: None for row in rows for name in row}
         scalars = {name: [row.get(name, np.nan) for row in rows] for name in names}
         trust_map = self.entries[0].trust_map
-        maps = np.stack([entry.trust_map.transpose("row", "col") for entry in self.entries])
+        maps = np.stack([entry.trust_map.values for entry in self.entries])
         return xr.Dataset(
             {
                 **{name: ("iteration", values) for name, values in scalars.items()},

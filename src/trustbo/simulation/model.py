@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell, Mission
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models import PooledTrust, TrustModel
+from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.workspace import Workspace
 
@@ -65,7 +66,9 @@ class ModelSimulator:
         z = np.swapaxes(self.awareness[:, *zip(*cells[1:], strict=True)], 0, 1)
         n_bounds = len(z)
         padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
-        sample = self.model.simulate(jax.random.key(seed), self.params, padded[None], self.n_ticks)
+        with own_settings():  # else the caller's flags decide what is drawn
+            key = jax.random.key(seed)
+        sample = self.model.simulate(key, self.params, padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
         features, robots = self.workspace.features, self.workspace.team.names
