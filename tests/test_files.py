@@ -1,11 +1,17 @@
 """Files are whole or not there, whatever interrupts their writing."""
 
+import os
+import resource
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
 
-from trustbo.files import write_file
+import trustbo.files
+from trustbo.errors import DamagedFileError
+from trustbo.files import read_checked, write_checked, write_file
 
 
 @pytest.fixture(autouse=True)
@@ -17,13 +23,13 @@ def _ctrl_c_raises():
     signal.signal(signal.SIGINT, before)
 
 
-def writes(presses):
+def writes(presses, number=signal.SIGINT):
     """Of two halves, with Ctrl-C so many times in between."""
 
     def write(file):
         file.write_text("half")
         for _ in range(presses):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         file.write_text("whole")
 
     return write
@@ -57,3 +63,63 @@ def test_files_are_written_in_threads_too(tmp_path):
     thread.start()
     thread.join()
     assert (tmp_path / "a.txt").read_text() == "whole"
+
+
+def test_sigterm_waits_too(tmp_path):
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_file(tmp_path / "a.txt", writes(1, signal.SIGTERM))
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert (tmp_path / "a.txt").read_text() == "whole"
+
+
+def test_a_full_disk_is_said_to_be_full(tmp_path):
+    """In a process whose files may have 10 kB: the largest real limit that needs no other disk."""
+    program = (
+        "import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "from trustbo.files import write_checked\n"
+        "write_checked('a.bin', b'x' * 1000)\n"
+        "write_checked('a.bin', b'x' * 100_000)\n"
+    )
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))  # noqa: E731
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", program], cwd=tmp_path, preexec_fn=limit, capture_output=True,
+        text=True,
+    )  # fmt: skip
+    assert "TrustboError: the disk is full: 'a.bin' was not written" in done.stderr
+    assert read_checked(tmp_path / "a.bin") == b"x" * 1000  # as it was, and known to be whole
+
+
+class DiedError(Exception):
+    """The process ends here."""
+
+
+def test_whenever_it_dies_a_file_and_its_sum_agree(tmp_path, monkeypatch):
+    """Twice in a row between the sum and the file, too."""
+    file, replace = tmp_path / "a.bin", os.replace
+
+    def dies_at(n):
+        count = [0]
+
+        def counted(*names):
+            count[0] += 1
+            if count[0] == n:
+                raise DiedError
+            replace(*names)
+
+        return counted
+
+    write_checked(file, b"0")
+    for j, n in enumerate([2, 2, 1, 2, 3, 1, 2], start=1):
+        with monkeypatch.context() as patch:
+            patch.setattr(trustbo.files.os, "replace", dies_at(n))
+            try:
+                write_checked(file, str(j).encode())
+            except DiedError:
+                assert n < 3
+        assert read_checked(file) == (b"5" if j >= 5 else b"0")
+    file.write_bytes(b"noise")
+    with pytest.raises(DamagedFileError, match=r"a.bin' is damaged: its bytes are not those"):
+        read_checked(file)

@@ -89,9 +89,11 @@ def write_checked(path: str | PathLike[str], content: bytes) -> None:
     The hidden file, which is written first, also keeps the sum of the file before: whichever of
     the two a process dies between, the pair agrees.
     """
-    path, digest = Path(path), hashlib.sha256(content).hexdigest()
-    before = _sums(path)[:1] if path.exists() else []
-    _write_bytes(_sum_file(path), "\n".join([digest, *before]).encode())
+    path = Path(path)
+    # Of the file that is there: its kept sum may be that of one whose writing died.
+    contents = [content, *([path.read_bytes()] if path.exists() else [])]
+    sums = "\n".join(hashlib.sha256(each).hexdigest() for each in contents)
+    _write_bytes(_sum_file(path), sums.encode())
     _write_bytes(path, content)
 
 
