@@ -1,5 +1,6 @@
 """ROS bags: what is written comes back, and what cannot be kept or read is refused."""
 
+import struct
 import sys
 from dataclasses import replace
 from itertools import pairwise
@@ -137,6 +138,28 @@ def test_topics_may_have_other_names(tmp_path):
         read_bag(tmp_path / "log")
     with pytest.raises(TrustboError, match=r"Topics\.contact must name the robot's place, e\.g\."):
         Topics(contact="/contact")
+
+
+@pytest.mark.parametrize("name", ["log.bag", "log"])
+def test_other_programs_read_what_was_measured(name, tmp_path):
+    """Bytes of the messages: a fault of both the writer and our own reader would come back."""
+    from rosbags.highlevel import AnyReader
+
+    one = mission()
+    write_bag([one], tmp_path / name)
+    found = {}
+    with AnyReader([tmp_path / name]) as reader:
+        for connection, time, raw in reader.messages():
+            body = raw if name == "log.bag" else raw[4:]  # CDR begins with its byte order
+            found.setdefault(connection.topic, []).append((time - S, bytes(body)))
+    ticks = [2.5 * k + 0.5 * (i + 1) for k in range(2) for i in range(5)]
+    for i, robot in enumerate(one.robots):
+        times, bodies = zip(*found[f"/{robot}/contact"], strict=True)
+        np.testing.assert_allclose(np.divide(times, S), ticks, rtol=0.0, atol=1e-9)
+        contact = np.concatenate([bound.contact[:, i] for bound in one.bounds])
+        assert bodies == tuple(b"\1" if seen else b"\0" for seen in contact)
+        awareness = [struct.unpack("<2d", body[-16:]) for _, body in found[f"/{robot}/awareness"]]
+        np.testing.assert_array_equal(awareness, one.awareness[:, i])
 
 
 def test_states_that_some_bounds_lack_stay_unknown(tmp_path):

@@ -36,6 +36,8 @@ from trustbo.models.samplers.target import NutsData, innovations_shape
 from trustbo.stacking import stack_missions
 
 N = 40
+AS_MANY_AS_PRIOR_DRAWS = 500  # then replicated and prior missions are of one compiled program
+SHORT = {"n_warmup": 300, "n_draws": 500, "n_trajectories": AS_MANY_AS_PRIOR_DRAWS}
 MODELS = {
     "pooled": PooledTrust(),
     "hierarchical": HierarchicalTrust(),
@@ -139,20 +141,20 @@ def test_robots_in_order_follow_the_one_before_at_the_same_bound():
     np.testing.assert_allclose(ordered_params(many, 0.5, 0.5).draw(0).B, p.B)
 
 
-def space_and_theta(model):
-    batch = stack_missions(counted_missions(2))
-    data = NutsData(*(jnp.asarray(a) for a in batch), jnp.ones(len(batch.awareness)))
-    space, rng = Coordinates(model, data), np.random.default_rng(0)
-    start = space.target.start
-    return space, data, start + 0.3 * jnp.asarray(rng.normal(size=len(start)))
+def nuts_data(missions):
+    batch = stack_missions(missions)
+    return NutsData(*(jnp.asarray(a) for a in batch), jnp.ones(len(batch.awareness)))
 
 
 @pytest.mark.parametrize("name", list(MODELS))
 def test_the_change_of_variables_leaves_the_posterior_as_it_is(name):
     """Its Jacobian, and the density at the point it leads to, by automatic differentiation."""
     model = MODELS[name]
-    with jax.enable_x64(True):
-        space, data, theta = space_and_theta(model)
+
+    @jax.jit  # one program compiles faster than each operation by itself
+    def evaluate(data, noise):
+        space = Coordinates(model, data)
+        theta = space.target.start + 0.3 * noise[: len(space.target.start)]
         robots = None
         if (pooling := model.partial_pooling) is not None:
             robots = fit_robots(space.target, pooling, space.to_sites(theta)[0])
@@ -163,38 +165,42 @@ def test_the_change_of_variables_leaves_the_posterior_as_it_is(name):
             site, _ = space.to_sites(theta, robots)
             return jnp.concatenate([site[n].ravel() for n in space.target.inverse])
 
-        log_jacobian = np.linalg.slogdet(np.asarray(jax.jacfwd(to_line)(theta)))[1]
         site, claimed = space.to_sites(theta, robots)
-        np.testing.assert_allclose(claimed, log_jacobian, atol=1e-8)
         args, ticks = (data.awareness, data.contact_rate), {"n_ticks": data.n_ticks}
         plain = potential_energy(model, args, ticks, site | given)
         found = space.potential({"theta": theta, **given}, robots)
-        np.testing.assert_allclose(found, plain - log_jacobian, rtol=1e-10)
+        return jax.jacfwd(to_line)(theta), claimed, plain, found
+
+    with jax.enable_x64(True):
+        noise = jnp.asarray(np.random.default_rng(0).normal(size=60))
+        numbers = map(np.asarray, evaluate(nuts_data(counted_missions(2)), noise))
+    jacobian, claimed, plain, found = numbers
+    log_jacobian = np.linalg.slogdet(jacobian)[1]
+    np.testing.assert_allclose(claimed, log_jacobian, atol=1e-8)
+    np.testing.assert_allclose(found, plain - log_jacobian, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", ["pooled", "hierarchical", "coupled"])
 def test_the_mode_has_no_slope(name):
-    with jax.enable_x64(True):
-        batch = stack_missions(simulate_missions(6))
-        data = NutsData(*(jnp.asarray(a) for a in batch), jnp.ones(8))
+    @jax.jit
+    def evaluate(data):
         target = reparametrise(MODELS[name], data, complete=True)
-        mode, hessian = newton(lambda t: target.potential({"theta": t}), target.start)
-        slope = jax.grad(lambda t: target.potential({"theta": t}))(mode)
-        assert np.abs(np.asarray(slope)).max() < 1e-4
-        assert np.linalg.eigvalsh(np.asarray(hessian)).min() > 0.0
+
+        def potential(theta):
+            return target.potential({"theta": theta})
+
+        mode, hessian = newton(potential, target.start)
+        return jax.grad(potential)(mode), hessian
+
+    with jax.enable_x64(True):
+        slope, hessian = evaluate(nuts_data(simulate_missions(6)))
+    assert np.abs(np.asarray(slope)).max() < 1e-4
+    assert np.linalg.eigvalsh(np.asarray(hessian)).min() > 0.0
 
 
-@pytest.fixture(scope="module")
-def hierarchical(missions):
-    return fit(missions, HierarchicalTrust())
-
-
-@pytest.fixture(scope="module")
-def coupled(missions):
-    return fit(missions, CoupledTrust())
-
-
-def test_hierarchical_robots_lie_between_pooled_and_separate_ones(missions, hierarchical):
+# One test a model, not a fixture for two: two workers would compile and sample it twice.
+def test_hierarchical_robots_lie_between_pooled_and_separate_ones(missions):
+    hierarchical = fit(missions, HierarchicalTrust())
     found = diagnostics(hierarchical)
     assert found["r_hat"] <= 1.01
     assert found["divergences"] == 0
@@ -211,9 +217,11 @@ def test_hierarchical_robots_lie_between_pooled_and_separate_ones(missions, hier
     params = params_of(hierarchical)
     assert isinstance(params, RobotParams)
     assert np.shape(params.delta_w) == (4000, 3)
+    require_trust_followed_in_real_time(hierarchical, HierarchicalTrust(), missions[0])
 
 
-def test_a_coupled_posterior_has_the_paper_s_matrices(coupled):
+def test_a_coupled_posterior_has_the_paper_s_matrices(missions):
+    coupled = fit(missions, CoupledTrust(), n_trajectories=AS_MANY_AS_PRIOR_DRAWS)
     assert diagnostics(coupled)["r_hat"] <= 1.01
     assert diagnostics(coupled)["divergences"] == 0
     draws = coupled["posterior"]
@@ -226,15 +234,12 @@ def test_a_coupled_posterior_has_the_paper_s_matrices(coupled):
     assert (np.abs(diagonal - 0.6) < 0.25).all()
     az.summary(coupled)
     assert isinstance(params_of(coupled), CoupledParams)
+    require_trust_followed_in_real_time(coupled, CoupledTrust(), missions[0])
 
 
-@pytest.mark.parametrize("which", ["hierarchical", "coupled"])
-def test_trust_is_followed_in_real_time(which, request, missions):
-    """One draw: the filter is the Kalman filter, whose last state is the smoother's."""
-    posterior = request.getfixturevalue(which)
-    model = MODELS[which]
+def require_trust_followed_in_real_time(posterior, model, mission):
+    """Each draw's filter is the Kalman filter, and draws are weighted by their likelihood."""
     live = TrustFilter(posterior, max_draws=3)
-    mission = missions[0]
     for z, y in zip(mission.awareness, mission.contact_rate, strict=True):
         state = live.update(z, y)
     log_weight = model.log_likelihood(live.params, [mission])[:, 0]
@@ -258,9 +263,9 @@ def test_trust_is_followed_in_real_time(which, request, missions):
 def test_families_are_compared_on_equal_terms_and_predict_in_their_own():
     """One test, not three: two workers would sample the posteriors twice."""
     missions = counted_missions()
-    families = {
-        family: fit(missions, PooledTrust(observation=family))
-        for family in ("gaussian", "censored", "beta_binomial")
+    families = {"gaussian": fit(missions, sampler="exact")} | {
+        family: fit(missions, PooledTrust(observation=family), **SHORT)
+        for family in ("censored", "beta_binomial")
     }
     require_equal_terms(families)
     require_trust_beyond_the_ends(families)
@@ -270,8 +275,11 @@ def test_families_are_compared_on_equal_terms_and_predict_in_their_own():
 def require_equal_terms(families):
     for family, posterior in families.items():
         found = diagnostics(posterior)
-        assert found["divergences"] == 0, family
-        assert found["r_hat"] <= 1.01, family
+        if posterior.attrs["sampler"] == "exact":
+            assert found["k_hat"] <= 0.7, family
+        else:
+            assert found["divergences"] == 0, family
+            assert found["r_hat"] <= 1.01, family
         assert posterior.attrs["log_likelihood_of"] == "ticks"
         # Probabilities of counts: none can be positive.
         assert float(posterior["log_likelihood"]["contact_rate"].max()) < 0.0
@@ -303,11 +311,11 @@ def require_predicted_counts(posterior):
 
 
 def test_rates_all_at_one_end_have_a_posterior_when_censored():
-    missions = counted_missions(2)
+    missions = counted_missions()  # as many as above: the same program
     same = [
         Mission.from_arrays(m.path, m.awareness, np.ones_like(m.contact_rate)) for m in missions
     ]
-    posterior = fit(same, PooledTrust(observation="censored"), check=False)
+    posterior = fit(same, PooledTrust(observation="censored"), **SHORT, check=False)
     assert float(posterior["latent"]["trust_mean"].mean()) > 0.9
 
 
