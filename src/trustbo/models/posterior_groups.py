@@ -44,7 +44,8 @@ def describe(
     few = {k: a[:, kept].reshape(-1, *a.shape[2:]) for k, a in draws.params.items()}
     all_params, few_params = assemble_params(every, model.x0), assemble_params(few, model.x0)
     if _by_numpy(model):
-        found = _trust_by_numpy(model, all_params, few_params, batch, seed)
+        n_bounds = np.array([len(mission.bounds) for mission in missions])
+        found = _trust_by_numpy(model, all_params, few_params, batch, n_bounds, seed)
     else:
         found = _trust_compiled(model, all_params, few_params, draws, kept, batch, seed)
     prior = draw_sites(model, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
@@ -79,14 +80,15 @@ def _trust_by_numpy(
     every: Params,
     few: Params,
     batch: MissionBatch,
+    n_bounds: np.ndarray,
     seed: int,
 ) -> dict[str, np.ndarray]:
     """Latent trust, log-likelihood and predictions of robots apart, without compiling."""
     rng = np.random.default_rng([seed, 1])
-    summary = kalman_numpy.summarize(every.flat(), model.lag, batch)
+    summary = kalman_numpy.summarize(every.flat(), model.lag, batch, n_bounds)
     return {
         "log_likelihood": summary.log_likelihood,
-        "trust": kalman_numpy.sample(few.flat(), model.lag, batch, rng),
+        "trust": kalman_numpy.sample(few.flat(), model.lag, batch, rng, n_bounds),
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
         "predicted": kalman_numpy.simulate(few.flat(), model.lag, batch.awareness, rng),
