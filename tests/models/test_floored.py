@@ -128,9 +128,9 @@ def test_statistics_know_the_floor_of_their_missions():
     statistics = model.update(model.update(None, missions[:3]), missions[3:])
     drawn = sample_statistics(model, statistics)
     assert drawn.params.delta_v.min() >= 0.025
-    # The same points of the same target, but for the rounding of sums.
+    # Two sums over 4096 points.
     evidence = fit(missions, sampler="exact").attrs["log_evidence"]
-    assert drawn.log_evidence == pytest.approx(evidence, abs=1e-4)
+    assert drawn.log_evidence == pytest.approx(evidence, abs=0.01)
 
 
 def test_the_evidence_is_that_of_the_normalised_prior():

@@ -117,7 +117,8 @@ def _groups(
     few = type(every)(*(values[index] for values in every))
     seed = posterior.attrs["seed"]
     if law.by_numpy:
-        found = _trust_by_numpy(law, every, few, batch, seed)
+        n_bounds = np.array([len(mission.bounds) for mission in missions])
+        found = _trust_by_numpy(law, every, few, batch, n_bounds, seed)
     else:
         found = _trust_compiled(law, every, few, latents, kept, batch, seed)
     prior = _prior_of(posterior)
@@ -145,14 +146,19 @@ def _prior_of(posterior: xr.DataTree) -> Params:
 
 
 def _trust_by_numpy(
-    law: _Law, every: Params, few: Params, batch: MissionBatch, seed: int
+    law: _Law,
+    every: Params,
+    few: Params,
+    batch: MissionBatch,
+    n_bounds: np.ndarray,
+    seed: int,
 ) -> dict[str, np.ndarray]:
     """Latent trust, log-likelihood and predictions of robots apart, without compiling."""
     rng = np.random.default_rng([seed, 1])
-    summary = kalman_numpy.summarize(every, law.lag, batch)
+    summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
     return {
         "log_likelihood": summary.log_likelihood,
-        "trust": kalman_numpy.sample(few, law.lag, batch, rng),
+        "trust": kalman_numpy.sample(few, law.lag, batch, rng, n_bounds),
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
         "predicted": kalman_numpy.simulate(few, law.lag, batch.awareness, rng),

@@ -1,9 +1,12 @@
 """Latent trust after sampling, where the Kalman recursions are at their limits."""
 
 import numpy as np
+import pytest
+from models.conftest import simulate_missions
+from references import dense_posterior_of_trust
 
 from trustbo.data import Mission
-from trustbo.models import TrustParams
+from trustbo.models import TrustParams, fit, params_of
 from trustbo.models.likelihood import kalman_numpy as trajectories
 from trustbo.stacking import stack_missions
 
@@ -24,3 +27,59 @@ def test_process_noise_that_underflows_is_no_process_noise():
     for usual, limit in zip(*found, strict=True):
         # They differ by the noise of 1e-8, carried back over five bounds by 1 / beta0 each.
         np.testing.assert_allclose(limit, usual, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def with_losses():
+    """Short and long missions: a last rate lost, one in the middle, and a robot never measured."""
+    missions = simulate_missions(3)
+    rates = [m.contact_rate.copy() for m in missions]
+    rates[0][-2:, 0] = np.nan
+    rates[1][:, 1] = np.nan
+    rates[2][[2, 7], 2] = np.nan
+    return [
+        Mission.from_arrays(m.path, m.awareness, y) for m, y in zip(missions, rates, strict=True)
+    ]
+
+
+def test_trust_is_that_of_dense_conditioning_where_no_rate_was_measured(with_losses):
+    n = 4000
+    params = TrustParams(0.6, np.array([0.3, 0.2]), 0.1, 0.05, 0.08, 0.4, 0.3)
+    draws = TrustParams(*(np.repeat(np.asarray(v, dtype=float)[None], n, 0) for v in params))
+    batch = stack_missions(with_losses, pad=False)
+    n_bounds = np.array([len(m.bounds) for m in with_losses])
+    few = TrustParams(*(v[:2] for v in draws))
+    summary = trajectories.summarize(few, 0.0, batch, n_bounds)
+    drawn = trajectories.sample(draws, 0.0, batch, np.random.default_rng(0), n_bounds)
+    for j, mission in enumerate(with_losses):
+        for i in range(3):
+            z, y = mission.awareness[:, i], mission.contact_rate[:, i]
+            mean, covariance = dense_posterior_of_trust(*params, z, y)
+            K, sd = len(mean), np.sqrt(np.diag(covariance))
+            np.testing.assert_allclose(summary.mean[j, :K, i], mean, rtol=1e-9)
+            np.testing.assert_allclose(summary.sd[j, :K, i], sd, rtol=1e-6)
+            # A covariance of 4000 draws: 5 standard errors of sd^2 sqrt(2 / 4000).
+            off = np.cov(drawn[:, j, :K, i].T) - covariance
+            assert np.abs(off / np.outer(sd, sd)).max() < 5 * np.sqrt(2 / n)
+
+
+@pytest.mark.parametrize("sampler", ["exact", "nuts"])
+def test_a_posterior_knows_trust_where_no_rate_was_measured(with_losses, sampler):
+    """The mean and variance over draws of dense conditioning given each, with one in forty."""
+    posterior = fit(with_losses, sampler=sampler)
+    draws = params_of(posterior)
+    picked = [draws.draw(d) for d in range(0, 4000, 40)]
+    latent = posterior["latent"]
+    for j, i in ((0, 0), (1, 1), (2, 2)):
+        mission = with_losses[j]
+        z, y = mission.awareness[:, i], mission.contact_rate[:, i]
+        each = [dense_posterior_of_trust(*p, z, y) for p in picked]
+        means = np.array([m for m, _ in each])
+        variance = np.mean([np.diag(c) for _, c in each], axis=0) + means.var(0)
+        here = {"mission": j, "robot": f"r{i + 1}", "bound": slice(1, len(y))}
+        sd = latent["trust_sd"].sel(here).values
+        # 100 draws: a mean to .1 sd, an sd to 7 %; 4 of these.
+        assert (np.abs(latent["trust_mean"].sel(here) - means.mean(0)) < 0.4 * sd).all()
+        np.testing.assert_allclose(sd, np.sqrt(variance), rtol=0.3)
+        spread = latent["trust"].sel(here).std(("chain", "draw")).values
+        np.testing.assert_allclose(spread, sd, rtol=0.25)  # 200 trajectories: 5 % each

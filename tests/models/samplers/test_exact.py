@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit
+from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams, diagnostics, fit
 from trustbo.models.likelihood.gram import sufficient_statistics
 from trustbo.models.samplers.exact import sample_exact
 from trustbo.models.samplers.nuts import NutsSettings, run_nuts
@@ -161,6 +161,70 @@ def test_other_priors_within_reach_move_the_posterior(missions):
     assert abs(exact.params["beta"].mean() - 0.1) < 0.05
     assert exact.params["beta0"].mean() < 0.5  # against a likelihood around 0.6
     assert TRUTH.beta0 == 0.6
+
+
+def odd(rates):
+    """Missions of one column of rates for each robot."""
+    rng = np.random.default_rng(5)
+    rates = [np.atleast_2d(np.asarray(each, dtype=float)) for each in rates]
+    return [
+        Mission.from_arrays([(0, k) for k in range(len(y) + 1)], rng.uniform(size=(*y.shape, 2)), y)
+        for y in rates
+    ]
+
+
+VAGUE = Priors(beta=dist.Normal(0.0, 1000.0), b=dist.Normal(0.0, 1000.0))
+ODD = {
+    "equal but for rounding": [np.full((7, 1), 0.7) + 1e-12 * (np.arange(7)[:, None] == 3)] * 2,
+    "one rate": [[[0.7]]],
+    "two rates": [[[0.7], [0.7 + 1e-12]]],
+    "two rates apart": [[[0.1], [0.9]]],
+    "one rate in the middle": [np.where(np.arange(5) == 2, 0.7, np.nan)[:, None]],
+    "contact but once": [np.where(np.arange(7) == j, 0.3, 1.0)[:, None] for j in (3, 9, 9)],
+    "none or all": [(np.arange(12).reshape(6, 2) % 5 < 2) * 1.0] * 2,
+}
+
+
+@pytest.mark.parametrize(
+    "priors", [Priors(), VAGUE, Priors.zheng2023()], ids=["ours", "1e6", "2023"]
+)
+@pytest.mark.parametrize("name", list(ODD))
+def test_odd_data_have_a_posterior(name, priors):
+    floored = PooledTrust(priors).at_resolution({})
+    statistics = floored.gather(stack_missions(odd(ODD[name])))[0]
+    exact = sample_exact(statistics, floored.priors, 1000, 0)
+    assert exact.khat < 0.6
+    for values in exact.params.values():
+        assert np.isfinite(values).all()
+
+
+def test_a_robot_never_measured_keeps_its_prior_and_one_always_in_contact_has_a_posterior():
+    missions = odd([np.c_[np.full(6, np.nan), np.ones(6), y] for y in np.full((3, 6), 0.5)])
+    rates = [m.contact_rate.copy() for m in missions]
+    for j, y in enumerate(rates):
+        y[:, 2] += 0.1 * np.random.default_rng(j).standard_normal(6)
+    missions = [
+        Mission.from_arrays(m.path, m.awareness, y) for m, y in zip(missions, rates, strict=True)
+    ]
+    posterior = fit(missions, CoupledTrust(inter_robot="none"), "exact")
+    assert posterior.attrs["sampler"] == "exact"
+    sites = posterior["posterior"].isel(robot=0)
+    floor = stats.halfnorm.cdf(0.005, scale=0.2)
+    laws = {
+        "beta0": (sites["beta0"], stats.beta(2, 2).cdf),
+        "beta": (sites["beta"].isel(feature=0), stats.norm(0, 1).cdf),
+        "b": (sites["b"], stats.norm(0, 0.5).cdf),
+        "delta_w": (sites["delta_w"], stats.halfnorm(0, 0.2).cdf),
+        "delta_v": (
+            sites["delta_v"],
+            lambda x: (stats.halfnorm.cdf(x, scale=0.2) - floor) / (1 - floor),
+        ),
+    }
+    for name, (draws, cdf) in laws.items():
+        # Resampled points repeat: as many independent ones as the Kish size.
+        found = stats.kstest(draws.values.ravel(), cdf).statistic
+        assert found < 1.95 / np.sqrt(posterior.attrs["kish"]), name  # one chance in a thousand
+    assert float(posterior["posterior"]["delta_v"].isel(robot=1).mean()) < 0.02
 
 
 @pytest.mark.parametrize(

@@ -152,6 +152,7 @@ class SufficientStatistics(NamedTuple):
     lag: float
     ticks: TickWeights
     """Weight of the rates by their number of ticks."""
+    n_features: int
 
     def __add__(self, other: Self) -> Self:  # pyright: ignore[reportIncompatibleMethodOverride]
         if (self.x0_mean, self.lag) != (other.x0_mean, other.lag):
@@ -175,6 +176,7 @@ class SufficientStatistics(NamedTuple):
             self.x0_mean,
             self.lag,
             add_ticks([self.ticks, other.ticks]),
+            self.n_features,
         )
 
     def scaled(self, factor: float) -> Self:
@@ -189,22 +191,17 @@ class SufficientStatistics(NamedTuple):
 
     @property
     def spread(self) -> float:
-        """Standard deviation of the rates."""
+        """Standard deviation of the rates; 0 if there are none."""
+        if not self.n_measured:
+            return 0.0
         mean, square = (total / self.n_measured for total in self.sums)
         return float(np.sqrt(max(square - mean**2, 0.0)))
 
-    @property
-    def n_features(self) -> int:
-        """Number of features."""
-        if self.gaps:
-            return self.gaps[0].u.shape[-1] - 1
-        return next(iter(self.grams.values())).spectral.shape[-1] - 4
-
     def evaluate(self, theta: np.ndarray, x0_sd: float) -> Quadratic:
         """The quadratic form at theta = (beta0, delta_w^2, delta_v^2), shape (theta, 3)."""
-        parts = [*self.grams.values(), *self.gaps]
-        total = parts[0].evaluate(theta, x0_sd, self.lag)
-        for part in parts[1:]:
+        n, d = len(theta), self.n_features + 1
+        total = Quadratic(np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d)), np.zeros(n))
+        for part in (*self.grams.values(), *self.gaps):
             total = total + part.evaluate(theta, x0_sd, self.lag)
         return total
 
@@ -256,8 +253,9 @@ def sufficient_statistics(
         gaps = (GapSequences(y[gappy, :n], u[gappy, :n], each[gappy], x0_mean),)
     weights, rates = (seen * each[:, None])[seen], y[seen]
     sums = (float(weights @ rates), float(weights @ rates**2))
-    ticks = weigh_ticks(batch, weight)
-    return SufficientStatistics(grams, gaps, float(weights.sum()), sums, x0_mean, lag, ticks)
+    ticks, n_features = weigh_ticks(batch, weight), z.shape[-1]
+    total = float(weights.sum())
+    return SufficientStatistics(grams, gaps, total, sums, x0_mean, lag, ticks, n_features)
 
 
 def lengths(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

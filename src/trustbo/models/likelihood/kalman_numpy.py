@@ -26,19 +26,22 @@ class TrustSummary(NamedTuple):
     log_likelihood: np.ndarray  # (draw, mission)
 
 
-def summarize(params: Params, lag: float, batch: MissionBatch) -> TrustSummary:
+def summarize(
+    params: Params, lag: float, batch: MissionBatch, n_bounds: np.ndarray | None = None
+) -> TrustSummary:
     """Mean and sd of latent trust over all draws, and each mission's log-likelihood per draw.
 
     Args:
         params: Draws with leading axis (draw,).
         lag: 0 where rates measure trust, 1 where they measure its change.
         batch: Missions, padded with NaN.
+        n_bounds: Bounds of each mission, measured or not; by default all of the batch.
     """
     n = len(params.b)
     shape = batch.contact_rate.shape
     total, squares = np.zeros(shape), np.zeros(shape)
     log_likelihood = np.zeros((n, shape[0]))
-    for group in _groups(params, batch):
+    for group in _groups(params, batch, n_bounds):
         step = max(1, _CELLS // group.y.size)
         for start in range(0, n, step):
             draws = slice(start, start + step)
@@ -57,10 +60,16 @@ def summarize(params: Params, lag: float, batch: MissionBatch) -> TrustSummary:
     return TrustSummary(mean, np.sqrt(np.maximum(squares / n - mean**2, 0.0)), log_likelihood)
 
 
-def sample(params: Params, lag: float, batch: MissionBatch, rng: np.random.Generator) -> np.ndarray:
+def sample(
+    params: Params,
+    lag: float,
+    batch: MissionBatch,
+    rng: np.random.Generator,
+    n_bounds: np.ndarray | None = None,
+) -> np.ndarray:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
     trust = np.zeros((len(params.b), *batch.contact_rate.shape))
-    for group in _groups(params, batch):
+    for group in _groups(params, batch, n_bounds):
         p, e = group.draws, rng.standard_normal((*group.y.shape, len(params.b)))
         f = _filter(p, lag, group)
         x = f.mean[-1] + np.sqrt(f.var[-1]) * e[-1]
@@ -128,28 +137,30 @@ class _Filtered(NamedTuple):
     log_likelihood: np.ndarray  # (sequence, draw)
 
 
-def _groups(params: Params, batch: MissionBatch) -> Iterator[_Group]:
-    n_missions, _, n_robots = batch.contact_rate.shape
+def _groups(
+    params: Params, batch: MissionBatch, n_bounds: np.ndarray | None = None
+) -> Iterator[_Group]:
+    n_missions, longest, n_robots = batch.contact_rate.shape
+    n_bounds = np.full(n_missions, longest) if n_bounds is None else n_bounds
     for members in params.alike(n_robots):
         draws = _draws_last(params.of_robot(members[0]))
         mission, robot = (a.ravel() for a in np.meshgrid(range(n_missions), members, indexing="ij"))
         y = batch.contact_rate[mission, :, robot].T
         seen = ~np.isnan(y)
         length, complete = lengths(seen.T)
-        for n in np.unique(length[length > 0]):
-            for shared in (True, False):
-                rows = np.flatnonzero((length == n) & (complete == shared))
-                if not len(rows):
-                    continue
-                here = seen[:n, rows, None]
-                yield _Group(
-                    draws,
-                    mission[rows],
-                    robot[rows],
-                    np.where(seen, y, 0.0)[:n, rows],
-                    np.swapaxes(batch.awareness[mission[rows], :n, robot[rows]], 0, 1),
-                    here[:, :1] if shared else here,
-                )
+        # Bounds after the last rate are predicted: trust has a mean and a variance there too.
+        kinds = np.stack([n_bounds[mission], np.where(complete, length, longest + 1)])
+        for n, measured in np.unique(kinds, axis=1).T:
+            rows = np.flatnonzero((kinds == [[n], [measured]]).all(0))
+            here = seen[:n, rows, None]
+            yield _Group(
+                draws,
+                mission[rows],
+                robot[rows],
+                np.where(seen, y, 0.0)[:n, rows],
+                np.swapaxes(batch.awareness[mission[rows], :n, robot[rows]], 0, 1),
+                here[:, :1] if measured <= longest else here,
+            )
 
 
 def _draws_last(params: Params) -> _Draws:

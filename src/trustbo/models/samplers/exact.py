@@ -9,8 +9,8 @@ in three dimensions; s^2 = delta_v^2 - floor^2, so that the floor of delta_v is 
 2. Some 1000 weighted points around it give the mean and covariance of a heavy-tailed proposal; the
    posterior is skewed, and its curvature at the mode alone makes a far worse one (`proposal`).
 3. 4096 scrambled Sobol points of the proposal get Pareto-smoothed importance weights (Vehtari,
-   Simpson, Gelman, Yao and Gabry 2024). Where k-hat says that they are uneven, a mixture along the
-   ridge of r takes the proposal's place: the data determine the noises' ratio badly.
+   Simpson, Gelman, Yao and Gabry 2024). Where k-hat says that they are uneven, a mixture fitted to
+   the weighted points takes the proposal's place, up to four times (adaptive importance sampling).
 4. Systematic resampling makes the points equally weighted; c is drawn from its normal conditional.
 
 State: weighted points with the conditional moments of c at each. Invariant: whatever the proposal,
@@ -39,7 +39,8 @@ from trustbo.models.samplers.priors_numpy import log_prob, number, numbers
 from trustbo.models.samplers.proposal import Mixture
 
 _LOG2_POINTS, _LOG2_AROUND = 12, 10
-_RIDGE_STEPS, _RIDGE_DROP = 12, 8.0  # largest number of components a side, and drop in nats
+_FEW = 50  # points
+_MAX_ROUNDS, _N_AROUND, _WIDE = 4, 32, 0.2  # of adapting; local components, and the other's share
 _CHUNK = 1024  # parameter values evaluated at once: bounds the memory of long missions
 
 
@@ -78,7 +79,7 @@ class _Target(NamedTuple):
         with np.errstate(all="ignore"):
             done = [self._evaluate(part) for part in parts]
         log_density, mean, factor = (np.concatenate(of, axis=-1) for of in zip(*done, strict=True))
-        return log_density, mean, factor
+        return np.where(np.isfinite(log_density), log_density, -np.inf), mean, factor
 
     def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         beta0, delta_w, delta_v, log_jacobian = self.constrain(z)
@@ -149,10 +150,12 @@ def sample_exact(
         target = _target(statistics, priors)
         mode, scale = laplace(target.log_density, _start(target))
         points = _weigh(target, _matched(target, mode, scale, seed), seed)
-        if not points.khat < GOOD_KHAT:
-            ridge = _weigh(target, _along_the_ridge(target, mode, scale), seed)
-            if ridge.khat < points.khat or not np.isfinite(points.khat):
-                points = ridge
+        last = points
+        for _ in range(_MAX_ROUNDS):
+            if points.khat < GOOD_KHAT:
+                break
+            last = _weigh(target, _adapted(last, seed), seed)
+            points = min(points, last, key=lambda each: each.khat)
     rng = np.random.default_rng(seed)
     weights = np.exp(points.log_w)
     chosen = rng.permutation(_systematic(weights, n_draws, rng))
@@ -195,6 +198,8 @@ def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) ->
     weights = np.exp(log_w)
     mean = weights @ z
     covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
+    if (kish := 1.0 / (weights**2).sum()) < _FEW:  # fewer points than a covariance needs
+        covariance += scale @ scale.T / kish
     return Mixture(mean[None], np.linalg.cholesky(covariance)[None], np.ones(1))
 
 
@@ -204,13 +209,17 @@ def _weigh(
     """Points of the proposal with Pareto-smoothed importance weights."""
     z = proposal.draw(2**log2_points, seed)
     log_p, mean, factor = target.evaluate(z)
-    log_p = np.where(np.isfinite(log_p), log_p, -np.inf)
     raw = log_p - proposal.log_density(z)
-    finite = np.where(np.isfinite(raw), raw, raw[np.isfinite(raw)].min() - 100.0)
-    smoothed, khat = array_stats.psislw(-finite)  # takes minus the log weights
+    finite = np.isfinite(raw)
+    if finite.sum() < _FEW:  # the proposal missed: equal weights, of which k-hat says so
+        nothing = np.full(len(z), -np.log(len(z)))
+        return _Weighted(z, log_p, nothing, mean, factor, np.inf, -np.inf)
+    # Minus the log weights, points without density far below all others.
+    smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
     log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
     log_w = smoothed - np.logaddexp.reduce(smoothed)
-    return _Weighted(z, log_p, log_w, mean, factor, float(khat), log_evidence)
+    khat = float(np.nan_to_num(khat, nan=np.inf))
+    return _Weighted(z, log_p, log_w, mean, factor, khat, log_evidence)
 
 
 def _start(target: _Target) -> np.ndarray:
@@ -219,36 +228,31 @@ def _start(target: _Target) -> np.ndarray:
     x = np.array([-3.0, -1.0, 0.0, 1.0, 2.0]) if unit else np.linspace(-0.5, 1.1, 5)
     t = np.log(max(target.statistics.spread, target.floor, 1e-3)) + np.linspace(-2.5, 0.5, 5)
     grid = np.stack(np.meshgrid(x, t, [-2.0, 0.0, 2.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    return grid[np.nanargmax(target.log_density(grid))]
+    return grid[np.argmax(target.log_density(grid))]
 
 
-def _along_the_ridge(target: _Target, mode: np.ndarray, scale: np.ndarray) -> Mixture:
-    """Mixture along r, each component at the mode of (beta0, t) given its r."""
-    spacing = float(np.clip(np.sqrt((scale @ scale.T)[2, 2]), 0.4, 1.0))
-    centers, scales, log_mass = [], [], []
+def _adapted(points: _Weighted, seed: int) -> Mixture:
+    """Mixture around draws of weighted points, each component as wide as the mass nearby.
 
-    def add(r: float, start: np.ndarray) -> np.ndarray:
-        def given_r(xt: np.ndarray) -> np.ndarray:
-            return target.log_density(np.column_stack([xt, np.full(len(xt), r)]))
-
-        center, factor = laplace(given_r, start)
-        full = np.zeros((3, 3))
-        full[:2, :2], full[2, 2] = factor, spacing
-        centers.append([*center, r])
-        scales.append(1.2 * full)
-        log_mass.append(float(given_r(center[None])[0]) + np.log(np.diag(factor)).sum())
-        return center
-
-    middle = add(mode[2], mode[:2])
-    for direction in (-1.0, 1.0):
-        start = middle
-        for step in range(1, _RIDGE_STEPS + 1):
-            start = add(mode[2] + direction * step * spacing, start)
-            if log_mass[-1] < max(log_mass) - _RIDGE_DROP:
-                break
-    weights = np.exp(np.array(log_mass) - np.max(log_mass))
-    weights = 0.9 * weights / weights.sum() + 0.1 / len(weights)
-    return Mixture(np.array(centers), np.array(scales), weights)
+    It follows any shape of the posterior: ridges, horns and modes. A wide component over all
+    remains, for what the points have not seen.
+    """
+    z, weights = points.z, np.exp(points.log_w)
+    mean = weights @ z
+    covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
+    covariance += 1e-6 * np.trace(covariance) * np.eye(3)  # where one point has all weight
+    whole = np.linalg.cholesky(covariance)
+    order = np.argsort(z[:, 2])
+    drawn = _systematic(weights[order], _N_AROUND, np.random.default_rng(seed))
+    centers, white = z[order[drawn]], np.linalg.solve(whole, z.T).T
+    scales = []
+    for center in white[order[drawn]]:
+        near = weights * np.exp(-0.5 * ((white - center) ** 2).sum(1))
+        near /= near.sum()
+        off = z - near @ z
+        scales.append(np.linalg.cholesky((off * near[:, None]).T @ off + 0.02 * covariance))
+    shares = np.append(np.full(_N_AROUND, (1.0 - _WIDE) / _N_AROUND), _WIDE)
+    return Mixture(np.vstack([centers, mean]), np.array([*scales, 1.5 * whole]), shares)
 
 
 def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -47,15 +47,19 @@ def laplace(
     z, value = start, float(log_density(start[None])[0])
     for _ in range(n_steps):
         gradient, hessian = _derivatives(log_density, z)
+        if not np.isfinite(hessian).all():  # beside a point without density
+            break
         step = newton_direction(np, gradient, -hessian, 1e-3)
         candidates = z + np.outer(0.5 ** np.arange(12), step)
         values = log_density(candidates)
-        best = int(np.nanargmax(values))
+        best = int(np.argmax(values))
         if not values[best] > value + 1e-10:
             break
         z, value = candidates[best], float(values[best])
-    covariance = inverse_hessian(np, -_derivatives(log_density, z)[1], 0.05)
-    return z, np.linalg.cholesky(covariance)
+    hessian = _derivatives(log_density, z)[1]
+    if not np.isfinite(hessian).all():
+        return z, np.eye(len(z))
+    return z, np.linalg.cholesky(inverse_hessian(np, -hessian, 0.05))
 
 
 def newton(
