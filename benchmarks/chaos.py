@@ -105,7 +105,8 @@ def draw(seed):
         simulator = Odd(simulator, kind)
     model = pick(PooledTrust(), PooledTrust(), PooledTrust(response="change"),
                  CoupledTrust(inter_robot="none"))  # fmt: skip
-    sampler = "nuts" if model == PooledTrust() and rng.uniform() < 0.1 else "exact"
+    plain = isinstance(model, PooledTrust) and model.response == "level"
+    sampler = "nuts" if rng.uniform() < 0.1 and plain else "exact"
     options = {
         "model": model, "sampler": sampler, "seed": int(rng.integers(100)),
         "policy": pick(*tb.planning.POLICIES), "objective": pick(*tb.planning.OBJECTIVES),

@@ -1,4 +1,7 @@
-"""Draws the figures of the documentation from what `make demo` left in out/demo."""
+"""Draws the figures of the documentation from what `make demo` left in out/demo.
+
+The figure of long campaigns is of the tables that `benchmarks/campaigns.py --csv` wrote.
+"""
 
 import io
 from pathlib import Path
@@ -14,6 +17,7 @@ from trustbo import plots
 
 mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
+RESULTS = FIGURES.parents[1] / "benchmarks" / "results"
 
 
 def main() -> None:
@@ -37,12 +41,31 @@ def main() -> None:
     }
     for name, axes in drawn.items():
         save(axes[0].figure, name)
+    save(long_campaigns(), "long_campaigns")
     film = plots.animate_mission(result.missions[-1], workspace)
     contact = np.concatenate([bound.contact for bound in result.missions[-1].bounds])
     divided = np.flatnonzero(contact.any(1) & ~contact.all(1))
     film._draw_frame(divided[len(divided) // 2])  # matplotlib has no public way to one frame
     film._draw_was_started = True
     save(film._fig, "animate_mission")
+
+
+def long_campaigns() -> Figure:
+    """Seconds, memory and disk over 200 missions, by version 0.1 and now."""
+    figure, axes = plt.subplots(1, 3, figsize=(9, 2.8), layout="constrained")
+    styles = {"0.1": ("#D55E00", "--", "version 0.1"), "0.2": ("#0072B2", "-", "now")}
+    for version, (color, line, label) in styles.items():
+        table = np.genfromtxt(RESULTS / f"campaigns_{version}.csv", delimiter=",", names=True)
+        memory = (table["memory_mb"] - table["memory_mb"][0]) / 1e3
+        for ax, values in zip(
+            axes, (table["seconds"], memory, table["disk_mb"] / 1e3), strict=True
+        ):
+            ax.plot(table["mission"], values, line, color=color, label=label)
+    for ax, name in zip(axes, ("seconds a mission", "memory gained, GB", "disk, GB"), strict=True):
+        ax.set(xlabel="mission", ylabel=name, ylim=(0, None), xlim=(0, 200))
+        ax.spines[["top", "right"]].set_visible(False)
+    axes[0].legend(frameon=False)
+    return figure
 
 
 def save(figure: Figure, name: str) -> None:

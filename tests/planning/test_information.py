@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 from references import dense_coupled
+from scipy.special import expit
 from scipy.stats import multivariate_normal
 
 from trustbo.errors import ShapeError
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams, sample_prior
+from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.params import CoupledParams
 from trustbo.planning.dynamics import transition
 from trustbo.planning.information import information_gain, rate_noise
@@ -26,7 +28,7 @@ def test_the_rates_noise_is_that_of_their_joint_normal(model):
         Q, R = params.Delta_w, params.Delta_v
     else:
         Q, R = (np.eye(n_robots) * np.square(sd) for sd in (params.delta_w, params.delta_v))
-    noise = rate_noise(params, n_bounds, n_robots)
+    noise = rate_noise(params, np.zeros((n_bounds, n_robots)))
     rng = np.random.default_rng(6)
     for _ in range(20):
         y = rng.standard_normal((n_bounds, n_robots))
@@ -39,7 +41,8 @@ def test_the_rates_noise_is_that_of_their_joint_normal(model):
 
 def test_the_noise_of_a_shorter_mission_is_the_leading_part():
     params = prior_draws(CoupledTrust()).draw(0)
-    np.testing.assert_array_equal(rate_noise(params, 2, 2), rate_noise(params, 5, 2)[:4, :4])
+    short, long = (rate_noise(params, np.zeros((n, 2))) for n in (2, 5))
+    np.testing.assert_allclose(short, long[:4, :4], rtol=1e-12)
 
 
 def only_b_is_unknown(b):
@@ -88,3 +91,67 @@ def test_maps_and_draws_go_in_pairs():
     params = sample_prior(PooledTrust(), 2, 5, seed=0)
     with pytest.raises(ShapeError, match="4 maps of awareness need as many draws"):
         information_gain(params, np.full((4, 1, 3, 3, 2), 0.5), [PATH])
+
+
+# --- rates that are not trust plus noise ---
+
+
+def test_rates_of_change_are_differences_of_trust():
+    """Against the noise of x0, w and v put through the recursion by hand."""
+    params = TrustParams(0.7, np.zeros(2), 0.1, 0.2, 0.1, 0.5, 0.4)
+    n = 4
+    x = np.zeros((n + 1, 1 + 2 * n))  # rows: steps; columns: x0, w_1.., v_1..
+    x[0, 0] = params.x0_sd
+    for k in range(1, n + 1):
+        x[k] = params.beta0 * x[k - 1]
+        x[k, k] += params.delta_w
+    y = np.diff(x, axis=0)
+    y[:, 1 + n :] += params.delta_v * np.eye(n)
+    found = rate_noise(params, np.zeros((n, 1)), lag=1.0)
+    np.testing.assert_allclose(found, y @ y.T, rtol=1e-12, atol=1e-15)
+
+
+def test_a_change_tells_nothing_of_where_trust_began():
+    """With beta0 = 1 and no drift, rates of change are noise alone, whatever x0 is."""
+    n = 30
+    x0 = np.random.default_rng(0).standard_normal(n)
+    params = TrustParams(
+        np.ones(n), np.zeros((n, 2)), np.zeros(n), np.full(n, 0.1), np.full(n, 0.1), x0, np.zeros(n)
+    )
+    awareness = np.full((1, 3, 3, 2), 0.5)
+    of_change = information_gain(params, awareness, [PATH], lag=1.0)
+    np.testing.assert_allclose(of_change, 0.0, atol=1e-12)
+    assert information_gain(params, awareness, [PATH]) > 1.0
+
+
+@pytest.mark.parametrize("name", list(FAMILIES))
+@pytest.mark.parametrize("trust", [-1.3, 0.2, 0.95])
+def test_moments_of_a_rate_are_those_of_simulated_ones(name, trust):
+    """1e5 rates: mean and variance within 5 standard errors; the slope by differences."""
+    family, sd, n = FAMILIES[name], np.array(0.15), 100_000
+    mean, slope, variance = family.rate_moments(np.array(trust), sd)
+    rng = np.random.default_rng(1)
+    if name == "beta_binomial":
+        p, phi = expit(trust), 1.0 / (sd**2 + 1e-6)
+        y = rng.binomial(200, rng.beta(phi * p, phi * (1.0 - p), n)) / 200
+    else:
+        y = trust + sd * rng.standard_normal(n)
+        y = np.clip(y, 0.0, 1.0) if name == "censored" else y
+    assert abs(y.mean() - mean) <= 5.0 * y.std() / np.sqrt(n) + 1e-15
+    fourth = ((y - y.mean()) ** 4).mean() - y.var() ** 2
+    assert abs(y.var() - variance) <= 5.0 * np.sqrt(fourth / n) + 1e-11
+    ends = [family.rate_moments(np.array(trust + h), sd)[0] for h in (-1e-5, 1e-5)]
+    np.testing.assert_allclose(slope, (ends[1] - ends[0]) / 2e-5, rtol=1e-6, atol=1e-9)
+
+
+def test_counts_teach_less_where_nearly_all_or_none_are_in_contact():
+    """The same spread of logits moves rates less at an end; so the policy must not see logits."""
+    rng = np.random.default_rng(2)
+    awareness = np.full((1, 3, 3, 2), 0.5)
+
+    def gain(level, family):
+        params = only_b_is_unknown(level + 0.3 * rng.standard_normal(200))
+        return information_gain(params, awareness, [PATH], FAMILIES[family])[0]
+
+    assert gain(4.0, "beta_binomial") < 0.7 * gain(0.0, "beta_binomial")
+    assert abs(gain(4.0, "gaussian") / gain(0.0, "gaussian") - 1.0) < 0.15

@@ -101,10 +101,11 @@ class Campaign:
         """
         self.options = CampaignOptions.of(options, Campaign.__init__)
         self._policy = resolve_policy(policy)
-        self.planner = self.options.planner(workspace, start, goal, objective)
-        self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self._learning = self.options.learning(model, sampler)
         self.model, self.log = self._learning.model, History()
+        law = self.model.observation, self.model.response
+        self.planner = self.options.planner(workspace, start, goal, objective, *law)
+        self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
         self.awareness = self.options.belief(workspace)
         self._plan: Plan | None = None
         self._believed: Planner | None = None

@@ -126,13 +126,20 @@ class CampaignOptions:
         return isinstance(self.awareness, AwarenessBelief)
 
     def planner(
-        self, workspace: "Workspace", start: "Cell", goal: "Cell", objective: str
+        self,
+        workspace: "Workspace",
+        start: "Cell",
+        goal: "Cell",
+        objective: str,
+        observation: str,
+        response: str,
     ) -> "Planner":
-        """Planner with these options."""
+        """Planner with these options, for a model of such rates."""
         from trustbo.planning import Planner
 
         chosen: dict[str, Any] = {name: getattr(self, name) for name in options_of(PLANNING)}
-        return Planner(workspace, start, goal, objective, **chosen)
+        law = {"observation": observation, "response": response}
+        return Planner(workspace, start, goal, objective, **law, **chosen)
 
     def learning(self, model: "TrustModel | None", sampler: str) -> "Learning":
         """Learning of a model, by default `PooledTrust()`."""

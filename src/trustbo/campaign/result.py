@@ -104,7 +104,11 @@ class Result:
             )
         options = CampaignOptions(**{name: self.settings[name] for name in names})
         start, goal = (_cell(self.settings[name]) for name in ("start", "goal"))
-        planner = options.planner(self.workspace, start, goal, self.settings["objective"])
+        law = [
+            self.settings.get(n, d) for n, d in (("observation", "gaussian"), ("response", "level"))
+        ]
+        objective = self.settings["objective"]
+        planner = options.planner(self.workspace, start, goal, objective, *law)
         if self.believed is None:
             return planner
         return planner.with_awareness(self.believed["draws"].values, self.believed["mean"].values)

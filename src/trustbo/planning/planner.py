@@ -12,6 +12,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
+from trustbo.errors import require_choice
+from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
 from trustbo.planning import search
 from trustbo.planning.dynamics import Dynamics
@@ -59,6 +62,8 @@ class Planner:
         length_weight: float = 0.0,
         engine: str = "auto",
         backend: str | None = None,
+        observation: str = "gaussian",
+        response: str = "level",
     ) -> None:
         """Prepare to plan.
 
@@ -81,6 +86,9 @@ class Planner:
                 single plans on up to 50 x 50 cells; for success, bottleneck and `team="min"` up to
                 10 x 10. All find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
+            observation: Family of the contact rates, and
+            response: quantity that they measure, both as of the trust model; the policy
+                `information` needs to know what a mission would teach.
 
         Raises:
             TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
@@ -89,6 +97,8 @@ class Planner:
             NoPathError: The goal cannot be reached.
         """
         self.engine, self._engine = engine, search.Engine(engine, backend)
+        self.family = FAMILIES[require_choice("observation", observation, FAMILIES)]
+        self.lag = float(require_choice("response", response, RESPONSES) == "change")
         self._engine.choose(0, 1)
         if max_bounds is None and objective not in LABELLED:
             max_bounds = "shortest+2"

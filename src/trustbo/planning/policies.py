@@ -93,7 +93,7 @@ def information(key: Array, posterior: Params, planner: Planner, *, n_random: in
     sampler = path_sampler(planner.paths)
     paths = list(drawn.candidates) + [sampler.draw(rng) for _ in range(n_random)]
     params, _ = choose_draws(posterior, N_DRAWS, _seed(key))
-    gains = information_gain(params, planner.mean_awareness, paths)
+    gains = information_gain(params, planner.mean_awareness, paths, planner.family, planner.lag)
     return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
 
 

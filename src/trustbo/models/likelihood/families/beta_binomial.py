@@ -13,10 +13,13 @@ import numpy as np
 import numpyro.distributions as dist
 from jax import Array, lax, random
 from jax.scipy.special import gammaln
+from scipy.special import expit
 
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.linearised import Data, Linearised
+
+_N_TICKS = 200.0  # of missions to come, whose ticks nobody knows
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,14 @@ class BetaBinomial(Linearised):
         p = random.beta(key_p, phi * jax.nn.sigmoid(trust), phi * jax.nn.sigmoid(-trust))
         N = lax.stop_gradient(jnp.where(n_ticks > 0.0, n_ticks, jnp.nan))
         return random.binomial(key_n, jnp.where(jnp.isnan(N), 0.0, N), p).astype(p.dtype) / N
+
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.rate_moments`."""
+        p, N = expit(trust), _N_TICKS
+        excess = 1.0 / (1.0 + 1.0 / (noise_sd**2 + 1e-6))  # correlation of two ticks of a bound
+        return p, p * (1.0 - p), p * (1.0 - p) * (1.0 + (N - 1.0) * excess) / N
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: counts have probabilities."""

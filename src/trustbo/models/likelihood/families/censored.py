@@ -10,6 +10,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy.stats import norm
 
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.gaussian import Gaussian
@@ -36,6 +37,19 @@ class Censored(Gaussian):
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
         """See `Family.measure`: `y` cut to [0, 1]."""
         return jnp.clip(y, 0.0, 1.0)
+
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.rate_moments`: of a normal variable cut to [0, 1] (Tobin 1958)."""
+        low, high = -trust / noise_sd, (1.0 - trust) / noise_sd
+        inside = norm.cdf(high) - norm.cdf(low)
+        first = norm.pdf(low) - norm.pdf(high)
+        second = inside + low * norm.pdf(low) - high * norm.pdf(high)
+        above = norm.sf(high)
+        mean = trust * inside + noise_sd * first + above
+        square = trust**2 * inside + 2.0 * trust * noise_sd * first + noise_sd**2 * second + above
+        return mean, inside, np.maximum(square - mean**2, 1e-12)
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: rates of 0 and 1 have a probability."""

@@ -93,6 +93,16 @@ class Family(ABC):
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """Mask of the measured rates that have a density, not a probability."""
 
+    @abstractmethod
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean of a rate given trust, its slope in trust, and the variance of the rate.
+
+        `noise_sd` is delta_v, broadcast to trust. Where ticks count, there are those of a rate that
+        is known to .005.
+        """
+
     def priors(self) -> dict[str, Any]:
         """Default priors that differ from those of `Priors()`, by name."""
         return {}

@@ -38,6 +38,12 @@ class Gaussian(Family):
         """See `Family.measure`: `y` as it is, which may leave [0, 1]."""
         return y
 
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.rate_moments`."""
+        return trust, np.ones(trust.shape), np.broadcast_to(noise_sd**2, trust.shape)
+
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: all have."""
         return np.ones(y.shape, dtype=bool)
