@@ -2,6 +2,9 @@
 
 import subprocess
 import sys
+import tomllib
+from importlib import resources
+from pathlib import Path
 
 import pytest
 
@@ -21,6 +24,13 @@ def test_importing_loads_nothing_heavy():
         "& set(sys.modules)))"
     )
     assert printed(program) == "[]"
+
+
+def test_type_checkers_are_told_that_it_is_typed():
+    assert resources.files("trustbo").joinpath("py.typed").is_file()
+    root = Path(__file__).resolve().parents[1]
+    build = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    assert build["targets"]["wheel"] == {"packages": ["src/trustbo"]}  # all files in it
 
 
 def test_every_public_name_is_there():

@@ -1,8 +1,11 @@
 """ROS bags: what is written comes back, and what cannot be kept or read is refused."""
 
+import math
 import struct
 import sys
+import time
 from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import pairwise
 
 import numpy as np
@@ -266,12 +269,31 @@ def test_a_bag_that_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
 def test_messages_are_in_the_order_of_time(tmp_path):
     from rosbags.highlevel import AnyReader
 
-    write_bag([mission(), mission()], tmp_path / "log")
+    write_bag([mission(), mission()], tmp_path / "log", start=1.0)
     with AnyReader([tmp_path / "log"]) as reader:
         times = [time for _, time, _ in reader.messages()]
     assert len(times) == 2 * (3 + 2 * (5 * 5 + 2 + 1))
     assert all(a <= b for a, b in pairwise(times))
     assert times[0] == S
+
+
+def test_stamps_begin_now_or_when_they_are_told_to(tmp_path):
+    from rosbags.highlevel import AnyReader
+
+    given = datetime(2024, 5, 1, 12, tzinfo=UTC)
+    before = time.time()
+    for name, start in (("now", None), ("date.bag", given), ("posix", 1714564800.25)):
+        write_bag([mission()], tmp_path / name, start=start)
+        with AnyReader([tmp_path / name]) as reader:
+            stamp = reader.start_time
+        if start is None:
+            assert before * S <= stamp <= time.time() * S
+        else:  # 12:00 UTC of that day in POSIX seconds, by `date -u -d ... +%s`
+            assert stamp == 1714564800 * S + (S // 4 if name == "posix" else 0)
+        assert_same(read_bag(tmp_path / name), [mission()])  # t0 counts from the first stamp
+    for start in (0, math.nan, "now", 2.0**31):
+        with pytest.raises(TrustboError, match=f"start must be .*; got {start!r}"):
+            write_bag([mission()], tmp_path / "refused", start=start)
 
 
 def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):

@@ -160,6 +160,25 @@ def test_a_robot_that_did_not_look_has_no_rate(tmp_path):
     assert one.bounds[1].contact is None
 
 
+@pytest.mark.parametrize("kind", ["std_msgs/msg/Float32", "std_msgs/msg/Float64"])
+def test_a_contact_of_nan_is_no_look(kind, tmp_path):
+    log, nan = markers(Log()), np.nan
+    log.contact("a", (14.5, 1.0), (15.0, nan), (16.0, 0.0), (21.0, 1.0), (23.0, nan), kind=kind)
+    log.contact("b", (14.5, nan), (15.0, 1.0), (21.0, nan), (22.0, nan), kind=kind)
+    (one,) = read_bag(log.save(tmp_path / "log"))
+    np.testing.assert_array_equal(one.contact_rate, [[0.5, 1.0], [1.0, nan]])
+    np.testing.assert_array_equal(one.n_ticks, [[2.0, 1.0], [1.0, nan]])
+    np.testing.assert_array_equal(one.bounds[0].contact, [[True, True], [False, True]])
+    assert one.duration[1, 0] == 3.0  # the robot was there until its last message
+
+
+@pytest.mark.parametrize("value", [85.0, -1.0, np.inf])
+def test_a_contact_that_is_no_share_is_refused(value, tmp_path):
+    log = markers(Log())
+    log.contact("a", (15.0, value), (21.0, 1.0), kind="std_msgs/msg/Float32")
+    refuse(log, tmp_path, rf"/a/contact: contact {value:g} is outside \[0, 1\]; .* by 100")
+
+
 def refuse(log, tmp_path, message, **options):
     with pytest.raises(TrustboError, match=message):
         read_bag(log.save(tmp_path / "log"), **options)

@@ -99,6 +99,15 @@ def test_without_poses_there_is_nothing_to_show(result, tmp_path):
 def test_an_mp4_without_ffmpeg_says_what_to_do(result, mission, tmp_path, monkeypatch):
     monkeypatch.setattr(writers, "is_available", lambda name: False)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(tb.TrustboError, match=r"an \.mp4 needs ffmpeg"):
+    message = r'an \.mp4 needs ffmpeg: .* pip install "trustbo\[video\]"; a \.gif does not'
+    with pytest.raises(tb.TrustboError, match=message):
         tb.plots.animate_mission(mission, result.workspace, tmp_path / "mission.mp4")
+    animation = tb.plots.animate_mission(mission, result.workspace, fps=1)
+    with pytest.raises(tb.TrustboError, match=message):
+        animation.save(tmp_path / "mission.mp4")
+    with pytest.raises(tb.TrustboError, match=r"unknown suffix '.avi'; choose one of .gif, .mp4"):
+        animation.save(tmp_path / "mission.avi")
     assert list(tmp_path.iterdir()) == []
+    animation.save(tmp_path / "mission.gif", dpi=30)
+    with Image.open(tmp_path / "mission.gif") as film:
+        assert film.info["duration"] == 1000

@@ -1,5 +1,7 @@
 """Tracks, worse lidars, threats, states: what a mission measures, and why."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -147,7 +149,18 @@ def test_a_mission_into_or_out_of_a_forbidden_cell_is_stuck(flat, cell):
         ({"kind": "smoke"}, "unknown threat 'smoke'; choose one of jam, forbid"),
         ({}, "either a circle, center and radius, or a polygon"),
         ({"polygon": [(0, 0), (1, 1)]}, "a polygon needs three corners"),
+        ({"polygon": [(0, 0), (1, 1), (2, math.nan)]}, r"corners .*; got .*nan\)\]"),
+        ({"polygon": [(0, 0), (1, 1), (2, "0")]}, r"corners .*; got .*'0'\)\]"),
+        ({"polygon": [(0, 0), (1, 1), (2,)]}, r"corners .*; got .*\(2,\)\]"),
+        ({"polygon": [(0, 0), (1, 1), (2, 0)], "radius": 3.0}, "either a circle, center and rad"),
+        (CIRCLE | {"center": (0.0, math.nan)}, r"center must be x and y .* got \(0\.0, nan\)"),
+        (CIRCLE | {"center": ("0", 0.0)}, r"center must be x and y .* got \('0', 0\.0\)"),
+        (CIRCLE | {"center": 3.0}, "center must be x and y in CRS metres; got 3.0"),
         (CIRCLE | {"radius": -1}, "radius must be positive"),
+        (CIRCLE | {"radius": math.nan}, "radius must be positive and finite; got nan"),
+        (CIRCLE | {"radius": "5"}, "radius must be positive and finite; got '5'"),
+        (CIRCLE | {"strength": math.nan}, r"strength must be in \(0, 1\]; got nan"),
+        (CIRCLE | {"strength": "1"}, r"strength must be in \(0, 1\]; got '1'"),
         (CIRCLE | {"strength": 0}, r"strength must be in \(0, 1\]"),
         (CIRCLE | {"first_mission": 3, "last_mission": 2}, "must be a whole number from 3 on"),
     ],
@@ -157,9 +170,29 @@ def test_impossible_threats_are_refused(arguments, message):
         Threat(**{"kind": "jam"} | arguments)
 
 
+def test_threats_that_act_nowhere_or_are_no_list_are_refused(flat):
+    grid = flat.grid
+    (left, bottom), right = grid.corner, grid.left + 3 * grid.cell_width
+    off = Threat("jam", (right + 50.0, grid.top), 20.0)
+    bounds = rf"x from {left:.7g} to {right:.7g} and y from {bottom:.7g} to {grid.top:.7g}"
+    with pytest.raises(TrustboError, match=rf"Threat\(kind='jam', .*no pixel .*{bounds}; give CRS"):
+        KinematicSimulator(flat, threats=[off])
+    lonlat = [(15.0, 50.0), (15.1, 50.0), (15.1, 50.1)]
+    with pytest.raises(TrustboError, match=r"Threat\(kind='forbid', .* has no pixel"):
+        KinematicSimulator(flat, threats=[Threat("forbid", polygon=lonlat, first_mission=9)])
+    for threats in (Threat("jam", grid.center((1, 1)), 20.0), ["jam"], None):
+        with pytest.raises(
+            TrustboError, match=r"threats must be a list, \[Threat\(\.\.\.\)\]; got"
+        ):
+            KinematicSimulator(flat, threats=threats)
+
+
 def test_impossible_degradations_are_refused(flat):
-    with pytest.raises(TrustboError, match=r"detection must be in \[0, 1\]; got 2"):
-        Degradation("r1", 2)
+    for value in (2, math.nan, "0.5"):
+        with pytest.raises(TrustboError, match=rf"detection must be in \[0, 1\]; got {value!r}"):
+            Degradation("r1", value)
+    with pytest.raises(TrustboError, match=r"degradations must be a list, .*; got Degradation\("):
+        KinematicSimulator(flat, degradations=Degradation("r1", 0.5))
     with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of r1, r2, r3"):
         KinematicSimulator(flat, degradations=[Degradation("r9", 0.5)])
 

@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -242,6 +243,15 @@ def test_executors_that_cannot_be_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("name", "package"), [("loky", "loky"), ("dask", "distributed")])
+def test_an_executor_that_is_not_installed_names_its_extra(name, package, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    message = rf"executor '{name}' needs {package}: pip install \"trustbo\[study\]\", or take"
+    with pytest.raises(tb.TrustboError, match=message):
+        run(tmp_path, name)
+    assert not list(tmp_path.iterdir())
+
+
 # --- resuming, and failing ---
 
 
@@ -473,9 +483,10 @@ n_iterations: 2
 """
 
 
-def test_the_command_runs_a_study_and_shows_its_regret(serial, tmp_path):
+def test_the_command_runs_a_study_and_shows_its_regret(serial, tmp_path, monkeypatch):
     (tmp_path / "config.yaml").write_text(YAML)
-    arguments = ["study", str(tmp_path / "config.yaml"), "--executor", "serial"]
+    monkeypatch.setitem(sys.modules, "loky", None)  # serial, as it is not there
+    arguments = ["study", str(tmp_path / "config.yaml")]
     done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "out")])
     assert done.exit_code == 0, done.output
     assert "median regret after each mission" in done.output

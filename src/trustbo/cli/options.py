@@ -60,7 +60,7 @@ Options
   export.resolution M: Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side
     where cells are not square.
   executor NAME: Executor of the runs: serial, loky, dask, or a scheduler's address,
-    tcp://host:8786.
+    tcp://host:8786; by default loky, or serial without the extra study.
   workers N: Number of processes of loky or dask; by default one for each core.
 Arguments
   folder FOLDER: Folder of the campaign's results.

@@ -1,5 +1,6 @@
 """`trustbo study`: many campaigns, on all cores."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import typer
@@ -11,7 +12,7 @@ from trustbo.cli.outputs import use_no_screen, write_figure
 def study(
     config: Path,
     out: Path = Path("out/study"),
-    executor: str = "loky",
+    executor: str | None = None,
     workers: int | None = None,
     quiet: bool = False,
     debug: bool = False,
@@ -32,6 +33,8 @@ def study(
 
         for name in ("summary.csv", "regret.png"):
             require_file(out / name)
+        if executor is None:
+            executor = "loky" if find_spec("loky") else "serial"
         results = run_study(config, out, executor, n_workers=workers, progress=not quiet)
         known = bool(results["regret"].notnull().any())
         table = summary(results, variable="regret" if known else "value")

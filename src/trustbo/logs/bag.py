@@ -6,21 +6,23 @@ times of publication are tabulated in docs/howto/your-own-robots.md, and can be 
 All times are those of recording, whole nanoseconds. A bound lasts from its marker to its status,
 else to the last contact message before the next marker; a message at the time of the next marker
 belongs to the bound before. The contact rate is the share of a robot's ticks with contact, n_ticks
-their number. If robots have unequal numbers, `Bound.contact` has the ticks of the one with most.
-Poses and states are the last ones at each tick, x and y as recorded: in CRS metres if their frame
-is; headings have no jumps. Awareness that was not published is NaN, which `Campaign.tell` takes
-from the map.
+their number; a contact of NaN was not measured, and is no tick. If robots have unequal numbers,
+`Bound.contact` has the ticks of the one with most. Poses and states are the last ones at each tick,
+x and y as recorded: in CRS metres if their frame is; headings have no jumps. Awareness that was not
+published is NaN, which `Campaign.tell` takes from the map.
 """
 
 import json
 import re
+import time
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from trustbo.data import FEATURES, Mission, default_features
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.files import FilePath
 from trustbo.logs.bagfile import STORAGES, Record, opened, require_new_bag, write_messages
 from trustbo.logs.messages import (
@@ -107,10 +109,12 @@ def write_bag(
     version: int | None = None,
     storage: str = "sqlite3",
     topics: Topics | None = None,
+    start: datetime | float | None = None,
 ) -> None:
     """Write missions as a ROS bag that `read_bag` reads back, on the same topics.
 
-    Times are kept to the nanosecond, headings up to whole turns.
+    Times are kept to the nanosecond, headings up to whole turns. Each mission begins 1 s after the
+    end of the one before.
 
     Args:
         missions: Missions with the same robots and features, and with a contact of every tick.
@@ -118,28 +122,39 @@ def write_bag(
         version: Version of ROS, 1 or 2; by default that of the path.
         storage: Storage of ROS 2, "sqlite3" or "mcap".
         topics: Names of topics, if not the default ones.
+        start: Time of the first message, a datetime or POSIX seconds; by default the present.
 
     Raises:
         ShapeError: No missions, or missions that disagree on robots or features.
         TrustboError: No rosbags; a path that exists, or is of the other version; missions whose
-            ticks do not hold all they measured; names that ROS does not take.
+            ticks do not hold all they measured; names or a start that ROS does not take.
     """
     require_same_team(missions)
     require_choice("storage", storage, STORAGES)
     target, names = Path(path), Topics() if topics is None else topics
+    begin = time.time_ns() if start is None else _ns(start)
     of_path = require_new_bag(target, version)
     _require_names(missions[0], names.lead)
     for j, mission in enumerate(missions):
         _require_ticks(f"mission {j}", mission)
 
     def records(messages: Messages) -> Iterator[Record]:
-        start = _NS  # not 0, which means "unknown" in ROS
+        now = begin
         for j, mission in enumerate(missions):
-            own = sorted(_records(j, mission, start, names, messages), key=lambda r: r.time)
+            own = sorted(_records(j, mission, now, names, messages), key=lambda r: r.time)
             yield from own
-            start = own[-1].time + _NS
+            now = own[-1].time + _NS
 
     write_messages(target, of_path, storage, records)
+
+
+def _ns(start: datetime | float) -> int:
+    """Time in ns; ROS has seconds from 1970 (0 means "unknown") to 2038."""
+    seconds = start.timestamp() if isinstance(start, datetime) else start
+    if require_positive("start", seconds) >= 2.0**31:
+        raise TrustboError(f"start must be before 2038, as times of ROS are; got {start!r}.")
+    whole, part = divmod(seconds, 1.0)  # apart, as a float holds 1e18 ns to 128 ns only
+    return int(whole) * _NS + round(part * _NS)
 
 
 def _require_names(mission: Mission, lead: str) -> None:

@@ -211,7 +211,7 @@ def _as_array(values: Sequence[Any], types: tuple[str, ...]) -> np.ndarray:
     if types is POSE_TYPES:
         return np.array(values, dtype=float).reshape(-1, 3)
     if types is CONTACT_TYPES:
-        return np.array(values, dtype=bool)
+        return np.array(values, dtype=float)
     return np.fromiter(values, dtype=object, count=len(values))
 
 

@@ -154,6 +154,17 @@ def read_marker(message: Any) -> dict[str, Any]:
         ) from None
 
 
+def read_contact(message: Any) -> float:
+    """Contact in [0, 1], NaN if it was not measured; TrustboError for other numbers."""
+    value = float(message.data)
+    if not (0.0 <= value <= 1.0 or math.isnan(value)):
+        raise TrustboError(
+            f"contact {value:g} is outside [0, 1]; publish a Bool, divide percentages by 100, and "
+            "write NaN for a look that failed."
+        )
+    return value
+
+
 def read_numbers(message: Any) -> tuple[tuple[str, ...], np.ndarray]:
     """Read the names, if any, and values of a vector; TrustboError if their numbers differ."""
     values = np.asarray(message.data, dtype=float)
@@ -180,7 +191,7 @@ def stamp_of(message: Any) -> int:
 READERS: dict[tuple[str, ...], Callable[[Any], Any]] = {
     MARKER_TYPES: read_marker,
     STATUS_TYPES: lambda message: str(message.data),
-    CONTACT_TYPES: lambda message: bool(message.data > 0.5),
+    CONTACT_TYPES: read_contact,
     AWARENESS_TYPES: read_numbers,
     POSE_TYPES: read_pose,
 }

@@ -47,7 +47,7 @@ class Recording:
     Attributes:
         markers: Starts of bounds.
         status: Statuses of bounds; the last of a mission is the mission's.
-        contact: Contact of each robot at its ticks.
+        contact: Contact of each robot at its ticks, if above 0.5; NaN where it was not measured.
         awareness: Awareness of each robot, shape (record, feature); the last of a bound counts.
         poses: Poses of the lead, then of each robot: x, y and heading, shape (record, 3). Empty if
             not recorded.
@@ -119,6 +119,10 @@ class Recording:
         contacts = [series.between(marker.time, end) for series in self.contact]
         if not len(said.time):
             end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=marker.time)
+        looks = [~np.isnan(c.value) for c in contacts]  # a failed look is no tick
+        contacts = [
+            Series(c.time[own], c.value[own] > 0.5) for c, own in zip(contacts, looks, strict=True)
+        ]
         n_ticks = np.array([len(c.time) for c in contacts])
         ticks = contacts[int(np.argmax(n_ticks))].time
         measured = [series.between(marker.time, until).value for series in self.awareness]

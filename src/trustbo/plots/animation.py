@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -24,6 +24,8 @@ SEEN, UNSEEN = "#009e73", "#d55e00"
 """Bluish green and vermilion of Okabe and Ito (2008); lines out of sight are also dashed."""
 SUFFIXES = (".gif", ".mp4")
 _SECONDS = 12.0  # default length of an animation
+_EVEN = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
+"""Even numbers of pixels, and a pixel format that every player supports."""
 _STEADY = 21  # number of ticks over which the position of the camera is averaged
 _GROWN = 0.5  # least height of vegetation above the ground, m
 _DASHED, _DOTTED = (0, (3, 2)), (0, (1, 2))
@@ -65,7 +67,7 @@ def animate_mission(
         dpi: Resolution of the file, dots per inch.
 
     Returns:
-        Animation. If it was written to a file, its figure is closed.
+        Animation, with `save(path)`. If it was written to a file, its figure is closed.
 
     Raises:
         TrustboError: The mission has no poses, the suffix is another, a number is not positive, or
@@ -76,20 +78,35 @@ def animate_mission(
         require_choice("suffix", target.suffix.lower(), SUFFIXES)
     require_positive("fps", fps)
     require_positive("dpi", dpi)
-    ffmpeg = _ffmpeg() if target is not None and target.suffix.lower() == ".mp4" else ""
+    if target is not None and target.suffix.lower() == ".mp4":
+        _ffmpeg()
     film = _film(mission, workspace)
     span = float(film.time[-1] - film.time[0])
     rate = max(1.0, span / _SECONDS) if speedup is None else require_positive("speedup", speedup)
     shown = np.arange(film.time[0], film.time[-1] + rate / fps, rate / fps)
     ticks = np.minimum(np.searchsorted(film.time, shown), len(film.time) - 1)
     figure, draw = _stage(mission, workspace, film)
-    animation = FuncAnimation(figure, draw, frames=ticks.tolist(), interval=1000.0 / fps)
+    animation = _Animation(figure, draw, frames=ticks.tolist(), interval=1000.0 / fps)
     if target is not None:
         try:
-            _save(animation, target, ffmpeg, fps, dpi)
+            animation.save(target, fps=fps, dpi=dpi)
         finally:
             plt.close(figure)
     return animation
+
+
+class _Animation(FuncAnimation):
+    """Animation that is saved as .gif or .mp4 by the writers at hand."""
+
+    def save(self, filename: FilePath, writer: Any = None, fps: Any = None, **options: Any) -> None:
+        """Write a file; TrustboError: another suffix, or no ffmpeg for an .mp4."""
+        path, fps = Path(filename), fps or 1000.0 / self._interval
+        if writer is None:
+            suffix = require_choice("suffix", path.suffix.lower(), SUFFIXES)
+            writer = PillowWriter(fps) if suffix == ".gif" else FFMpegWriter(fps, extra_args=_EVEN)
+        known = {"animation.ffmpeg_path": _ffmpeg()} if isinstance(writer, FFMpegWriter) else {}
+        with mpl.rc_context(known):
+            write_file(path, lambda file: FuncAnimation.save(self, file, writer, **options))
 
 
 def _film(mission: Mission, workspace: Workspace) -> Film:
@@ -220,17 +237,6 @@ def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
     cells = np.array([workspace.grid.center(cell) for cell in mission.path])
     ax.plot(*(cells - workspace.grid.corner).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
-
-
-def _save(animation: FuncAnimation, path: Path, ffmpeg: str, fps: int, dpi: int) -> None:
-    if path.suffix.lower() == ".gif":
-        write_file(path, lambda file: animation.save(file, PillowWriter(fps=fps), dpi=dpi))
-        return
-    with mpl.rc_context({"animation.ffmpeg_path": ffmpeg}):
-        # Even numbers of pixels, and a pixel format that every player supports.
-        even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
-        film = FFMpegWriter(fps=fps, extra_args=even)
-        write_file(path, lambda file: animation.save(file, film, dpi=dpi))
 
 
 def _ffmpeg() -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from rasterio.features import geometry_mask
@@ -42,13 +43,18 @@ class Threat:
     def __post_init__(self) -> None:
         require_choice("threat", self.kind, KINDS)
         require_missions(self.first_mission, self.last_mission)
-        if (self.polygon is None) == (self.center is None or self.radius is None):
+        given = [value is not None for value in (self.center, self.radius, self.polygon)]
+        if given not in ([True, True, False], [False, False, True]):
             raise TrustboError("a threat is either a circle, center and radius, or a polygon.")
-        if self.polygon is not None and len(self.polygon) < 3:
-            raise TrustboError(f"a polygon needs three corners; got {self.polygon}.")
-        if self.radius is not None:
+        if self.polygon is None:
             require_positive("radius", self.radius)
-        if not 0.0 < self.strength <= 1.0:
+            if not _are_positions(self.center, 1):
+                raise TrustboError(f"center must be x and y in CRS metres; got {self.center!r}.")
+        elif not _are_positions(self.polygon, 2) or len(self.polygon) < 3:
+            raise TrustboError(
+                f"a polygon needs three corners (x, y) in CRS metres; got {self.polygon!r}."
+            )
+        if not isinstance(self.strength, Real) or not 0.0 < self.strength <= 1.0:
             raise TrustboError(f"strength must be in (0, 1]; got {self.strength!r}.")
 
     def mask(self, surface: Surface) -> np.ndarray:
@@ -92,7 +98,7 @@ class Degradation:
 
     def __post_init__(self) -> None:
         require_missions(self.first_mission, self.last_mission)
-        if not 0.0 <= self.detection <= 1.0:
+        if not isinstance(self.detection, Real) or not 0.0 <= self.detection <= 1.0:
             raise TrustboError(f"detection must be in [0, 1]; got {self.detection!r}.")
 
 
@@ -100,6 +106,22 @@ def acts_in(event: Threat | Degradation, mission: int) -> bool:
     """Whether it acts in a mission."""
     last = event.last_mission
     return event.first_mission <= mission and (last is None or mission <= last)
+
+
+def require_events(what: str, events: object, kind: type) -> None:
+    """Check that `events` is a list of one kind of event: TrustboError if not."""
+    if not isinstance(events, Sequence) or not all(isinstance(event, kind) for event in events):
+        raise TrustboError(f"{what} must be a list, [{kind.__name__}(...)]; got {events!r}.")
+
+
+def _are_positions(value: object, ndim: int) -> bool:
+    """Whether it is one position (x, y), or with 2 dimensions many."""
+    try:
+        xy = np.asarray(value)
+    except ValueError:  # unequal numbers of coordinates
+        return False
+    right = xy.ndim == ndim and xy.shape[-1] == 2 and xy.dtype.kind in "iuf"
+    return right and bool(np.isfinite(xy).all())
 
 
 def require_missions(first: int, last: int | None) -> None:

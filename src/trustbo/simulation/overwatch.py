@@ -69,7 +69,7 @@ class KinematicSimulator:
 
         Raises:
             TrustboError: A workspace without terrain, an unknown sight mode, bounding or robot, a
-                value that is not positive.
+                value that is not positive, a threat off the terrain.
         """
         if not isinstance(sight, str | Sight):
             raise TrustboError(f"sight must be a mode's name or a Sight; got {sight!r}.")

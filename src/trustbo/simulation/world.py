@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.simulation.events import Degradation, Threat, acts_in
+from trustbo.simulation.events import Degradation, Threat, acts_in, require_events
 from trustbo.workspace import Workspace
 from trustbo.workspace.positions import Positions, surface_of
 from trustbo.workspace.routes import Routes
@@ -38,8 +38,11 @@ class Worlds:
     ) -> None:
         """Prepare a terrain; see `KinematicSimulator` for the arguments.
 
-        TrustboError: a workspace without a terrain in memory, or a robot not in the team.
+        TrustboError: a workspace without a terrain in memory, a threat off it, or a robot not in
+        the team.
         """
+        require_events("threats", threats, Threat)
+        require_events("degradations", degradations, Degradation)
         if workspace.terrain is None or workspace.pixels is None:
             raise TrustboError(
                 "the kinematic simulator needs a terrain in memory; make the workspace with "
@@ -52,6 +55,14 @@ class Worlds:
         self._workspace, self._sight, self._radius = workspace, sight, formation_radius
         self._traversability = workspace.pixels["traversability"]
         self._threats, self._degradations = tuple(threats), tuple(degradations)
+        for threat in threats:
+            if not threat.mask(self.surface).any():
+                left, bottom, right, top = workspace.terrain.rio.bounds(recalc=True)
+                raise TrustboError(
+                    f"{threat} has no pixel of the terrain, which is x from {left:.9g} to "
+                    f"{right:.9g} and y from {bottom:.9g} to {top:.9g}; give CRS metres, and a "
+                    "region of a pixel at least."
+                )
         self._known: dict[object, World] = {}
         self._grounds: dict[object, tuple[Surface, Positions, Routes]] = {}
 

@@ -1,5 +1,6 @@
 """Executors of runs: this process, processes of this machine, or a Dask cluster."""
 
+import importlib.util
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
@@ -14,7 +15,6 @@ from trustbo.study.run import Run, execute
 EXECUTORS = ("serial", "loky", "dask")
 _N_POOLS = 3
 """Pools in a row in which no run ends, before a study gives up."""
-_MISSING = '{0!r} is not installed; pip install "trustbo[study]".'
 
 
 def completed(
@@ -81,12 +81,18 @@ def _through(
 
 
 def require_executor(executor: object) -> None:
-    """Refuse an executor that cannot run a study, unknown or one that forks: TrustboError."""
+    """Refuse an executor that cannot run a study: unknown, not installed, or one that forks."""
     if executor is None or hasattr(executor, "get_executor"):
         return
     if isinstance(executor, str):
         if "://" not in executor:
             require_choice('executor (or give an address, "tcp://...")', executor, EXECUTORS)
+        package = executor if executor in ("serial", "loky") else "distributed"
+        if package != "serial" and importlib.util.find_spec(package) is None:
+            raise TrustboError(
+                f'executor {executor!r} needs {package}: pip install "trustbo[study]", or take '
+                '"serial".'
+            )
     elif isinstance(executor, ProcessPoolExecutor):
         context: Any = getattr(executor, "_mp_context", None)
         if context is not None and context.get_start_method() == "fork":
@@ -116,10 +122,8 @@ def _pool(executor: Any, n_workers: int) -> Iterator[Executor]:
 
 
 def _loky(n_workers: int) -> Iterator[Executor]:
-    try:
-        from loky import ProcessPoolExecutor as LokyExecutor
-    except ModuleNotFoundError:
-        raise TrustboError(_MISSING.format("loky")) from None
+    from loky import ProcessPoolExecutor as LokyExecutor
+
     pool = LokyExecutor(n_workers)
     try:
         yield pool
@@ -130,11 +134,9 @@ def _loky(n_workers: int) -> Iterator[Executor]:
 
 
 def _dask(address: str, n_workers: int) -> Iterator[Executor]:
-    try:
-        from dask.config import set as configured
-        from distributed import Client, LocalCluster
-    except ModuleNotFoundError:
-        raise TrustboError(_MISSING.format("distributed")) from None
+    from dask.config import set as configured
+    from distributed import Client, LocalCluster
+
     if address != "dask":
         with Client(address) as client:
             yield _of_client(client)
