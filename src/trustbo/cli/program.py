@@ -6,12 +6,10 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from trustbo.cli.demo import demo
+from trustbo.cli.campaigns import demo, resume, run
 from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.options import with_flags
 from trustbo.cli.results import export, report
-from trustbo.cli.resume import resume
-from trustbo.cli.run import run
 from trustbo.cli.study import study
 
 EPILOG = """

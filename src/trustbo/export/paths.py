@@ -29,16 +29,15 @@ def path_frame(
 ) -> gpd.GeoDataFrame:
     """Return a path as points, one per cell.
 
+    Columns are `bound` (0 for the start), `row`, `col`, `x` and `y` (centre of the cell, metres in
+    the CRS of the grid); for each robot the expected trust after the bound, `trust_<robot>`, and
+    its 5 % and 95 % quantiles over the posterior, `trust_<robot>_low` and `_high`, NaN for bound 0;
+    `geometry` in `crs`.
+
     Args:
         plan: Plan, or result whose recommended path is meant.
         workspace: Workspace of the plan; by default that of the result.
         crs: CRS of the geometry, anything that pyproj accepts; None for that of the grid, if any.
-
-    Returns:
-        Columns `bound` (0 for the start), `row`, `col`, `x` and `y` (centre of the cell, metres in
-        the CRS of the grid); for each robot the expected trust after the bound, `trust_<robot>`,
-        and its 5 % and 95 % quantiles over the posterior, `trust_<robot>_low` and `_high`, NaN for
-        bound 0; `geometry` in `crs`.
 
     Raises:
         ShapeError: The plan and the workspace differ in their numbers of robots.

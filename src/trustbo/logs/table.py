@@ -81,12 +81,8 @@ def read_table(
 def write_table(missions: Sequence[Mission], path: FilePath) -> None:
     """Write missions, without their ticks, as a CSV file that `read_table` reads back.
 
-    Args:
-        missions: Missions with the same robots and features.
-        path: File; written whole or not at all.
-
-    Raises:
-        ShapeError: No missions, or missions that disagree on robots or features.
+    The file is written whole or not at all. ShapeError: no missions, or missions that disagree on
+    robots or features.
     """
     require_same_team(missions)
     features = [column_of(name) for name in missions[0].features]

@@ -194,18 +194,12 @@ class TrustModel(ABC):
     def log_likelihood(
         self, params: Params, missions: Sequence[Mission], *, seed: int = 0
     ) -> np.ndarray:
-        """Log p(contact rates | parameters), latent trust integrated out.
+        """Log p(contact rates | parameters), latent trust integrated out; nats, (..., mission).
 
-        Exact for Gaussian observations, else importance sampling over 32 antithetic trajectories.
-        A density of rates; for censored ones with mass at 0 and 1, for counts a probability.
-
-        Args:
-            params: Parameters with leading axes (...,).
-            missions: Missions; a contact rate that is NaN was not measured.
-            seed: Seed of the importance sampling.
-
-        Returns:
-            Nats, shape (..., mission).
+        Exact for Gaussian observations, else importance sampling over 32 antithetic trajectories by
+        `seed`. A density of rates; for censored ones with mass at 0 and 1, for counts a
+        probability. Parameters have leading axes (...,); a contact rate that is NaN was not
+        measured.
 
         Raises:
             ShapeError: The parameters are for another number of features or robots.
@@ -229,7 +223,7 @@ class TrustModel(ABC):
         awareness: ArrayLike,
         n_ticks: ArrayLike | None = None,
     ) -> TrustSample:
-        """Missions drawn from the model for given parameters.
+        """Missions drawn from the model for given parameters, one draw.
 
         Args:
             key: Random key.
@@ -239,8 +233,8 @@ class TrustModel(ABC):
                 beta-binomial family needs them.
 
         Raises:
-            ShapeError: Awareness has other axes, or the parameters have leading axes or are for
-                another number of features or robots.
+            ShapeError: Awareness has other axes; parameters with leading axes, or of other robots
+                or features.
             TrustboError: A covariance is not positive definite, or n_ticks is missing.
         """
         z = np.asarray(awareness, dtype=float)
@@ -265,14 +259,9 @@ class TrustModel(ABC):
     ) -> Statistics:
         """Sufficient statistics with more missions, for `sample_statistics`.
 
-        Args:
-            statistics: Statistics of earlier missions; None for none.
-            missions: New missions.
-            forgetting: Weight of the earlier missions, in (0, 1].
-
-        Raises:
-            ShapeError: The number of robots or features changed.
-            TrustboError: The model has no such statistics, or the weight is outside (0, 1].
+        Those of earlier missions, None for none, have the weight `forgetting`, in (0, 1].
+        ShapeError: the number of robots or features changed. TrustboError: the model has no such
+        statistics, or the weight is outside (0, 1].
         """
         self.require_exact()
         require_forgetting(forgetting)

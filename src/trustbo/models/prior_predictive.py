@@ -27,15 +27,14 @@ def prior_predictive(
     n_draws: int = 500,
     seed: int = 0,
 ) -> xr.DataTree:
-    """Draw parameters and contact rates from the priors alone.
+    """Draw parameters and contact rates from the priors alone; one seed gives the same draws.
 
     Args:
         model: Trust model.
         awareness: Shape (mission, bound, robot, feature).
-        n_ticks: Ticks, broadcast to (mission, bound, robot); the beta-binomial family needs
-            them.
+        n_ticks: Ticks, broadcast to (mission, bound, robot); the beta-binomial family needs them.
         n_draws: Number of draws.
-        seed: Seed; the same seed gives the same draws.
+        seed: Seed of the draws.
 
     Returns:
         ArviZ DataTree with the groups `prior` and `prior_predictive` (contact_rate[chain, draw,

@@ -31,20 +31,12 @@ class Dynamics(NamedTuple):
         """True if the state is a single number, trust of the team."""
         return self.views.shape == (1, 1)
 
-    def draw(self, index: int) -> "Dynamics":
-        """Select one draw, without its leading axis."""
-        return self.take(index)
-
     def take(self, which: int | slice | np.ndarray) -> "Dynamics":
-        """Select some of the draws."""
+        """Select some of the draws; one, by its index, without its leading axis."""
         return Dynamics(self.transition[which], self.drift[which], self.start[which], self.views)
 
-    def stacked(self) -> "Dynamics":
-        """Add a leading axis (draw,) of length 1."""
-        return Dynamics(self.transition[None], self.drift[None], self.start[None], self.views)
-
     def flat(self) -> "Dynamics":
-        """Reshape to exactly one leading axis (draw,)."""
+        """Reshape to exactly one leading axis (draw,), of length 1 if there is none."""
 
         def one(value: np.ndarray, core: int) -> np.ndarray:
             return value.reshape(-1, *value.shape[value.ndim - core :])

@@ -32,17 +32,10 @@ SIMPLE = ("shortest", "shortest+1", "shortest+2")
 class AdmissiblePaths:
     """Start, goal and the admissible paths between them, with the tables that engines need.
 
-    Attributes:
-        start: First cell.
-        goal: Last cell; a path ends on entering it.
-        shortest: Fewest bounds from start to goal.
-        longest: Largest number of bounds of an admissible path.
-        max_bounds: Limit on the number of bounds, as `Planner` takes it.
-        u_turns: True if a bound may lead back to the cell that the last one left.
-        revisit: True if a path may enter a cell twice.
-        connectivity: 4 or 8.
-        steps: Moves to neighbouring cells, shape (move, 2).
-        lengths: Length of each move in metres, shape (move,).
+    A path ends on entering the goal, and has `shortest` to `longest` bounds; `max_bounds` is the
+    limit as `Planner` takes it. With `u_turns` a bound may lead back to the cell that the last one
+    left, with `revisit` a path may enter a cell twice. `steps` are the moves to neighbouring cells,
+    shape (move, 2), `lengths` theirs in metres, shape (move,).
     """
 
     def __init__(

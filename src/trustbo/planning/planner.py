@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import require_choice
+from trustbo.errors import ShapeError, require_choice
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
@@ -161,7 +161,11 @@ class Planner:
             TrustboError: beta0 is outside the range the objective is exact for.
         """
         started = time.perf_counter()
-        search.require_one_draw(params)
+        if params.leading:
+            raise ShapeError(
+                f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
+                "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
+            )
         path, gap, engine = search.find_path(self.problem, self.dynamics(params, x0), self._engine)
         plan = evaluate(self.problem, path, params, x0)
         return replace(
@@ -227,8 +231,8 @@ class Planner:
 
         Args:
             path: Cells from start to goal, each a neighbour of the last.
-            params: One draw of parameters, or many, or a posterior: then `trust` and `value` are
-                those of mean trust over draws, and `bands` its quantiles.
+            params: Draws of parameters, one or many, or a posterior; of many, `trust` and `value`
+                are those of mean trust, and `bands` its quantiles.
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
@@ -244,21 +248,18 @@ class Planner:
     def trust_map(
         self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
-        """Compute the largest expected trust with which each cell can be reached.
+        """Compute the largest expected trust with which each cell can be reached; NaN if none can.
 
         Over the paths to each cell with the fewest possible bounds, or, unless `max_bounds` is
         "shortest", up to two more without U-turns: with the default `max_bounds`, the value of the
         goal is the terminal trust of the `terminal` plan. Longer walks, which an int admits, are
-        excluded, for they loiter to gather trust.
+        excluded, for they loiter to gather trust. Shape (row, col), with `per_robot` (robot, row,
+        col), with a leading (draw,) for draws.
 
         Args:
             params: Parameters of any model; a map for every draw if they have draws.
             per_robot: True for one map per robot instead of the team's.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
-
-        Returns:
-            DataArray (row, col), or (robot, row, col), with a leading (draw,) for draws; NaN where
-            no robot can go.
         """
         return trust_map(self.problem, draws_of(params), per_robot=per_robot, x0=x0)
 

@@ -16,10 +16,9 @@ from trustbo.planning.values import path_value
 
 @dataclass(frozen=True, eq=False)
 class DrawnPaths:
-    """Best path under each of some draws.
+    """Best path under each of some draws of a planning problem.
 
     Attributes:
-        problem: Planning problem that the paths solve.
         dynamics: Recursion of expected trust with leading axis (draw,).
         paths: Flat indices of cells, shape (draw, length), filled with -1.
         gap: Optimality gap of each path, shape (draw,); 0 where exact.

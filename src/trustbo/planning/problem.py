@@ -21,17 +21,12 @@ from trustbo.workspace import Workspace
 class PlanningProblem:
     """Workspace, admissible paths, objective and awareness: the data of a `Planner`.
 
-    Attributes:
-        paths: Start, goal and the admissible paths between them.
-        objective: Objective and length weight.
-        team: `"mean"` or `"min"`: trust of the team as the mean or the least of its robots'.
-        awareness: Shape (robot, row, col, feature); or with a leading axis (draw,), where it is
-            uncertain.
-        mean_awareness: Mean over draws, shape (robot, row, col, feature).
+    Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. Awareness has shape
+    (robot, row, col, feature), with a leading axis (draw,) where it is uncertain, and a mean over
+    these.
 
-    Raises:
-        TrustboError: Unknown team or objective; a length weight that is negative, or for success
-            or bottleneck.
+    TrustboError: unknown team or objective; a length weight that is negative, or for success or
+    bottleneck.
     """
 
     paths: AdmissiblePaths

@@ -6,8 +6,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.models.params import Params
+from trustbo.errors import TrustboError, require_choice
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.compiled import expected_path, plan_compiled
 from trustbo.planning.engines.reference import plan_networkx
@@ -55,7 +54,7 @@ def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> F
     name = engine.choose(paths.passable.size, 1, labels=_has_labels(problem))
     if name == "networkx":
         return FoundPath(plan_networkx(paths, dynamics, objective, engine.backend), 0.0, name)
-    best = plan_compiled(paths, dynamics.stacked(), objective)
+    best = plan_compiled(paths, dynamics.flat(), objective)
     return FoundPath(paths.cells(best.paths[0]), float(best.gap[0]), name)
 
 
@@ -73,7 +72,7 @@ def find_paths(
     if engine.choose(paths.passable.size, n_draws, labels=_has_labels(problem)) == "numba":
         return plan_compiled(paths, dynamics, objective)
     found = [
-        plan_networkx(paths, dynamics.draw(d), objective, engine.backend) for d in range(n_draws)
+        plan_networkx(paths, dynamics.take(d), objective, engine.backend) for d in range(n_draws)
     ]
     padded = np.full((n_draws, max(map(len, found))), -1)
     for flat, path in zip(padded, found, strict=True):
@@ -93,15 +92,6 @@ def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, .
             f"team's mean trust; got {objective.name!r} with team={problem.team!r}."
         )
     return paths.cells(expected_path(paths, dynamics, objective))
-
-
-def require_one_draw(params: Params) -> None:
-    """Refuse parameters with leading axes: ShapeError."""
-    if params.leading:
-        raise ShapeError(
-            f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
-            "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
-        )
 
 
 def require_valid(dynamics: Dynamics, objective: str) -> None:

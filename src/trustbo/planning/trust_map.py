@@ -87,5 +87,5 @@ def _trust_at(
     )
     paths = plan_compiled(there, dynamics, Objective("terminal")).paths
     return np.array(
-        [trust_along(dynamics.draw(d), there.cells(path))[-1] for d, path in enumerate(paths)]
+        [trust_along(dynamics.take(d), there.cells(path))[-1] for d, path in enumerate(paths)]
     )

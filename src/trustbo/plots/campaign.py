@@ -27,16 +27,14 @@ def parameter_history(
     """Draw the posterior of each parameter after each mission, and the prior.
 
     Thin bars hold 90 % of the draws, thick ones 50 %, dots are medians. Panels are scaled to the
-    posteriors; a wide prior, in grey, may extend beyond them.
+    posteriors; a wide prior, in grey, may extend beyond them. Returns Axes (parameter,), titled by
+    labels such as "beta[visibility]".
 
     Args:
         posteriors: Posterior after each mission, such as `Result.posteriors`.
         names: Parameters to draw, such as `["beta0", "beta"]`; by default all.
         truth: True values by label, such as `{"beta[visibility]": 0.4}`, where they are known.
         n_columns: Panels per row; by default three.
-
-    Returns:
-        Axes, shape (parameter,), titled by labels such as "beta[visibility]".
 
     Raises:
         TrustboError: There are no posteriors, a parameter or label is unknown, or there are too

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import ShapeError, TrustboError
@@ -99,11 +98,23 @@ def _panels(
     named: tuple[str, str],
     n_columns: int | None,
 ) -> np.ndarray:
+    what, centre = named
     figure, axes, panels = small_multiples(
         len(robots), n_columns, _SIZE, margin=0.3, sharex=True, sharey=True
     )
     for i, (ax, name) in enumerate(zip(panels, robots, strict=True)):
-        _draw(ax, bounds, middle[:, i], bands[:, :, i], rates[:, i], named)
+        x, m, (low, lower, upper, high) = bounds, middle[:, i], bands[:, :, i]
+        if len(x) == 1:  # a band of one bound would not be seen
+            x = np.array([x[0] - 0.3, x[0] + 0.3])
+            m, low, lower, upper, high = (np.repeat(v, 2) for v in (m, low, lower, upper, high))
+        ax.fill_between(x, low, high, color=OUTER, linewidth=0.0, label=f"90 % of {what}")
+        ax.fill_between(x, lower, upper, color=INNER, linewidth=0.0, label=f"50 % of {what}")
+        ax.plot(x, m, color=LINE, linewidth=1.2, label=f"{centre} of {what}")
+        label = "contact rate measured" if np.isfinite(rates[:, i]).any() else "_"
+        (dots,) = ax.plot(bounds, rates[:, i], "o", color="black", markersize=3.8, label=label)
+        dots.set(markeredgecolor="white", markeredgewidth=0.5)
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        plain(ax)
         ax.set_title(as_text(name), fontsize=9)
     for ax in lowest(axes):
         ax.set_xlabel("bound", fontsize=8)
@@ -113,36 +124,3 @@ def _panels(
     keys = panels[0].get_legend_handles_labels()
     figure.legend(*keys, loc="outside upper center", ncols=2, fontsize=7, frameon=False)
     return panels
-
-
-def _draw(
-    ax: Axes,
-    bounds: np.ndarray,
-    middle: np.ndarray,
-    bands: np.ndarray,
-    rates: np.ndarray,
-    named: tuple[str, str],
-) -> None:
-    what, centre = named
-    x, (low, lower, upper, high) = bounds, bands
-    if len(bounds) == 1:  # a band of one bound would not be seen
-        x = np.array([bounds[0] - 0.3, bounds[0] + 0.3])
-        middle, low, lower, upper, high = (
-            np.repeat(values, 2) for values in (middle, low, lower, upper, high)
-        )
-    ax.fill_between(x, low, high, color=OUTER, linewidth=0.0, label=f"90 % of {what}")
-    ax.fill_between(x, lower, upper, color=INNER, linewidth=0.0, label=f"50 % of {what}")
-    ax.plot(x, middle, color=LINE, linewidth=1.2, label=f"{centre} of {what}")
-    ax.plot(
-        bounds,
-        rates,
-        linestyle="none",
-        marker="o",
-        markersize=3.8,
-        color="black",
-        markeredgecolor="white",
-        markeredgewidth=0.5,
-        label="contact rate measured" if np.isfinite(rates).any() else "_",
-    )
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    plain(ax)

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
@@ -10,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.plots.layout import DASHES, MARKERS
+from trustbo.plots.layout import DASHES, MARKERS, small_multiples
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Quantiles over the runs: ends of the thin bars, of the thick bars, and the marker."""
@@ -61,14 +60,8 @@ def regret_curves(
     names = list(dict.fromkeys(dataset[by].values.tolist()))
     values = [None] if panels is None else list(dict.fromkeys(dataset[panels].values.tolist()))
     width = min(1.0 + 0.16 * len(names) * regret.sizes["mission"], 7.5)
-    axes = plt.subplots(
-        1,
-        len(values),
-        figsize=(2.2 + max(width, 2.5) * len(values), 3.6),
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )[1][0]
+    size, n = (max(width, 2.5), 3.6), len(values)
+    figure, _, axes = small_multiples(n, n, size, margin=2.2, sharey=True)
     for ax, value in zip(axes, values, strict=True):
         chosen = regret if value is None else regret[dataset[panels].values == value]
         _draw(ax, chosen, names, by)
@@ -80,7 +73,7 @@ def regret_curves(
     axes[0].set_ylabel(f"{_MEANING[variable]},\n{what}")
     axes[0].set_ylim(bottom=-0.03 * axes[0].get_ylim()[1])  # shows markers at 0 whole
     # Beside the panels, so that it covers no curve.
-    axes[-1].figure.legend(
+    figure.legend(
         *axes[0].get_legend_handles_labels(),
         title=f"{by}: median,\n50 % and 90 % of runs",
         loc="outside right upper",
@@ -104,18 +97,9 @@ def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str) -> N
         place, own_style = mission[known] + dodge[i], {"color": shades[i], "zorder": 3}
         ax.vlines(place, ends[0], ends[4], linewidth=0.9, **own_style)
         ax.vlines(place, ends[1], ends[3], linewidth=3.2, **own_style)
-        ax.plot(
-            place,
-            ends[2],
-            linestyle=DASHES[i % len(DASHES)],
-            linewidth=1.1,
-            marker=MARKERS[i % len(MARKERS)],
-            markersize=6.0,
-            markeredgecolor="white",
-            markeredgewidth=0.6,
-            label=str(name),
-            **own_style,
-        )
+        (curve,) = ax.plot(place, ends[2], linewidth=1.1, label=str(name), **own_style)
+        curve.set(linestyle=DASHES[i % len(DASHES)], marker=MARKERS[i % len(MARKERS)])
+        curve.set(markersize=6.0, markeredgecolor="white", markeredgewidth=0.6)
     for k in mission[::2]:
         ax.axvspan(k - 0.5, k + 0.5, color="0.955", linewidth=0.0, zorder=0)
     ax.set_xlim(mission[0] - 0.5, mission[-1] + 0.5)

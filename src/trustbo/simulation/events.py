@@ -84,8 +84,7 @@ class Degradation:
     Attributes:
         robot: Name of the robot.
         detection: Factor on the probability of detection, in [0, 1].
-        first_mission: First mission with the worse lidar; missions count from 0.
-        last_mission: Last mission with it; None: no last.
+        first_mission, last_mission: Missions with the worse lidar, see `Threat`.
 
     Raises:
         TrustboError: A value out of range.

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -71,7 +70,7 @@ class Measure:
     def states(self, poses: np.ndarray) -> np.ndarray:
         """Values of `STATES` of each robot at each tick, shape (tick, robot, state)."""
         motion = _motion(self._surface, self._workspace.team.robots, poses, self._tick)
-        seen = self._lidar.at(self._surface.nearest(poses[..., 0], poses[..., 1]))
+        seen = self._lidar[self._surface.nearest(poses[..., 0], poses[..., 1])]
         return np.concatenate([motion, seen], axis=-1)
 
     def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
@@ -89,50 +88,31 @@ class Measure:
         }
 
     @cached_property
-    def _lidar(self) -> "_LidarMaps":
-        return _LidarMaps.of(self._workspace, self._surface, self._sight)
+    def _lidar(self) -> np.ndarray:
+        return _lidar_maps(self._workspace, self._surface, self._sight)
 
 
-class _LidarMaps(NamedTuple):
-    """Mean range of a lidar's returns from each pixel, and share of clear beams."""
+def _lidar_maps(workspace: Workspace, surface: Surface, sight: Sight) -> np.ndarray:
+    """Mean range of a lidar's returns, m, and share of clear beams, by pixel: (row, col, 2).
 
-    return_range: np.ndarray  # (row, col), m
-    visible_share: np.ndarray  # (row, col)
-
-    @classmethod
-    def of(cls, workspace: Workspace, surface: Surface, sight: Sight) -> Self:
-        """Compute the maps of a team's lidar, by rays all around.
-
-        The mean range of returns is the integral over range of the share of beams that reach it.
-        Beams are blocked by what blocks sight: for "wall", a canopy opaque from the ground up.
-        """
-        terrain, team = workspace.terrain, workspace.team
-        assert terrain is not None  # noqa: S101  # `Worlds` has refused others
-        sides = [
-            n * step for n, step in zip(surface.ground.shape, pixel_size(terrain), strict=True)
-        ]
-        reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
-        eye, target = team.robots[0].sensor_height, team.lead.target_height
-        canopy = {"bare": (0.0, sight.crown_base), "wall": (_OPAQUE, 0.0)}
-        extinction, crown_base = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
-        shares = [np.ones(surface.ground.shape)]
-        for part in _PARTS:
-            share = openness(
-                terrain,
-                part * reach,
-                eye=eye,
-                target=target,
-                n_rays=_N_RAYS,
-                extinction=extinction,
-                crown_base=crown_base,
-            )
-            shares.append(np.nan_to_num(share.values))
-        return_range = np.asarray(reach * np.trapezoid(shares, [0.0, *_PARTS], axis=0))
-        return cls(return_range, shares[-1])
-
-    def at(self, pixels: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """Values of both maps at pixels (row, col), along a new last axis."""
-        return np.stack([self.return_range[pixels], self.visible_share[pixels]], axis=-1)
+    By rays all around. The mean range of returns is the integral over range of the share of beams
+    that reach it. Beams are blocked by what blocks sight: for "wall", a canopy opaque from the
+    ground up.
+    """
+    terrain, team = workspace.terrain, workspace.team
+    assert terrain is not None  # noqa: S101  # `Worlds` has refused others
+    sides = [n * step for n, step in zip(surface.ground.shape, pixel_size(terrain), strict=True)]
+    reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
+    heights = {"eye": team.robots[0].sensor_height, "target": team.lead.target_height}
+    canopy = {"bare": (0.0, sight.crown_base), "wall": (_OPAQUE, 0.0)}
+    extinction, crown_base = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
+    options = {"n_rays": _N_RAYS, "extinction": extinction, "crown_base": crown_base}
+    shares = [np.ones(surface.ground.shape)]
+    for part in _PARTS:
+        share = openness(terrain, part * reach, **heights, **options)
+        shares.append(np.nan_to_num(share.values))
+    return_range = reach * np.trapezoid(shares, [0.0, *_PARTS], axis=0)
+    return np.stack([return_range, shares[-1]], axis=-1)
 
 
 def _motion(

@@ -119,13 +119,9 @@ class KinematicSimulator:
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
         """Run a path from start to goal, or until it fails.
 
-        Args:
-            path: Cells, each a neighbour of the last.
-            seed: Seed of slip and detections; same seed, same mission, on any machine.
-            mission: Number of the mission, from 0, which threats and degradations go by.
-
-        Raises:
-            TrustboError: A cell that is off the grid or impassable, or fewer than two cells.
+        The seed is that of slip and detections: same seed, same mission, on any machine. Threats
+        and degradations go by the number of the mission, from 0. TrustboError: a cell that is off
+        the grid or impassable, or fewer than two cells.
         """
         return self.run_batch(path, [seed], mission=mission)[0]
 

@@ -4,7 +4,6 @@ At each tick, one look goes from each robot that stands to each that moves.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -15,40 +14,24 @@ from trustbo.simulation.world import World
 from trustbo.workspace.sight import Sight, detection_probability, optics
 
 
-class Looks(NamedTuple):
-    """Looks between the lead and each robot of T2, from the one that stands to the other."""
-
-    sensor: np.ndarray  # (tick * robot, 2), CRS metres
-    target: np.ndarray  # likewise
-    optics: np.ndarray  # (tick * robot, 4), see `sight.optics`
-    t2_looks: np.ndarray  # (tick, 1), else the lead does
-
-    @classmethod
-    def of(cls, team: Team, drives: Sequence[Drive]) -> Self:
-        """Concatenate the looks of several bounds."""
-        poses = np.concatenate([drive.poses[..., :2] for drive in drives])
-        t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]
-        lead = np.repeat(poses[:, :1], len(team.robots), axis=1)
-        by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
-        by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
-        return cls(
-            np.where(t2_looks[..., None], poses[:, 1:], lead).reshape(-1, 2),
-            np.where(t2_looks[..., None], lead, poses[:, 1:]).reshape(-1, 2),
-            np.where(t2_looks[..., None], by_t2, by_lead).reshape(-1, 4),
-            t2_looks,
-        )
-
-
 def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) -> list[np.ndarray]:
     """Probability that a look detects its target, shape (tick, robot) for each bound."""
-    looks, surface = Looks.of(team, drives), world.surface
-    found = detection_probability(surface, sight, looks.sensor, looks.target, looks.optics)
+    poses = np.concatenate([drive.poses[..., :2] for drive in drives])
+    t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
+    lead, t2 = np.repeat(poses[:, :1], len(team.robots), axis=1), poses[:, 1:]
+    by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
+    by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
+    sensor, target, of_look = (
+        np.where(t2_looks[..., None], a, b).reshape(-1, a.shape[-1])  # (tick * robot, ...)
+        for a, b in ((t2, lead), (lead, t2), (by_t2, by_lead))
+    )
+    found = detection_probability(world.surface, sight, sensor, target, of_look)
     for mask, strength in world.jams:
-        inside = mask[surface.nearest(looks.sensor[:, 0], looks.sensor[:, 1])]
-        inside |= mask[surface.nearest(looks.target[:, 0], looks.target[:, 1])]
+        inside = mask[world.surface.nearest(sensor[:, 0], sensor[:, 1])]
+        inside |= mask[world.surface.nearest(target[:, 0], target[:, 1])]
         found[inside] *= 1.0 - strength
     found = found.reshape(-1, len(team.robots))
-    found *= np.where(looks.t2_looks, world.detection, team.lead.detection)
+    found *= np.where(t2_looks, world.detection, team.lead.detection)
     return np.split(found, np.cumsum([len(drive.poses) for drive in drives])[:-1])
 
 

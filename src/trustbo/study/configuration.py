@@ -12,10 +12,8 @@ from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import FilePath, read_yaml
 from trustbo.models.samplers.run import SAMPLERS, require_sampler
 from trustbo.planning import OBJECTIVES, POLICIES
-from trustbo.study.models import MODELS
-from trustbo.study.parts import parts_of
+from trustbo.study.parts import MODELS, SIMULATORS, parts_of
 from trustbo.study.run import Run
-from trustbo.study.simulators import SIMULATORS
 from trustbo.study.terrains import TERRAINS
 
 OPTIONS = (

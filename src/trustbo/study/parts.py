@@ -1,4 +1,4 @@
-"""Parts of a study: terrains, simulators and models, each as plain settings."""
+"""Parts of a study as plain settings: their base, trust models and simulators."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -6,7 +6,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from trustbo import models, simulation
 from trustbo.errors import TrustboError, require_choice
+from trustbo.workspace import Workspace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,3 +82,101 @@ def _frozen(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         value = value.tolist()
     return tuple(_frozen(v) for v in value) if isinstance(value, list | tuple) else value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model(Part):
+    """Trust model with its default priors, or those of `"zheng2023"`."""
+
+    observation: str = "gaussian"
+    response: str = "level"
+    priors: str = "default"
+    make: ClassVar[type[models.TrustModel]]
+
+    def __post_init__(self) -> None:
+        require_choice("priors", self.priors, ("default", "zheng2023"))
+        self.model()
+
+    def model(self) -> models.TrustModel:
+        """Make the model."""
+        own = asdict(self)
+        vague = own.pop("priors") == "zheng2023"
+        return self.make(models.Priors.zheng2023() if vague else None, **own)  # pyright: ignore
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pooled(Model):
+    """Settings of `models.PooledTrust`."""
+
+    kind, make = "pooled", models.PooledTrust
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hierarchical(Model):
+    """Settings of `models.HierarchicalTrust`."""
+
+    kind, make = "hierarchical", models.HierarchicalTrust
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coupled(Model):
+    """Settings of `models.CoupledTrust`."""
+
+    kind, make = "coupled", models.CoupledTrust
+    inter_robot: str = "full"
+
+
+MODELS = (Pooled, Hierarchical, Coupled)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulating(Part):
+    """Simulator that runs the paths."""
+
+    def simulator(self, workspace: Workspace) -> simulation.Simulator:
+        """Make the simulator."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kinematic(Simulating):
+    """Settings of `simulation.KinematicSimulator`, which needs a terrain."""
+
+    kind = "kinematic"
+    sight: str = "transmittance"
+    tick: float = 0.5
+    formation_radius: float = 8.0
+    bound_timeout: float = 600.0
+    bounding: str = "successive"
+
+    def simulator(self, workspace: Workspace) -> simulation.Simulator:
+        """Make the simulator."""
+        return simulation.KinematicSimulator(workspace, **asdict(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FromModel(Simulating):
+    """Settings of `simulation.ModelSimulator`: the pooled model with these true parameters."""
+
+    kind = "model"
+    REQUIRED = ("beta0", "beta", "b", "delta_w", "delta_v")
+    beta0: float
+    beta: tuple[float, ...]
+    b: float
+    delta_w: float
+    delta_v: float
+    x0_mean: float = 0.5
+    x0_sd: float = 0.5
+    observation: str = "gaussian"
+    n_ticks: int | None = None
+
+    def simulator(self, workspace: Workspace) -> simulation.Simulator:
+        """Make the simulator."""
+        own = asdict(self)
+        n_ticks = own.pop("n_ticks")
+        model = models.PooledTrust(observation=own.pop("observation"))
+        truth = models.TrustParams(**own | {"beta": np.array(self.beta, dtype=float)})
+        return simulation.ModelSimulator(workspace, truth, model, n_ticks=n_ticks)
+
+
+SIMULATORS = (Kinematic, FromModel)

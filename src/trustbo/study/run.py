@@ -25,8 +25,7 @@ from trustbo.errors import TrustboError
 from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator, Simulator
 from trustbo.study import workers
-from trustbo.study.models import Model
-from trustbo.study.simulators import Simulating
+from trustbo.study.parts import Model, Simulating
 from trustbo.study.terrains import Terrain
 
 

@@ -27,49 +27,27 @@ REACH = 50.0
 """Length of the rays of openness, m."""
 
 
-@register_feature("slope", sign=-1, kernel=stencil.slope)
-def slope(terrain: xr.Dataset) -> xr.DataArray:
-    """Slope of the ground, rad, by Horn's (1981) 3 x 3 stencil."""
-    return _stencil(terrain, stencil.slope, "slope", "rad")
+def _of_window(kernel: Callable, sign: int, units: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    """Register the attribute of the 3 x 3 window of a kernel, with its name and docstring."""
+    name = kernel.__name__
+
+    def feature(terrain: xr.Dataset) -> xr.DataArray:
+        values = values_of_kernel(terrain, kernel, slice(None), np.empty)
+        return _named(terrain["dem"].copy(deep=False, data=values), name, units)
+
+    feature.__name__ = feature.__qualname__ = name
+    feature.__doc__ = kernel.__doc__
+    return register_feature(name, sign=sign, kernel=kernel)(feature)
 
 
-@register_feature("aspect", sign=1, kernel=stencil.aspect)
-def aspect(terrain: xr.Dataset) -> xr.DataArray:
-    """Direction of the steepest descent, rad clockwise from grid north; NaN where flat.
-
-    An angle: take a function of it, such as its cosine, for a composite.
-    """
-    return _stencil(terrain, stencil.aspect, "aspect", "rad")
-
-
-@register_feature("curvature", sign=1, kernel=stencil.curvature)
-def curvature(terrain: xr.Dataset) -> xr.DataArray:
-    """Minus the Laplacian of the ground, 1/m: positive on ridges, negative in hollows."""
-    return _stencil(terrain, stencil.curvature, "curvature", "1/m")
-
-
-@register_feature("roughness", sign=-1, kernel=stencil.roughness)
-def roughness(terrain: xr.Dataset) -> xr.DataArray:
-    """Highest minus lowest ground in the 3 x 3 window, m (GDAL's roughness)."""
-    return _stencil(terrain, stencil.roughness, "roughness", "m")
-
-
-@register_feature("tri", sign=-1, kernel=stencil.tri)
-def tri(terrain: xr.Dataset) -> xr.DataArray:
-    """Terrain ruggedness index, m: root sum of squared steps to the 8 neighbours (Riley 1999)."""
-    return _stencil(terrain, stencil.tri, "tri", "m")
-
-
-@register_feature("tpi", sign=1, kernel=stencil.tpi)
-def tpi(terrain: xr.Dataset) -> xr.DataArray:
-    """Topographic position index, m: height above the mean of the 8 neighbours."""
-    return _stencil(terrain, stencil.tpi, "tpi", "m")
-
-
-@register_feature("step_height", sign=-1, kernel=stencil.step_height)
-def step_height(terrain: xr.Dataset) -> xr.DataArray:
-    """Largest step up or down to one of the 8 neighbours, m."""
-    return _stencil(terrain, stencil.step_height, "step_height", "m")
+# Beyond the raster's edge the ground is level.
+slope = _of_window(stencil.slope, -1, "rad")
+aspect = _of_window(stencil.aspect, 1, "rad")
+curvature = _of_window(stencil.curvature, 1, "1/m")
+roughness = _of_window(stencil.roughness, -1, "m")
+tri = _of_window(stencil.tri, -1, "m")
+tpi = _of_window(stencil.tpi, 1, "m")
+step_height = _of_window(stencil.step_height, -1, "m")
 
 
 @register_feature("canopy_height", sign=-1)
@@ -170,7 +148,7 @@ def exposure(
     crown_base: float = 0.3,
     rows: slice | None = None,
 ) -> xr.DataArray:
-    """Expected share of a set of observers, such as enemy posts, that see a pixel.
+    """Expected share of some observers, such as enemy posts, that see a pixel: (y, x), in [0, 1].
 
     Args:
         terrain: DEM and DSM.
@@ -181,9 +159,6 @@ def exposure(
         extinction: Extinction coefficient of the canopy, 1/m.
         crown_base: Lower edge of the canopy layer as a share of its height.
         rows: Rows of pixels to compute; the others are NaN.
-
-    Returns:
-        Dims (y, x), in [0, 1].
 
     Raises:
         ShapeError: Observers that are no list of positions.
@@ -255,12 +230,6 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
     out = np.empty((2, *dem.shape), dem.dtype)
     stencil.gradient(np.pad(dem, 1, mode="edge"), pixel, out)
     return out
-
-
-def _stencil(terrain: xr.Dataset, kernel: Callable, name: str, units: str) -> xr.DataArray:
-    """Attribute of the 3 x 3 window; beyond the raster's edge the ground is level."""
-    values = values_of_kernel(terrain, kernel, slice(None), np.empty)
-    return _named(terrain["dem"].copy(deep=False, data=values), name, units)
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:

@@ -55,20 +55,17 @@ class _Registrar(Protocol):
 def register_feature(
     name: str, *, sign: int, halo: float = 0.0, kernel: Callable | None = None
 ) -> _Registrar:
-    """Register a pixel feature under a name.
+    """Register a pixel feature under a new name, by a decorator.
+
+    It is for a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), m) that returns a
+    DataArray (y, x), NaN where unknown. TerrainError: the name is taken, or the sign neither 1 nor
+    -1.
 
     Args:
         name: New name.
         sign: +1 if the feature raises an index, -1 if it lowers it.
         halo: Radius of the surroundings that a pixel depends on, m, for computing in strips.
         kernel: See `PixelFeature`.
-
-    Returns:
-        Decorator for a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), m) that
-        returns a DataArray (y, x), NaN where unknown.
-
-    Raises:
-        TerrainError: The name is taken, or the sign neither 1 nor -1.
     """
     if name in FEATURES:
         raise TerrainError(f"there is a feature {name!r} already; take another name.")

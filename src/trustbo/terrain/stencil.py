@@ -33,7 +33,7 @@ def gradient(z, pixel, out):
 
 @_compiled
 def slope(z, pixel, out):
-    """Angle of the steepest ascent, rad."""
+    """Slope of the ground, rad, by Horn's (1981) 3 x 3 stencil."""
     one, kx, ky = _as(z, 1.0), _as(z, 0.125 / pixel[1]), _as(z, 0.125 / pixel[0])
     # Cephes' arctangent, without branches, error 2e-8 rad: `hypot` and `atan` do not vectorise,
     # and would take most of the time.
@@ -59,7 +59,10 @@ def slope(z, pixel, out):
 
 @_compiled
 def aspect(z, pixel, out):
-    """Direction of the steepest descent, rad clockwise from north in [0, 2 pi); NaN where flat."""
+    """Direction of the steepest descent, rad clockwise from grid north, [0, 2 pi); NaN where flat.
+
+    An angle: take a function of it, such as its cosine, for a composite.
+    """
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             x, y = _rises(z[i], z[i + 1], z[i + 2], j)
@@ -72,7 +75,7 @@ def aspect(z, pixel, out):
 
 @_compiled
 def curvature(z, pixel, out):
-    """Minus the Laplacian, 1/m: positive on ridges, negative in hollows."""
+    """Minus the Laplacian of the ground, 1/m: positive on ridges, negative in hollows."""
     kx, ky = _as(z, pixel[1] ** -2.0), _as(z, pixel[0] ** -2.0)
     for i in range(out.shape[0]):
         up, mid, down = z[i], z[i + 1], z[i + 2]
@@ -85,7 +88,7 @@ def curvature(z, pixel, out):
 
 @_compiled
 def tri(z, pixel, out):
-    """Root of the sum of squared steps to the 8 neighbours (Riley, DeGloria and Elliot 1999), m."""
+    """Terrain ruggedness index, m: root sum of squared steps to the 8 neighbours (Riley 1999)."""
     for i in range(out.shape[0]):
         up, mid, down = z[i], z[i + 1], z[i + 2]
         for j in range(out.shape[1]):
@@ -99,7 +102,7 @@ def tri(z, pixel, out):
 
 @_compiled
 def tpi(z, pixel, out):
-    """Height above the mean of the 8 neighbours, m (Wilson et al. 2007)."""
+    """Topographic position index, m: height above the mean of 8 neighbours (Wilson et al. 2007)."""
     eighth = _as(z, 0.125)
     for i in range(out.shape[0]):
         up, mid, down = z[i], z[i + 1], z[i + 2]
@@ -112,7 +115,7 @@ def tpi(z, pixel, out):
 
 @_compiled
 def roughness(z, pixel, out):
-    """Highest minus lowest of the window, m (Wilson et al. 2007)."""
+    """Highest minus lowest ground in the 3 x 3 window, m (GDAL's; Wilson et al. 2007)."""
     for i in range(out.shape[0]):
         up, mid, down = z[i], z[i + 1], z[i + 2]
         for j in range(out.shape[1]):

@@ -29,11 +29,8 @@ def synthetic_terrain(
         hurst: Hurst exponent of the relief in (0, 1]; higher is smoother.
         canopy_cover: Share of the area under vegetation.
         canopy_height: Mean height of the vegetation, m.
-        crs: Metric CRS written to the result; by default a UTM zone of northern Michigan, with the
-            terrain on the Keweenaw peninsula.
-
-    Returns:
-        Dataset as from `read_terrain`.
+        crs: Metric CRS written to the result, a Dataset as from `read_terrain`; by default a UTM
+            zone of northern Michigan, with the terrain on the Keweenaw peninsula.
 
     Raises:
         TerrainError: A size under 4 pixels, or a parameter out of its range.

@@ -33,16 +33,14 @@ MAX_MISSING = 0.5
 class Workspace:
     """Planning grid with the situational awareness of each robot in each cell.
 
-    Make it with `from_terrain` or `from_awareness`.
-
     Attributes:
         awareness: DataArray (robot, row, col, feature), in [0, 1]; NaN in cells without data.
         passable: DataArray (row, col), bool.
         grid: Positions of the cells.
         team: Lead and robots.
         terrain: DEM and DSM; None without a terrain.
-        pixels: Dataset (y, x) of traversability, visibility and passable per pixel; None without a
-            terrain in memory.
+        pixels: Dataset (y, x) of traversability, visibility and passable; None without a terrain in
+            memory.
         composites: Fitted composites by feature.
     """
 

@@ -97,7 +97,7 @@ def _labelled(
 
     def work(first: int, last: int) -> None:
         for d in range(first, last):
-            found[d] = _label_one(admissible, dynamics.draw(d), objective, length_cost)
+            found[d] = _label_one(admissible, dynamics.take(d), objective, length_cost)
 
     work(0, n_draws) if n_draws == 1 else over_rows(work, n_draws)
     paths = np.full((n_draws, max(len(path) for path, _ in found)), -1, np.int64)

@@ -39,7 +39,7 @@ def plan_networkx(
         return best_labelled(admissible, dynamics, objective.name)
     paths = []
     weights = additive_weights(
-        dynamics.stacked(), dynamics.views[0], objective.name, admissible.longest
+        dynamics.flat(), dynamics.views[0], objective.name, admissible.longest
     )
     gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, row, col)
     for n_bounds in range(admissible.shortest, admissible.longest + 1):

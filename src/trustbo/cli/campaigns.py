@@ -1,4 +1,4 @@
-"""`trustbo run`: a campaign on your own terrain."""
+"""`trustbo run`, `demo` and `resume`: campaigns on your own or a synthetic terrain."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +10,7 @@ from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
     from trustbo.data import Team
+    from trustbo.simulation import KinematicSimulator
 
 
 def run(
@@ -51,7 +52,7 @@ def run(
     is not replaced: give another --out, or --overwrite.
     """
     with one_line_errors(debug, campaign=out):
-        require_names(policy, objective, model, sampler, sight, iterations=iterations, seed=seed)
+        _require_names(policy, objective, model, sampler, sight, iterations=iterations, seed=seed)
         chosen = CampaignOptions(**options)
         require_outputs(out, overwrite=overwrite)
         trust_model = _models()[model](observation=observation).model()
@@ -84,7 +85,93 @@ def run(
         write_outputs(result, out, table=not quiet)
 
 
-def require_names(
+def demo(
+    policy: str = POLICY,
+    objective: str = "mean",
+    model: str = "pooled",
+    sampler: str = SAMPLER,
+    iterations: int = 8,
+    seed: int = 0,
+    config: Path | None = None,
+    out: Path = Path("out/demo"),
+    overwrite: bool = False,
+    quiet: bool = False,
+    debug: bool = False,
+) -> None:
+    """Run a campaign on a synthetic terrain of 500 m x 500 m, and write its DEM and DSM too.
+
+    Example: trustbo demo --sampler exact --iterations 4 --out out/demo
+
+    Then open out/demo/report.html. The objective here is the mean trust on the
+    way, which every bound changes; the paper's, which is the default of run, is
+    trust at the goal, which depends on the last few bounds.
+    """
+    from trustbo import terrain
+    from trustbo.files import write_file
+
+    with one_line_errors(debug, campaign=out):
+        _require_names(policy, objective, model, sampler, iterations=iterations, seed=seed)
+        require_outputs(out, "dem.tif", "dsm.tif", overwrite=overwrite)
+        ground = terrain.synthetic_terrain(seed=seed)
+        for name in ("dem", "dsm"):
+            raster = ground[name].astype("float32")
+            write_file(out / f"{name}.tif", raster.rio.to_raster)
+    run(
+        dem=out / "dem.tif",
+        dsm=out / "dsm.tif",
+        start="9,0",
+        goal="0,9",
+        policy=policy,
+        objective=objective,
+        model=model,
+        sampler=sampler,
+        iterations=iterations,
+        seed=seed,
+        out=out,
+        overwrite=overwrite,
+        quiet=quiet,
+        debug=debug,
+    )
+
+
+def resume(
+    folder: Path,
+    iterations: int | None = None,
+    stop_regret: float | None = None,
+    quiet: bool = False,
+    debug: bool = False,
+) -> None:
+    """Go on with a campaign that was interrupted, or with more missions.
+
+    Example: trustbo resume out/demo
+    More missions, 12 in all: trustbo resume out/demo --iterations 12
+
+    The result is the same as without the interruption. The folder keeps all flags.
+    A campaign that --stop-regret has ended goes on with more --iterations only.
+    """
+    with one_line_errors(debug, campaign=folder):
+        if iterations is not None:
+            require_whole("n_iterations", iterations, 1)
+        state = _state(folder)
+        require_outputs(folder, overwrite=True)
+        from trustbo.campaign.loop import resume as go_on
+        from trustbo.campaign.stopping import RegretBound
+
+        stop = None if stop_regret is None else RegretBound(eps=stop_regret)
+        total = iterations or state["notes"]["n_iterations"]
+        if state["n_missions"] >= total and not quiet:
+            print(f"all {state['n_missions']} missions are done; for more, give --iterations.")
+        result = go_on(
+            folder,
+            simulator=_simulator(folder, state["notes"]),
+            n_iterations=iterations,
+            stop=stop,
+            progress=not quiet,
+        )
+        write_outputs(result, folder, table=not quiet)
+
+
+def _require_names(
     policy: str,
     objective: str,
     model: str,
@@ -112,7 +199,7 @@ def require_names(
 
 
 def _models() -> dict[str, Any]:
-    from trustbo.study.models import MODELS
+    from trustbo.study.parts import MODELS
 
     return {model.kind: model for model in MODELS}
 
@@ -136,3 +223,35 @@ def _pair(what: str, text: str) -> tuple[int, int]:
     except ValueError:
         raise TrustboError(f"--{what} must be two whole numbers as 9,0; got {text!r}.") from None
     return first, second
+
+
+def _state(folder: Path) -> dict[str, Any]:
+    """Read the state of a campaign from its folder."""
+    if not (folder / "campaign.json").exists():
+        raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
+    from trustbo.campaign.damage import naming_what_is_left
+    from trustbo.campaign.folder import read_state
+
+    with naming_what_is_left(folder):
+        state = read_state(folder)
+    name = state["notes"].get("simulator")
+    if name != "KinematicSimulator":
+        raise TrustboError(
+            f"the campaign in {str(folder)!r} was run by {name or 'robots of your own'}, not by "
+            "trustbo run; go on with it in Python: trustbo.resume(folder, simulator=...)."
+        )
+    return state
+
+
+def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
+    """Make the simulator that the campaign was begun with."""
+    from trustbo.logs.netcdf import read_tree
+    from trustbo.simulation import KinematicSimulator
+    from trustbo.workspace import Sight
+    from trustbo.workspace import netcdf as archive
+
+    workspace = archive.workspace_from_tree(read_tree(folder / "workspace.nc"))
+    sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
+    return KinematicSimulator(
+        workspace, sight=sight, tick=notes["tick"], bounding=notes["bounding"]
+    )
