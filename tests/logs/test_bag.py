@@ -149,7 +149,7 @@ def test_other_programs_read_what_was_measured(name, tmp_path):
     from rosbags.highlevel import AnyReader
 
     one = mission()
-    write_bag([one], tmp_path / name)
+    write_bag([one], tmp_path / name, start=1.0)
     found = {}
     with AnyReader([tmp_path / name]) as reader:
         for connection, time, raw in reader.messages():

@@ -235,7 +235,7 @@ def test_states_see_as_far_as_the_simulator_s_sight(wooded, mode):
     there = here[:, None] + reach * np.stack([np.cos(angle), -np.sin(angle)], axis=1)
     ends = np.repeat(here, 12, axis=0), there.reshape(-1, 2)
     cast = detection_probability(surface, Sight(mode), *ends, np.array([1.0, 1.0, np.inf, 1.0]))
-    shares = lidar.visible_share[rows, cols]
+    shares = lidar[rows, cols, 1]
     if mode == "wall":  # which also tests the lines that a ray crosses the fewer of
         assert np.abs(shares - cast.reshape(-1, 12).mean(1)).mean() < 0.02
     else:

@@ -98,13 +98,15 @@ def animate_mission(
 class _Animation(FuncAnimation):
     """Animation that is saved as .gif or .mp4 by the writers at hand."""
 
-    def save(self, filename: FilePath, writer: Any = None, fps: Any = None, **options: Any) -> None:
+    def save(self, filename: FilePath, writer: Any = None, fps: Any = None, **options: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Write a file; TrustboError: another suffix, or no ffmpeg for an .mp4."""
-        path, fps = Path(filename), fps or 1000.0 / self._interval
+        path, fps = Path(filename), fps or 1000.0 / self._interval  # pyright: ignore[reportAttributeAccessIssue]
         if writer is None:
             suffix = require_choice("suffix", path.suffix.lower(), SUFFIXES)
             writer = PillowWriter(fps) if suffix == ".gif" else FFMpegWriter(fps, extra_args=_EVEN)
-        known = {"animation.ffmpeg_path": _ffmpeg()} if isinstance(writer, FFMpegWriter) else {}
+        known: dict[Any, Any] = {}
+        if isinstance(writer, FFMpegWriter):
+            known["animation.ffmpeg_path"] = _ffmpeg()
         with mpl.rc_context(known):
             write_file(path, lambda file: FuncAnimation.save(self, file, writer, **options))
 
