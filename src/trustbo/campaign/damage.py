@@ -35,10 +35,10 @@ def naming_what_is_left(folder: Path) -> Iterator[None]:
     try:
         yield
     except DamagedFileError as error:
-        measured = folder / MEASURED
-        if str(measured) in str(error) or not measured.exists():
-            raise
-        raise DamagedFileError(f"{error} {salvage(measured)}") from None
+        for name in (MEASURED, "missions.nc"):  # the latter with awareness filled in
+            if str(folder / name) not in str(error) and (folder / name).exists():
+                raise DamagedFileError(f"{error} {salvage(folder / name)}") from None
+        raise
 
 
 def salvage(measured: Path) -> str:

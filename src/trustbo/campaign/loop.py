@@ -243,9 +243,9 @@ _RENAMED = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulato
 def _require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Refuse to go on with another simulator than the one begun with."""
     for name in now.keys() - {"n_iterations", "stop"}:
-        if name not in before:  # version 0.1 did not record it
+        if name not in before and "stop" not in before:  # version 0.1 did not record it
             continue
-        old = _RENAMED.get(str(before[name]), before[name])
+        old = _RENAMED.get(str(before.get(name)), before.get(name))
         if isinstance(old, int) and isinstance(now[name], list):  # only counted in version 0.1
             now = now | {name: len(now[name])}
         if to_json(old) != to_json(now[name]):  # as text: NaN equals itself

@@ -39,7 +39,8 @@ def require_mission(
     for what, found in (("robot", mission.robots), ("feature", mission.features)):
         if sorted(found) != sorted(names[what]):
             raise ShapeError(
-                f"the mission has {what}s {found}, the workspace {tuple(names[what])}."
+                f"the mission has {what}s {found}, the workspace {tuple(names[what])}; give "
+                f"{what}s= the workspace's names, or use the workspace of this team."
             )
     _require_path(mission, list(path), workspace.grid.shape, other_path)
     return mission.in_order(names["robot"], names["feature"])
