@@ -90,7 +90,7 @@ def draw(seed):
         terrain = tb.terrain.synthetic_terrain(size, resolution=2.0, seed=seed, relief=5.0)
         workspace = tb.Workspace.from_terrain(terrain, (rows, cols), team)
         if rng.uniform() < 0.5:
-            x, y = rng.uniform(0.0, size[0]), rng.uniform(0.0, size[1])
+            x, y = (float(rng.choice(terrain[axis].values)) for axis in "xy")
             threats = [Threat(pick("jam", "forbid"), (x, y), 12.0, first_mission=1)]
         degradations = [Degradation("r1", 0.5, 1)] if rng.uniform() < 0.5 else []
         simulator = KinematicSimulator(workspace, threats=threats, degradations=degradations)

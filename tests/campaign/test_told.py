@@ -446,7 +446,7 @@ def test_settings_of_a_simulator_survive_a_file(workspace, tmp_path):
         {"formation_radius": 12.0},
         {"bound_timeout": 99.0},
         {"lost_contact_after": 40.0},
-        {"threats": [tb.simulation.Threat("jam", (30.0, 30.0), 12.0, strength=0.4)]},
+        {"threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.4)]},
         {"degradations": [tb.simulation.Degradation("r1", 0.4)]},
     ],
 )
@@ -454,7 +454,7 @@ def test_the_description_of_the_simulator_is_complete(changed):
     terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
     before = {
-        "threats": [tb.simulation.Threat("jam", (30.0, 30.0), 12.0, strength=0.5)],
+        "threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.5)],
         "degradations": [tb.simulation.Degradation("r1", 0.5)],
     }
     one = tb.simulation.KinematicSimulator(workspace, **before).describe()
