@@ -10,7 +10,7 @@ from trustbo.workspace.routes import Routes, _a_star
 from trustbo.workspace.sight import Surface
 
 
-def cheapest(pace, start, goal):
+def cheapest(pace, pixel, start, goal):
     """Cost of the cheapest way by networkx, with the same rule against cutting corners."""
     graph = nx.Graph()
     rows, cols = pace.shape
@@ -21,24 +21,25 @@ def cheapest(pace, start, goal):
                 if not (0 <= i < rows and 0 <= j < cols):
                     continue
                 if np.isfinite([pace[r, c], pace[i, j], pace[i, c], pace[r, j]]).all():
-                    length = np.hypot(dr, dc)
+                    length = np.hypot(dr * pixel[0], dc * pixel[1])
                     graph.add_edge((r, c), (i, j), weight=0.5 * (pace[r, c] + pace[i, j]) * length)
     return nx.dijkstra_path_length(graph, start, goal)
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_routes_cost_what_networkx_says_is_the_least(seed):
-    rng = np.random.default_rng(seed)
-    pace = rng.uniform(1.0, 8.0, (15, 20))
+    rng, pixel = np.random.default_rng(seed), (1.0, 1.7)
+    # On even ground every estimate of the way ahead is nearly reached: one too large misleads.
+    pace = rng.uniform(1.0, (1.3, 8.0)[seed % 2], (15, 20))
     pace[rng.uniform(size=pace.shape) < 0.25] = np.inf
     pace[0, 0] = pace[14, 19] = 1.0
-    cells = _a_star(pace, (1.0, 1.0), (0, 0), (14, 19))
+    cells = _a_star(pace, pixel, (0, 0), (14, 19))
     try:
-        expected = cheapest(pace, (0, 0), (14, 19))
+        expected = cheapest(pace, pixel, (0, 0), (14, 19))
     except (nx.NetworkXNoPath, nx.NodeNotFound):
         assert not len(cells)
         return
-    steps = np.hypot(*np.diff(cells, axis=0).T)
+    steps = np.hypot(*(np.diff(cells, axis=0) * pixel).T)
     paces = pace[cells[:, 0], cells[:, 1]]
     np.testing.assert_allclose((0.5 * (paces[1:] + paces[:-1]) * steps).sum(), expected)
 
