@@ -20,6 +20,7 @@ Terrain and grid
   shape ROWS,COLS: Planning grid.
   crs CRS: CRS of rasters that carry none, e.g. EPSG:32633.
   resolution M: Pixel size of rasters that carry none.
+  nodata VALUE: Stored height that means missing, where no tag declares it.
 Robots and sight
   robots N: Number of robots that overwatch the lead.
   max_slope DEG: Steepest slope that robots can drive.
