@@ -1,14 +1,21 @@
 """`trustbo report` and `export`, the help of all commands, and how fast it comes."""
 
 import importlib.util
+import os
 import re
 import subprocess
 import sys
 
 import pytest
+import typer
 
-from trustbo.cli import main
+from trustbo.cli import app, main
 from trustbo.export import FORMATS
+from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.samplers.run import SAMPLERS
+from trustbo.planning import OBJECTIVES, POLICIES
+from trustbo.study.models import MODELS
+from trustbo.workspace import SIGHT_MODES
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
 
@@ -66,7 +73,7 @@ def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished,
 @pytest.mark.parametrize(
     ("ask", "message"),
     [
-        (("gpx", "--resolution", 5), "resolution=5 is of maps for ROS; leave it out, or ask for"),
+        (("gpx", "--resolution", 5), "--resolution 5 is of maps for ROS; leave it out, or ask for"),
         (("ros_map", "--resolution", 0), "resolution must be positive and finite; got 0.0"),
     ],
 )
@@ -119,8 +126,11 @@ def test_help_of_export_names_every_format(invoke):
         (
             ["run", "--dem", "x.tif"],
             2,
-            "error: Missing option '--start'.\nhint: trustbo run --help ",
+            "error: missing options --start, --goal.\nhint: trustbo run --help ",
         ),
+        (["run"], 2, "error: missing options --dem, --start, --goal.\nhint: trustbo run "),
+        (["export"], 2, "error: missing arguments FOLDER, --format.\nhint: trustbo export "),
+        (["report"], 2, "error: missing argument FOLDER.\nhint: trustbo report --help "),
         (["run", "--robots", "two"], 2, "error: Invalid value for '--robots': "),
         (["fly"], 2, "error: No such command 'fly'.\nhint: trustbo --help "),
         (["report", "nowhere"], 2, "error: 'nowhere' holds no result;"),
@@ -135,6 +145,45 @@ def test_misuse_is_a_line_and_a_hint(words, code, said, capsys):
     error = capsys.readouterr().err
     assert error.startswith(said)
     assert len(error.splitlines()) <= 2
+
+
+def complete(line, **more):
+    """What bash would be given, by the protocol of its completion."""
+    words = {
+        "_TRUSTBO_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": line.count(" "),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "trustbo.cli"],
+        env=os.environ | {name: str(value) for name, value in (words | more).items()},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return done.stdout.split()
+
+
+def test_shells_complete_commands_flags_and_names():
+    assert complete("trustbo re") == ["resume", "report"]
+    assert complete("trustbo run --pol") == ["--policy"]
+    assert complete("trustbo run --policy ") == [*POLICIES]
+    assert complete("trustbo demo --policy e") == ["ei", "epsilon_greedy"]
+    script = complete("", _TRUSTBO_COMPLETE="source_bash")
+    assert "_TRUSTBO_COMPLETE=complete_bash" in script
+
+
+@pytest.mark.parametrize(
+    ("option", "names"),
+    [
+        ("policy", POLICIES), ("objective", OBJECTIVES), ("sampler", SAMPLERS),
+        ("model", [model.kind for model in MODELS]), ("observation", FAMILIES),
+        ("sight", SIGHT_MODES),
+    ],
+)  # fmt: skip
+def test_the_names_that_shells_complete_are_all_there_are(option, names):
+    options = typer.main.get_command(app).commands["run"].params
+    (flag,) = [each for each in options if each.name == option]
+    context = typer.Context(typer.main.get_command(app).commands["run"])
+    assert {item.value for item in flag.shell_complete(context, "")} == set(names)
 
 
 def test_help_imports_nothing_heavy():

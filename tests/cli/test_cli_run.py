@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 import rasterio
 import xarray as xr
+from rasterio.errors import NotGeoreferencedWarning
 
 
 def test_run_writes_every_file_and_says_where(finished):
@@ -132,15 +133,15 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
         (("--replan", "tick"), "unknown replan 'tick'; choose one of mission, bound"),
         (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
-        (("--stop-regret", "2"), "RegretBound.eps must be in (0, 1); got 2.0"),
+        (("--stop-regret", "2"), "--stop-regret must be in (0, 1); got 2.0"),
         (("--model", "hierarchical"), 'sampler "exact" needs Gaussian observations, and Pooled'),
-        (("--iterations", "0"), "n_iterations must be a whole number from 1 on; got 0"),
+        (("--iterations", "0"), "--iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),
         (("--seed", "-1"), "seed must be a whole number from 0 on; got -1"),
         (("--max-slope", "95"), "--max-slope must be between 0 and 90 degrees; got 95"),
         (("--max-slope", "0.1"), "no cell is passable"),
-        (("--robots", "0"), "n_robots must be a whole number from 1 on; got 0"),
-        (("--max-bounds", "1"), "max_bounds = 1 is below the fewest possible"),
+        (("--robots", "0"), "--robots must be a whole number from 1 on; got 0"),
+        (("--max-bounds", "1"), "--max-bounds = 1 is below the fewest possible"),
         (("--dsm", "absent.tif"), "dsm: there is no file 'absent.tif'"),
         (("--shape", "100,100"), "needs at least 2 x 2 pixels per cell"),
     ],
@@ -154,6 +155,30 @@ def test_bad_input_is_one_line_exit_2_and_nothing_written(
     assert done.stderr.startswith("error: ")
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
+    assert not out.exists()
+
+
+def test_errors_speak_of_the_flags_that_mend_them(invoke, flags, tmp_path):
+    """As typed, they do: each remedy is taken, and leads to the next error or to none."""
+    heights = np.random.default_rng(0).uniform(100.0, 101.0, (30, 30)).astype("float32")
+    heights[3, 4] = 12345.0
+    profile = {"height": 30, "width": 30, "count": 1, "dtype": "float32"}
+    with (
+        pytest.warns(NotGeoreferencedWarning),
+        rasterio.open(tmp_path / "bare.tif", "w", "GTiff", **profile) as sink,
+    ):
+        sink.write(heights, 1)
+    out = tmp_path / "never"
+    words = ["run", *flags[4:], "--dem", tmp_path / "bare.tif", "--out", out]
+    for remedy, said in (
+        ([], "pass both --crs and --resolution (metres).\n"),
+        (["--crs", "EPSG:32633", "--resolution", 1], "Pass --nodata 12345.0, or set the tag"),
+        (["--nodata", "12345.0", "--model", "hierarchical"], "Use --sampler nuts.\n"),
+    ):
+        words += remedy
+        done = invoke(*words)
+        assert done.exit_code == 2
+        assert said in done.stderr, done.stderr
     assert not out.exists()
 
 

@@ -74,7 +74,7 @@ def test_geojson_is_in_degrees_on_the_right_place(result, centers, tmp_path):
     back = Transformer.from_crs(4326, 32616, always_xy=True).transform(*np.transpose(positions))
     np.testing.assert_allclose(np.transpose(back), centers, atol=2e-3)  # 1e-8 degree is 1 mm
     facts = line["properties"]
-    assert (facts["name"], facts["bounds"]) == ("most trustworthy path", len(points) - 1)
+    assert (facts["name"], facts["n_bounds"]) == ("most trustworthy path", len(points) - 1)
     assert facts["value"] == pytest.approx(result.value)
     length = np.hypot(*np.diff(centers, axis=0).T).sum()
     assert facts["length_m"] == pytest.approx(length)
@@ -93,7 +93,9 @@ def test_gpx_is_a_route_over_the_ground(result, centers, tmp_path):
     assert gpx.version == "1.1"
     (route,), n = gpx.routes, len(centers)
     assert route.name == "most trustworthy path"
-    assert [point.name for point in route.points] == [str(k) for k in range(n)]
+    between = [f"bound {k}" for k in range(1, n - 1)]
+    assert between
+    assert [point.name for point in route.points] == ["start", *between, "goal"]
     lon, lat = TO_DEGREES.transform(*centers.T)
     np.testing.assert_allclose([p.longitude for p in route.points], lon, rtol=0.0, atol=1e-8)
     np.testing.assert_allclose([p.latitude for p in route.points], lat, rtol=0.0, atol=1e-8)
@@ -142,7 +144,7 @@ def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, cent
     ).fetchone()
     assert place["code"] == 32616
     np.testing.assert_array_equal(way.coords, centers)
-    assert line["bounds"] == len(centers) - 1
+    assert line["n_bounds"] == len(centers) - 1
     assert line["value"] == pytest.approx(result.value)
     points = base.execute("SELECT * FROM bounds ORDER BY bound").fetchall()
     base.close()

@@ -21,6 +21,7 @@ def run(
     shape: str = "10,10",
     crs: str | None = None,
     resolution: float | None = None,
+    nodata: float | None = None,
     robots: int = 3,
     max_slope: float = 45.0,
     lidar_range: float = 100.0,
@@ -65,7 +66,7 @@ def run(
         from trustbo.workspace import Workspace
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
-        ground = terrain.read_terrain(dem, dsm, crs=crs, resolution=resolution)
+        ground = terrain.read_terrain(dem, dsm, crs=crs, resolution=resolution, nodata=nodata)
         workspace = Workspace.from_terrain(ground, rows_cols, team)
         result = iterate(
             workspace,

@@ -1,9 +1,11 @@
 """Errors of commands: one line and an exit code, without a traceback."""
 
+import re
 import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
@@ -13,6 +15,9 @@ from trustbo.errors import PosteriorError, TrustboError
 
 FAILED, BAD_INPUT, REFUSED, INTERRUPTED = 1, 2, 3, 130
 """Exit codes; the epilog of the program explains them."""
+_CLICK = typer.Context.__mro__[1].__module__.rpartition(".")[0]  # wherever typer keeps it
+_ALIASES = {"n_iterations": "iterations", "n_robots": "robots", "RegretBound.eps": "stop_regret"}
+"""Names in Python whose flags are called otherwise."""
 
 
 @contextmanager
@@ -23,7 +28,7 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
     """
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
-        print(f"warning: {message}", file=sys.stderr)
+        print(f"warning: {in_flags(str(message))}", file=sys.stderr)
 
     with warnings.catch_warnings():
         warnings.showwarning = show
@@ -45,8 +50,24 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
 
 def fail(error: Exception, code: int, hint: str = "") -> NoReturn:
     """End a command with an error in one line, and maybe a hint in another."""
-    complain(str(error), hint)
+    complain(in_flags(str(error)), hint)
     raise typer.Exit(code)
+
+
+def in_flags(text: str) -> str:
+    """Write the names of Python's arguments as the flags of the command that runs.
+
+    `crs=` and, with its value, `nodata=-1.0`; names with underscores also alone.
+    """
+    context = import_module(f"{_CLICK}.globals").get_current_context(silent=True)
+    options = () if context is None else context.command.params
+    flags = {p.name: p.opts[-1] for p in options if p.param_type_name == "option"}
+    flags |= {name: flags[flag] for name, flag in _ALIASES.items() if flag in flags}
+    for name, flag in flags.items():
+        alone = r"|(?![\w=/'\"])" if {"_", "."} & set(name) else ""
+        word = rf"(?<![\w./'\"-]){re.escape(name)}(?:=(['\"]?)([\w.+:-]*\w)\1|=(?=\W|$){alone})"
+        text = re.sub(word, lambda m, to=flag: f"{to} {m[2]}" if m[2] else to, text)
+    return text
 
 
 def complain(error: str, hint: str = "") -> None:

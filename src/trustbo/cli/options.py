@@ -20,6 +20,7 @@ Terrain and grid
   shape ROWS,COLS: Planning grid.
   crs CRS: CRS of rasters that carry none, e.g. EPSG:32633.
   resolution M: Pixel size of rasters that carry none.
+  nodata VALUE: Stored height that means missing, where no tag declares it.
 Robots and sight
   robots N: Number of robots that overwatch the lead.
   max_slope DEG: Steepest slope that robots can drive.
@@ -32,8 +33,8 @@ Paths
 Learning
   policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb, ei,
     epsilon_greedy, cvar, random.
-  model NAME: Trust model: robots are alike (pooled), similar (hierarchical), or influence each
-    other (coupled).
+  model NAME: Trust model: pooled (robots are alike), hierarchical (similar), coupled (influence
+    each other).
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial.
   sampler NAME: Sampler of the posterior: nuts; exact (importance sampling, which need not compile;
     pooled only); joint (nuts, for other than gaussian).
@@ -91,8 +92,20 @@ def _flags() -> dict[str, Any]:
         if panel == "Arguments":
             flags[name] = typer.Argument(**about)
         else:
+            if metavar in ("NAME", "MODE"):
+                about["autocompletion"] = _beginning(text)
             flags[name] = typer.Option(*_NAMES.get(name, ()), rich_help_panel=panel, **about)
     return flags
+
+
+def _beginning(text: str) -> Callable[[str], list[str]]:
+    """Names in a list of the help, remarks in brackets apart, that begin with some letters."""
+    listed = re.split(r"[;,] ?", re.sub(r" \(.*?\)", "", text.partition(": ")[2].rstrip(".")))
+
+    def names(incomplete: str) -> list[str]:
+        return [name for name in listed if name.startswith(incomplete) and " " not in name]
+
+    return names
 
 
 _FLAGS = _flags()

@@ -22,7 +22,6 @@ _PANELS = (("Campaigns", (demo, run, resume)), ("Results", (report, export)), ("
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["--help", "-h"]},
@@ -67,6 +66,21 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        complain(str(error.format_message()), f"{name} --help lists commands and flags.")
+        said = _missing(error) or str(error.format_message())
+        complain(said, f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)
+
+
+def _missing(error: Any) -> str:
+    """Name all required options that are missing, not only the first, which the error names."""
+    if not hasattr(error, "param_type") or error.ctx is None:
+        return ""
+    given, defaults = error.ctx.params, error.ctx.default_map or {}
+    lacking = [
+        option.metavar if option.param_type_name == "argument" else option.opts[0]
+        for option in error.ctx.command.params
+        if option.required and given.get(option.name) is None and option.name not in defaults
+    ]
+    kind = "argument" if any(not name.startswith("-") for name in lacking) else "option"
+    return f"missing {kind}{'s' * (len(lacking) > 1)} {', '.join(lacking)}."

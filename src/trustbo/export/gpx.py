@@ -22,12 +22,13 @@ def gpx_route(frame: gpd.GeoDataFrame, workspace: Workspace, name: str) -> str:
     ).text = "expected trust in each robot after each bound, and its 90 % band"
     heights = _ground(frame, workspace)
     rows = frame.drop(columns="geometry").to_dict("records")
+    names = {0: "start", len(rows) - 1: "goal"}
     for row, place, height in zip(rows, frame.geometry, heights, strict=True):
         point = ET.SubElement(route, "rtept", lat=f"{place.y:.8f}", lon=f"{place.x:.8f}")
         # The order is that of the schema.
         if np.isfinite(height):
             ET.SubElement(point, "ele").text = f"{height:.2f}"
-        ET.SubElement(point, "name").text = str(row["bound"])
+        ET.SubElement(point, "name").text = names.get(row["bound"], f"bound {row['bound']}")
         said = "start" if row["bound"] == 0 else _trust(row, workspace.team.names)
         ET.SubElement(point, "desc").text = said
     ET.indent(root)

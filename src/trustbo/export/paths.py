@@ -62,9 +62,9 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
     ======== ========================================================================
     .geojson RFC 7946: a LineString from start to goal, then a Point per cell with
              its `bound`, `cell` and trust; longitude and latitude on WGS 84.
-    .gpx     GPX 1.1: a route; the name of each point is the bound, its description
-             the trust, its elevation that of the ground above the datum of the DEM,
-             in metres, if the workspace has a terrain.
+    .gpx     GPX 1.1: a route; its points are named start, bound 1, ..., goal; the
+             description is the trust, the elevation that of the ground above the
+             datum of the DEM, in metres, if the workspace has a terrain.
     .gpkg    GeoPackage: layers `path` (LineString) and `bounds` (points), in the
              terrain's CRS.
     .csv     The points as a table, with longitude and latitude if there is a CRS.
@@ -120,7 +120,7 @@ def _facts(plan: Plan) -> dict[str, object]:
     """Return the properties of the whole path."""
     return {
         "name": _NAME,
-        "bounds": len(plan.path) - 1,
+        "n_bounds": len(plan.path) - 1,
         "value": float(plan.value),
         "objective": plan.objective,
         "length_m": float(plan.length),

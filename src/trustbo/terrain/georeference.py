@@ -40,8 +40,7 @@ def _georeference(raster: Raster, crs: object, resolution: float | None) -> Rast
     """Put an image without a georeference at the origin, with the given pixel size."""
     if resolution is None or crs is None:
         raise TerrainError(
-            f"{raster.name} carries no georeference; pass both crs= and resolution= (metres), on "
-            "the command line --crs and --resolution."
+            f"{raster.name} carries no georeference; pass both crs= and resolution= (metres)."
         )
     known = _given_crs(raster.name, crs)
     if known.is_geographic:
@@ -56,8 +55,7 @@ def _georeference(raster: Raster, crs: object, resolution: float | None) -> Rast
 def _given_crs(name: str, crs: object) -> CRS:
     if crs is None:
         raise TerrainError(
-            f"{name} has no coordinate reference system; pass crs=, e.g. "
-            '"EPSG:32633" (--crs on the command line).'
+            f"{name} has no coordinate reference system; pass crs=, e.g. EPSG:32633."
         )
     return known_crs(crs)
 
