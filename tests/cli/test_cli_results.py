@@ -14,7 +14,7 @@ from trustbo.export import FORMATS
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.samplers.run import SAMPLERS
 from trustbo.planning import OBJECTIVES, POLICIES
-from trustbo.study.models import MODELS
+from trustbo.study.parts import MODELS
 from trustbo.workspace import SIGHT_MODES
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
