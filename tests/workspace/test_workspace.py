@@ -125,7 +125,7 @@ def test_a_workspace_of_arrays():
     workspace = Workspace.from_awareness(awareness, cell_size=20.0)
     assert not workspace.passable[1, 2]
     assert int(workspace.passable.sum()) == 11
-    assert list(workspace.awareness["feature"].values) == ["traversability", "visibility", "z3"]
+    assert workspace.features == ("traversability", "visibility", "z3")
     assert workspace.grid.center((2, 0)) == (10.0, 10.0)
 
 
