@@ -5,9 +5,10 @@ integrate out in closed form (`gram`: generalised least squares under normal pri
 the density of z = (beta0 on the real line, t, r), t = log hypot(delta_w, s), r = log(delta_w / s),
 in three dimensions; s^2 = delta_v^2 - floor^2, so that the floor of delta_v is no boundary.
 
-1. Newton's search from the best point of a coarse grid finds the mode (`laplace`).
-2. Some 1000 weighted points around it give the mean and covariance of a heavy-tailed proposal; the
-   posterior is skewed, and its curvature at the mode alone makes a far worse one (`proposal`).
+1. Newton's searches from the local maxima of a grid find the modes (`laplace`).
+2. Some 1000 weighted points around them give the means and covariances of a mixture of heavy-tailed
+   densities, one for each mode; the posterior is skewed, and its curvature at a mode alone makes a
+   far worse proposal (`proposal`).
 3. 4096 scrambled Sobol points of the proposal get Pareto-smoothed importance weights (Vehtari,
    Simpson, Gelman, Yao and Gabry 2024). Where k-hat says that they are uneven, a mixture fitted to
    the weighted points takes the proposal's place, up to four times (adaptive importance sampling).
@@ -27,6 +28,7 @@ import numpyro.distributions as dist
 from arviz_stats.base.array import array_stats
 from numpyro.distributions import constraints
 from scipy import special
+from scipy.ndimage import maximum_filter
 from threadpoolctl import ThreadpoolController
 
 from trustbo.errors import TrustboError
@@ -40,7 +42,8 @@ from trustbo.models.samplers.proposal import Mixture
 
 _LOG2_POINTS, _LOG2_AROUND = 12, 10
 _FEW = 50  # points
-_MAX_ROUNDS, _N_AROUND, _WIDE = 4, 32, 0.2  # of adapting; local components, and the other's share
+_N_STARTS, _SAME_MODE, _LEAST_LOG_MASS = 6, 0.5, 12.0  # sd of the fit at a mode, and nats
+_MAX_ROUNDS, _N_AROUND, _KEPT = 4, 32, 0.15  # of adapting; local components, share of the others
 _CHUNK = 1024  # parameter values evaluated at once: bounds the memory of long missions
 
 
@@ -148,13 +151,12 @@ def sample_exact(
     # Matrices are small: a second BLAS thread costs more than it brings.
     with _blas().limit(limits=1, user_api="blas"):
         target = _target(statistics, priors)
-        mode, scale = laplace(target.log_density, _start(target))
-        points = _weigh(target, _matched(target, mode, scale, seed), seed)
-        last = points
-        for _ in range(_MAX_ROUNDS):
+        first = _matched(target, _modes(target), seed)
+        points = last = _weigh(target, first, seed)
+        for k in range(_MAX_ROUNDS):
             if points.khat < GOOD_KHAT:
                 break
-            last = _weigh(target, _adapted(last, seed), seed)
+            last = _weigh(target, _adapted(last, first, seed + k), seed)
             points = min(points, last, key=lambda each: each.khat)
     rng = np.random.default_rng(seed)
     weights = np.exp(points.log_w)
@@ -191,16 +193,39 @@ def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
     return _Target(statistics, priors, each("loc"), each("scale") ** -2.0, floor)
 
 
-def _matched(target: _Target, mode: np.ndarray, scale: np.ndarray, seed: int) -> Mixture:
-    """Proposal with the mean and covariance of weighted points around the mode."""
-    around = Mixture(mode[None], 1.3 * scale[None], np.ones(1))
+def _modes(target: _Target) -> Mixture:
+    """Gaussian fits at the distinct modes, each with its share of the mass."""
+    z, value, scale = laplace(target.log_density, _starts(target))
+    log_mass = value + np.log(np.einsum("sii->si", scale)).sum(1)
+    kept: list[int] = []
+    for i in np.argsort(-value, kind="stable"):
+        apart = [np.linalg.solve(scale[j], z[i] - z[j]) for j in kept]
+        if log_mass[i] > log_mass.max() - _LEAST_LOG_MASS and all(
+            np.abs(gap).max() > _SAME_MODE for gap in apart
+        ):
+            kept.append(i)
+    shares = np.exp(log_mass[kept] - log_mass[kept].max())
+    return Mixture(z[kept], scale[kept], shares / shares.sum())
+
+
+def _matched(target: _Target, modes: Mixture, seed: int) -> Mixture:
+    """Proposal with the mean and covariance of weighted points around each mode."""
+    n = len(modes.weights)
+    around = Mixture(modes.centers, 1.3 * modes.scales, 0.5 * modes.weights + 0.5 / n)
     z, _, log_w, *_ = _weigh(target, around, seed, _LOG2_AROUND)
-    weights = np.exp(log_w)
-    mean = weights @ z
-    covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
-    if (kish := 1.0 / (weights**2).sum()) < _FEW:  # fewer points than a covariance needs
-        covariance += scale @ scale.T / kish
-    return Mixture(mean[None], np.linalg.cholesky(covariance)[None], np.ones(1))
+    centers, scales, shares = [], [], []
+    for scale, near in zip(modes.scales, around.responsibilities(z), strict=True):
+        weights = np.exp(log_w) * near
+        shares.append(weights.sum())
+        weights /= max(shares[-1], 1e-300)
+        mean = weights @ z
+        covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
+        if not (kish := 1.0 / (weights**2).sum()) > _FEW:  # fewer points than a covariance needs
+            covariance += scale @ scale.T / kish
+        centers.append(mean)
+        scales.append(np.linalg.cholesky(covariance))
+    shares = 0.9 * np.array(shares) / sum(shares) + 0.1 / n
+    return Mixture(np.array(centers), np.array(scales), shares)
 
 
 def _weigh(
@@ -222,37 +247,53 @@ def _weigh(
     return _Weighted(z, log_p, log_w, mean, factor, khat, log_evidence)
 
 
-def _start(target: _Target) -> np.ndarray:
-    """The best point of a coarse grid around the scatter of the rates."""
+def _starts(target: _Target) -> np.ndarray:
+    """Points to search a mode from: the local maxima of a grid around the scatter of the rates.
+
+    The first is the best point of a coarse one.
+    """
     unit = target.priors.beta0.support is constraints.unit_interval
+    scatter = np.log(max(target.statistics.spread, target.floor, 1e-3))
+
+    def grid(x: np.ndarray, t: np.ndarray, r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        axes = np.stack(np.meshgrid(x, scatter + t, r, indexing="ij"), axis=-1)
+        return axes, target.log_density(axes.reshape(-1, 3)).reshape(axes.shape[:3])
+
     x = np.array([-3.0, -1.0, 0.0, 1.0, 2.0]) if unit else np.linspace(-0.5, 1.1, 5)
-    t = np.log(max(target.statistics.spread, target.floor, 1e-3)) + np.linspace(-2.5, 0.5, 5)
-    grid = np.stack(np.meshgrid(x, t, [-2.0, 0.0, 2.0], indexing="ij"), axis=-1).reshape(-1, 3)
-    return grid[np.argmax(target.log_density(grid))]
+    coarse, value = grid(x, np.linspace(-2.5, 0.5, 5), np.array([-2.0, 0.0, 2.0]))
+    first = coarse[np.unravel_index(value.argmax(), value.shape)]
+    x = np.linspace(-6.0, 4.0, 9) if unit else np.r_[-1.5, -1.0, np.linspace(-0.6, 1.2, 19), 1.5]
+    fine, value = grid(x, np.linspace(-3.5, 1.0, 6), np.linspace(-4.0, 4.0, 5))
+    peak = (value == maximum_filter(value, 3, mode="nearest")) & np.isfinite(value)
+    best = np.argsort(-value[peak])[:_N_STARTS]
+    return np.vstack([first, fine[peak][best]])
 
 
-def _adapted(points: _Weighted, seed: int) -> Mixture:
+def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
     """Mixture around draws of weighted points, each component as wide as the mass nearby.
 
-    It follows any shape of the posterior: ridges, horns and modes. A wide component over all
-    remains, for what the points have not seen.
+    It follows any shape of the posterior. One component over all, for tails, has a share, and so
+    has the first proposal: no mode is lost, no weight exceeds its first value over that share.
     """
     z, weights = points.z, np.exp(points.log_w)
     mean = weights @ z
-    covariance = ((z - mean) * weights[:, None]).T @ (z - mean)
+    off = z - mean
+    covariance = (off * weights[:, None]).T @ off
     covariance += 1e-6 * np.trace(covariance) * np.eye(3)  # where one point has all weight
     whole = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(whole, z.T).T
     order = np.argsort(z[:, 2])
-    drawn = _systematic(weights[order], _N_AROUND, np.random.default_rng(seed))
-    centers, white = z[order[drawn]], np.linalg.solve(whole, z.T).T
+    drawn = order[_systematic(weights[order], _N_AROUND, np.random.default_rng(seed))]
     scales = []
-    for center in white[order[drawn]]:
+    for center in white[drawn]:
         near = weights * np.exp(-0.5 * ((white - center) ** 2).sum(1))
         near /= near.sum()
         off = z - near @ z
         scales.append(np.linalg.cholesky((off * near[:, None]).T @ off + 0.02 * covariance))
-    shares = np.append(np.full(_N_AROUND, (1.0 - _WIDE) / _N_AROUND), _WIDE)
-    return Mixture(np.vstack([centers, mean]), np.array([*scales, 1.5 * whole]), shares)
+    shares = np.append(np.full(_N_AROUND, (1.0 - 2.0 * _KEPT) / _N_AROUND), _KEPT)
+    local = Mixture(np.vstack([z[drawn], mean]), np.array([*scales, 1.5 * whole]), shares)
+    kept = first._replace(weights=_KEPT * first.weights)
+    return Mixture(*(np.concatenate(both) for both in zip(local, kept, strict=True)))
 
 
 def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:

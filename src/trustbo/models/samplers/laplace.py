@@ -41,25 +41,43 @@ def inverse_hessian(xp: ModuleType, hessian: Any, floor: float) -> Any:
 
 
 def laplace(
-    log_density: Density, start: np.ndarray, n_steps: int = 60
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mode, and Cholesky factor of the inverse negative Hessian there, in NumPy."""
-    z, value = start, float(log_density(start[None])[0])
+    log_density: Density, starts: np.ndarray, n_steps: int = 60
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mode found from each start, all searches in one batch, in NumPy.
+
+    Args:
+        log_density: Log density of points (point, axis), shape (point,).
+        starts: Shape (start, axis).
+        n_steps: Largest number of Newton steps.
+
+    Returns:
+        Modes (start, axis), their log densities (start,), and Cholesky factors (start, axis, axis)
+        of the inverse negative Hessians there.
+    """
+    z, value = starts.copy(), log_density(starts)
+    active = np.flatnonzero(np.isfinite(value))
     for _ in range(n_steps):
-        gradient, hessian = _derivatives(log_density, z)
-        if not np.isfinite(hessian).all():  # beside a point without density
+        if not len(active):
             break
-        step = newton_direction(np, gradient, -hessian, 1e-3)
-        candidates = z + np.outer(0.5 ** np.arange(12), step)
-        values = log_density(candidates)
-        best = int(np.argmax(values))
-        if not values[best] > value + 1e-10:
-            break
-        z, value = candidates[best], float(values[best])
-    hessian = _derivatives(log_density, z)[1]
-    if not np.isfinite(hessian).all():
-        return z, np.eye(len(z))
-    return z, np.linalg.cholesky(inverse_hessian(np, -hessian, 0.05))
+        steps = np.zeros_like(z[active])
+        for i, (gradient, hessian) in enumerate(
+            zip(*_derivatives(log_density, z[active]), strict=True)
+        ):
+            if np.isfinite(hessian).all():  # else it stands beside a point without density
+                steps[i] = newton_direction(np, gradient, -hessian, 1e-3)
+        candidates = z[active, None] + 0.5 ** np.arange(12)[:, None] * steps[:, None]
+        values = log_density(candidates.reshape(-1, z.shape[1])).reshape(len(active), -1)
+        best = values.argmax(1)
+        row = np.arange(len(active))
+        better = values[row, best] > value[active] + 1e-10
+        active, moved = active[better], candidates[row, best][better]
+        z[active], value[active] = moved, values[row, best][better]
+    hessians = _derivatives(log_density, z)[1]
+    scales = np.tile(np.eye(z.shape[1]), (len(z), 1, 1))
+    for i, hessian in enumerate(hessians):
+        if np.isfinite(hessian).all():
+            scales[i] = np.linalg.cholesky(inverse_hessian(np, -hessian, 0.05))
+    return z, value, scales
 
 
 def newton(
@@ -94,18 +112,21 @@ def newton(
 
 
 def _derivatives(log_density: Density, z: np.ndarray, h: float = 1e-3):
-    """Gradient and Hessian by central differences, all points in one batch."""
-    d = len(z)
+    """Gradients and Hessians at points (point, axis) by central differences, in one batch."""
+    n, d = z.shape
     steps = h * np.eye(d)
     offsets = [np.zeros(d)]
     offsets += [sign * steps[i] for i in range(d) for sign in (1, -1)]
     pairs = [(i, j) for i in range(d) for j in range(i)]
     for i, j in pairs:
         offsets += [a * steps[i] + b * steps[j] for a in (1, -1) for b in (1, -1)]
-    f = log_density(z + np.array(offsets))
-    plus, minus = f[1 : 1 + 2 * d : 2], f[2 : 2 + 2 * d : 2]
-    gradient = (plus - minus) / (2.0 * h)
-    hessian = np.diag((plus - 2.0 * f[0] + minus) / h**2)
-    for (i, j), four in zip(pairs, f[1 + 2 * d :].reshape(-1, 4), strict=True):
-        hessian[i, j] = hessian[j, i] = (four[0] - four[1] - four[2] + four[3]) / (4.0 * h**2)
+    f = log_density((z[:, None] + np.array(offsets)).reshape(-1, d)).reshape(n, -1)
+    plus, minus = f[:, 1 : 1 + 2 * d : 2], f[:, 2 : 2 + 2 * d : 2]
+    with np.errstate(invalid="ignore"):
+        gradient = (plus - minus) / (2.0 * h)
+        hessian = ((plus - 2.0 * f[:, :1] + minus) / h**2)[:, :, None] * np.eye(d)
+        for k, (i, j) in enumerate(pairs):
+            four = f[:, 1 + 2 * d + 4 * k :]
+            mixed = (four[:, 0] - four[:, 1] - four[:, 2] + four[:, 3]) / (4.0 * h**2)
+            hessian[:, i, j] = hessian[:, j, i] = mixed
     return gradient, hessian

@@ -1,8 +1,8 @@
 """NUTS on a trust model, as one compiled program that takes missions and priors as data.
 
 numpyro's functional sampler is called inside a single `jax.jit`, so that the next mission, or
-other numbers in the priors, meet the compiled code of the last. The chains start around the
-posterior mode, in coordinates that its Hessian makes standard normal (Laplace).
+other numbers in the priors, meet the compiled code of the last. The chains start around posterior
+modes, in coordinates that the Hessian there makes standard normal (Laplace).
 """
 
 import math
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax, random
+from jax.scipy.linalg import solve_triangular
 from numpyro.infer.hmc import hmc
 
 from trustbo.models.model import TrustModel
@@ -21,6 +22,7 @@ from trustbo.models.samplers.reparam import reparametrise
 from trustbo.models.samplers.target import NutsData, innovations_shape
 
 _DRAWS_PER_UNKNOWN = 10  # of the warm-up, to learn a covariance from
+_SAME_MODE, _LEAST_LOG_MASS = 0.5, 5.0  # sd of the fit at a mode, and nats below the largest
 
 
 class NutsSettings(NamedTuple):
@@ -65,25 +67,35 @@ def run_nuts(
     """
     target = reparametrise(model, data, complete=complete, collapse=settings.collapse)
     joint, shape = not model.family.integrates_out, innovations_shape(data)
-    mode, hessian = newton(target.profile, target.start)
-    scale = jnp.linalg.cholesky(inverse_hessian(jnp, hessian, 0.1))
+    zeros = {"innovations": jnp.zeros(shape)} if joint else {}
 
-    # NUTS sees standard normal coordinates. With many unknowns it leaves them so: a covariance
-    # learnt from the few hundred draws of a warm-up is then worse than Laplace's.
-    def theta_of(x: Array) -> Array:
-        return mode + scale @ x
+    def search(start: Array) -> _Fit:
+        mode, hessian = newton(target.profile, start)
+        scale = jnp.linalg.cholesky(inverse_hessian(jnp, hessian, 0.1))
+        log_density = -target.potential({"theta": mode, **zeros})
+        return _Fit(mode, scale, log_density + jnp.log(jnp.diagonal(scale)).sum())
 
-    def potential(z: dict[str, Array]) -> Array:
-        return target.potential(z | {"theta": theta_of(z["theta"])})
+    n_unknowns = target.starts.shape[1]
+    fits = _spread(lax.map(search, target.starts), settings.n_chains)
 
     # Innovations are close to standard normal by construction: their mass starts as the identity.
-    mass = {("theta",): jnp.eye(len(mode))}
+    mass = {("theta",): jnp.eye(n_unknowns)}
     if joint:
         mass[("innovations",)] = jnp.ones(math.prod(shape))
 
-    adapt = joint or _DRAWS_PER_UNKNOWN * len(mode) <= settings.n_warmup
+    adapt = joint or _DRAWS_PER_UNKNOWN * n_unknowns <= settings.n_warmup
 
-    def chain(key: Array):
+    def chain(inputs: tuple[Array, _Fit]):
+        key, (mode, scale, _) = inputs
+
+        # NUTS sees standard normal coordinates. With many unknowns it leaves them so: a covariance
+        # learnt from the few hundred draws of a warm-up is then worse than Laplace's.
+        def theta_of(x: Array) -> Array:
+            return mode + scale @ x
+
+        def potential(z: dict[str, Array]) -> Array:
+            return target.potential(z | {"theta": theta_of(z["theta"])})
+
         key_start, key_innovations, key_run = random.split(key, 3)
         # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
         z = {"theta": 1.5 * random.normal(key_start, mode.shape, mode.dtype)}
@@ -94,8 +106,35 @@ def run_nuts(
         return params, stats, z.get("innovations")
 
     # One chain after the other: vectorised chains would all wait for the longest trajectory.
-    params, stats, drawn = lax.map(chain, random.split(key, settings.n_chains))
+    keys = random.split(key, settings.n_chains)
+    params, stats, drawn = lax.map(chain, (keys, fits))
     return NutsDraws(params, stats, drawn, target.linearisation)
+
+
+class _Fit(NamedTuple):
+    """Gaussian fits at modes, with a leading axis (start,) or (chain,) where there are many."""
+
+    mode: Array
+    scale: Array  # Cholesky factor of the covariance
+    log_mass: Array
+
+
+def _spread(fits: _Fit, n_chains: int) -> _Fit:
+    """A fit for each chain: the distinct modes of noteworthy mass in turn, the largest first.
+
+    Chains that start at different modes and do not meet give an R-hat that says so.
+    """
+    log_mass = jnp.where(jnp.isnan(fits.log_mass), -jnp.inf, fits.log_mass)
+    order = jnp.argsort(-log_mass)
+    sorted_ = jax.tree.map(lambda a: a[order], fits)
+    gaps = sorted_.mode[:, None] - sorted_.mode[None]  # (other, start, unknown)
+    white = jax.vmap(lambda L, gap: solve_triangular(L, gap.T, lower=True))(sorted_.scale, gaps)
+    near = jnp.abs(white).max(1) < _SAME_MODE
+    again = jnp.triu(near, 1).any(0)  # as one of more mass
+    light = log_mass[order] < log_mass[order[0]] - _LEAST_LOG_MASS
+    kept = ~again & ~light
+    places = jnp.argsort(~kept, stable=True)[jnp.arange(n_chains) % kept.sum()]
+    return jax.tree.map(lambda a: a[places], sorted_)
 
 
 def _run_chain(

@@ -35,10 +35,19 @@ class Mixture(NamedTuple):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log density, shape (point,)."""
+        terms = self._terms(z)
+        return terms[0] if len(terms) == 1 else np.logaddexp.reduce(terms, axis=0)
+
+    def responsibilities(self, z: np.ndarray) -> np.ndarray:
+        """Share of each component in the density, shape (component, point)."""
+        terms = np.array(self._terms(z))
+        return np.exp(terms - np.logaddexp.reduce(terms, axis=0))
+
+    def _terms(self, z: np.ndarray) -> list[np.ndarray]:
         norm = np.log(3.0 / (4.0 * np.pi * _WIDTH**3))
         terms = []
         for center, scale, weight in zip(*self, strict=True):
             r2 = (np.linalg.solve(scale, (z - center).T) ** 2).sum(0) / _WIDTH**2
             shape = -(1.0 + 3.0 / _TAIL) * np.log1p(r2 ** (0.5 * _TAIL))
             terms.append(np.log(weight) + norm - np.log(np.diag(scale)).sum() + shape)
-        return terms[0] if len(terms) == 1 else np.logaddexp.reduce(terms, axis=0)
+        return terms

@@ -27,7 +27,9 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 from jax import Array
+from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
+from numpyro.distributions import constraints
 
 from trustbo.models.likelihood.gram_jax import Spectrum, coefficients
 from trustbo.models.model import TrustModel
@@ -36,12 +38,14 @@ from trustbo.models.samplers.laplace import newton
 from trustbo.models.samplers.partial_centring import RobotFit, centre, fit_robots
 from trustbo.models.samplers.target import NutsData, Sites, Target, innovations_shape
 
+_AUTOREGRESSIONS = {"beta0", "mean_beta0", "B0_diagonal"}
+
 
 class Reparametrisation(NamedTuple):
     """A posterior in the coordinates that NUTS samples."""
 
-    start: Array
-    """Flat real vector to start the search of the mode from."""
+    starts: Array
+    """Flat real vectors to start the search of modes from, (start, unknown)."""
     constrain: Callable[[Array], Sites]
     """Parameters by name, from such a vector."""
     potential: Callable[[Sites], Array]
@@ -91,7 +95,22 @@ def reparametrise(
         n_locations = len(theta) - 2 * total.size
         return energy - n_locations * total.mean()
 
-    return Reparametrisation(target.start, constrain, potential, profile, target.linearisation)
+    starts = _starts(model, target, space.means.scatter)
+    return Reparametrisation(starts, constrain, potential, profile, target.linearisation)
+
+
+def _starts(model: TrustModel, target: Target, scatter: Array) -> Array:
+    """The priors' means, and other autoregressions, where modes differ, at the rates' scatter."""
+    site = target.unravel(target.start)
+    unit = model.priors.beta0.support is constraints.unit_interval
+    others = (-4.0, -1.5, 2.0) if unit else (-0.2, 0.2, 0.8)  # logits, or values
+    starts = [target.start]
+    noise = {"delta_w": jnp.log(scatter) - 1.0, "delta_v": 0.0}  # (t, r), see above
+    site = site | {name: jnp.full_like(site[name], value) for name, value in noise.items()}
+    for value in others:
+        moved = {name: jnp.full_like(site[name], value) for name in _AUTOREGRESSIONS & site.keys()}
+        starts.append(ravel_pytree(site | moved)[0])
+    return jnp.stack(starts)
 
 
 class Coordinates:
@@ -154,15 +173,18 @@ class _Means(NamedTuple):
     z: Array  # (feature,)
     log_unit: Array
     """Log of the noise of trust that an observation noise of 1 is worth."""
+    scatter: Array
+    """Standard deviation of the rates, at least .005."""
 
 
 def _average(model: TrustModel, data: NutsData) -> _Means:
     if data.means is not None:
-        y, z = data.means
-        return _Means(jnp.asarray(y), jnp.asarray(z), jnp.zeros(()))
+        y, z, scatter = (jnp.asarray(each) for each in data.means)
+        return _Means(y, z, jnp.zeros(()), jnp.maximum(scatter, 0.005))
     measured = ~jnp.isnan(data.contact_rate)
     n = jnp.maximum(measured.sum(), 1)
     y = jnp.where(measured, data.contact_rate, 0.0).sum() / n
     z = jnp.where(measured[..., None], data.awareness, 0.0).sum((0, 1, 2)) / n
+    scatter = jnp.sqrt((jnp.where(measured, data.contact_rate - y, 0.0) ** 2).sum() / n)
     y, log_unit = model.family.mean_level(y)
-    return _Means(y, z, log_unit)
+    return _Means(y, z, log_unit, jnp.maximum(scatter, 0.005) * jnp.exp(log_unit))

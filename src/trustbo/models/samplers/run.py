@@ -67,7 +67,12 @@ def nuts_data(model: TrustModel, batch: MissionBatch, weight: np.ndarray) -> Nut
         (statistics,) = model.gather(batch, weight)
         if not statistics.gaps:
             seen = ~np.isnan(batch.contact_rate)
-            means = (np.asarray(batch.contact_rate[seen].mean()), batch.awareness[seen].mean(0))
+            rates = batch.contact_rate[seen]
+            means = (
+                np.asarray(rates.mean()),
+                batch.awareness[seen].mean(0),
+                np.asarray(rates.std()),
+            )
             # One bound and robot that measured nothing: the shape tells the number of features.
             nothing = np.full((1, 1, 1), np.nan)
             awareness = np.zeros((1, 1, 1, batch.awareness.shape[3]))

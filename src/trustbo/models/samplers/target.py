@@ -35,8 +35,8 @@ class NutsData(NamedTuple):
     weight: Array | np.ndarray  # (mission,)
     spectrum: Spectrum | None = None
     """Sums over pooled Gaussian missions without gaps, which take the rates' place."""
-    means: tuple[Array | np.ndarray, Array | np.ndarray] | None = None
-    """Mean rate and mean awareness (feature,), which go with the sums."""
+    means: tuple[Array | np.ndarray, ...] | None = None
+    """Mean rate, mean awareness (feature,) and the rates' sd, which go with the sums."""
 
 
 class Target:
