@@ -1,6 +1,7 @@
 """`trustbo resume`: after Ctrl-C, for more missions, and when a posterior was refused."""
 
 import json
+import resource
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import time
 import numpy as np
 import pytest
 import typer
+import xarray as xr
 
 import trustbo as tb
 from trustbo.cli.errors import one_line_errors
@@ -21,31 +23,50 @@ PROGRAM = (
 )
 
 
+def fill_disk(process):
+    """Let no file of a process be longer than 1000 bytes from now on."""
+    hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1000, hard))
+
+
 @pytest.mark.usefixtures("blank_figures")
-def test_ctrl_c_keeps_what_is_done_and_resume_goes_on(invoke, flags, tmp_path):
+@pytest.mark.parametrize(
+    ("strike", "code", "message"),
+    [
+        (lambda p: p.send_signal(signal.SIGINT), 130, "kept: trustbo resume {} goes on."),
+        (lambda p: p.send_signal(signal.SIGTERM), 130, "kept: trustbo resume {} goes on."),
+        (fill_disk, 2, "error: the disk is full: '{}/"),
+    ],
+    ids=["ctrl-c", "sigterm", "full disk"],
+)
+def test_what_is_done_is_kept_and_resume_goes_on(strike, code, message, invoke, flags, tmp_path):
+    """To the same result as without the interruption."""
     out = tmp_path / "out"
-    arguments = ["run", *flags, "--iterations", 500, "--seed", 2, "--out", out, "--quiet"]
-    command = [sys.executable, "-c", PROGRAM, *(str(a) for a in arguments)]
+    words = ["run", *flags, "--seed", 2, "--quiet", "--iterations"]
+    command = [sys.executable, "-c", PROGRAM, *(str(a) for a in (*words, 500, "--out", out))]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + 120
             while not (out / "result.json").exists() and time.monotonic() < deadline:
                 assert process.poll() is None, process.communicate()[1]
                 time.sleep(0.05)
-            process.send_signal(signal.SIGINT)
+            strike(process)
             said = process.communicate(timeout=60)[1]
         finally:
             process.kill()  # or a test that fails would wait for it
-    assert process.returncode == 130, said
-    assert f"all missions so far are kept: trustbo resume {out} goes on" in said
+    assert process.returncode == code, said
+    assert message.format(out) in said.splitlines()[-1]
     assert "Traceback" not in said
     n = json.loads((out / "campaign.json").read_text())["n_missions"]
     assert 1 <= n < 500
     done = invoke("resume", out, "--iterations", n + 1, "--quiet")
     assert done.exit_code == 0, done.output
-    again = tb.load_result(out)
+    assert invoke(*words, n + 1, "--out", tmp_path / "whole").exit_code == 0
+    again, whole = tb.load_result(out), tb.load_result(tmp_path / "whole")
     assert len(again.missions) == n + 1
-    assert again.stop_reason == "n_iterations"
+    assert (again.path, again.stop_reason) == (whole.path, whole.stop_reason)
+    for a, b in zip(again.posteriors, whole.posteriors, strict=True):
+        xr.testing.assert_identical(a["posterior"].to_dataset(), b["posterior"].to_dataset())
     assert (out / "report.html").exists()
 
 

@@ -1,7 +1,9 @@
 """Errors of commands: one line and an exit code, without a traceback."""
 
 import re
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,8 +26,11 @@ _ALIASES = {"n_iterations": "iterations", "n_robots": "robots", "RegretBound.eps
 def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]:
     """Print an error in one line (with `debug`, its traceback), and each warning in a line.
 
-    An error says the way on, too, if the folder of the `campaign` at work is given.
+    An error says the way on, too, if the folder of the `campaign` at work is given. SIGTERM ends a
+    command as Ctrl-C does.
     """
+    main = threading.current_thread() is threading.main_thread()  # others cannot set handlers
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
         print(f"warning: {in_flags(str(message))}", file=sys.stderr)
@@ -46,6 +51,9 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
             if debug:
                 raise
             fail(error, BAD_INPUT)
+        finally:
+            if main:
+                signal.signal(signal.SIGTERM, before)
 
 
 def fail(error: Exception, code: int, hint: str = "") -> NoReturn:
