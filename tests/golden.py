@@ -79,6 +79,8 @@ def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:
     }
     found |= {name: history[name].values.tolist() for name in ("objective", "contact_rate")}
     for group in ("posterior", "latent", "log_likelihood", "posterior_predictive"):
+        if group not in result.posterior.children:  # of weighted missions: another name
+            continue
         for name, array in sorted(result.posterior[group].to_dataset().data_vars.items()):
             values = np.ascontiguousarray(np.nan_to_num(array.values, nan=-9.0))
             found[f"{group} {name}"] = float(values.mean())

@@ -8,6 +8,7 @@ from trustbo.models.filter import TrustFilter, TrustState
 from trustbo.models.fit import fit
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
+from trustbo.models.loo import loo
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
 from trustbo.models.pooled import PooledTrust
@@ -35,6 +36,7 @@ __all__ = [
     "complete",
     "diagnostics",
     "fit",
+    "loo",
     "moment_matched",
     "params_of",
     "prior_predictive",

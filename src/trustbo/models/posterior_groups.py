@@ -17,6 +17,8 @@ from trustbo.models.params import Params, assemble_params, params_of
 from trustbo.models.posterior_tree import missions_of, to_datatree
 from trustbo.stacking import MissionBatch, stack_missions
 
+LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
+"""Group of log p(rates of a mission | draw), without and with weights of missions."""
 _N_TRAJECTORIES = 200
 
 
@@ -67,7 +69,9 @@ def complete(
 
     Returns:
         The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive` and
-        `log_likelihood`; itself, if it has them.
+        `log_likelihood`; itself, if it has them. Where missions have weights, the last is called
+        `mission_log_likelihood`: `az.loo` would take it for that of an unweighted posterior; use
+        `trustbo.models.loo`.
 
     Raises:
         TrustboError: The posterior holds no data and no missions are given; or its trust does not
@@ -128,7 +132,7 @@ def _groups(
 
     likelihood, of = _count_ticks(law.family, batch, found["log_likelihood"], len(missions))
     return {
-        "log_likelihood": {"contact_rate": by_chain(likelihood)},
+        _likelihood_name(posterior): {"contact_rate": by_chain(likelihood)},
         "latent": {
             "trust": by_chain(found["trust"]),
             "trust_mean": found["trust_mean"],
@@ -138,6 +142,11 @@ def _groups(
         "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
         "prior_predictive": {"contact_rate": _predict(law, prior, batch, seed + 3)[None]},
     }, of
+
+
+def _likelihood_name(posterior: xr.DataTree) -> str:
+    """The name that `az.loo` reads, unless missions have weights, which it would not know of."""
+    return LIKELIHOODS[bool((np.asarray(posterior.attrs.get("weights", 1.0)) != 1.0).any())]
 
 
 def _prior_of(posterior: xr.DataTree) -> Params:

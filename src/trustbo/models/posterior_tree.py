@@ -46,7 +46,11 @@ def to_datatree(
         draw = arrays.pop("draw", None)
         variables, used, shape = {}, set(), (0, 0)
         for name, array in arrays.items():
-            dims = ("mission",) if group == "log_likelihood" else (_DIMS | site_dims).get(name, ())
+            dims = (
+                ("mission",)
+                if group.endswith("log_likelihood")
+                else (_DIMS | site_dims).get(name, ())
+            )
             kept = array[(..., *(slice(len(coords[d])) for d in dims))]
             if "bound" in dims:
                 kept = np.where(ended, np.nan, kept)
