@@ -11,6 +11,9 @@ from trustbo.errors import TrustboError, require_choice, require_whole
 if TYPE_CHECKING:
     from trustbo.data import Team
 
+_MOST_PIXELS = 9e6
+"""Of a raster: a campaign on it takes some 2 GB."""
+
 
 def run(
     dem: Path,
@@ -65,7 +68,10 @@ def run(
         from trustbo.workspace import Workspace
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
-        ground = terrain.read_terrain(dem, dsm, crs=crs, resolution=resolution, nodata=nodata)
+        place = {"crs": crs, "resolution": resolution, "nodata": nodata}
+        ground = terrain.read_terrain(
+            dem, dsm, **place, max_pixels=_MOST_PIXELS, progress=not quiet
+        )
         workspace = Workspace.from_terrain(ground, rows_cols, team)
         result = iterate(
             workspace,
