@@ -143,6 +143,8 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--robots", "0"), "--robots must be a whole number from 1 on; got 0"),
         (("--max-bounds", "1"), "--max-bounds = 1 is below the fewest possible"),
         (("--dsm", "absent.tif"), "dsm: there is no file 'absent.tif'"),
+        (("--resolution", "60"), "90 x 90 pixels, too few to average 60 x 60 of them"),
+        (("--resolution", "0"), "resolution must be positive and finite; got 0.0"),
         (("--shape", "100,100"), "needs at least 2 x 2 pixels per cell"),
     ],
 )

@@ -1,6 +1,7 @@
 """Every kind of raster that is opened, and every way in which one says "missing"."""
 
 import zipfile
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from rasterio.io import MemoryFile
 from rasterio.transform import from_origin
 from rasterio.vrt import WarpedVRT
 
-from trustbo.errors import TerrainError
+from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import assemble_terrain, read_terrain
 from trustbo.terrain.dataset import require_terrain
 
@@ -380,3 +381,61 @@ def test_arrays_that_are_not_in_metres_are_no_terrain_yet(tif):
         require_terrain(terrain.assign(dsm=feet))
     with pytest.raises(TerrainError, match="in 'm' by its band, but in 'US survey foot' by its CR"):
         require_terrain(terrain.rio.write_crs(IN_FEET))
+
+
+# --- averaged ---
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory):
+    """A DEM and a DSM of 3007 x 3000 pixels of 1 m, and the DEM's values."""
+    folder, fill = tmp_path_factory.mktemp("large"), -9999.0
+    values = np.random.default_rng(0).uniform(100.0, 200.0, (3007, 3000)).astype("float32")
+    values[:30, :20] = values[30:60, :10] = values[60:90, :30] = fill  # 2/3, 1/3, all of a block
+    for name, extra in (("dem", 0.0), ("dsm", 5.0)):
+        stored = np.where(values == fill, fill, values + np.float32(extra))
+        tiled = {"tiled": True, "blockxsize": 512, "blockysize": 512}
+        write_raster(folder / f"{name}.tif", stored.astype("float32"), nodata=fill, **tiled)
+    return folder, np.where(values == fill, np.nan, values.astype(float))
+
+
+@pytest.mark.parametrize("how", [{"max_pixels": 10_100}, {"resolution": 30.2}])
+@pytest.mark.parametrize("lazy", [False, True])
+def test_large_rasters_are_averaged_block_by_block(how, lazy, large, capsys, monkeypatch):
+    folder, values = large
+    monkeypatch.setattr("trustbo.terrain.raster._PIXELS", 400_000)  # in several strips
+    paths = folder / "dem.tif", folder / "dsm.tif"
+    each = "'.*' has 3007 x 3000 pixels, 30 x 30 of them are averaged to one of 30 m"
+    said = rf"^dem: {each}; dsm: {each}\. For another size, give resolution=\.$"
+    with pytest.warns(UserWarning, match=said) if "max_pixels" in how else nullcontext():
+        terrain = read_terrain(*paths, **how, lazy=lazy, progress=True)
+    blocks = values[:3000].reshape(100, 30, 100, 30)
+    mean = np.nanmean(np.where(np.isnan(blocks).all((1, 3), keepdims=True), 0.0, blocks), (1, 3))
+    mean[0, 0] = mean[2, 0] = np.nan  # over half is missing
+    assert np.isfinite(mean[1, 0])
+    # Sums of 900 float64 in another order; lazily, heights are float32.
+    np.testing.assert_allclose(terrain["dem"], mean, rtol=1e-6 if lazy else 1e-12)
+    np.testing.assert_allclose(terrain["dsm"], mean + 5.0, rtol=1e-6)  # stored as float32
+    assert terrain.rio.bounds() == (500_000.0, 4_997_000.0, 503_000.0, 5_000_000.0)
+    assert "reading dem" in capsys.readouterr().err
+    terrain.close()
+
+
+def test_rasters_of_one_crs_are_averaged_to_one_size(large, tmp_path):
+    folder, values = large
+    half = from_origin(500_000.0, 5_000_000.0, 2.0, 2.0)
+    coarse = values[:3006].reshape(1503, 2, 1500, 2).mean((1, 3)) + 5.0
+    write_raster(tmp_path / "dsm.tif", coarse.astype("float32"), nodata=np.nan, transform=half)
+    said = r"3000 pixels, 30 x 30 .* of 30 m; .* 1503 x 1500 pixels, 15 x 15 .* of 30 m\. For"
+    with pytest.warns(UserWarning, match=said):
+        terrain = read_terrain(folder / "dem.tif", tmp_path / "dsm.tif", max_pixels=10_100)
+    both = terrain["dsm"] - terrain["dem"]
+    np.testing.assert_allclose(both.values[3:], 5.0, atol=1e-4)
+
+
+def test_a_size_that_no_pixels_are_left_of_is_refused(tif):
+    with pytest.raises(TerrainError, match="8 x 10 pixels, too few to average 5 x 5 of them; give"):
+        read_terrain(tif, tif, resolution=5.0)
+    for how in ({"resolution": 0.0}, {"max_pixels": -1.0}):
+        with pytest.raises(TrustboError, match=f"{next(iter(how))} must be positive and finite"):
+            read_terrain(tif, tif, **how)

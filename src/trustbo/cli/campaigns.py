@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from trustbo.data import Team
     from trustbo.simulation import KinematicSimulator
 
+_MOST_PIXELS = 9e6
+"""Of a raster: a campaign on it takes some 2 GB."""
+
 
 def run(
     dem: Path,
@@ -66,7 +69,10 @@ def run(
         from trustbo.workspace import Workspace
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
-        ground = terrain.read_terrain(dem, dsm, crs=crs, resolution=resolution, nodata=nodata)
+        place = {"crs": crs, "resolution": resolution, "nodata": nodata}
+        ground = terrain.read_terrain(
+            dem, dsm, **place, max_pixels=_MOST_PIXELS, progress=not quiet
+        )
         workspace = Workspace.from_terrain(ground, rows_cols, team)
         result = iterate(
             workspace,

@@ -19,7 +19,8 @@ Terrain and grid
   goal ROW,COL: Last cell.
   shape ROWS,COLS: Planning grid.
   crs CRS: CRS of rasters that carry none, e.g. EPSG:32633.
-  resolution M: Pixel size of rasters that carry none.
+  resolution M: Pixel size of rasters that carry none; others are averaged to about it. Rasters of
+    over 9 million pixels are averaged to fewer without it.
   nodata VALUE: Stored height that means missing, where no tag declares it.
 Robots and sight
   robots N: Number of robots that overwatch the lead.

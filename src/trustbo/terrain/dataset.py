@@ -1,5 +1,6 @@
 """Aligned, metric dataset of a DEM and a DSM."""
 
+import math
 import warnings
 from contextlib import ExitStack
 
@@ -7,7 +8,7 @@ import numpy as np
 import xarray as xr
 from rasterio.crs import CRS
 
-from trustbo.errors import TerrainError
+from trustbo.errors import TerrainError, require_positive
 from trustbo.terrain.align import on_one_grid
 from trustbo.terrain.georeference import require_metres, require_metric_crs, require_regular
 from trustbo.terrain.open_raster import RasterLike, open_raster
@@ -16,6 +17,7 @@ from trustbo.terrain.units import METRE
 
 CLIP_WARNING_SHARE = 0.02
 _ROWS = 256  # checked together
+_DEGREE = 111_195.0  # of latitude, m
 
 
 def read_terrain(
@@ -26,6 +28,8 @@ def read_terrain(
     resolution: float | None = None,
     nodata: float | None = None,
     lazy: bool = False,
+    max_pixels: float | None = None,
+    progress: bool = False,
 ) -> xr.Dataset:
     """Read a digital elevation model (ground) and a digital surface model (canopy, roofs).
 
@@ -44,12 +48,16 @@ def read_terrain(
             canopy is known, and the surface is the ground (a warning says so, and the terrain's
             attribute `surface`).
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
-        resolution: Pixel size in metres of rasters without a georeference.
+        resolution: Pixel size in metres of rasters without a georeference; others with smaller
+            pixels are averaged over whole numbers of pixels, to about this size.
+        max_pixels: Number of pixels above which a raster is averaged likewise, with a warning,
+            unless `resolution` is given. None: no limit.
         nodata: Another stored value that means missing.
         lazy: Leave the heights in the files, for rasters larger than the memory. Both variables
             are then float32 and read when a window of them is loaded, e.g. by
             `terrain.isel(y=slice(0, 512)).load()`; `clean` puts NaN in common and clips the
             surface of a window. Close the files with `terrain.close()`.
+        progress: Show a bar while a raster is averaged.
 
     Returns:
         Dataset with `dem` and `dsm`, float64 in metres (float32 if lazy), dims (y, x) with north
@@ -69,6 +77,7 @@ def read_terrain(
             for role, source in sources.items()
         ]
         _say(rasters)
+        rasters = _averaged(rasters, resolution, max_pixels, progress)
         ground, surface = on_one_grid(rasters[0], rasters[-1])
         surface = ground if dsm is None else surface
         if lazy:
@@ -96,6 +105,46 @@ def _say(rasters: list[Raster]) -> None:
             "no surface (DSM) is given, so no canopy is known: only the ground blocks sight.",
             stacklevel=3,
         )
+
+
+def _averaged(
+    rasters: list[Raster], resolution: float | None, max_pixels: float | None, progress: bool
+) -> list[Raster]:
+    """Coarsen rasters to a resolution, else to a number of pixels; rasters of one CRS alike."""
+    ground = rasters[0]
+    if resolution is not None:
+        sides = [_side(raster) for raster in rasters]
+        factors = [max(1, round(require_positive("resolution", resolution) / s)) for s in sides]
+    elif max_pixels is None:
+        return rasters
+    else:
+        limit = require_positive("max_pixels", max_pixels)
+        factors = [math.ceil(math.sqrt(math.prod(raster.shape) / limit)) for raster in rasters]
+        if rasters[-1].crs == ground.crs:
+            factors[-1] = max(1, round(factors[0] * _side(ground) / _side(rasters[-1])))
+    for raster, factor in zip(rasters, factors, strict=True):
+        if min(raster.shape) < 2 * factor:
+            raise TerrainError(
+                f"{raster.name} has {raster.shape[0]} x {raster.shape[1]} pixels, too few to "
+                f"average {factor} x {factor} of them; give a smaller resolution or more pixels."
+            )
+    if resolution is None and max(factors) > 1:
+        averaged = (
+            f"{r.name} has {r.shape[0]} x {r.shape[1]} pixels, {k} x {k} of them are averaged to "
+            f"one of {_side(r) * k:.3g} m"
+            for r, k in zip(rasters, factors, strict=True)
+        )
+        said = "; ".join(averaged)
+        warnings.warn(f"{said}. For another size, give resolution=.", stacklevel=3)
+    return [
+        raster if factor == 1 else raster.coarsened(factor, progress)
+        for raster, factor in zip(rasters, factors, strict=True)
+    ]
+
+
+def _side(raster: Raster) -> float:
+    """Height of a pixel, m."""
+    return -raster.transform.e * (_DEGREE if raster.crs.is_geographic else 1.0)
 
 
 def _noted(terrain: xr.Dataset, rasters: list[Raster]) -> xr.Dataset:

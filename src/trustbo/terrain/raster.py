@@ -1,7 +1,7 @@
 """Raster that is read window by window, and its lazy array."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,14 @@ from rasterio import Affine
 from rasterio.crs import CRS
 from rasterio.errors import RasterioError
 from rasterio.transform import array_bounds
+from tqdm import tqdm
 from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from trustbo.errors import TerrainError
 from trustbo.terrain.units import METRE, HeightUnit
+
+_PIXELS = 1 << 23  # read together, to be averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,32 @@ class Raster:
     def bounds(self) -> tuple[float, float, float, float]:
         """Left, bottom, right and top in the CRS."""
         return array_bounds(*self.shape, self.transform)
+
+    def coarsened(self, factor: int, progress: bool = False) -> "Raster":
+        """Raster of the means of `factor` x `factor` pixels, computed strip by strip when read.
+
+        Missing pixels do not count; over half of them make a mean missing. Rows and columns at the
+        southern and eastern edges that fill no pixel are left out.
+        """
+        rows, cols = (n // factor for n in self.shape)
+
+        def strip(above: slice, columns: slice) -> np.ndarray:
+            fine = self.read(*(slice(s.start * factor, s.stop * factor) for s in (above, columns)))
+            blocks = fine.reshape(above.stop - above.start, factor, -1, factor)
+            known = np.isfinite(blocks)
+            n = known.sum((1, 3))
+            total = np.add.reduce(np.where(known, blocks, 0.0), (1, 3))
+            return np.where(2 * n >= factor**2, total / np.maximum(n, 1), np.nan)
+
+        def read(above: slice, columns: slice) -> np.ndarray:
+            step = max(1, _PIXELS // (factor**2 * (columns.stop - columns.start)))
+            tops = range(above.start, above.stop, step)
+            shown = tqdm(tops, f"reading {self.name}", disable=not progress, leave=False)
+            parts = [strip(slice(top, min(top + step, above.stop)), columns) for top in shown]
+            return np.concatenate(parts)
+
+        wider = self.transform * Affine.scale(factor)
+        return replace(self, transform=wider, shape=(rows, cols), read=read)
 
     def array(self, dtype: type[np.floating]) -> xr.DataArray:
         """Make the array of heights, dims (y, x), read when a window of it is loaded."""
