@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from trustbo.simulation import KinematicSimulator
 
 _MOST_PIXELS = 9e6
-"""Of a raster: a campaign on it takes some 2 GB."""
+"""Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
 
 
 def run(
