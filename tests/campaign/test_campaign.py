@@ -182,6 +182,7 @@ def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
         Campaign(workspace, *ENDS, update="online")
 
 
+@pytest.mark.slow  # it samples trust
 def test_a_campaign_with_censored_rates(workspace, monkeypatch):
     # The shortest run shows which sampler is taken.
     short = partial(fit, n_warmup=60, n_draws=20, n_chains=2, check=False)
