@@ -87,9 +87,10 @@ def animate_mission(
     ticks = np.minimum(np.searchsorted(film.time, shown), len(film.time) - 1)
     figure, draw = _stage(mission, workspace, film)
     animation = _Animation(figure, draw, frames=ticks.tolist(), interval=1000.0 / fps)
+    animation.fps = fps
     if target is not None:
         try:
-            animation.save(target, fps=fps, dpi=dpi)
+            animation.save(target, dpi=dpi)
         finally:
             plt.close(figure)
     return animation
@@ -98,17 +99,19 @@ def animate_mission(
 class _Animation(FuncAnimation):
     """Animation that is saved as .gif or .mp4 by the writers at hand."""
 
-    def save(self, filename: FilePath, writer: Any = None, fps: Any = None, **options: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+    fps: int = 8
+
+    def save(self, filename: Any, writer: Any = None, *args: Any, **options: Any) -> None:
         """Write a file; TrustboError: another suffix, or no ffmpeg for an .mp4."""
-        path, fps = Path(filename), fps or 1000.0 / self._interval  # pyright: ignore[reportAttributeAccessIssue]
+        path, fps = Path(filename), int(options.pop("fps", None) or self.fps)
         if writer is None:
             suffix = require_choice("suffix", path.suffix.lower(), SUFFIXES)
             writer = PillowWriter(fps) if suffix == ".gif" else FFMpegWriter(fps, extra_args=_EVEN)
-        known: dict[Any, Any] = {}
-        if isinstance(writer, FFMpegWriter):
-            known["animation.ffmpeg_path"] = _ffmpeg()
+        known: dict[Any, Any] = (
+            {"animation.ffmpeg_path": _ffmpeg()} if isinstance(writer, FFMpegWriter) else {}
+        )
         with mpl.rc_context(known):
-            write_file(path, lambda file: FuncAnimation.save(self, file, writer, **options))
+            write_file(path, lambda file: FuncAnimation.save(self, file, writer, *args, **options))
 
 
 def _film(mission: Mission, workspace: Workspace) -> Film:
