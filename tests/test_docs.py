@@ -211,3 +211,10 @@ def test_the_page_of_the_command_line_has_every_flag_with_its_help():
             flag = option.metavar if option.param_type_name == "argument" else option.opts[0]
             assert texts.pop(flag).replace("[studies](studies.md)", "docs/studies.md") == help_text
         assert texts == {}, f"trustbo {name} has no such flags"
+
+
+def test_the_page_on_planning_says_which_path_every_objective_prefers():
+    text = (ROOT / "docs" / "planning.md").read_text()
+    table = text.split("| objective | prefers | take it when |")[1].split("\n\n")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (.{20,}) \| (.{20,}) \|$", table, flags=re.M)
+    assert [name for name, *_ in rows] == list(trustbo.planning.OBJECTIVES)

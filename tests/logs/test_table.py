@@ -1,5 +1,8 @@
 """Tables of missions: what is written comes back, and whatever is amiss is named."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -312,3 +315,20 @@ def test_only_missions_of_one_team_make_a_table(tmp_path):
         with pytest.raises(ShapeError, match=r"give at least one|must be a list of missions"):
             write_table(nothing, tmp_path / "missions.csv")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_how_to_says_which_columns_are_required(tmp_path):
+    page = Path(__file__).resolve().parents[2] / "docs" / "howto" / "your-own-robots.md"
+    told = re.findall(r"^\| (`\w+`.*?) \| (yes|no|instead) \|", page.read_text(), flags=re.M)
+    said = {name: word for names, word in told for name in re.findall(r"`(\w+)`", names)}
+    assert said["mission"] == "yes"
+    assert said["contact_time"] == said["x"] == "instead"
+    write_table(missions(), tmp_path / "missions.csv")
+    table = pd.read_csv(tmp_path / "missions.csv")
+    for column in table.columns:
+        part = table.drop(columns=column)
+        if said.get(column, "no") == "no":
+            assert len(read_table(part)) == 2
+        else:
+            with pytest.raises(TrustboError, match=column):
+                read_table(part)

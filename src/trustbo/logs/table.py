@@ -1,11 +1,17 @@
 """Missions as a table in long form: one row per mission, bound and robot.
 
-Columns: `mission` (a label), `bound` (a number), `robot` (a name), `row` and `col` of the cell
-entered, or a position in it, `contact_rate` (or `contact_time` and `duration`, s), and one for each
-awareness feature that was measured. Optional: `duration` (s), `n_ticks`, `t0` (s), `status` of the
-bound and `mission_status`. A blank means "not measured". Bound 0 is the start cell, without
-measurements; bounds after the last one with a measurement were planned, not run: rows of either
-need no robot. A feature with the name of one of these columns takes the prefix `awareness_`, e.g.
+| column | required | |
+|---|---|---|
+| `mission` | yes | label |
+| `bound` | yes | 0 for the start cell, without measurements; then 1, 2, ... |
+| `robot` | yes | name; blank where nothing was measured |
+| `row`, `col` | yes, or `x`, `y`, or `lon`, `lat` | cell of the bound, or a position in it |
+| `contact_rate` | yes, or `contact_time` and `duration` (s) | in [0, 1] |
+| `duration`, `t0` (s), `n_ticks`, `status`, `mission_status` | no | |
+| any other | no | awareness feature, in [0, 1] |
+
+A blank means "not measured". Bounds after the last one with a measurement were planned, not run. A
+feature with the name of one of these columns takes the prefix `awareness_`, e.g.
 `awareness_status`; so does `exposure`, which was the name of `n_ticks` in version 0.1 and is still
 read as such.
 """
@@ -35,7 +41,12 @@ def read_table(
     robots: Sequence[str] | None = None,
     ignore: Sequence[str] = (),
 ) -> list[Mission]:
-    """Read missions from a table in long form (see this module).
+    """Read missions from a table in long form.
+
+    Required columns are `mission`, `bound`, `robot`, the cell (`row` and `col`, or `x` and `y`, or
+    `lon` and `lat`) and the contact (`contact_rate`, or `contact_time` and `duration`). Optional
+    ones are `duration`, `t0`, `n_ticks`, `status`, `mission_status` and a column for each awareness
+    feature: docs/howto/your-own-robots.md.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs, or a
