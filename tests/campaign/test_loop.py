@@ -66,7 +66,7 @@ def test_the_result_recommends_the_best_path_under_the_last_posterior(result, wo
 
 
 def test_it_learns_the_truth_and_finds_the_oracle_s_path(workspace):
-    result = run(workspace, n_iterations=8, policy="random")
+    result = run(workspace, n_iterations=8, policy="random", sampler="exact")
     posterior = result.posterior["posterior"]
     for name, truth in zip(("beta0", "b"), (TRUTH.beta0, TRUTH.b), strict=True):
         draws = posterior[name]
@@ -99,7 +99,9 @@ def test_other_policies_run(workspace, policy):
 
 
 def test_failed_missions_are_learned_from(workspace):
-    result = run(workspace, simulator=ModelSimulator(workspace, fail_at=2), n_iterations=2)
+    result = run(
+        workspace, simulator=ModelSimulator(workspace, fail_at=2), sampler="exact", n_iterations=2
+    )
     assert list(result.history["status"].values) == ["stuck", "stuck"]
     assert result.posterior["observed_data"].sizes["bound"] == 2
 
