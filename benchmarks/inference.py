@@ -37,8 +37,7 @@ from trustbo.models import (
     sample_prior,
     sample_statistics,
 )
-from trustbo.models.samplers.exact import _matched, _start, _target
-from trustbo.models.samplers.laplace import laplace
+from trustbo.models.samplers.exact import _matched, _modes, _target
 from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.reparam import reparametrise
 from trustbo.models.samplers.run import draw_posterior, nuts_data
@@ -370,8 +369,7 @@ def exact_cost(data):
     model, batch = PooledTrust(), stack_missions(data.missions)
     with threadpool_limits(limits=1):  # as the sampler does
         target = _target(model.gather(batch)[0], model.priors)
-        mode, scale = laplace(target.log_density, _start(target))
-        z = _matched(target, mode, scale, 0).draw(4096, 0)
+        z = _matched(target, _modes(target), 0).draw(4096, 0)
         density = median_seconds(lambda: target.log_density(z), 7)
     gather = median_seconds(lambda: model.gather(batch), 5)
     return density, gather, median_seconds(lambda: model.update(None, data.missions), 5)
