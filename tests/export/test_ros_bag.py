@@ -4,6 +4,7 @@ import math
 import sqlite3
 import struct
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -36,7 +37,8 @@ class Bytes:
     def header(self):
         if not self.cdr:
             assert self.take("I") == 0  # seq
-        assert self.take("I", 2) == (1, 0)  # stamp
+        seconds, _ = self.take("I", 2)  # stamp: now, not 1970
+        assert 0 <= time.time() - seconds < 600
         text = bytes(self.take("B", self.take("I")))
         assert text == (b"map\0" if self.cdr else b"map")
 
@@ -89,7 +91,7 @@ def test_a_bag_of_ros_1_is_latched(result, maps, tmp_path):
 
     write_ros_bag(tmp_path / "path.bag", result.plan, maps["cost"], result.workspace)
     with Reader(tmp_path / "path.bag") as reader:
-        raw = {c.topic: data for c, time, data in reader.messages() if time == 1_000_000_000}
+        raw = {c.topic: data for c, _, data in reader.messages()}
         kinds = {c.topic: (c.msgtype, c.digest, c.ext.latching) for c in reader.connections}
     # The sums are those that ROS 1 itself has of these types.
     assert kinds == {

@@ -6,6 +6,7 @@ corner of the grid there instead.
 """
 
 import math
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +28,6 @@ IMPASSABLE, UNKNOWN = 100, -1
 # Costmaps publish 99 and 100 for "inscribed" and "lethal", where no robot may go.
 WORST_PASSABLE = 98
 _MOST_PIXELS = 100_000_000
-_TIME = 1_000_000_000  # time of the messages, ns; 0 means "unknown" in ROS
 
 
 class _Raster(NamedTuple):
@@ -164,10 +164,11 @@ def write_ros_bag(
 
     def records(make: Messages) -> list[Record]:
         corner = np.array([*raster.corner, 0.0])
-        grid = make.grid(_TIME, raster.values, raster.resolution, corner)
+        now = time.time_ns()
+        grid = make.grid(now, raster.values, raster.resolution, corner)
         return [
-            Record(_TIME, "/trustbo/cost", GRID, grid),
-            Record(_TIME, "/trustbo/path", PATH, make.path(_TIME, poses)),
+            Record(now, "/trustbo/cost", GRID, grid),
+            Record(now, "/trustbo/path", PATH, make.path(now, poses)),
         ]
 
     write_messages(target, of_path, storage, records, latched=True)
