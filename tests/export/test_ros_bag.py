@@ -52,7 +52,8 @@ class Bytes:
 
     def grid(self):
         self.header()
-        assert self.take("I", 2) == (1, 0)  # map_load_time
+        seconds, _ = self.take("I", 2)  # map_load_time
+        assert 0 <= time.time() - seconds < 600
         resolution, width, height = self.take("f"), *self.take("I", 2)
         corner, n = self.pose(), self.take("I")
         assert n == width * height
