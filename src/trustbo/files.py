@@ -42,7 +42,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        with _defer_interrupt():
+        with defer_interrupt():
             write(temporary)
             os.replace(temporary, path)
     except Exception as error:
@@ -58,7 +58,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
 
 
 @contextmanager
-def _defer_interrupt() -> Iterator[None]:
+def defer_interrupt() -> Iterator[None]:
     """Defer the first Ctrl-C or SIGTERM: it can leave the netCDF library locked for ever."""
     handlers = {int(n): signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
     before = {n: then for n, then in handlers.items() if callable(then)}  # others raise nothing

@@ -1,5 +1,6 @@
 """Missions in netCDF files: as they were, also those of version 0.1; damage is an error."""
 
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -78,6 +79,25 @@ def test_a_file_of_version_0_1_is_read(driven, tmp_path):
     np.testing.assert_array_equal(
         read_missions(tmp_path / "old.nc")[1].bounds[0].poses, driven[1].bounds[0].poses
     )
+
+
+class Pressed:
+    """A tree during whose serialisation Ctrl-C is pressed."""
+
+    def to_netcdf(self):
+        signal.raise_signal(signal.SIGINT)
+        return b"whole"
+
+
+def test_ctrl_c_waits_for_the_netcdf_library(tmp_path):
+    """Else it may stay locked, and the next write waits for ever."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            write_tree(tmp_path / "a.nc", Pressed())
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (tmp_path / "a.nc").read_bytes() == b"whole"
 
 
 def test_damage_is_named_with_its_file(driven, tmp_path):

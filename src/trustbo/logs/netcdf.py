@@ -10,7 +10,7 @@ import xarray as xr
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import read_checked, remove_checked, write_checked
+from trustbo.files import defer_interrupt, read_checked, remove_checked, write_checked
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
@@ -24,7 +24,7 @@ def read_tree(path: str | PathLike[str]) -> xr.DataTree:
     """
     content = read_checked(path)
     try:
-        with xr.open_datatree(content, engine="netcdf4") as tree:
+        with defer_interrupt(), xr.open_datatree(content, engine="netcdf4") as tree:
             return tree.load()
     except (OSError, ValueError, RuntimeError, KeyError):
         raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
@@ -32,7 +32,8 @@ def read_tree(path: str | PathLike[str]) -> xr.DataTree:
 
 def write_tree(path: str | PathLike[str], tree: xr.DataTree) -> None:
     """Write a netCDF file of groups, with its checksum."""
-    write_checked(path, bytes(tree.to_netcdf()))
+    with defer_interrupt():  # which could leave the netCDF library locked, in memory too
+        write_checked(path, bytes(tree.to_netcdf()))
 
 
 def write_missions(
