@@ -97,6 +97,8 @@ class Learning:
             except TrustboError as error:  # no other attempt would take these data
                 raise CannotLearnError(str(error)) from error
             except Exception as error:  # a defect must not cost a mission that was driven
+                if isinstance(error.__cause__, KeyboardInterrupt):  # numba makes it a SystemError
+                    raise error.__cause__ from None
                 reason = f"{type(error).__name__}: {error}"
         raise CannotLearnError(reason)
 

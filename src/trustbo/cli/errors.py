@@ -51,6 +51,11 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
             if debug:
                 raise
             fail(error, BAD_INPUT)
+        except SystemError as error:
+            if not isinstance(error.__cause__, KeyboardInterrupt):  # which numba makes of it
+                raise
+            print(f"\ninterrupted; {_way_on(campaign)}", file=sys.stderr)
+            raise typer.Exit(INTERRUPTED) from None
         finally:
             if main:
                 signal.signal(signal.SIGTERM, before)
