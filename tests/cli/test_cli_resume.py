@@ -47,7 +47,7 @@ def test_what_is_done_is_kept_and_resume_goes_on(strike, code, message, invoke, 
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + 120
-            while not (out / "result.json").exists() and time.monotonic() < deadline:
+            while not (out / "posteriors" / "0004.nc").exists() and time.monotonic() < deadline:
                 assert process.poll() is None, process.communicate()[1]
                 time.sleep(0.05)
             strike(process)
