@@ -83,7 +83,7 @@ def defer_interrupt() -> Iterator[None]:
             before[seen[0]](seen[0], None)
 
 
-def write_checked(path: str | PathLike[str], content: bytes) -> None:
+def write_checked(path: FilePath, content: bytes) -> None:
     """Write a file atomically and durably, and its SHA-256 to a hidden file beside it.
 
     The hidden file, which is written first, also keeps the sum of the file before: whichever of
@@ -97,7 +97,7 @@ def write_checked(path: str | PathLike[str], content: bytes) -> None:
     _write_bytes(path, content)
 
 
-def read_checked(path: str | PathLike[str]) -> bytes:
+def read_checked(path: FilePath) -> bytes:
     """Read a file of `write_checked`, or any other file, which then has no sum to be checked.
 
     Raises:

@@ -5,7 +5,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
-from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,13 +30,14 @@ from trustbo.campaign.result import Result
 from trustbo.campaign.told import never_to_be_learned, require_extra, require_mission, require_new
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
+from trustbo.files import FilePath
 from trustbo.models import TrustModel, diagnostics, params_of
 from trustbo.models.params import Params
 from trustbo.models.posterior_groups import parameters_alone
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
-from trustbo.planning.policies import greedy, resolve_policy
+from trustbo.planning.policies import resolve_policy
 from trustbo.stacking import fill_awareness
 from trustbo.workspace import Workspace
 
@@ -76,7 +76,7 @@ class Campaign:
         objective: str = OBJECTIVE,
         sampler: str = SAMPLER,
         seed: int = 0,
-        directory: str | PathLike[str] | None = None,
+        directory: FilePath | None = None,
         **options: Any,
     ) -> None:
         """Prepare a campaign; nothing is computed yet.
@@ -240,8 +240,7 @@ class Campaign:
             told = (e.measured for e in self.log.entries if e.state != SET_ASIDE)
             require_new(mission, list(told))
         self._take(mission, require_extra(extra))
-        last = self.log.last
-        return None if last is None else last()
+        return self.log.last_tree
 
     def set_aside(self, reason: str, mission: int | None = None) -> xr.DataTree | None:
         """Leave a mission out of what is learned from, for good; telling it again takes it back.
@@ -266,8 +265,7 @@ class Campaign:
         self._learn(self.seed_of("fit"))
         self._plan = self._believed = None
         self._write()
-        last = self.log.last
-        return None if last is None else last()
+        return self.log.last_tree
 
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
         """Keep a mission on disk, then learn from it."""
@@ -311,7 +309,7 @@ class Campaign:
             return
         try:
             tree = self._learning.learn(
-                [entries[j].mission for j in numbers], len(waiting), last and last(), seed
+                [entries[j].mission for j in numbers], len(waiting), self.log.last_tree, seed
             )
         except CannotLearnError as error:
             for j in waiting:
@@ -359,7 +357,7 @@ class Campaign:
 
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, whatever the policy would try next."""
-        return greedy(random.key(0, impl="threefry2x32"), self.belief, self.planner_now())
+        return self.planner_now().plan(self.belief.mean())
 
     def trust_map(self) -> xr.DataArray:
         """Compute the team's trust map under the mean of the belief, dims (row, col)."""
@@ -401,7 +399,7 @@ class Campaign:
 
     # --- the folder ---
 
-    def keep(self, directory: str | PathLike[str]) -> None:
+    def keep(self, directory: FilePath) -> None:
         """Write everything to a folder, replacing what is there, and keep it up to date from now.
 
         Raises:
@@ -410,7 +408,7 @@ class Campaign:
         self.close()
         self._open(CampaignFolder(directory), overwrite=True)
 
-    def save(self, directory: str | PathLike[str]) -> None:
+    def save(self, directory: FilePath) -> None:
         """Write everything to a folder that `Campaign.load` reads.
 
         Another campaign in it is replaced. To keep a campaign as it goes, make it with a
@@ -432,7 +430,7 @@ class Campaign:
     @classmethod
     def load(
         cls,
-        directory: str | PathLike[str],
+        directory: FilePath,
         *,
         model: TrustModel | None = None,
         policy: Policy | None = None,
@@ -472,8 +470,8 @@ class Campaign:
             if campaign.awareness is not None:
                 for mission in campaign.log.measured:
                     campaign.awareness.update(mission)
-            if campaign.log.last is not None:
-                campaign.belief = params_of(campaign.log.last())
+            if (last := campaign.log.last_tree) is not None:
+                campaign.belief = params_of(last)
             suggested = state["suggested"]
             campaign._plan = suggested and plan_from_record(suggested)
             campaign._folder = folder

@@ -2,10 +2,10 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import xarray as xr
 from filelock import FileLock, Timeout
 
 from trustbo.campaign.damage import MEASURED, naming_what_is_left, read_json, salvage
@@ -14,13 +14,14 @@ from trustbo.campaign.result import Result, read_kept
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
+    FilePath,
     remove_checked,
     remove_leftovers,
     require_folder,
     to_json,
     write_checked,
 )
-from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
+from trustbo.logs.netcdf import missions_of_tree, read_tree, write_missions, write_tree
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
 
@@ -47,7 +48,7 @@ class CampaignFolder:
         path: Path of the folder.
     """
 
-    def __init__(self, directory: str | PathLike[str], *, begun: bool = False) -> None:
+    def __init__(self, directory: FilePath, *, begun: bool = False) -> None:
         """Take hold of the folder, until `close` or the end of the process.
 
         Args:
@@ -140,8 +141,9 @@ class CampaignFolder:
             extras: list[dict[str, float]] = []
             n = state["n_missions"]
             if n or (self.path / MEASURED).exists():
-                measured = read_missions(self.path / MEASURED)
-                extras = _extras(self.path / MEASURED, len(measured))
+                tree = read_tree(self.path / MEASURED)
+                measured = missions_of_tree(tree, self.path / MEASURED)
+                extras = _extras(tree, len(measured))
             if len(measured) < n:
                 raise DamagedFileError(
                     f"{str(self.path / MEASURED)!r} holds {len(measured)} missions of {n}."
@@ -160,7 +162,7 @@ def read_state(folder: Path) -> dict[str, Any]:
     return read_json(folder / STATE, "n_missions", "options", "plans", "rows", "notes")
 
 
-def _extras(file: Path, n: int) -> list[dict[str, float]]:
+def _extras(tree: xr.DataTree, n: int) -> list[dict[str, float]]:
     """Numbers that missions were told with; none in a file of version 0.1."""
-    text = read_tree(file)["missions"].attrs.get("extra")
+    text = tree["missions"].attrs.get("extra")
     return [{} for _ in range(n)] if text is None else json.loads(text)

@@ -175,6 +175,11 @@ class History:
         """Posterior after the last mission."""
         return self.entries[-1].posterior if self.entries else None
 
+    @property
+    def last_tree(self) -> xr.DataTree | None:
+        """The tree of `last`; None where nothing could be learned yet."""
+        return None if self.last is None else self.last()
+
     def numbers(self, *states: str) -> list[int]:
         """Numbers, from 0, of the missions in one of these states."""
         return [j for j, entry in enumerate(self.entries) if entry.state in states]

@@ -4,7 +4,6 @@ import json
 import logging
 import sys
 from collections.abc import Iterator, Sequence
-from os import PathLike
 from typing import Any
 
 from tqdm import tqdm
@@ -23,7 +22,7 @@ from trustbo.campaign.stopping import (
 )
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.files import to_json
+from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Policy
 from trustbo.simulation import KinematicSimulator, Simulator
@@ -44,7 +43,7 @@ def iterate(
     sampler: str = SAMPLER,
     simulator: Simulator | None = None,
     stop: Stop | Sequence[Stop] | None = None,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: FilePath | None = None,
     seed: int = 0,
     progress: bool = True,
     **options: Any,
@@ -101,7 +100,7 @@ def iterate(
 
 
 def resume(
-    directory: str | PathLike[str],
+    directory: FilePath,
     *,
     simulator: Simulator | None = None,
     n_iterations: int | None = None,

@@ -84,10 +84,10 @@ def run_replanning(
 
 def _live(campaign: Campaign) -> TrustFilter | None:
     """Filter of the campaign's posterior; None before anything was learned."""
-    last, n_robots = campaign.log.last, campaign.workspace.awareness.sizes["robot"]
+    last, n_robots = campaign.log.last_tree, campaign.workspace.awareness.sizes["robot"]
     if last is None:
         return None
-    return TrustFilter(params_of(last()), n_robots, response=campaign.model.response)
+    return TrustFilter(params_of(last), n_robots, response=campaign.model.response)
 
 
 def better_rest(

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
 from trustbo.data import Cell, Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
+    FilePath,
     remove_checked,
     require_folder,
     to_json,
@@ -159,7 +159,7 @@ class Result:
             self.history, self.trust_map, self.path, self.workspace, n_columns=n_columns
         )
 
-    def save(self, directory: str | PathLike[str]) -> None:
+    def save(self, directory: FilePath) -> None:
         """Write everything to a folder that `load_result` reads.
 
         Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
@@ -171,29 +171,30 @@ class Result:
         """
         folder = require_folder(directory)
         remove_checked(folder / "result.json")  # its other files are replaced now
-        for kept in {id(kept): kept for kept in self._kept if kept}.values():
-            write_tree(_posterior_file(folder, kept.after), kept())
         write_tree(folder / "workspace.nc", archive.workspace_to_tree(self.workspace))
-        write_missions(folder / "missions.nc", self.missions)
-        self.checkpoint(folder)
+        self._write(folder, whole=True)
         if self.has_posterior:
             write_tree(folder / "posterior.nc", self.posterior)
 
-    def checkpoint(self, directory: str | PathLike[str]) -> None:
+    def checkpoint(self, directory: FilePath) -> None:
         """Write the last mission to a folder that holds all before it.
 
         The workspace and the earlier posteriors never change, and are not written again.
         """
-        folder = require_folder(directory)
+        self._write(require_folder(directory), whole=False)
+
+    def _write(self, folder: Path, *, whole: bool) -> None:
+        """Write all but the workspace; of missions before the last only if `whole`."""
         files = {_posterior_file(folder, kept.after): kept for kept in self._kept if kept}
-        for file, kept in list(files.items())[-2:]:
-            if file != kept.file:
+        for file, kept in list(files.items())[0 if whole else -2 :]:
+            if whole or file != kept.file:
                 write_tree(file, kept())
                 kept.file = file  # it is there from now on
         for file in (folder / "posteriors").glob("*.nc"):
             if file not in files:
                 remove_checked(file)
-        write_missions(folder / "missions.nc", self.missions, since=len(self.missions))
+        since = 0 if whole else len(self.missions)  # whose ticks are there
+        write_missions(folder / "missions.nc", self.missions, since=since)
         history = self.history.assign(final_trust_map=self.trust_map)
         write_tree(folder / "history.nc", xr.DataTree(history))
         if self.believed is None:
@@ -223,7 +224,7 @@ class Result:
         return [Posterior(j + 1, tree) for j, tree in enumerate(self.posteriors)]
 
 
-def load_result(directory: str | PathLike[str]) -> Result:
+def load_result(directory: FilePath) -> Result:
     """Read a result that `Result.save` wrote.
 
     Args:
@@ -261,13 +262,13 @@ def load_result(directory: str | PathLike[str]) -> Result:
 def read_kept(folder: Path, record: dict[str, Any]) -> Kept:
     """Read the missions that a record counts, their posteriors and the history."""
     n = record["n_missions"]
+    order = record.get("posterior_after", range(1, n + 1))  # of version 0.1: one a mission
     kept: dict[int, Posterior] = {}
-    for after in {*record.get("posterior_after", range(1, n + 1))} - {None}:
+    for after in {*order} - {None}:
         file = _posterior_file(folder, after)
         if not file.exists():
             raise DamagedFileError(f"{str(file)!r} is missing.")
         kept[after] = Posterior(after, file=file)
-    order = record.get("posterior_after", range(1, n + 1))
     history = read_tree(folder / "history.nc").to_dataset()
     return Kept(
         read_missions(folder / "missions.nc")[:n],

@@ -6,12 +6,10 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from jax import random
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.models import params_of
-from trustbo.planning.policies import greedy
 
 Stop = Callable[[Campaign], str | bool | None]
 """Rule that is called after each mission; a reason (or True) ends the campaign."""
@@ -68,7 +66,7 @@ class RegretBound:
         if posterior is None:
             return 0.0
         planner, draws = campaign.planner_now(), params_of(posterior)
-        path = greedy(random.key(0, impl="threefry2x32"), draws, planner).path
+        path = planner.plan(draws.mean()).path
         drawn = planner.plan_draws(draws, n_draws=self.n_draws)
         return float(np.mean(drawn.regret(path) <= self.eps * np.abs(drawn.values)))
 

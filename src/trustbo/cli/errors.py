@@ -40,7 +40,12 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
         warnings.simplefilter("default", UserWarning)
         try:
             yield
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, SystemError) as error:
+            if not isinstance(error, KeyboardInterrupt) and not isinstance(
+                error.__cause__,
+                KeyboardInterrupt,  # which numba makes a SystemError
+            ):
+                raise
             print(f"\ninterrupted; {_way_on(campaign)}", file=sys.stderr)
             raise typer.Exit(INTERRUPTED) from None
         except PosteriorError as error:
@@ -51,11 +56,6 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
             if debug:
                 raise
             fail(error, BAD_INPUT)
-        except SystemError as error:
-            if not isinstance(error.__cause__, KeyboardInterrupt):  # which numba makes of it
-                raise
-            print(f"\ninterrupted; {_way_on(campaign)}", file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
         finally:
             if main:
                 signal.signal(signal.SIGTERM, before)

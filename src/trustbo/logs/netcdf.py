@@ -1,7 +1,6 @@
 """Missions as trees of arrays, for netCDF files."""
 
 from collections.abc import Mapping, Sequence
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,13 @@ import xarray as xr
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import defer_interrupt, read_checked, remove_checked, write_checked
+from trustbo.files import FilePath, defer_interrupt, read_checked, remove_checked, write_checked
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
 
 
-def read_tree(path: str | PathLike[str]) -> xr.DataTree:
+def read_tree(path: FilePath) -> xr.DataTree:
     """Read a netCDF file of groups into memory.
 
     Raises:
@@ -30,14 +29,14 @@ def read_tree(path: str | PathLike[str]) -> xr.DataTree:
         raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
 
 
-def write_tree(path: str | PathLike[str], tree: xr.DataTree) -> None:
+def write_tree(path: FilePath, tree: xr.DataTree) -> None:
     """Write a netCDF file of groups, with its checksum."""
     with defer_interrupt():  # which could leave the netCDF library locked, in memory too
         write_checked(path, bytes(tree.to_netcdf()))
 
 
 def write_missions(
-    path: str | PathLike[str],
+    path: FilePath,
     missions: Sequence[Mission],
     *,
     since: int = 0,
@@ -63,12 +62,12 @@ def write_missions(
     write_tree(path, xr.DataTree.from_dict({"missions": table}))
 
 
-def ticks_file(path: str | PathLike[str], j: int) -> Path:
+def ticks_file(path: FilePath, j: int) -> Path:
     """Name of the file with the ticks of mission j, from 0, beside a file of missions."""
     return Path(path).parent / "ticks" / f"{j + 1:04d}.nc"
 
 
-def read_missions(path: str | PathLike[str]) -> list[Mission]:
+def read_missions(path: FilePath) -> list[Mission]:
     """Read missions from a netCDF file, such as `measured.nc` of a campaign, and their ticks.
 
     Args:
@@ -77,7 +76,11 @@ def read_missions(path: str | PathLike[str]) -> list[Mission]:
     Raises:
         DamagedFileError: There is no such file, it was changed, or it holds no missions.
     """
-    tree = read_tree(path)
+    return missions_of_tree(read_tree(path), path)
+
+
+def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
+    """Missions of a tree that was read from a file, see `read_missions`."""
     try:
         table = {str(n): a.values for n, a in tree["missions"].to_dataset().variables.items()}
         if "exposure" in table:  # its name in version 0.1

@@ -1,7 +1,6 @@
 """Simulation-based calibration of posteriors (Talts et al. 2018)."""
 
 import json
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from trustbo.errors import TrustboError, require_choice, require_whole
-from trustbo.files import write_text
+from trustbo.files import FilePath, write_text
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
@@ -34,7 +33,7 @@ def sbc(
     n_draws: int = 1000,
     n_ranked: int = 396,
     seed: int = 0,
-    checkpoint: str | PathLike[str] | None = None,
+    checkpoint: FilePath | None = None,
     progress: bool = True,
 ) -> xr.Dataset:
     """Rank each true parameter among posterior draws, over data sets simulated from the prior.
@@ -127,7 +126,7 @@ def _uniformity(ranks: np.ndarray, n_ranked: int) -> float:
     return float(stats.chisquare(counts, expected).pvalue)
 
 
-def _read(checkpoint: str | PathLike[str] | None, asked: str) -> list[dict[str, int]]:
+def _read(checkpoint: FilePath | None, asked: str) -> list[dict[str, int]]:
     if checkpoint is None or not Path(checkpoint).exists():
         return []
     kept = json.loads(Path(checkpoint).read_text(encoding="utf-8"))
@@ -139,7 +138,7 @@ def _read(checkpoint: str | PathLike[str] | None, asked: str) -> list[dict[str, 
     return kept["ranks"]
 
 
-def _write(checkpoint: str | PathLike[str] | None, asked: str, ranks: list[dict[str, int]]) -> None:
+def _write(checkpoint: FilePath | None, asked: str, ranks: list[dict[str, int]]) -> None:
     if checkpoint is None:
         return
     write_text(checkpoint, json.dumps({"asked": asked, "ranks": ranks}))

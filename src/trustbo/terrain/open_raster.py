@@ -22,12 +22,13 @@ from rasterio.windows import Window
 from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TerrainError
+from trustbo.files import FilePath
 from trustbo.terrain.georeference import known_crs, placed, require_regular
 from trustbo.terrain.nodata import decoder, require_real, scaling, tagged
 from trustbo.terrain.raster import Raster
 from trustbo.terrain.units import height_unit
 
-type RasterLike = str | PathLike[str] | DatasetReader | WarpedVRT | xr.DataArray | xr.Dataset
+type RasterLike = FilePath | DatasetReader | WarpedVRT | xr.DataArray | xr.Dataset
 
 # A GDAL dataset serves one thread at a time.
 GDAL_LOCK = threading.Lock()
