@@ -68,15 +68,15 @@ def require_same_team(missions: Sequence[Mission]) -> None:
             )
 
 
-def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Fill awareness that a mission did not measure (NaN) with that of a map.
+def fill_awareness(mission: Mission, known: np.ndarray) -> Mission:
+    """Fill awareness that a mission did not measure (NaN) with what is known of its bounds.
 
-    The map has shape (robot, row, col, feature), such as `Workspace.awareness`.
+    `known` has shape (robot, bound, feature), such as `moves.along` gives it.
     """
     if not np.isnan(mission.awareness).any():
         return mission
     bounds = tuple(
-        replace(b, awareness=np.where(np.isnan(b.awareness), awareness[:, *b.cell], b.awareness))
-        for b in mission.bounds
+        replace(b, awareness=np.where(np.isnan(b.awareness), known[:, k], b.awareness))
+        for k, b in enumerate(mission.bounds)
     )
     return replace(mission, bounds=bounds)

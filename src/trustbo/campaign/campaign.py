@@ -40,6 +40,7 @@ from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import resolve_policy
 from trustbo.stacking import fill_awareness
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import along
 
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness")
 _N_MAPS = 500
@@ -270,7 +271,7 @@ class Campaign:
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
         """Keep a mission on disk, then learn from it."""
         plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
-        filled = fill_awareness(mission, self.planner_now().mean_awareness)
+        filled = fill_awareness(mission, self.known_along(mission.path))
         told, entries = time.perf_counter(), self.log.entries
         if self._folder is not None:
             extras = [*(entry.extra for entry in entries), extra]
@@ -554,6 +555,10 @@ class Campaign:
             maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
             self._believed = self.planner.with_awareness(maps, self.awareness.mean())
         return self._believed
+
+    def known_along(self, path: Sequence[Cell]) -> np.ndarray:
+        """Awareness expected in the bounds of a path, shape (robot, bound, feature)."""
+        return along(self.planner_now().mean_awareness[:, None], path)
 
     def _believed_awareness(self) -> xr.Dataset | None:
         """`Result.believed`."""

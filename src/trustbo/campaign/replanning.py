@@ -71,7 +71,7 @@ def run_replanning(
             break
         if live is not None and k + 1 < len(path):
             planner = campaign.planner_now().onward(path[: k + 1])
-            awareness = _known(campaign, bound)
+            awareness = _known(campaign, path[k - 1], bound)
             live.update(awareness, bound.contact_rate)
             path = [*path[:k], *better_rest(planner, live, path[k:], threshold)]
         k += 1
@@ -124,7 +124,7 @@ def takes(function: Callable[..., object], name: str) -> bool:
     return name in inspect.signature(function).parameters
 
 
-def _known(campaign: Campaign, bound: Bound) -> np.ndarray:
+def _known(campaign: Campaign, left: Cell, bound: Bound) -> np.ndarray:
     """Awareness of a bound, filled in by the map or the belief where it was not measured."""
-    one = Mission((bound.cell, bound.cell), (bound,), bound.status)
-    return fill_awareness(one, campaign.planner_now().mean_awareness).awareness[0]
+    one = Mission((left, bound.cell), (bound,), bound.status)
+    return fill_awareness(one, campaign.known_along(one.path)).awareness[0]

@@ -1,7 +1,5 @@
 """Graph of passable cells, and the fewest bounds between cells."""
 
-from collections.abc import Mapping
-
 import networkx as nx
 import numpy as np
 from numba import njit
@@ -9,24 +7,11 @@ from numba import njit
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
-
-Steps = tuple[tuple[int, int], ...]
-MOVES: Mapping[int, Steps] = {
-    4: ((-1, 0), (0, -1), (0, 1), (1, 0)),
-    8: ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)),
-}
-"""Moves to the neighbouring cells, by connectivity; the reverse of move m is the m-th from last."""
+from trustbo.workspace.moves import MOVES, require_connectivity
 
 
 class NoPathError(TrustboError, nx.NetworkXNoPath):
     """The goal cannot be reached from the start."""
-
-
-def require_connectivity(connectivity: int) -> int:
-    """Return the connectivity if it is 4 or 8, else raise TrustboError."""
-    if connectivity not in MOVES:
-        raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
-    return connectivity
 
 
 def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:

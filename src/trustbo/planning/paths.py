@@ -12,15 +12,14 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
 from trustbo.planning.engines.layers import Layers, build_layers
 from trustbo.planning.graph import (
-    MOVES,
     NoPathError,
     cell_graph,
     fewest_bounds,
     move_lengths,
-    require_connectivity,
     require_way,
 )
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVES, require_connectivity
 
 DEFAULT_EXTRA = 8
 """Bounds beyond the fewest possible that `success` and `bottleneck` may take by default."""

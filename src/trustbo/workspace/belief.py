@@ -17,6 +17,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError, require_positive
+from trustbo.workspace.moves import along
 from trustbo.workspace.workspace import Workspace
 
 _MOST_CELLS = 4000  # with jointly drawn errors
@@ -64,7 +65,7 @@ class AwarenessBelief:
             scale, (0.3, 100.0), nu=1.5
         ) + WhiteKernel(require_positive("noise", noise) ** 2, (1e-6, 1.0))
         self._learns = learn_scales
-        self._map = workspace.awareness.values
+        self._map, self._bounds = workspace.awareness.values, workspace.bound_maps
         n_features = self._map.shape[-1]
         self._seen: list[list[tuple[int, int, float]]] = [[] for _ in range(n_features)]
 
@@ -76,7 +77,8 @@ class AwarenessBelief:
     def update(self, mission: Mission) -> None:
         """Condition on the awareness that a mission measured; NaN is left out.
 
-        The error in a bound is the mean over robots of measured less mapped awareness.
+        The error in the cell entered is the mean over robots of the awareness measured in a bound,
+        less that of the bound in the map.
 
         Raises:
             ShapeError: Robots or features differ from the workspace's.
@@ -94,8 +96,9 @@ class AwarenessBelief:
                     f"the mission enters {bound.cell}, outside the grid of {rows} rows and {cols} "
                     "columns."
                 )
-        for bound in mission.bounds:
-            error = bound.awareness - self._map[:, *bound.cell]
+        mapped = along(self._bounds, mission.path)
+        for k, bound in enumerate(mission.bounds):
+            error = bound.awareness - mapped[:, k]
             for m in range(error.shape[1]):
                 known = error[~np.isnan(error[:, m]), m]
                 if len(known):

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Self
 
 import numpy as np
@@ -23,7 +23,9 @@ from trustbo.terrain.features import (
 )
 from trustbo.terrain.pixel_feature import PixelFeature
 from trustbo.workspace.awareness import FeatureSpec, cell_maps, feature_specs
+from trustbo.workspace.cells import of_cells
 from trustbo.workspace.grid import Grid
+from trustbo.workspace.moves import MOVE_NAMES
 
 MAX_MISSING = 0.5
 """Largest share of missing or too steep pixels in a passable cell."""
@@ -42,6 +44,9 @@ class Workspace:
         pixels: Dataset (y, x) of traversability, visibility and passable; None without a terrain in
             memory.
         composites: Fitted composites by feature.
+        of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
+            move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
+            the cell entered, whichever way.
     """
 
     awareness: xr.DataArray
@@ -51,6 +56,7 @@ class Workspace:
     terrain: xr.Dataset | None = None
     pixels: xr.Dataset | None = None
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
+    of_bounds: xr.DataArray | None = None
 
     @classmethod
     def from_terrain(
@@ -140,8 +146,11 @@ class Workspace:
         """Make a workspace from arrays, without a terrain.
 
         Args:
-            awareness: Shape (robot, row, col, feature), in [0, 1].
-            passable: Shape (row, col); by default the cells without NaN in `awareness`.
+            awareness: Shape (robot, row, col, feature), in [0, 1]; or (robot, move, row, col,
+                feature), of the bound into a cell by each of the eight `MOVES`: a cell's awareness
+                is then the mean over the bounds into it.
+            passable: Shape (row, col); by default the cells without NaN in `awareness`, or with a
+                bound into them.
             cell_size: Side of a cell, m.
             team: Lead and robots; by default as many robots as `awareness` has rows.
             features: Names of the features; by default traversability, visibility, z3, ...
@@ -150,24 +159,10 @@ class Workspace:
             ShapeError: Axes that do not fit together.
             TrustboError: A value outside [0, 1], NaN in a passable cell, or no passable cell.
         """
-        z = np.asarray(awareness, dtype=float)
-        if z.ndim != 4:
-            raise ShapeError(f"awareness must be (robot, row, col, feature); got shape {z.shape}.")
+        z, free, bounds = of_cells(awareness, passable)
         team = Team(n_robots=len(z)) if team is None else team
         if len(team.robots) != len(z):
             raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
-        known = np.isfinite(z).all((0, 3))
-        free = known if passable is None else np.asarray(passable, dtype=bool)
-        if free.shape != z.shape[1:3]:
-            raise ShapeError(f"passable must be (row, col) = {z.shape[1:3]}; got {free.shape}.")
-        if (free & ~known).any():
-            cell = tuple(int(i) for i in np.argwhere(free & ~known)[0])
-            raise TrustboError(
-                f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
-            )
-        if (bad := (z < 0.0) | (z > 1.0)).any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")
         if not free.any():
             raise TrustboError(
                 "no cell is passable: more than half of every cell is missing or too steep. Use "
@@ -184,24 +179,46 @@ class Workspace:
             "col": np.arange(z.shape[2]),
             **_positions(grid),
         }
-        return cls(
-            xr.DataArray(
-                z,
-                coords | {"feature": list(names)},
-                ("robot", "row", "col", "feature"),
-                "awareness",
-            ),
-            xr.DataArray(
-                free, {k: v for k, v in coords.items() if k != "robot"}, ("row", "col"), "passable"
-            ),
+        features_too = coords | {"feature": list(names)}
+        dims = ("robot", "row", "col", "feature")
+        coords.pop("robot")
+        made = cls(
+            xr.DataArray(z, features_too, dims, "awareness"),
+            xr.DataArray(free, coords, dims[1:3], "passable"),
             grid,
             team,
         )
+        return made if bounds is None else made.with_bounds(bounds)
 
     @property
     def features(self) -> tuple[str, ...]:
         """Names of the awareness features."""
         return tuple(str(name) for name in self.awareness["feature"].values)
+
+    def with_bounds(self, values: np.ndarray) -> Self:
+        """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""
+        like = self.awareness.expand_dims(move=list(MOVE_NAMES), axis=1)
+        return dataclasses.replace(self, of_bounds=like.copy(data=values).rename("bound_awareness"))
+
+    @cached_property
+    def bound_awareness(self) -> xr.DataArray:
+        """Awareness of bounds, DataArray (robot, move, row, col, feature), in [0, 1].
+
+        The bound enters the cell (row, col) by the move, one of the eight of `MOVES`; NaN where
+        there is none. Where awareness is that of cells, every move meets that of the cell entered.
+        """
+        if self.of_bounds is not None:
+            return self.of_bounds
+        return self.awareness.expand_dims(move=list(MOVE_NAMES), axis=1).rename("bound_awareness")
+
+    @property
+    def bound_maps(self) -> np.ndarray:
+        """Values of `bound_awareness`; the axis of moves has length 1 if all moves meet the same.
+
+        Shape (robot, move, row, col, feature); see `moves.along`.
+        """
+        values = self.awareness.values[:, None]
+        return values if self.of_bounds is None else self.of_bounds.values
 
     def require_cell(self, what: str, cell: Cell) -> Cell:
         """Check that a cell is passable, and return it as a pair of ints.

@@ -11,9 +11,9 @@ from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams,
 from trustbo.planning import Planner
 from trustbo.planning.engines import compiled as engines
 from trustbo.planning.engines.buckets import best_stationary
-from trustbo.planning.graph import MOVES
 from trustbo.planning.search import Engine
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVES
 
 OBJECTIVES = ("terminal", "mean", "success", "bottleneck", "stationary")
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from trustbo.planning.engines.reachable_trust import best_trust
-from trustbo.planning.graph import MOVES, fewest_bounds
+from trustbo.planning.graph import fewest_bounds
+from trustbo.workspace.moves import MOVES
 
 
 def walks(shape, passable, start, moves, most):

@@ -1,0 +1,66 @@
+"""Moves between neighbouring cells: a bound is the cell it enters, and the move that enters it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError
+
+Steps = tuple[tuple[int, int], ...]
+MOVES: Mapping[int, Steps] = {
+    4: ((-1, 0), (0, -1), (0, 1), (1, 0)),
+    8: ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)),
+}
+"""Moves to the neighbouring cells, by connectivity; the reverse of move m is the m-th from last."""
+MOVE_NAMES = ("nw", "n", "ne", "w", "e", "sw", "s", "se")
+"""Labels of the moves of `MOVES[8]`; row 0 is in the north."""
+
+
+def require_connectivity(connectivity: int) -> int:
+    """Return the connectivity if it is 4 or 8, else raise TrustboError."""
+    if connectivity not in MOVES:
+        raise TrustboError(f"connectivity must be 4 or 8; got {connectivity!r}.")
+    return connectivity
+
+
+def move_indices(connectivity: int) -> np.ndarray:
+    """Indices of a connectivity's moves among the eight of `MOVES[8]`, shape (move,)."""
+    return np.array([MOVES[8].index(step) for step in MOVES[require_connectivity(connectivity)]])
+
+
+def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+    """Indices in `MOVES[8]` of the bounds of a path, shape (bound,).
+
+    TrustboError: two successive cells are no neighbours.
+    """
+    cells = np.asarray(path)
+    steps = np.diff(cells, axis=0)
+    if (far := np.abs(steps).max(1) != 1).any():
+        k = int(np.argmax(far))
+        a, c = (tuple(cells[i].tolist()) for i in (k, k + 1))
+        raise TrustboError(f"no bound leads from {a} to {c}: the cells are no neighbours.")
+    index = 3 * (steps[:, 0] + 1) + steps[:, 1] + 1  # 0..8, the middle one being no move
+    return index - (index > 4)
+
+
+def existing_bounds(passable: np.ndarray) -> np.ndarray:
+    """Whether a bound enters each cell by each move, shape (move, row, col), from (row, col).
+
+    Both the cell entered and the cell left are passable.
+    """
+    rows, cols = passable.shape
+    framed = np.pad(passable, 1)
+    left = [framed[1 - down :, 1 - right :][:rows, :cols] for down, right in MOVES[8]]
+    return np.stack(left) & passable
+
+
+def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+    """Values of the bounds of a path, shape (..., bound, feature).
+
+    From maps (..., move, row, col, feature), whose axis of moves has length 1 where values are
+    those of the cell entered, whichever way it is.
+    """
+    rows, cols = np.asarray(path)[1:].T
+    moves = moves_along(path) if maps.shape[-4] > 1 else 0
+    return maps[..., moves, rows, cols, :]
