@@ -8,7 +8,7 @@ from numba import njit
 
 from trustbo.data import Robot
 from trustbo.workspace.routes import speed_share
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 LOOKAHEAD = 1.5
 """Distance along its route to the point that a robot steers for, m."""
