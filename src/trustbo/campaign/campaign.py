@@ -112,9 +112,9 @@ class Campaign:
         self._believed: Planner | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
-        sizes = workspace.awareness.sizes
+        n_robots, seed_of_prior = len(workspace.team.robots), self.seed_of("prior")
         self._prior: Params = self._learning.prior_belief(
-            self.options.initial, sizes["robot"], sizes["feature"], self.seed_of("prior")
+            self.options.initial, n_robots, workspace.features, seed_of_prior
         )
         self.belief = self._prior
         own_policy = not isinstance(policy, str)
