@@ -6,8 +6,9 @@ from references import walks
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models import HierarchicalTrust, PooledTrust, sample_prior
-from trustbo.planning import NoPathError, Planner, roll_trust
+from trustbo.planning import NoPathError, Planner, problem, roll_trust
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import along
 
 N = 4
 
@@ -174,3 +175,31 @@ def test_awareness_of_its_own_goes_with_each_draw(workspace, draws):
     maps[3, 0, 0, 0, 1] = np.nan
     with pytest.raises(TrustboError, match=r"awareness of the passable cell \(0, 0\) is NaN"):
         planner.with_awareness(maps)
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
+def test_what_cells_are_believed_to_differ_in_goes_to_all_bounds_into_them(
+    model, connectivity, monkeypatch
+):
+    monkeypatch.setattr(problem, "_ENTRIES", 2000)  # a few draws at a time
+    rng = np.random.default_rng(8)
+    workspace = Workspace.from_awareness(rng.uniform(size=(2, 8, N, N, 2)))
+    draws = sample_prior(model, 2, 30, seed=4, n_robots=2)
+    maps = rng.uniform(size=(7, 2, N, N, 2))
+    planner = Planner(workspace, (3, 0), (0, 3), connectivity=connectivity).with_awareness(maps)
+    drawn = planner.plan_draws(draws)
+    bounds, cells = workspace.bound_maps, workspace.awareness.values
+    for d in (0, 13, 29):
+        believed = np.clip(bounds + (maps[d % 7] - cells)[:, None], 0.0, 1.0)
+        own = Planner(workspace.with_bounds(believed), (3, 0), (0, 3), connectivity=connectivity)
+        alone = own.plan(draws.draw(d))
+        np.testing.assert_allclose(drawn.values[d], alone.value, rtol=1e-12)
+        assert planner.of_draw(d).plan(draws.draw(d)).path == alone.path
+        bands = planner.evaluate(alone.path, draws).bands
+    everyone = np.clip(bounds + (maps - cells)[:, :, None], 0.0, 1.0)
+    rolled = [
+        roll_trust(draws.draw(d), np.swapaxes(along(everyone[d % 7], alone.path), 0, 1))
+        for d in range(30)
+    ]
+    np.testing.assert_allclose(bands[-1], np.quantile(rolled, 0.95, axis=0), rtol=1e-12)

@@ -13,7 +13,7 @@ from trustbo.planning.engines.reachable_trust import best_trust
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import SIMPLE, AdmissiblePaths
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.values import trust_along
+from trustbo.planning.values import team_trust
 
 
 def trust_map(
@@ -87,5 +87,5 @@ def _trust_at(
     )
     paths = plan_compiled(there, dynamics, Objective("terminal")).paths
     return np.array(
-        [trust_along(dynamics.take(d), there.cells(path))[-1] for d, path in enumerate(paths)]
+        [team_trust(dynamics.take(d).along(there.cells(path)))[-1] for d, path in enumerate(paths)]
     )
