@@ -81,10 +81,15 @@ def random_problem(model, n, n_robots, beta0, rng, *, moves=()):
     return z, CoupledParams(B0, B, b, noise, noise), of_bounds(u), B0
 
 
-def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weight=0.0):
-    """Planners with either engine, parameters, and the value of every admissible path."""
+def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weight=0.0, more=None):
+    """Planners with either engine, parameters, and the value of every admissible path.
+
+    `more` bounds than the fewest, without U-turns, in place of what `admissible` says.
+    """
     rng = np.random.default_rng([seed, n, connectivity, int(10 * abs(beta0))])
     extra, cap, kind = admissible(objective, n, connectivity)
+    if more is not None:
+        extra, cap, kind = more, f"shortest+{more}", (("u_turns", False),)
     passable, shortest, paths, n_cells, length = random_map(n, connectivity, seed % 3, extra, kind)
     n_robots = (1, 3)[seed % 2] if model == "pooled" else 3
     moves = (8,) if seed else ()  # all seeds but 0 have a drift for each bound
@@ -188,6 +193,19 @@ def test_vector_trust_is_planned_exactly_too(objective, model, team):
     for seed in range(4):
         for beta0 in (0.3, 0.7):
             check(*plan_and_best(objective, model, 4, 8, seed, beta0, team=team))
+
+
+@pytest.mark.parametrize("more", range(7))
+@pytest.mark.parametrize("objective", ["terminal", "mean", "success"])
+def test_any_number_of_bounds_more_than_the_fewest_is_planned_exactly(objective, more):
+    for connectivity, seed in ((4, 1), (8, 2)):
+        for beta0 in (0.3, 0.9):
+            case = objective, "pooled", 3, connectivity, seed, beta0
+            plans, best = plan_and_best(*case, more=more)
+            check(plans, best)
+            for plan in plans:
+                assert plan.revisits == len(plan.path) - len(set(plan.path))
+                assert plan.revisits == 0 or more > 2
 
 
 @pytest.mark.parametrize("objective", ["terminal", "mean", "stationary"])

@@ -152,6 +152,9 @@ def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
     np.testing.assert_allclose(
         float(rest.trust_map(params, x0=plan.trust[0])[0, 3]), plan.trust[-1].mean(), rtol=1e-12
     )
+    longer = Planner(workspace, (3, 0), (0, 3), max_bounds="shortest+5")
+    rest = longer.onward([(3, 0), (3, 1), (2, 1)])  # one bound of five was spent
+    assert (rest.max_bounds, rest.longest, rest.paths.u_turns) == ("shortest+4", 6, False)
     with pytest.raises(TrustboError, match=r"the mission began at \(0, 0\)"):
         planner.onward([(0, 0), (1, 0)])
     with pytest.raises(NoPathError, match=r"it takes 3 bounds, but 2 are left"):

@@ -72,8 +72,9 @@ class Planner:
             objective: `"terminal"`, `"mean"`, `"success"`, `"bottleneck"` or `"stationary"`.
             connectivity: 4, or 8 to allow diagonal bounds too.
             max_bounds: Limit on the number of bounds. `"shortest"`: the fewest possible;
-                `"shortest+2"` (default for terminal and mean): up to two more, without U-turns,
-                which keeps paths simple. An int: walks of at most that many bounds (default for
+                `"shortest+n"`: up to n more, without U-turns, which keeps paths simple for n up to
+                2 (default for terminal and mean); `Plan.revisits` counts cells entered again
+                beyond. An int: walks of at most that many bounds (default for
                 success and bottleneck: shortest + 8). Without effect on stationary, whose
                 admissible paths are all simple paths.
             revisit: True if walks of success and bottleneck may enter a cell twice.

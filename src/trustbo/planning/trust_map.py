@@ -11,7 +11,7 @@ from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.compiled import plan_compiled
 from trustbo.planning.engines.reachable_trust import best_trust
 from trustbo.planning.objectives import Objective
-from trustbo.planning.paths import SIMPLE, AdmissiblePaths
+from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
 from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.values import team_trust
 
@@ -65,7 +65,7 @@ def _of_robot(dynamics: Dynamics, robot: int) -> Dynamics:
 
 def _largest_trust(admissible: AdmissiblePaths, dynamics: Dynamics) -> np.ndarray:
     """Largest trust of every draw and cell, shape (draw, row, col); NaN if out of reach."""
-    extra = min(2, admissible.longest - admissible.shortest)
+    extra = min(SIMPLE_EXTRA, admissible.longest - admissible.shortest)
     fewest = admissible.bounds_from_start
     if dynamics.is_scalar:
         beta0, x0 = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
@@ -83,7 +83,12 @@ def _trust_at(
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
     there = AdmissiblePaths(
-        admissible.workspace, admissible.start, cell, admissible.connectivity, SIMPLE[extra], True
+        admissible.workspace,
+        admissible.start,
+        cell,
+        admissible.connectivity,
+        f"shortest+{extra}",
+        True,
     )
     paths = plan_compiled(there, dynamics, Objective("terminal")).paths
     return np.array(
