@@ -41,7 +41,7 @@ class CampaignOptions:
 
     Attributes:
         connectivity: Number of directions of a bound: 8, or 4 for no diagonal bounds.
-        max_bounds: Admissible paths: shortest, shortest+2, or the most bounds allowed. See
+        max_bounds: Admissible paths: shortest, shortest+n, or the most bounds allowed. See
             `Planner`, also for the default.
         team: Trust of the team, the mean or the min of its robots'.
         length_weight: Cost of a metre of the path, in units of the objective. See `Planner`.
