@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import xarray as xr
@@ -193,6 +193,44 @@ class KinematicSimulator:
         """End the mission that runs bound by bound."""
         self._state = None
 
+    def run_ahead(
+        self,
+        way: tuple[Cell, Cell],
+        ahead: Sequence[Cell | None],
+        rng: np.random.Generator,
+        state: State | None = None,
+    ) -> list[tuple[np.ndarray, str, State]]:
+        """Run a successive bound once for each cell that may follow it, the lead's move shared.
+
+        It leads from a cell to the next, from a state of the team there, by default in position.
+        Returns for each the contact rate (robot,), the status and the state after it. The rate is
+        the mean probability of contact over the ticks where looks are independent; where tracks
+        outlast misses, or lost contact ends a mission, that of simulated looks.
+        """
+        max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
+        state = self._start(way[0], 0, cell) if state is None else state
+        lead, status = self._phase("lead", state.poses, way, None, max_ticks, rng)
+        drives = [Drive(lead, np.ones(len(lead), bool), status, way)]
+        for next_cell in ahead if status == "ok" else ():
+            t2, ended = self._phase("t2", lead[-1], way, next_cell, max_ticks - len(lead), rng)
+            drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell)))
+        seen, *others = detections(self._now, self.sight, self.workspace.team, drives)
+        independent = self.lost_contact_after is None and all(
+            robot.acquire == robot.drop == 1
+            for robot in (self.workspace.team.lead, *self.workspace.team.robots)
+        )
+        outcomes = []
+        for closing, found in zip(drives[1:], others, strict=True):
+            after = replace(state, cells=(cell, cell), poses=closing.poses[-1])
+            after.tracks, status = state.tracks.copy(), closing.status
+            probability = np.concatenate([seen, found])
+            if not independent:
+                moves = np.concatenate([drives[0].lead_moves, closing.lead_moves])
+                both = closing._replace(lead_moves=moves)
+                probability, status = self._contact(after, both, probability, rng)
+            outcomes.append((probability.mean(0), status, after))
+        return outcomes or [(seen.mean(0), status, state)] * len(ahead)
+
     def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
         """Simulate random bounds, without threats, to fit `CompositeIndex.realtime` on.
 
@@ -271,30 +309,44 @@ class KinematicSimulator:
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
     ) -> Drive:
         """Drive the lead, then T2; or only one of them, by turns."""
-        team, cells, status = self.workspace.team, list(state.cells), "ok"
+        cells, status = list(state.cells), "ok"
         poses, lead_moves = [state.poses[None]], []
         ticks_left = round(self.bound_timeout / self.tick)
         for mover in turns(self.bounding, k, next_cell is None):
-            if mover == "lead":
-                i, members, robots = 0, slice(0, 1), (team.lead,)
-                goals = self._positions.waypoint(cell)[None]
-            else:
-                i, members, robots = 1, slice(1, None), team.robots
-                goals = self._positions.formation(cell, next_cell)
-            now = poses[-1][-1]
+            i = int(mover != "lead")
             way = cells[i], cell
-            moved, status = self._move(now[members], robots, list(goals), way, ticks_left, rng)
-            part = np.repeat(now[None], len(moved), axis=0)
-            part[:, members] = moved
+            part, status = self._phase(mover, poses[-1][-1], way, next_cell, ticks_left, rng)
             poses.append(part)
-            lead_moves.append(np.full(len(moved), mover == "lead"))
-            ticks_left -= len(moved)
+            lead_moves.append(np.full(len(part), mover == "lead"))
+            ticks_left -= len(part)
             if status != "ok":
                 break
             cells[i] = cell
         return Drive(
             np.concatenate(poses[1:]), np.concatenate(lead_moves), status, (cells[0], cells[1])
         )
+
+    def _phase(
+        self,
+        mover: str,
+        now: np.ndarray,
+        way: tuple[Cell, Cell],
+        next_cell: Cell | None,
+        max_ticks: int,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, str]:
+        """Drive the lead or T2: poses of all, (tick, 1 + robot, 3), until it ends, and status."""
+        team = self.workspace.team
+        if mover == "lead":
+            members, robots = slice(0, 1), (team.lead,)
+            goals = self._positions.waypoint(way[1])[None]
+        else:
+            members, robots = slice(1, None), team.robots
+            goals = self._positions.formation(way[1], next_cell)
+        moved, status = self._move(now[members], robots, list(goals), way, max_ticks, rng)
+        part = np.repeat(now[None], len(moved), axis=0)
+        part[:, members] = moved
+        return part, status
 
     def _move(
         self,
