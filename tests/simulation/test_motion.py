@@ -6,7 +6,7 @@ import pytest
 from trustbo.data import Robot
 from trustbo.simulation.motion import drive
 from trustbo.workspace.routes import Routes
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 
 def flat_surface(n=60, dz_dx=0.0, dz_dy=0.0):

@@ -16,7 +16,8 @@ from trustbo.simulation.mujoco import MujocoSimulator
 from trustbo.simulation.vehicle import WHEEL_RADIUS, Ground, Physics, center_of_mass, crop, grip_of
 from trustbo.terrain import assemble_terrain, synthetic_terrain
 from trustbo.workspace import Workspace
-from trustbo.workspace.sight import Surface, detection_probability, optics
+from trustbo.workspace.sight import detection_probability, optics
+from trustbo.workspace.surface import Surface
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 HUSKY = Robot()
@@ -72,7 +73,12 @@ def drive(workspace, surface, starts, goals, *, robot=HUSKY, heading=0.0, second
     goals = [CORNER + flip * goal for goal in goals]
     ticks = round(seconds / simulator.tick)
     robots, rng = [robot] * len(poses), np.random.default_rng(0)
-    track, status = simulator._move(poses, robots, goals, ((1, 0), (1, 2)), ticks, rng)
+    ways, window = simulator._ways, simulator._ways.posts.window((1, 0), (1, 2))
+    routes = [
+        ways.routes.find(robot, pose[:2], goal, window)
+        for pose, goal in zip(poses, goals, strict=True)
+    ]
+    track, status = simulator._move(poses, robots, routes, window, ticks, rng)
     return np.concatenate([poses[None], track]), status
 
 
@@ -408,8 +414,7 @@ def test_gaps_edges_and_other_pixels_are_no_obstacle():
 
 def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
     terrain = tb.terrain.read_terrain(*real_terrain("wellington"))
-    with pytest.warns(UserWarning, match=r"openness"):
-        workspace = Workspace.from_terrain(terrain, (6, 8))
+    workspace = Workspace.from_terrain(terrain, (6, 8))
     simulator = MujocoSimulator(workspace, sight="transmittance")
     result = tb.iterate(
         workspace,

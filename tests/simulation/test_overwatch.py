@@ -49,7 +49,8 @@ def test_contact_is_lost_beyond_the_lidar_s_range():
 def test_a_mission_records_what_happened(wooded):
     mission = KinematicSimulator(wooded).run(PATH, seed=3)
     assert mission.status == "ok"
-    assert mission.awareness.shape == (2, 3, 2)
+    assert mission.awareness.shape == (2, 3, 3)
+    assert np.isnan(mission.awareness[..., 2]).all()  # line of sight is predicted, not measured
     first, second = mission.bounds
     assert first.cell == (1, 1)
     assert second.t0 == pytest.approx(first.t1)
@@ -216,8 +217,7 @@ def test_bad_input():
     with pytest.raises(TrustboError, match="at least two cells"):
         KinematicSimulator(workspace).run([(0, 0)], seed=0)
     for options, message in (
-        ({"sight": None}, "sight must be a mode's name or a Sight; got None"),
-        ({"formation_radius": 1.0}, "formation_radius must be at least 2 m"),
+        ({"sight": 3}, "sight must be a mode's name or a Sight, or several; got 3"),
         ({"bound_timeout": np.inf}, "bound_timeout must be positive and finite; got inf"),
     ):
         with pytest.raises(TrustboError, match=message):

@@ -69,10 +69,12 @@ def test_a_lazily_read_terrain_gives_what_one_in_memory_gives(terrain, tmp_path,
     for name in ("dem", "dsm"):
         terrain[name].astype("float32").rio.to_raster(tmp_path / f"{name}.tif")
     files = tmp_path / "dem.tif", tmp_path / "dsm.tif"
-    eager = Workspace.from_terrain(read_terrain(*files), (4, 3))
+    eager = Workspace.from_terrain(read_terrain(*files), (4, 3), bounds=False)
     monkeypatch.setattr("trustbo.terrain.strips._PIXELS", 90 * 7)
     lazy_terrain = read_terrain(*files, lazy=True)
-    lazy = Workspace.from_terrain(lazy_terrain, (4, 3))
+    with pytest.raises(TerrainError, match=r"average it to pixels of 2 m, .* bounds=False"):
+        Workspace.from_terrain(lazy_terrain, (4, 3))
+    lazy = Workspace.from_terrain(lazy_terrain, (4, 3), bounds=False)
     lazy_terrain.close()
     assert lazy.pixels is None
     np.testing.assert_allclose(lazy.awareness, eager.awareness, atol=1e-5)
@@ -101,7 +103,11 @@ def test_features_of_one_s_own_and_one_used_as_it_is(terrain):
             "cover": PixelFeature(partial(canopy_cover, radius=3.0), -1, 3.0),
         },
     )
-    assert list(workspace.awareness["feature"].values) == ["traversability", "cover"]
+    assert list(workspace.awareness["feature"].values) == [
+        "traversability",
+        "cover",
+        "line_of_sight",
+    ]
     assert set(workspace.composites) == {"traversability"}
     mean = workspace.grid.cell_means(canopy_cover(terrain, radius=3.0))
     np.testing.assert_allclose(
@@ -148,7 +154,7 @@ def test_clipping_is_reported_for_lazy_terrains_too(tmp_path):
     (terrain["dem"] - 1.0).rio.write_crs(terrain.rio.crs).rio.to_raster(tmp_path / "dsm.tif")
     lazy = read_terrain(tmp_path / "dem.tif", tmp_path / "dsm.tif", lazy=True)
     with pytest.warns(UserWarning, match="DSM lies below the DEM on 100.0% of pixels"):
-        Workspace.from_terrain(lazy, (2, 2), features={"z": ["slope", "tri"]})
+        Workspace.from_terrain(lazy, (2, 2), features={"z": ["slope", "tri"]}, bounds=False)
     lazy.close()
 
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from trustbo.data import Robot
-from trustbo.workspace.positions import _largest_region
+from trustbo.workspace.posts import _largest_region
 from trustbo.workspace.routes import Routes, _a_star
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 
 def cheapest(pace, pixel, start, goal):

@@ -10,7 +10,8 @@ import rasterio
 
 from trustbo.data import Robot
 from trustbo.terrain import rays
-from trustbo.workspace.sight import Sight, Surface, detection_probability, optics
+from trustbo.workspace.sight import Sight, detection_probability, optics
+from trustbo.workspace.surface import Surface
 
 VIEWSHEDS = Path(__file__).parent.parent / "data" / "gdal" / "viewsheds.tif"
 

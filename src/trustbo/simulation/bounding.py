@@ -17,6 +17,7 @@ class State:
 
     cells: tuple[Cell, Cell]  # of the lead, and of T2
     poses: np.ndarray  # (1 + robot, 3), the lead first
+    stops: np.ndarray  # (1 + robot, 2), where they were to stop: their ways begin there
     time: float
     seed: int
     tracks: np.ndarray  # (phase, robot, 2), see `sensing.new_tracks`
@@ -29,6 +30,7 @@ class Drive(NamedTuple):
     lead_moves: np.ndarray  # (tick,), else T2 does
     status: str
     cells: tuple[Cell, Cell]
+    stops: np.ndarray  # (1 + robot, 2)
 
     def closing(self, n_ticks: int) -> np.ndarray:
         """Mask of the first ticks in which T2 moves; the last tick if it has not moved yet."""

@@ -9,7 +9,7 @@ from rasterio.features import geometry_mask
 from rasterio.transform import Affine
 
 from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 KINDS = ("jam", "forbid")
 

@@ -6,12 +6,13 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Bound, Robot
+from trustbo.data import Bound, Robot, Team
 from trustbo.errors import require_choice
 from trustbo.logs.netcdf import STATES
-from trustbo.terrain import CompositeIndex, openness, pixel_size
+from trustbo.terrain import CompositeIndex, fan
 from trustbo.workspace import Workspace
-from trustbo.workspace.sight import Sight, Surface
+from trustbo.workspace.sight import Sight
+from trustbo.workspace.surface import Surface
 
 _PARTS, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
 _OPAQUE = 1e6
@@ -24,6 +25,7 @@ class Measure:
     def __init__(
         self,
         workspace: Workspace,
+        team: Team,
         surface: Surface,
         sight: Sight,
         tick: float,
@@ -33,24 +35,29 @@ class Measure:
 
         TrustboError: a real-time index of an unknown feature.
         """
-        self._workspace, self._surface, self._sight, self._tick = workspace, surface, sight, tick
-        self._names = workspace.features
+        self._team, self._surface, self._sight, self._tick = team, surface, sight, tick
+        pixels, planned = workspace.pixels, workspace.surface
+        assert pixels is not None and planned is not None  # noqa: S101, PT018  # refused before
+        self._planned = planned
+        # Lines of sight are of bounds, and not measured.
+        self._names = [name for name in workspace.features if name in pixels]
         for feature in realtime:
             require_choice("awareness feature", feature, self._names)
         self._realtime = realtime
-        pixels = workspace.pixels
-        assert pixels is not None  # noqa: S101  # `Worlds` has refused others
         self._maps = np.stack([pixels[name].values for name in self._names], axis=-1)
+        self._columns = [workspace.features.index(name) for name in self._names]
+        self._n_features = len(workspace.features)
 
     def __call__(self, ways: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> np.ndarray:
         """Mean awareness along tracks, shape (track, robot, feature).
 
-        From the poses of each track, shape (tick, robot, 3), and for real-time indices the states
-        of each, shape (tick, robot, state), else empty.
+        NaN for a feature that is no map of pixels. From the poses of each track, shape (tick,
+        robot, 3), and for real-time indices the states of each, shape (tick, robot, state), else
+        empty.
         """
         poses = np.concatenate(ways)
         starts = np.cumsum([0, *(len(way) for way in ways[:-1])])
-        values = self._maps[self._surface.nearest(poses[..., 0], poses[..., 1])]
+        values = self._maps[self._planned.nearest(poses[..., 0], poses[..., 1])]
         for m, name in enumerate(self._names):
             index = self._realtime.get(name)
             if index is not None and states:
@@ -64,19 +71,23 @@ class Measure:
         moved[starts] = True
         weight = moved[..., None] & np.isfinite(values)
         total = np.add.reduceat(np.where(weight, values, 0.0), starts, axis=0)
+        found = np.full((*total.shape[:-1], self._n_features), np.nan)
         with np.errstate(invalid="ignore"):
-            return total / np.add.reduceat(weight, starts, axis=0, dtype=np.int64)
+            found[..., self._columns] = total / np.add.reduceat(weight, starts, 0, dtype=np.int64)
+        return found
 
     def states(self, poses: np.ndarray) -> np.ndarray:
         """Values of `STATES` of each robot at each tick, shape (tick, robot, state)."""
-        motion = _motion(self._surface, self._workspace.team.robots, poses, self._tick)
+        motion = _motion(self._surface, self._team.robots, poses, self._tick)
         seen = self._lidar[self._surface.nearest(poses[..., 0], poses[..., 1])]
         return np.concatenate([motion, seen], axis=-1)
 
     def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
         """Map's value and mean states by feature, one sample per robot and bound, (sample)."""
         rows = [
-            np.concatenate([self([b.poses[:, 1:]], [])[0], b.states.mean(0)], axis=1)
+            np.concatenate(
+                [self([b.poses[:, 1:]], [])[0][:, self._columns], b.states.mean(0)], axis=1
+            )
             for b in bounds
             if b.poses is not None and b.states is not None
         ]
@@ -89,28 +100,26 @@ class Measure:
 
     @cached_property
     def _lidar(self) -> np.ndarray:
-        return _lidar_maps(self._workspace, self._surface, self._sight)
+        return _lidar_maps(self._team, self._surface, self._sight)
 
 
-def _lidar_maps(workspace: Workspace, surface: Surface, sight: Sight) -> np.ndarray:
+def _lidar_maps(team: Team, surface: Surface, sight: Sight) -> np.ndarray:
     """Mean range of a lidar's returns, m, and share of clear beams, by pixel: (row, col, 2).
 
     By rays all around. The mean range of returns is the integral over range of the share of beams
     that reach it. Beams are blocked by what blocks sight: for "wall", a canopy opaque from the
     ground up.
     """
-    terrain, team = workspace.terrain, workspace.team
-    assert terrain is not None  # noqa: S101  # `Worlds` has refused others
-    sides = [n * step for n, step in zip(surface.ground.shape, pixel_size(terrain), strict=True)]
+    sides = [n * step for n, step in zip(surface.ground.shape, surface.pixel, strict=True)]
     reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
-    heights = {"eye": team.robots[0].sensor_height, "target": team.lead.target_height}
+    heights = team.robots[0].sensor_height, team.lead.target_height
     canopy = {"bare": (0.0, sight.crown_base), "wall": (_OPAQUE, 0.0)}
-    extinction, crown_base = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
-    options = {"n_rays": _N_RAYS, "extinction": extinction, "crown_base": crown_base}
+    opacity = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
+    rasters = surface.ground, surface.canopy, surface.pixel
     shares = [np.ones(surface.ground.shape)]
     for part in _PARTS:
-        share = openness(terrain, part * reach, **heights, **options)
-        shares.append(np.nan_to_num(share.values))
+        share = fan.openness(*rasters, part * reach, *heights, _N_RAYS, *opacity, slice(None))
+        shares.append(np.nan_to_num(share))
     return_range = reach * np.trapezoid(shares, [0.0, *_PARTS], axis=0)
     return np.stack([return_range, shares[-1]], axis=-1)
 

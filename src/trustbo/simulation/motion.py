@@ -8,14 +8,14 @@ from numba import njit
 
 from trustbo.data import Robot
 from trustbo.workspace.routes import speed_share
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 LOOKAHEAD = 1.5
 """Distance along its route to the point that a robot steers for, m."""
 ARRIVED = 0.5
 """Distance from its goal at which a robot stops, m."""
 _LEAST_STEPS = 5
-_compiled = njit(cache=True, error_model="numpy")
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
 _STATUS = ("ok", "stuck", "tipped", "timeout")
 
 

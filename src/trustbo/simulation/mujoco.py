@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.data import Cell, Robot
+from trustbo.data import Robot
 from trustbo.errors import require_positive
 from trustbo.simulation.motion import ARRIVED, LOOKAHEAD
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.vehicle import Physics, crop, grip_of, require_mujoco, wheel_speeds
 from trustbo.workspace import Workspace
 from trustbo.workspace.routes import SLOWEST
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 MARGIN = 5.0
 """Width of the ground simulated around the pixels that a route may use, m."""
@@ -97,16 +97,14 @@ class MujocoSimulator(KinematicSimulator):
         self,
         poses: np.ndarray,
         robots: Sequence[Robot],
-        goals: Sequence[np.ndarray],
-        cells: tuple[Cell, Cell],
+        routes: Sequence[np.ndarray | None],
+        window: tuple[int, int, int, int],
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
         """Drive robots at the same time: poses (tick, robot, 3) until all arrive or one fails."""
-        window = self._positions.window(*cells)
         legs: list[_Leg] = []
-        for pose, robot, goal in zip(poses, robots, goals, strict=True):
-            route = self._routes.find(robot, pose[:2], goal, window)
+        for robot, route in zip(robots, routes, strict=True):
             if route is None:
                 return poses[None].copy(), "stuck"
             legs.append(_Leg(route, robot))
@@ -116,7 +114,7 @@ class MujocoSimulator(KinematicSimulator):
         grip *= np.exp(GRIP_SD * rng.standard_normal(len(robots)))
         slip = np.exp(SLIP_SD * rng.standard_normal((max(1, max_ticks), len(robots), 2)))
         physics = Physics(
-            crop(self._surface, window, MARGIN),
+            crop(self._surface, self._true_window(window), MARGIN),
             robots,
             grip.tolist(),
             self.tick / n_commands / n_steps,
@@ -133,6 +131,15 @@ class MujocoSimulator(KinematicSimulator):
             if status != "underway":
                 break
         return np.stack(track[1:]), "timeout" if status == "underway" else status
+
+    def _true_window(self, window: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+        """The window's pixels on the true surface, whose raster may be another."""
+        planned, true = self._ways.posts.surface, self._surface
+        if planned.pixel == true.pixel and planned.origin == true.origin:
+            return window
+        y, x = planned.axes
+        row, col = true.nearest(x[[window[2], window[3] - 1]], y[[window[0], window[1] - 1]])
+        return int(row[0]), int(row[1]) + 1, int(col[0]), int(col[1]) + 1
 
 
 class _Convoy:

@@ -1,24 +1,24 @@
 """Kinematic simulator of bounding overwatch: movements and contacts, bound by bound."""
 
 import copy
+import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
 
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Bound, Cell, Mission, Robot
+from trustbo.data import Bound, Cell, Mission, Robot, Team
 from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
 from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, detections, new_tracks
-from trustbo.simulation.world import Worlds
+from trustbo.simulation.world import Worlds, true_surface
 from trustbo.terrain import CompositeIndex
+from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
-from trustbo.workspace.positions import SPACING
-from trustbo.workspace.sight import Sight
+from trustbo.workspace.sight import Sight, sights_of
 
 
 class KinematicSimulator:
@@ -39,9 +39,10 @@ class KinematicSimulator:
         self,
         workspace: Workspace,
         *,
-        sight: Sight | str = "transmittance",
+        terrain: xr.Dataset | None = None,
+        sight: Sight | str | None = None,
+        team: Team | None = None,
         tick: float = 0.5,
-        formation_radius: float = 8.0,
         bound_timeout: float = 600.0,
         lost_contact_after: float | None = None,
         bounding: str = "successive",
@@ -52,15 +53,21 @@ class KinematicSimulator:
     ) -> None:
         """Prepare a terrain for simulation.
 
+        Robots stand and drive where the workspace planned. The true terrain, sight and team decide
+        contact, motion and failure only.
+
         Args:
             workspace: A workspace made from a terrain in memory.
-            sight: Model of sight, or only its mode: "bare", "wall" or "transmittance".
+            terrain: True DEM and DSM, where they differ from the workspace's, which they cover.
+            sight: True model of sight, or only its mode: "bare", "wall" or "transmittance"; by
+                default the workspace's first.
+            team: True robots, of the same names; by default the workspace's.
             tick: Length of a tick, s.
-            formation_radius: Largest distance of T2 from the lead's waypoint, m.
             bound_timeout: Longest duration of a bound, s; the mission then ends as "timeout".
             lost_contact_after: Longest time without contact of any robot, s; the mission then ends
                 as "lost_contact". None: no limit.
-            bounding: "successive" or "alternate".
+            bounding: "successive" or "alternate". The workspace's posts, ways and awareness of
+                bounds are those of successive bounding.
             threats: Regions that jam sight or forbid passage in some missions.
             degradations: Lidars of T2 that are worse in some missions.
             realtime: Fitted `CompositeIndex.realtime` by feature: measured awareness is then the
@@ -71,17 +78,17 @@ class KinematicSimulator:
             TrustboError: A workspace without terrain, an unknown sight mode, bounding or robot, a
                 value that is not positive, a threat off the terrain.
         """
-        if not isinstance(sight, str | Sight):
-            raise TrustboError(f"sight must be a mode's name or a Sight; got {sight!r}.")
-        if require_positive("formation_radius", formation_radius) < SPACING:
+        assumed = (*workspace.sights, Sight())[0]
+        self.workspace, self.terrain = workspace, terrain
+        self.sight = assumed if sight is None else sights_of(sight)[0]
+        self.team = workspace.team if team is None else team
+        if self.team.names != workspace.team.names:
             raise TrustboError(
-                f"formation_radius must be at least {SPACING:g} m, the least distance between two "
-                f"robots; got {formation_radius:g}."
+                f"the true team has robots {self.team.names}, the workspace's "
+                f"{workspace.team.names}; give as many, by the same names."
             )
-        self.workspace = workspace
-        self.sight = Sight(sight) if isinstance(sight, str) else sight
+        surface = true_surface(workspace, terrain)
         self.tick = require_positive("tick", tick)
-        self.formation_radius = formation_radius
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
         self.lost_contact_after = lost_contact_after
         if lost_contact_after is not None:
@@ -89,18 +96,17 @@ class KinematicSimulator:
         self.bounding = require_choice("bounding", bounding, BOUNDING)
         self.realtime, self.record_states = dict(realtime or {}), record_states
         self._wants_states = record_states or bool(self.realtime)
-        self._worlds = Worlds(workspace, self.sight, formation_radius, threats, degradations)
+        self._worlds = Worlds(workspace, self.sight, self.team, surface, threats, degradations)
         self.threats, self.degradations = tuple(threats), tuple(degradations)
-        self._measure = Measure(
-            workspace, self._worlds.surface, self.sight, self.tick, self.realtime
-        )
-        team = workspace.team
-        self._watchers = team.robots, (team.lead,) * len(team.robots)
+        self._measure = Measure(workspace, self.team, surface, self.sight, self.tick, self.realtime)
+        self._watchers = self.team.robots, (self.team.lead,) * len(self.team.robots)
         self._state: State | None = None
         self._enter(0)
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
+        team = {} if self.team == self.workspace.team else {"team": dataclasses.asdict(self.team)}
+        true = {} if self.terrain is None else {"terrain": digest_of(self.terrain)}
         return {
             "simulator": type(self).__name__,
             "sight": self.sight.mode,
@@ -108,12 +114,14 @@ class KinematicSimulator:
             "crown_base": self.sight.crown_base,
             "tick": self.tick,
             "bounding": self.bounding,
-            "formation_radius": self.formation_radius,
+            "formation_radius": self.workspace.formation_radius,
             "bound_timeout": self.bound_timeout,
             "lost_contact_after": self.lost_contact_after,
-            "threats": [asdict(threat) for threat in self.threats],
-            "degradations": [asdict(degradation) for degradation in self.degradations],
+            "threats": [dataclasses.asdict(threat) for threat in self.threats],
+            "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],
             "realtime": sorted(self.realtime),
+            **team,
+            **true,
         }
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
@@ -209,22 +217,24 @@ class KinematicSimulator:
         """
         max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
         state = self._start(way[0], 0, cell) if state is None else state
-        lead, status = self._phase("lead", state.poses, way, None, max_ticks, rng)
-        drives = [Drive(lead, np.ones(len(lead), bool), status, way)]
+        lead, status = self._phase(0, state.poses, state.stops, way, None, max_ticks, rng)
+        drives = [Drive(lead, np.ones(len(lead), bool), status, way, state.stops)]
         for next_cell in ahead if status == "ok" else ():
-            t2, ended = self._phase("t2", lead[-1], way, next_cell, max_ticks - len(lead), rng)
-            drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell)))
-        seen, *others = detections(self._now, self.sight, self.workspace.team, drives)
-        independent = self.lost_contact_after is None and all(
-            robot.acquire == robot.drop == 1
-            for robot in (self.workspace.team.lead, *self.workspace.team.robots)
-        )
+            left = max_ticks - len(lead)
+            t2, ended = self._phase(1, lead[-1], state.stops, way, next_cell, left, rng)
+            stops = np.concatenate([self._goals(i, cell, next_cell) for i in (0, 1)])
+            drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell), stops))
+        seen, *others = detections(self._now, self.sight, self.team, drives)
+        lidars = self.team.lead, *self.team.robots
+        independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
         outcomes = []
         for closing, found in zip(drives[1:], others, strict=True):
-            after = replace(state, cells=(cell, cell), poses=closing.poses[-1])
+            after = dataclasses.replace(
+                state, cells=closing.cells, poses=closing.poses[-1], stops=closing.stops
+            )
             after.tracks, status = state.tracks.copy(), closing.status
             probability = np.concatenate([seen, found])
-            if not independent:
+            if not independent or self.lost_contact_after is not None:
                 moves = np.concatenate([drives[0].lead_moves, closing.lead_moves])
                 both = closing._replace(lead_moves=moves)
                 probability, status = self._contact(after, both, probability, rng)
@@ -245,8 +255,9 @@ class KinematicSimulator:
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         plain = copy.copy(self)
         plain.record_states = plain._wants_states = True
-        plain._measure = Measure(self.workspace, self._worlds.surface, self.sight, self.tick, {})
-        plain._worlds = Worlds(self.workspace, self.sight, self.formation_radius)
+        of_world = self._worlds.surface, self.sight
+        plain._measure = Measure(self.workspace, self.team, *of_world, self.tick, {})
+        plain._worlds = Worlds(self.workspace, self.sight, self.team, self._worlds.surface)
         free, rows = np.argwhere(self.workspace.passable.values), []
         for tried in range(20 * require_whole("n_bounds", n_bounds, 1)):
             a = free[rng.integers(len(free))]
@@ -262,18 +273,17 @@ class KinematicSimulator:
     def _enter(self, mission: int) -> None:
         """Switch to the world of a mission."""
         self._now = self._worlds.at(require_whole("mission", mission, 0))
-        self._surface, self._positions, self._routes, *_ = self._now
+        self._surface, self._ways, *_ = self._now
 
     # --- one bound ---
 
     def _start(self, start: Cell, seed: int, next_cell: Cell | None) -> State:
         cell = self.workspace.require_cell("start", start)
-        here = self._positions.waypoint(cell)
-        positions = self._positions.formation(cell, next_cell)
-        poses = np.zeros((1 + len(positions), 3))
-        poses[0, :2], poses[1:, :2] = here, positions
-        tracks = new_tracks(len(positions))
-        return State((cell, cell), poses, 0.0, require_whole("seed", seed, 0), tracks)
+        posts = self._ways.posts
+        stops = np.concatenate([posts.waypoint(cell)[None], posts.at(cell, next_cell)])
+        poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
+        tracks = new_tracks(len(stops) - 1)
+        return State((cell, cell), poses, stops, 0.0, require_whole("seed", seed, 0), tracks)
 
     def _bounds(
         self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
@@ -284,7 +294,7 @@ class KinematicSimulator:
             self._drive(state, k, cell, next_cell, rng)
             for state, rng in zip(states, rngs, strict=True)
         ]
-        found = detections(self._now, self.sight, self.workspace.team, drives)
+        found = detections(self._now, self.sight, self.team, drives)
         contacts = [self._contact(*own) for own in zip(states, drives, found, rngs, strict=True)]
         poses = [drive.poses[: len(c)] for drive, (c, _) in zip(drives, contacts, strict=True)]
         closing = [drive.closing(len(p)) for drive, p in zip(drives, poses, strict=True)]
@@ -302,67 +312,89 @@ class KinematicSimulator:
             kept = x if self.record_states else None
             of_bound = cell, z, contact.mean(0), duration, status, state.time
             bounds.append(Bound(*of_bound, track, contact, ticks, kept))
-            state.cells, state.poses, state.time = drive.cells, track[-1], bounds[-1].t1
+            state.cells, state.poses, state.stops = drive.cells, track[-1], drive.stops
+            state.time = bounds[-1].t1
         return bounds
 
     def _drive(
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
     ) -> Drive:
         """Drive the lead, then T2; or only one of them, by turns."""
-        cells, status = list(state.cells), "ok"
+        cells, status, stops = list(state.cells), "ok", state.stops.copy()
         poses, lead_moves = [state.poses[None]], []
         ticks_left = round(self.bound_timeout / self.tick)
         for mover in turns(self.bounding, k, next_cell is None):
-            i = int(mover != "lead")
-            way = cells[i], cell
-            part, status = self._phase(mover, poses[-1][-1], way, next_cell, ticks_left, rng)
+            i, members = (0, slice(0, 1)) if mover == "lead" else (1, slice(1, None))
+            way, now = (cells[i], cell), poses[-1][-1]
+            part, status = self._phase(i, now, stops, way, next_cell, ticks_left, rng)
             poses.append(part)
-            lead_moves.append(np.full(len(part), mover == "lead"))
+            lead_moves.append(np.full(len(part), i == 0))
             ticks_left -= len(part)
             if status != "ok":
                 break
-            cells[i] = cell
-        return Drive(
-            np.concatenate(poses[1:]), np.concatenate(lead_moves), status, (cells[0], cells[1])
-        )
+            cells[i], stops[members] = cell, self._goals(i, cell, next_cell)
+        moves = np.concatenate(lead_moves)
+        return Drive(np.concatenate(poses[1:]), moves, status, (cells[0], cells[1]), stops)
+
+    def _goals(self, i: int, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+        """Where the lead (i = 0) or T2 is to stop in a cell, shape (robot, 2)."""
+        posts = self._ways.posts
+        return posts.at(cell, next_cell) if i else posts.waypoint(cell)[None]
 
     def _phase(
         self,
-        mover: str,
+        i: int,
         now: np.ndarray,
+        stops: np.ndarray,
         way: tuple[Cell, Cell],
         next_cell: Cell | None,
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive the lead or T2: poses of all, (tick, 1 + robot, 3), until it ends, and status."""
-        team = self.workspace.team
-        if mover == "lead":
-            members, robots = slice(0, 1), (team.lead,)
-            goals = self._positions.waypoint(way[1])[None]
-        else:
-            members, robots = slice(1, None), team.robots
-            goals = self._positions.formation(way[1], next_cell)
-        moved, status = self._move(now[members], robots, list(goals), way, max_ticks, rng)
+        """Drive the lead (i = 0) or T2 while the others stand: poses (tick, 1 + robot, 3), status.
+
+        Their ways begin at the `stops` that were planned, the robots where they are now.
+        """
+        members = slice(1, None) if i else slice(0, 1)
+        robots = self.team.robots if i else (self.team.lead,)
+        window, goals = self._ways.posts.window(*way), self._goals(i, way[1], next_cell)
+        routes = self._routes(i, stops[members], goals, now[members], window)
+        moved, status = self._move(now[members], robots, routes, window, max_ticks, rng)
         part = np.repeat(now[None], len(moved), axis=0)
         part[:, members] = moved
         return part, status
+
+    def _routes(
+        self,
+        i: int,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        poses: np.ndarray,
+        window: tuple[int, int, int, int],
+    ) -> list[np.ndarray | None]:
+        """Planned ways of the lead (i = 0) or T2, begun where the robots really are."""
+        team = self.workspace.team
+        routes = []
+        for robot, start, goal, pose in zip(
+            team.robots if i else (team.lead,), starts, goals, poses, strict=True
+        ):
+            route = self._ways.routes.find(robot, start, goal, window)
+            routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
+        return routes
 
     def _move(
         self,
         poses: np.ndarray,
         robots: Sequence[Robot],
-        goals: Sequence[np.ndarray],
-        cells: tuple[Cell, Cell],
+        routes: Sequence[np.ndarray | None],
+        window: tuple[int, int, int, int],
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive robots at the same time: poses (tick, robot, 3) until all arrive or one fails."""
-        window = self._positions.window(*cells)
-        routes = [
-            self._routes.find(robot, pose[:2], goal, window)
-            for pose, robot, goal in zip(poses, robots, goals, strict=True)
-        ]
+        """Drive robots at the same time: poses (tick, robot, 3) until all arrive or one fails.
+
+        The routes keep within a window of the planned surface: first and end row, then column.
+        """
         return drive_together(self._surface, robots, routes, poses, self.tick, max_ticks, rng)
 
     def _contact(

@@ -29,6 +29,7 @@ from trustbo.simulation.model_contact import ModelContact
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import takes
 from trustbo.simulation.replicates import KinematicReplicates, PlainReplicates
+from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
 
 OBJECTIVES = ("lost_contact", "mean")
@@ -277,12 +278,12 @@ def _table(
 def _content(simulator: Any) -> list[bytes]:
     """What the contact of a simulator depends on besides its description."""
     workspace: Workspace = simulator.workspace
-    parts = [to_json([workspace.grid, workspace.team]).encode(), _bytes(workspace.passable)]
+    own = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
+    parts = [to_json(own).encode(), _bytes(workspace.passable)]
     if workspace.terrain is None or workspace.pixels is None:
         return [*parts, _bytes(workspace.awareness)]
-    maps = [workspace.terrain[name] for name in ("dem", "dsm")]
-    pixels = [workspace.pixels[name] for name in ("traversability", "passable")]
-    return [*parts, *map(_bytes, [*maps, *pixels])]
+    pixels = [_bytes(workspace.pixels[name]) for name in ("traversability", "passable")]
+    return [*parts, digest_of(workspace.terrain).encode(), *pixels]
 
 
 def _bytes(array: xr.DataArray) -> bytes:

@@ -9,8 +9,7 @@ import numpy as np
 
 from trustbo.data import Robot
 from trustbo.errors import TrustboError
-from trustbo.workspace.positions import filled
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface, filled
 
 # A Husky: 1.0 x 0.7 x 0.4 m over all, 50 kg.
 MASS, WHEEL_MASS = 50.0, 2.5

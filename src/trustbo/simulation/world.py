@@ -4,21 +4,25 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.data import Team
+from trustbo.errors import TerrainError, TrustboError, require_choice
 from trustbo.simulation.events import Degradation, Threat, acts_in, require_events
+from trustbo.terrain.dataset import is_lazy, require_terrain
 from trustbo.workspace import Workspace
-from trustbo.workspace.positions import Positions, surface_of
-from trustbo.workspace.routes import Routes
-from trustbo.workspace.sight import Sight, Surface
+from trustbo.workspace.sight import Sight
+from trustbo.workspace.surface import Surface, surface_of
+from trustbo.workspace.ways import Ways
 
 
 class World(NamedTuple):
-    """Terrain, positions and routes of a mission, and what impairs its lidars."""
+    """Terrain, posts and ways of a mission, and what impairs its lidars."""
 
     surface: Surface
-    positions: Positions
-    routes: Routes
+    """True terrain, which decides contact, motion and failure."""
+    ways: Ways
+    """Posts and ways over the terrain of the workspace."""
     jams: tuple[tuple[np.ndarray, float], ...]
     """Mask of the pixels inside, shape (row, col), and strength of each jam."""
     detection: np.ndarray
@@ -32,39 +36,32 @@ class Worlds:
         self,
         workspace: Workspace,
         sight: Sight,
-        formation_radius: float,
+        team: Team,
+        surface: Surface,
         threats: Sequence[Threat] = (),
         degradations: Sequence[Degradation] = (),
     ) -> None:
-        """Prepare a terrain; see `KinematicSimulator` for the arguments.
+        """Prepare the true `surface`; see `KinematicSimulator` for the arguments.
 
-        TrustboError: a workspace without a terrain in memory, a threat off it, or a robot not in
-        the team.
+        TrustboError: a threat off the terrain, or a robot not in the team.
         """
         require_events("threats", threats, Threat)
         require_events("degradations", degradations, Degradation)
-        if workspace.terrain is None or workspace.pixels is None:
-            raise TrustboError(
-                "the kinematic simulator needs a terrain in memory; make the workspace with "
-                "Workspace.from_terrain (of a lazily read terrain: coarsen it first), or pass your "
-                "own simulator."
-            )
         for degradation in degradations:
-            require_choice("robot", degradation.robot, workspace.team.names)
-        self.surface = surface_of(workspace.terrain, workspace.pixels)
-        self._workspace, self._sight, self._radius = workspace, sight, formation_radius
-        self._traversability = workspace.pixels["traversability"]
+            require_choice("robot", degradation.robot, team.names)
+        self.surface = surface
+        self._workspace, self._sight, self._team = workspace, sight, team
         self._threats, self._degradations = tuple(threats), tuple(degradations)
         for threat in threats:
-            if not threat.mask(self.surface).any():
-                left, bottom, right, top = workspace.terrain.rio.bounds(recalc=True)
+            if not threat.mask(surface).any():
+                left, bottom, right, top = surface.extent
                 raise TrustboError(
                     f"{threat} has no pixel of the terrain, which is x from {left:.9g} to "
                     f"{right:.9g} and y from {bottom:.9g} to {top:.9g}; give CRS metres, and a "
                     "region of a pixel at least."
                 )
         self._known: dict[object, World] = {}
-        self._grounds: dict[object, tuple[Surface, Positions, Routes]] = {}
+        self._ways: dict[object, Ways] = {}
 
     def at(self, mission: int) -> World:
         """World of a mission, counted from 0."""
@@ -76,22 +73,61 @@ class Worlds:
         return self._known[key]
 
     def _make(self, threats: Sequence[Threat], worse: Sequence[Degradation]) -> World:
-        team = self._workspace.team
-        detection = np.array([robot.detection for robot in team.robots])
+        detection = np.array([robot.detection for robot in self._team.robots])
         for degradation in worse:
-            detection[team.names.index(degradation.robot)] *= degradation.detection
+            detection[self._team.names.index(degradation.robot)] *= degradation.detection
         jams = tuple((t.mask(self.surface), t.strength) for t in threats if t.kind == "jam")
-        return World(*self._ground([t for t in threats if t.kind == "forbid"]), jams, detection)
+        ways = self._planned([t for t in threats if t.kind == "forbid"])
+        return World(self.surface, ways, jams, detection)
 
-    def _ground(self, closing: Sequence[Threat]) -> tuple[Surface, Positions, Routes]:
-        """Surface, positions and routes, which jams and worse lidars leave unchanged."""
+    def _planned(self, closing: Sequence[Threat]) -> Ways:
+        """Posts and ways, which keep out of closed areas; jams and worse lidars change none."""
         key = tuple(map(id, closing))
-        if key not in self._grounds:
-            surface = self.surface
-            for threat in closing:
-                surface = surface._replace(passable=surface.passable & ~threat.mask(surface))
-            positions = Positions(
-                self._workspace, surface, self._sight, self._traversability, self._radius
-            )
-            self._grounds[key] = surface, positions, Routes(surface)
-        return self._grounds[key]
+        if key not in self._ways:
+            ground = self._workspace.ground
+            assert ground is not None  # noqa: S101  # `planned_surface` has refused others
+            if closing:
+                surface = ground.posts.surface
+                for threat in closing:
+                    surface = surface._replace(passable=surface.passable & ~threat.mask(surface))
+                ground = self._workspace.ways_over(surface, self._sight)
+            self._ways[key] = ground
+        return self._ways[key]
+
+
+def planned_surface(workspace: Workspace) -> Surface:
+    """Surface that posts and ways are planned on; TrustboError without a terrain in memory."""
+    if workspace.surface is None:
+        raise TrustboError(
+            "the kinematic simulator needs a terrain in memory; make the workspace with "
+            "Workspace.from_terrain (of a lazily read terrain: coarsen it first), or pass your "
+            "own simulator."
+        )
+    return workspace.surface
+
+
+def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
+    """Surface that robots are simulated on: the workspace's, or of another terrain.
+
+    TerrainError: it does not cover the grid, has another CRS, or is read lazily. TrustboError: the
+    workspace has no terrain in memory.
+    """
+    planned = planned_surface(workspace)
+    if terrain is None:
+        return planned
+    terrain = require_terrain(terrain)
+    if is_lazy(terrain):
+        raise TerrainError("the true terrain must be in memory: read it without lazy=True.")
+    if terrain.rio.crs != workspace.terrain.rio.crs:  # pyright: ignore[reportOptionalMemberAccess]
+        raise TerrainError(
+            f"the true terrain has CRS {terrain.rio.crs}, the workspace's another; reproject it."
+        )
+    surface = surface_of(terrain, np.isfinite(terrain["dem"].values))
+    own, needed, pixel = surface.extent, planned.extent, max(*surface.pixel, *planned.pixel)
+    short = [(own[0] - needed[0]), (own[1] - needed[1]), needed[2] - own[2], needed[3] - own[3]]
+    if max(short) > pixel:
+        raise TerrainError(
+            f"the true terrain ends {max(short):.3g} m inside the planning grid; give one that "
+            "covers it."
+        )
+    return surface

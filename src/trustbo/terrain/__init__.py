@@ -3,6 +3,7 @@
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.dataset import assemble_terrain, pixel_size, read_terrain
 from trustbo.terrain.features import (
+    PAPER_VISIBILITY,
     TRAVERSABILITY,
     VISIBILITY,
     aspect,
@@ -19,8 +20,8 @@ from trustbo.terrain.pixel_feature import FEATURES, PixelFeature, register_featu
 from trustbo.terrain.synthetic import synthetic_terrain
 
 __all__ = [
-    "FEATURES", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "PixelFeature", "aspect",
-    "assemble_terrain", "canopy_cover", "canopy_height", "exposure", "openness", "pixel_features",
-    "pixel_size", "read_lidar", "read_terrain", "register_feature", "slope", "synthetic_terrain",
-    "vegetation_density",
+    "FEATURES", "PAPER_VISIBILITY", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex",
+    "PixelFeature", "aspect", "assemble_terrain", "canopy_cover", "canopy_height", "exposure",
+    "openness", "pixel_features", "pixel_size", "read_lidar", "read_terrain", "register_feature",
+    "slope", "synthetic_terrain", "vegetation_density",
 ]  # fmt: skip

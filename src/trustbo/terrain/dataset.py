@@ -1,5 +1,6 @@
 """Aligned, metric dataset of a DEM and a DSM."""
 
+import hashlib
 import math
 import warnings
 from contextlib import ExitStack
@@ -312,3 +313,11 @@ def _same_coordinates(a: xr.DataArray, b: xr.DataArray) -> bool:
         np.allclose(a[axis], b[axis], rtol=0.0, atol=1e-3 * abs(float(a[axis][1] - a[axis][0])))
         for axis in ("x", "y")
     )
+
+
+def digest_of(terrain: xr.Dataset) -> str:
+    """Hash of a terrain's heights and positions, the same wherever it was read from."""
+    digest = hashlib.sha256()
+    for name in ("y", "x", "dem", "dsm"):
+        digest.update(np.ascontiguousarray(terrain[name].values, dtype=float).tobytes())
+    return digest.hexdigest()

@@ -204,8 +204,10 @@ def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
 
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 """Pixel features of traversability (z1); each lowers it."""
-VISIBILITY = ("canopy_height", "canopy_cover", "openness")
-"""Pixel features of visibility (z2): canopy lowers it, openness raises it."""
+VISIBILITY = ("vegetation_density", "openness")
+"""Pixel features of visibility (z2): vegetation lowers it, openness raises it."""
+PAPER_VISIBILITY = ("canopy_height", "canopy_cover", "openness")
+"""Visibility of version 0.1, in the paper's setting; in forest it points the wrong way."""
 
 
 def pixel_features(

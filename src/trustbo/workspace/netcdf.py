@@ -9,6 +9,8 @@ from trustbo.data import Robot, Team
 from trustbo.files import to_json
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.grid import Grid
+from trustbo.workspace.posts import FORMATION_RADIUS
+from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace
 
 
@@ -25,6 +27,8 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     result.attrs = {
         "grid": to_json(asdict(workspace.grid)),
         "team": to_json(asdict(workspace.team)),
+        "sights": to_json([asdict(sight) for sight in workspace.sights]),
+        "formation_radius": workspace.formation_radius,
     }
     return result
 
@@ -50,4 +54,6 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
             for name, node in (tree["composites"].children if "composites" in tree else {}).items()
         },
         cells.get("bound_awareness"),
+        tuple(Sight(**sight) for sight in json.loads(tree.attrs.get("sights", "[]"))),
+        float(tree.attrs.get("formation_radius", FORMATION_RADIUS)),
     )

@@ -7,11 +7,11 @@ import numpy as np
 from numba import njit
 
 from trustbo.data import Robot
-from trustbo.workspace.sight import Surface
+from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
 """Share of its speed that a robot keeps at its slope limit."""
-_compiled = njit(cache=True, error_model="numpy")
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Routes:

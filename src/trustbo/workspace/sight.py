@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -10,6 +9,7 @@ from numba import njit
 from trustbo.data import Robot
 from trustbo.errors import TrustboError, require_choice
 from trustbo.terrain import rays
+from trustbo.workspace.surface import Surface
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
@@ -46,34 +46,18 @@ class Sight:
             )
 
 
-class Surface(NamedTuple):
-    """Rasters for sight and motion, and the map from positions to their pixels."""
+def sights_of(sight: object) -> tuple[Sight, ...]:
+    """Assumed sights, of which some may be given by their mode.
 
-    ground: np.ndarray  # (row, col), m
-    canopy: np.ndarray  # (row, col), m: the DSM
-    gradient: np.ndarray  # (2, row, col): dz/dx and dz/dy
-    passable: np.ndarray  # (row, col), bool
-    pixel: tuple[float, float]  # height, width of a pixel, m
-    origin: tuple[float, float]  # x, y of the centre of pixel (0, 0)
-
-    def to_pixel(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Fractional row and column of positions in CRS metres."""
-        return (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
-
-    def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Row and column of the pixels at positions."""
-        row, col = self.to_pixel(np.asarray(x), np.asarray(y))
-        rows, cols = self.ground.shape
-        return (
-            np.minimum(np.maximum(np.rint(row), 0), rows - 1).astype(int),
-            np.minimum(np.maximum(np.rint(col), 0), cols - 1).astype(int),
-        )
-
-    def pixel_at(self, x: float, y: float) -> tuple[int, int]:
-        """Row and column of the pixel at one position."""
-        rows, cols = self.ground.shape
-        row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
-        return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
+    TrustboError: an unknown mode, no sight, or something else.
+    """
+    given = [sight] if isinstance(sight, str | Sight) else sight
+    if not isinstance(given, list | tuple) or not given:
+        raise TrustboError(f"sight must be a mode's name or a Sight, or several; got {sight!r}.")
+    for one in given:
+        if not isinstance(one, str | Sight):
+            raise TrustboError(f"sight must be a mode's name or a Sight; got {one!r}.")
+    return tuple(Sight(one) if isinstance(one, str) else one for one in given)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:

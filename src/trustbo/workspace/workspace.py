@@ -1,7 +1,7 @@
 """Workspace of planner and simulator: awareness and passability of every cell."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Self
@@ -10,11 +10,13 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, Team, default_features
+from trustbo.data import Cell, Mission, Team, default_features
 from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
+from trustbo.stacking import fill_awareness
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
 from trustbo.terrain.features import (
+    PAPER_VISIBILITY,
     TRAVERSABILITY,
     VISIBILITY,
     exposure,
@@ -23,9 +25,19 @@ from trustbo.terrain.features import (
 )
 from trustbo.terrain.pixel_feature import PixelFeature
 from trustbo.workspace.awareness import FeatureSpec, cell_maps, feature_specs
+from trustbo.workspace.bound_awareness import (
+    TRAVERSABLE,
+    of_bounds,
+    require_sight,
+    sight_features,
+)
 from trustbo.workspace.cells import of_cells
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import MOVE_NAMES
+from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
+from trustbo.workspace.posts import FORMATION_RADIUS, Posts, require_formation
+from trustbo.workspace.sight import Sight, sights_of
+from trustbo.workspace.surface import Surface, surface_of
+from trustbo.workspace.ways import Ways
 
 MAX_MISSING = 0.5
 """Largest share of missing or too steep pixels in a passable cell."""
@@ -47,6 +59,9 @@ class Workspace:
         of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
             the cell entered, whichever way.
+        sights: Assumed models of sight; posts go by the first. Empty without a terrain, and in
+            files of version 0.1.
+        formation_radius: Largest distance of T2's posts from the lead's waypoint, m.
     """
 
     awareness: xr.DataArray
@@ -57,6 +72,8 @@ class Workspace:
     pixels: xr.Dataset | None = None
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     of_bounds: xr.DataArray | None = None
+    sights: tuple[Sight, ...] = ()
+    formation_radius: float = FORMATION_RADIUS
 
     @classmethod
     def from_terrain(
@@ -69,13 +86,22 @@ class Workspace:
         features: Mapping[str, object] | None = None,
         observers: ArrayLike | None = None,
         aggregate: str | float = "mean",
+        bounds: bool = True,
+        sight: Sight | str | Sequence[Sight | str] = "transmittance",
+        formation_radius: float = FORMATION_RADIUS,
     ) -> Self:
-        """Derive traversability and visibility from a DEM and a DSM.
+        """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
         A cell's awareness is the mean of its pixels' composites, the same for every robot. A cell
         is impassable if more than half of its pixels are missing or steeper than the slope limit.
         Openness is measured over the lidar's range, at most the diagonal of a cell: sight beyond
         one bound does not matter to overwatch.
+
+        Overwatch is about pairs of places, so a bound from one cell to the next has awareness of
+        its own, `bound_awareness`: traversability along the way, the visibility of the cell
+        entered, and `line_of_sight`, the share of the bound's time in which a robot and the lead
+        should see each other under the assumed sight. The features of `awareness` are those of
+        cells, with the mean line of sight of the bounds into each.
 
         Args:
             terrain: Dataset of `read_terrain` or `synthetic_terrain`; of a lazily read one, only a
@@ -90,17 +116,29 @@ class Workspace:
             observers: Positions of enemies, shape (observer, 2), x and y in CRS metres: the share
                 of them that see a pixel becomes one more feature, `exposure`.
             aggregate: `"mean"` of a cell's pixels, or a quantile in [0, 1].
+            bounds: False for awareness of cells alone, as in the paper: traversability, and the
+                visibility of `terrain.PAPER_VISIBILITY`.
+            sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
+                several, features `line_of_sight_1`, `line_of_sight_2`, ...
+            formation_radius: Largest distance of T2's posts from the lead's waypoint, m.
 
         Raises:
-            TerrainError: A grid too fine for the raster, an observer off the terrain, or a dataset
-                that is no terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
-            TrustboError: No cell is passable, or an unknown scaling, feature or aggregate.
+            TerrainError: A grid too fine for the raster, an observer off the terrain, a cell
+                without standing room for the team, a DSM without the canopy that a sight needs, a
+                terrain that is read lazily, unless `bounds` is False, or a dataset that is no
+                terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
+            TrustboError: No cell is passable, or an unknown scaling, feature, aggregate or sight.
         """
-        terrain = require_terrain(terrain)
-        lazy = is_lazy(terrain)
+        terrain, sights = require_terrain(terrain), sights_of(sight)
+        require_formation(formation_radius)
         team = Team() if team is None else team
         grid = Grid.over(terrain, shape)
-        asked = features or {"traversability": TRAVERSABILITY, "visibility": VISIBILITY}
+        if bounds:
+            require_sight(terrain, sights, features or {})
+        asked = features or {
+            "traversability": TRAVERSABILITY,
+            "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
+        }
         chosen = _within_reach(feature_specs(asked), terrain, grid, team)
         if observers is not None:
             place = require_observers(terrain, observers)
@@ -114,7 +152,7 @@ class Workspace:
             max_slope=team.max_slope,
             scaling=scaling,
             aggregate=aggregate,
-            keep_pixels=not lazy,
+            keep_pixels=not is_lazy(terrain),
         )
         passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
         workspace = cls.from_awareness(
@@ -123,7 +161,7 @@ class Workspace:
             team=team,
             features=tuple(chosen),
         )
-        return dataclasses.replace(
+        workspace = dataclasses.replace(
             workspace,
             awareness=workspace.awareness.assign_coords(_positions(grid)),
             passable=workspace.passable.assign_coords(_positions(grid)),
@@ -131,7 +169,10 @@ class Workspace:
             terrain=terrain,
             pixels=maps.pixels,
             composites=maps.composites,
+            sights=sights,
+            formation_radius=formation_radius,
         )
+        return workspace._with_line_of_sight() if bounds else workspace
 
     @classmethod
     def from_awareness(
@@ -194,6 +235,92 @@ class Workspace:
     def features(self) -> tuple[str, ...]:
         """Names of the awareness features."""
         return tuple(str(name) for name in self.awareness["feature"].values)
+
+    def _with_line_of_sight(self) -> Self:
+        ways, pixels = self.ground, self.pixels
+        assert ways is not None and pixels is not None  # noqa: S101, PT018  # `require_sight`
+        passable, names = self.passable.values, (*self.features, *sight_features(len(self.sights)))
+        easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
+        bounds = of_bounds(ways, self.sights, self.awareness.values, passable, self.features, easy)
+        n_cell = len(self.features)
+        into = np.maximum(existing_bounds(passable).sum(0), 1)[..., None]
+        seen = np.nansum(bounds[..., n_cell:], axis=1) / into
+        cells = np.concatenate([self.awareness, np.where(passable[..., None], seen, np.nan)], -1)
+        like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=list(names))
+        return dataclasses.replace(self, awareness=like.copy(data=cells)).with_bounds(bounds)
+
+    @cached_property
+    def ground(self) -> Ways | None:
+        """Posts and ways over the terrain; None without a terrain in memory."""
+        return self.ways_over(self.surface) if self.surface is not None else None
+
+    @cached_property
+    def surface(self) -> Surface | None:
+        """Rasters to stand, drive and look on; None without a terrain in memory."""
+        if self.terrain is None or self.pixels is None:
+            return None
+        return surface_of(self.terrain, self.pixels["passable"].values.astype(bool))
+
+    def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
+        """Posts and ways over another surface of the same terrain, such as one with closed areas.
+
+        Posts go by the workspace's sight, or by another where it has none.
+        """
+        assumed = (*self.sights, sight or Sight())[0]
+        assert self.pixels is not None  # noqa: S101  # there is a surface
+        easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
+        return Ways(Posts(self.grid, self.team, surface, assumed, easy, self.formation_radius))
+
+    def posts(self, a: Cell, c: Cell) -> np.ndarray | None:
+        """Overwatch points of T2 in cell a while the lead bounds to c, shape (robot, 2).
+
+        X and y in CRS metres, for successive bounding; None without a terrain.
+
+        Raises:
+            TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
+        """
+        pair = self._require_bound(a, c)
+        return None if self.ground is None else self.ground.posts.at(*pair)
+
+    def ways(
+        self, a: Cell, c: Cell, next_cell: Cell | None = None
+    ) -> tuple[np.ndarray | None, ...] | None:
+        """Ways that the robots drive in the bound a -> c: the lead's, then each of T2's.
+
+        The lead drives to its waypoint in c, then T2 from its posts in a to those from which it
+        watches the bound from c to `next_cell`; at the goal (None) it closes up around the lead.
+
+        Returns:
+            Polylines, shape (point, 2), x and y in CRS metres; None for one without a way. None
+            without a terrain.
+
+        Raises:
+            TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
+        """
+        a, c = self._require_bound(a, c)
+        if next_cell is not None:
+            next_cell = self._require_bound(c, next_cell)[1]
+        if self.ground is None:
+            return None
+        return self.ground.lead(a, c), *self.ground.closing(a, c, next_cell)
+
+    def _require_bound(self, a: Cell, c: Cell) -> tuple[Cell, Cell]:
+        a, c = self.require_cell("cell", a), self.require_cell("cell", c)
+        moves_along([a, c])
+        return a, c
+
+    def fill(self, mission: Mission) -> Mission:
+        """Fill awareness that a mission did not measure (NaN) with that of its bounds.
+
+        A simulator measures no line of sight; a campaign fills it in by itself.
+
+        Raises:
+            TrustboError: The mission's path is no path of neighbouring cells on the grid.
+        """
+        for k, cell in enumerate(mission.path):
+            self.require_cell(f"path[{k}]", cell)
+        own = mission.in_order(self.team.names, self.features)
+        return fill_awareness(own, along(self.bound_maps, own.path))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""

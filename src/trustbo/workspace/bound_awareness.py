@@ -1,0 +1,116 @@
+"""Awareness of bounds on a terrain: traversability of the way, line of sight, and maps of cells."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import batched
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Cell
+from trustbo.errors import TerrainError, TrustboError
+from trustbo.parallel import in_order
+from trustbo.terrain.composite import MAX_PIXELS
+from trustbo.terrain.dataset import is_lazy, pixel_size
+from trustbo.workspace.line_of_sight import bound_features, geometry
+from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.sight import Sight
+from trustbo.workspace.ways import Ways
+
+LINE_OF_SIGHT = "line_of_sight"
+"""Name of the feature; `line_of_sight_1`, `_2`, ... where several sights are assumed."""
+TRAVERSABLE = "traversability"
+"""Name of the feature that is averaged along the way, instead of over the cell entered."""
+_BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
+
+
+def sight_features(n_sights: int) -> tuple[str, ...]:
+    """Names of the line of sight under each assumed sight."""
+    if n_sights == 1:
+        return (LINE_OF_SIGHT,)
+    return tuple(f"{LINE_OF_SIGHT}_{n + 1}" for n in range(n_sights))
+
+
+def require_sight(
+    terrain: xr.Dataset, sights: Sequence[Sight], features: Mapping[str, object]
+) -> None:
+    """Refuse a terrain on which no line of sight can be computed.
+
+    TerrainError: it is read lazily, or has no canopy where a sight needs one. TrustboError: a
+    feature has the name of a line of sight.
+    """
+    for name in features:
+        if is_line_of_sight(name):
+            raise TrustboError(
+                f"{name!r} is the name of a feature of bounds; give yours another, or bounds=False."
+            )
+    if is_lazy(terrain):
+        step = pixel_size(terrain)[0] * max(
+            2.0, np.sqrt(terrain["dem"].size / MAX_PIXELS)
+        )  # a raster in memory
+        raise TerrainError(
+            f"line of sight needs the terrain in memory, and it is read lazily: average it to "
+            f"pixels of {step:.3g} m, read_terrain(..., resolution={step:.3g}), or do without: "
+            "from_terrain(..., bounds=False)."
+        )
+    if any(sight.mode == "wall" for sight in sights):
+        if not (terrain["dsm"].values > terrain["dem"].values).any():
+            raise TerrainError(
+                "sight mode 'wall' needs canopy, and the DSM is nowhere above the DEM; give a DSM, "
+                "or sight='bare'."
+            )
+
+
+def is_line_of_sight(feature: str) -> bool:
+    """Whether a feature is a predicted contact rate."""
+    return feature.startswith(LINE_OF_SIGHT)
+
+
+def of_bounds(
+    ways: Ways,
+    sights: Sequence[Sight],
+    cells: np.ndarray,
+    passable: np.ndarray,
+    features: Sequence[str],
+    traversability: np.ndarray | None,
+) -> np.ndarray:
+    """Compute awareness of bounds, (robot, move, row, col, feature); NaN where there is none.
+
+    Of the maps of `cells` (robot, row, col, feature) under the names `features`, followed by the
+    line of sight under each of `sights`; `traversability` is the map of pixels (row, col), if there
+    is one. Posts are those of `ways`, whatever the sight. TerrainError: a cell without standing
+    room for the team.
+    """
+    exists = existing_bounds(passable)
+    index = np.argwhere(exists)  # (bound, (move, row, col))
+    steps = np.array(MOVES[8])
+    n_robots, n_features = len(cells), cells.shape[-1]
+    maps = np.full((n_robots, *exists.shape, n_features + len(sights)), np.nan)
+    maps[..., :n_features] = np.where(exists[..., None], cells[:, None], np.nan)
+    surface = ways.posts.surface
+    easy_pixels = (
+        np.full(surface.ground.shape, np.nan) if traversability is None else traversability
+    )
+    for cell in _cells(np.argwhere(passable)):
+        ways.posts.require_room(cell)
+
+    def work(block: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+        own = np.array(block)
+        pairs = list(zip(_cells(own[:, 1:] - steps[own[:, 0]]), _cells(own[:, 1:]), strict=True))
+        given = geometry(ways, pairs, passable)
+        found = partial(bound_features, surface, team=ways.posts.team, given=given)
+        both = [found(sight=sight, index=easy_pixels) for sight in sights]
+        return own, [los for los, _ in both], both[0][1]
+
+    for own, seen, easy in in_order(work, batched(index, _BLOCK)):
+        for n, los in enumerate(seen):
+            maps[:, *own.T, n_features + n] = los.T
+        if TRAVERSABLE in features:
+            m = list(features).index(TRAVERSABLE)
+            known = np.where(np.isfinite(easy.T), easy.T, maps[:, *own.T, m])
+            maps[:, *own.T, m] = known
+    return np.clip(maps, 0.0, 1.0)
+
+
+def _cells(index: np.ndarray) -> list[Cell]:
+    return [(row, col) for row, col in index.tolist()]

@@ -1,0 +1,185 @@
+"""Posts: where the lead stops in a cell, and where T2 stands to watch it go to the next.
+
+The lead stops at a traversable pixel near the cell's centre, its waypoint. T2 stands around it, at
+most `radius` metres away, each robot where it sees the lead's next waypoint best.
+"""
+
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from trustbo.data import Cell, Team
+from trustbo.errors import TerrainError, TrustboError, require_positive
+from trustbo.workspace.grid import Grid
+from trustbo.workspace.moves import MOVES
+from trustbo.workspace.sight import Sight, detection_probability, optics
+from trustbo.workspace.surface import Surface
+
+SPACING = 2.0
+"""Least distance between two robots of T2, m."""
+FORMATION_RADIUS = 8.0
+"""Largest distance of T2 from the lead's waypoint, m, by default."""
+
+
+def require_formation(radius: float) -> None:
+    """Refuse a formation radius below the robots' least distance: TrustboError."""
+    if require_positive("formation_radius", radius) < SPACING:
+        raise TrustboError(
+            f"formation_radius must be at least {SPACING:g} m, the least distance between two "
+            f"robots; got {radius:g}."
+        )
+
+
+class Posts:
+    """Waypoints of the lead and posts of T2 in the cells of a grid, x and y in CRS metres."""
+
+    def __init__(
+        self,
+        grid: Grid,
+        team: Team,
+        surface: Surface,
+        sight: Sight,
+        traversability: np.ndarray,
+        radius: float,
+    ) -> None:
+        """Prepare the maps of pixels; `traversability` has shape (row, col) of pixels."""
+        self.grid, self.team, self.surface = grid, team, surface
+        self._sight, self._radius = sight, radius
+        self._traversability = _smoothed(traversability, surface.pixel)
+        self._standable = _largest_region(surface.passable)
+        self._waypoints: dict[Cell, np.ndarray] = {}
+        self._known: dict[Cell, dict[Cell | None, np.ndarray]] = {}
+        # Row and column of the cell that each row and column of pixels belongs to, ascending.
+        self._cells = grid.cells_along(*surface.axes)
+
+    def window(self, a: Cell, c: Cell) -> tuple[int, int, int, int]:
+        """Window of pixels of two cells and half a cell around: first and end row, then col."""
+        (rows, cols), shape = self.surface.ground.shape, self.grid.shape
+        per_row, per_col = rows / shape[0], cols / shape[1]
+        top, bottom = min(a[0], c[0]) - 0.5, max(a[0], c[0]) + 1.5
+        left, right = min(a[1], c[1]) - 0.5, max(a[1], c[1]) + 1.5
+        return (
+            max(0, int(top * per_row)),
+            min(rows, int(np.ceil(bottom * per_row))),
+            max(0, int(left * per_col)),
+            min(cols, int(np.ceil(right * per_col))),
+        )
+
+    def waypoint(self, cell: Cell) -> np.ndarray:
+        """Stop of the lead in a cell, shape (2,): a traversable pixel near the centre."""
+        if cell not in self._waypoints:
+            self._waypoints[cell] = self._waypoint(cell)
+        return self._waypoints[cell]
+
+    def at(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+        """Posts of T2 in a cell, shape (robot, 2), from which it watches the next waypoint.
+
+        Without a next cell, around the lead at the goal.
+        """
+        if cell not in self._known:
+            self._known[cell] = self._posts(cell)
+        if next_cell not in self._known[cell]:  # no neighbour
+            self._known[cell] |= self._aimed(cell, [next_cell])
+        return self._known[cell][next_cell]
+
+    def _waypoint(self, cell: Cell) -> np.ndarray:
+        row, col = self._pixels_of(cell)
+        center = np.array(self.grid.center(cell))
+        position = self._position(row, col)
+        size = np.hypot(self.grid.cell_height, self.grid.cell_width)
+        off_center = np.linalg.norm(position - center, axis=1) / size
+        return position[np.argmax(self._traversability[row, col] - off_center)]
+
+    def _posts(self, cell: Cell) -> dict[Cell | None, np.ndarray]:
+        """Posts of T2 by the next cell, for all that a bound leads to."""
+        rows, cols = self.grid.shape
+        near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
+        inside = [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
+        return self._aimed(cell, [None, *inside])
+
+    def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> dict[Cell | None, np.ndarray]:
+        """Posts of T2 by the next cell: of equal sight the closer one, none on top of another."""
+        here, robots = self.waypoint(cell), self.team.robots
+        position = self._position(*self._pixels_of(cell))
+        distance = np.linalg.norm(position - here, axis=1)
+        near = np.flatnonzero((distance <= self._radius) & (distance >= SPACING))
+        if len(near) < len(robots):  # few passable pixels, or large ones
+            order = np.argsort(distance, kind="stable")
+            near = order[distance[order] > 0.0][: len(robots)]
+            near = near if len(near) else order
+        position, distance = position[near], distance[near]
+        goals = np.stack([here if c is None else self.waypoint(c) for c in ahead])
+        seen = self._seen(position, goals)
+        posts = np.empty((len(ahead), len(robots), 2))
+        score = np.empty((len(ahead), len(position)))
+        for i in range(len(robots)):
+            score[:] = seen[i] - 1e-3 * distance
+            if i:
+                gaps = np.linalg.norm(position - posts[:, :i, None], axis=-1).min(1)
+                score -= 10.0 * (gaps < SPACING)
+            posts[:, i] = position[np.argmax(score, axis=1)]
+        return dict(zip(ahead, posts, strict=True))
+
+    def _seen(self, position: np.ndarray, goals: np.ndarray) -> list[np.ndarray]:
+        """Detection of the lead at each goal from each position, (goal, position) per robot."""
+        sensor = np.tile(position, (len(goals), 1))
+        target = np.repeat(goals, len(position), axis=0)
+        known: dict[bytes, np.ndarray] = {}
+        found = []
+        for robot in self.team.robots:
+            lidar = optics(robot, self.team.lead)
+            if (key := lidar.tobytes()) not in known:
+                seen = detection_probability(self.surface, self._sight, sensor, target, lidar)
+                known[key] = seen.reshape(len(goals), len(position))
+            found.append(known[key])
+        return found
+
+    def require_room(self, cell: Cell) -> None:
+        """Refuse a cell without a pixel for each robot: TerrainError that names cell and robot."""
+        n_pixels, names = len(self._pixels_of(cell)[0]), self.team.names
+        if n_pixels <= len(names):
+            raise TerrainError(
+                f"cell {cell} has {n_pixels} passable pixels, on which robot "
+                f"{names[max(0, n_pixels - 1)]!r} finds no post beside the lead; take larger "
+                "cells, a finer raster or fewer robots."
+            )
+
+    def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of a cell's passable pixels, those of the largest region if any.
+
+        All of its pixels if none is passable; no route leads there.
+        """
+        rows, cols = self._cells
+        top, bottom = np.searchsorted(rows, (cell[0], cell[0] + 1))
+        left, right = np.searchsorted(cols, (cell[1], cell[1] + 1))
+        anywhere = np.ones_like(self._standable)
+        for allowed in (self._standable, self.surface.passable, anywhere):
+            row, col = np.nonzero(allowed[top:bottom, left:right])
+            if len(row):
+                break
+        return row + top, col + left
+
+    def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+        y, x = self.surface.axes
+        return np.stack([x[col], y[row]], axis=-1)
+
+
+def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:
+    size = [max(1, round(width / step)) for step in pixel]
+    window: dict[str, Any] = {"size": size, "mode": "nearest"}
+    return ndimage.uniform_filter(np.nan_to_num(values), **window)
+
+
+def _largest_region(passable: np.ndarray) -> np.ndarray:
+    """Largest connected set of passable pixels; no route leaves it.
+
+    Pixels are connected by edges: routes do not pass where two touch at a corner only.
+    """
+    regions: Any = ndimage.label(passable)
+    labels, n_regions = regions
+    if n_regions == 0:
+        return passable
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return labels == np.argmax(sizes)

@@ -1,0 +1,75 @@
+"""Rasters on which robots stand, drive and look."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy import ndimage
+
+from trustbo.terrain import pixel_size
+from trustbo.terrain.features import gradient
+
+
+class Surface(NamedTuple):
+    """Rasters for sight and motion, and the map from positions to their pixels."""
+
+    ground: np.ndarray  # (row, col), m
+    canopy: np.ndarray  # (row, col), m: the DSM
+    gradient: np.ndarray  # (2, row, col): dz/dx and dz/dy
+    passable: np.ndarray  # (row, col), bool
+    pixel: tuple[float, float]  # height, width of a pixel, m
+    origin: tuple[float, float]  # x, y of the centre of pixel (0, 0)
+
+    @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Y of each row of pixels and x of each column, CRS metres."""
+        rows, cols = self.ground.shape
+        y = self.origin[1] - np.arange(rows) * self.pixel[0]
+        return y, self.origin[0] + np.arange(cols) * self.pixel[1]
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Least x and y, and largest x and y, of the pixels' edges."""
+        y, x = self.axes
+        high, wide = 0.5 * self.pixel[0], 0.5 * self.pixel[1]
+        return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
+
+    def to_pixel(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Fractional row and column of positions in CRS metres."""
+        return (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
+
+    def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of the pixels at positions."""
+        row, col = self.to_pixel(np.asarray(x), np.asarray(y))
+        rows, cols = self.ground.shape
+        return (
+            np.minimum(np.maximum(np.rint(row), 0), rows - 1).astype(int),
+            np.minimum(np.maximum(np.rint(col), 0), cols - 1).astype(int),
+        )
+
+    def pixel_at(self, x: float, y: float) -> tuple[int, int]:
+        """Row and column of the pixel at one position."""
+        rows, cols = self.ground.shape
+        row, col = round((self.origin[1] - y) / self.pixel[0]), (x - self.origin[0])
+        return min(max(row, 0), rows - 1), min(max(round(col / self.pixel[1]), 0), cols - 1)
+
+
+def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
+    """Arrays of a terrain for sight and motion; `passable` has shape (row, col) of pixels."""
+    ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
+    return Surface(
+        ground=ground,
+        canopy=canopy,
+        gradient=gradient(filled(ground), pixel_size(terrain)),
+        passable=passable,
+        pixel=pixel_size(terrain),
+        origin=(float(terrain["x"][0]), float(terrain["y"][0])),
+    )
+
+
+def filled(dem: np.ndarray) -> np.ndarray:
+    """Heights, missing ones replaced by the nearest: a robot may touch the edge of the data."""
+    nearest: Any = ndimage.distance_transform_edt(
+        ~np.isfinite(dem), return_distances=False, return_indices=True
+    )
+    return dem[tuple(nearest)]

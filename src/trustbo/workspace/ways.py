@@ -1,0 +1,32 @@
+"""Ways: what each robot drives within a bound, from post to post, by the fastest routes.
+
+The simulator drives these, exports carry them, and line of sight is computed along them.
+"""
+
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.workspace.posts import Posts
+from trustbo.workspace.routes import Routes
+
+
+class Ways:
+    """Ways of a team between its posts; positions are x, y in CRS metres."""
+
+    def __init__(self, posts: Posts) -> None:
+        """Prepare the routes over the posts' surface."""
+        self.posts, self.routes = posts, Routes(posts.surface)
+
+    def lead(self, a: Cell, c: Cell) -> np.ndarray | None:
+        """Way of the lead from waypoint to waypoint, (point, 2); None if there is none."""
+        lead, window = self.posts.team.lead, self.posts.window(a, c)
+        return self.routes.find(lead, self.posts.waypoint(a), self.posts.waypoint(c), window)
+
+    def closing(self, a: Cell, c: Cell, next_cell: Cell | None) -> list[np.ndarray | None]:
+        """Way of each robot of T2, from where it watched a -> c to where it watches c -> next."""
+        window = self.posts.window(a, c)
+        ends = zip(self.posts.at(a, c), self.posts.at(c, next_cell), strict=True)
+        return [
+            self.routes.find(robot, start, goal, window)
+            for robot, (start, goal) in zip(self.posts.team.robots, ends, strict=True)
+        ]

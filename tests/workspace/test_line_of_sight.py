@@ -1,0 +1,272 @@
+"""Posts, ways and line of sight: beside scalar code, and beside the simulator without its noise."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from trustbo.data import Robot, Team
+from trustbo.errors import TerrainError, TrustboError
+from trustbo.simulation import KinematicSimulator
+from trustbo.simulation.sensing import detections
+from trustbo.terrain import read_terrain, synthetic_terrain
+from trustbo.workspace import Sight, Workspace
+from trustbo.workspace.line_of_sight import N_SAMPLES, bound_features, geometry
+from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
+from trustbo.workspace.posts import SPACING
+
+A, C, NEXT = (3, 0), (2, 1), (1, 2)
+
+
+@pytest.fixture(scope="module")
+def wooded():
+    terrain = synthetic_terrain((160.0, 160.0), seed=5, relief=8.0)
+    return Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2))
+
+
+def bounds_of(workspace):
+    """Bounds as (move, row, col), and as pairs of cells."""
+    index = np.argwhere(existing_bounds(workspace.passable.values)).tolist()
+    pairs = [((r - MOVES[8][m][0], c - MOVES[8][m][1]), (r, c)) for m, r, c in index]
+    return index, pairs
+
+
+def clear(ground, eye, target, heights):
+    """Whether a straight line clears a ground of pixels of 1 m, by dense steps, rows downwards."""
+    share = np.linspace(0.0, 1.0, 4000)[:, None]
+    col, row = (eye + share * (target - eye)).T
+    i, j = np.clip(np.floor(row), 0, 58).astype(int), np.clip(np.floor(col), 0, 58).astype(int)
+    p, q = row - i, col - j
+    z = (1 - p) * ((1 - q) * ground[i, j] + q * ground[i, j + 1]) + p * (
+        (1 - q) * ground[i + 1, j] + q * ground[i + 1, j + 1]
+    )
+    ends = z[0] + heights[0], z[-1] + heights[1]
+    return bool((z <= ends[0] + share[:, 0] * (ends[1] - ends[0]) + 1e-9).all())
+
+
+def bumpy(seed):
+    ground = np.zeros((60, 60))
+    rng = np.random.default_rng(seed)
+    for row, col in rng.integers(8, 52, (6, 2)):
+        y, x = np.mgrid[:60, :60]
+        ground += rng.uniform(0.5, 2.5) * np.exp(-((y - row) ** 2 + (x - col) ** 2) / 18.0)
+    return ground
+
+
+def workspace_on(ground, team):
+    terrain = synthetic_terrain((60.0, 60.0), seed=0)
+    terrain["dem"].values[:] = ground
+    terrain["dsm"].values[:] = ground
+    return Workspace.from_terrain(terrain, (3, 3), team, sight="bare")
+
+
+def test_line_of_sight_is_what_scalar_code_computes():
+    """On level ground with bumps all robots drive at one speed, so both phases last as long."""
+    team = Team(robots=(Robot(vertical_fov=1.4),), lead=Robot(vertical_fov=1.4))
+    workspace = workspace_on(bumpy(1), team)
+    surface, (_, pairs) = workspace.surface, bounds_of(workspace)
+    given = geometry(workspace.ground, pairs, workspace.passable.values)
+    found, _ = bound_features(surface, Sight("bare"), team, given, surface.ground)
+
+    def pixel(xy):
+        return np.array([xy[0] - surface.origin[0], surface.origin[1] - xy[1]])
+
+    for b in range(0, len(pairs), 5):
+        way, post = given.ways[b], given.posts[b, 0]
+        length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+        seen = []
+        for k in range(N_SAMPLES):
+            share = (k + 0.5) / N_SAMPLES
+            lead = [np.interp(share * length[-1], length, way[:, axis]) for axis in (0, 1)]
+            own = lead + (1 - share) * (post - way[0]) + share * (given.ends[b, k, 0] - way[-1])
+            seen.append(clear(surface.ground, pixel(post), pixel(lead), (1.0, 1.0)))
+            seen.append(clear(surface.ground, pixel(way[-1]), pixel(own), (1.0, 1.0)))
+        # Even times are even lengths up to the slope of the bumps: a sample or two may differ.
+        assert found[b, 0] == pytest.approx(np.mean(seen), abs=2.5 / (2 * N_SAMPLES))
+
+
+def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
+    low = Robot(vertical_fov=np.deg2rad(80.0))
+    team = Team(robots=(low,) * 3, lead=low)
+    workspace = workspace_on(bumpy(2), team)
+    given = geometry(workspace.ground, bounds_of(workspace)[1], workspace.passable.values)
+    higher = Team(robots=(low, replace(low, sensor_height=3.0), low), lead=low)
+    level, raised = (
+        bound_features(workspace.surface, Sight("bare"), t, given, workspace.surface.ground)[0]
+        for t in (team, higher)
+    )
+    np.testing.assert_array_equal(level[:, [0, 2]], raised[:, [0, 2]])
+    # From 3 m, 80 degrees and the slope leave out what passes within a metre of one's feet.
+    gap = [
+        np.linalg.norm(w - p, axis=1).min()
+        for w, p in zip(given.ways, given.posts[:, 1], strict=True)
+    ]
+    beside = np.array(gap) > 1.0
+    assert beside.mean() > 0.5
+    assert (raised[beside, 1] >= level[beside, 1]).all()
+    assert (raised[:, 1] > level[:, 1] + 0.05).any()
+
+
+@pytest.mark.parametrize("name", ["synthetic", "wellington", "tahoe", "topography"])
+@pytest.mark.filterwarnings("ignore:.*enters its composite", "ignore:the first component of")
+def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
+    """All the difference is T2's own route, and slip; `benchmarks/line_of_sight.py` has more."""
+    made = synthetic_terrain((500.0, 500.0), resolution=2.0, seed=1)
+    terrain = made if name == "synthetic" else read_terrain(*real_terrain(name))
+    workspace = Workspace.from_terrain(terrain, (10, 10))
+    simulator = KinematicSimulator(workspace)
+    index, pairs = bounds_of(workspace)
+    rng, expected, simulated = np.random.default_rng(0), [], []
+    for b in rng.permutation(len(index))[:60]:
+        (m, row, col), (a, c) = index[b], pairs[b]
+        ahead = [n for p, n in pairs if p == c and n != a]
+        drives = []
+        for n in ahead:
+            state = simulator._start(a, 0, c)
+            drives.append(simulator._drive(state, 1, c, n, np.random.default_rng(0)))
+        if any(drive.status != "ok" for drive in drives):
+            continue
+        rates = [f.mean(0) for f in detections(simulator._now, Sight(), simulator.team, drives)]
+        simulated.append(np.mean(rates, axis=0))
+        expected.append(workspace.bound_awareness.values[:, m, row, col, 2])
+    expected, simulated = np.ravel(expected), np.ravel(simulated)
+    assert np.corrcoef(expected, simulated)[0, 1] > 0.95
+    assert abs((expected - simulated).mean()) < 0.02
+
+
+def test_posts_are_near_apart_and_the_best_there_are(wooded):
+    posts = wooded.posts(A, C)
+    assert posts.shape == (2, 2)
+    ground = wooded.ground.posts
+    assert (np.linalg.norm(posts - ground.waypoint(A), axis=1) <= wooded.formation_radius).all()
+    assert np.linalg.norm(posts[0] - posts[1]) >= SPACING
+    assert all(wooded.grid.cell_at(*post) == A for post in posts)
+    assert (wooded.posts(A, (3, 1)) != posts).any()
+
+
+def test_ways_lead_from_post_to_post(wooded):
+    lead, *closing = wooded.ways(A, C, NEXT)
+    ground = wooded.ground.posts
+    np.testing.assert_array_equal(lead[[0, -1]], [ground.waypoint(A), ground.waypoint(C)])
+    for way, start, end in zip(closing, wooded.posts(A, C), wooded.posts(C, NEXT), strict=True):
+        np.testing.assert_array_equal(way[[0, -1]], [start, end])
+    at_goal = wooded.ways(A, C)[1]
+    np.testing.assert_array_equal(at_goal[-1], ground.at(C, None)[0])
+
+
+@pytest.mark.parametrize(("slip", "tolerance"), [(False, 1.0), (True, 1.5)])
+def test_what_is_planned_is_what_is_driven(wooded, slip, tolerance, monkeypatch):
+    """Within a pixel of 1 m, and .5 m more with slip."""
+    simulator, path = KinematicSimulator(wooded), [A, C, NEXT, (0, 3)]
+    if not slip:
+        of_simulator = "trustbo.simulation.overwatch.np.random.default_rng"
+        monkeypatch.setattr(of_simulator, lambda *_: Steady())
+    mission = simulator.run(path, seed=0)
+    for k, bound in enumerate(mission.bounds):
+        ahead = path[k + 2] if k + 2 < len(path) else None
+        for i, way in enumerate(wooded.ways(path[k], path[k + 1], ahead)):
+            fine = np.concatenate([np.linspace(p, q, 20) for p, q in itertools.pairwise(way)])
+            track = bound.poses[:, i, :2]
+            gap = np.linalg.norm(track[:, None] - fine, axis=-1).min(1)
+            assert gap.max() <= tolerance
+
+
+class Steady:
+    """Random numbers of a world without chance: no slip, and every look finds what it may."""
+
+    def standard_normal(self, size):
+        return np.zeros(size)
+
+    def random(self, size):
+        return np.full(size, 0.5)
+
+
+def test_robots_differ():
+    terrain = synthetic_terrain((160.0, 160.0), seed=5, relief=8.0)
+    blind = Robot(lidar_range=15.0)
+    workspace = Workspace.from_terrain(terrain, (4, 4), Team(robots=(Robot(), blind)))
+    seen = workspace.bound_awareness.sel(feature="line_of_sight")
+    known = np.isfinite(seen.values[0])
+    assert (seen.values[1][known] < seen.values[0][known] + 1e-12).mean() > 0.95
+    assert seen.values[1][known].mean() < seen.values[0][known].mean() - 0.1
+
+
+def test_several_sights_are_several_features(wooded):
+    sights = [Sight(), "wall", Sight(extinction=0.0)]
+    workspace = Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, sight=sights)
+    names = ["line_of_sight_1", "line_of_sight_2", "line_of_sight_3"]
+    assert workspace.features == ("traversability", "visibility", *names)
+    first, wall, clear_air = (workspace.bound_awareness.sel(feature=name) for name in names)
+    np.testing.assert_array_equal(first, wooded.bound_awareness.sel(feature="line_of_sight"))
+    known = np.isfinite(first.values)
+    assert (wall.values[known] <= first.values[known]).all()
+    assert (first.values[known] <= clear_air.values[known]).all()
+
+
+def test_a_workspace_of_bounds_survives_a_file(wooded):
+    again = workspace_from_tree(workspace_to_tree(wooded))
+    np.testing.assert_array_equal(again.bound_awareness, wooded.bound_awareness)
+    assert (again.sights, again.formation_radius) == (wooded.sights, wooded.formation_radius)
+    np.testing.assert_array_equal(again.posts(A, C), wooded.posts(A, C))
+
+
+def test_the_paper_s_setting_has_maps_of_cells_alone(wooded):
+    paper = Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, bounds=False)
+    assert paper.features == ("traversability", "visibility")
+    assert paper.of_bounds is None
+    assert list(paper.composites["visibility"].signs) == [
+        "canopy_height",
+        "canopy_cover",
+        "openness",
+    ]
+    assert paper.posts(A, C) is not None
+
+
+def test_without_a_terrain_there_are_no_posts():
+    workspace = Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
+    assert workspace.posts((0, 0), (0, 1)) is None
+    assert workspace.ways((0, 0), (0, 1)) is None
+
+
+def test_missing_awareness_of_a_mission_is_filled(wooded):
+    mission = KinematicSimulator(wooded).run([A, C, NEXT], seed=0)
+    assert np.isnan(mission.awareness[..., 2]).all()
+    filled = wooded.fill(mission)
+    expected = wooded.bound_awareness.sel(move="ne", feature="line_of_sight")
+    np.testing.assert_array_equal(filled.awareness[0, :, 2], expected.sel(row=2, col=1))
+    np.testing.assert_array_equal(filled.awareness[..., :2], mission.awareness[..., :2])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sight": "fog"}, "unknown sight mode 'fog'"),
+        ({"sight": []}, r"or several; got \[\]"),
+        ({"formation_radius": 1.0}, "formation_radius must be at least 2 m"),
+        ({"features": {"line_of_sight": ["slope"]}}, "'line_of_sight' is the name of a feature of"),
+    ],
+)
+def test_impossible_settings_are_refused(wooded, options, message):
+    with pytest.raises(TrustboError, match=message):
+        Workspace.from_terrain(wooded.terrain, (4, 4), **options)
+
+
+def test_no_room_to_stand_is_named():
+    terrain = synthetic_terrain((12.0, 12.0), resolution=2.0, seed=0)
+    with pytest.raises(
+        TerrainError, match=r"cell \(0, 0\) has 2 passable pixels, on which robot 'r2'"
+    ):
+        Workspace.from_terrain(terrain, (3, 3), Team(n_robots=6))
+
+
+def test_a_terrain_without_canopy_has_no_wall():
+    terrain = synthetic_terrain((60.0, 60.0), seed=0, canopy_cover=0.0)
+    with pytest.raises(TerrainError, match="'wall' needs canopy, and the DSM is nowhere above"):
+        Workspace.from_terrain(terrain, (3, 3), sight="wall")
+
+
+def test_a_bound_is_between_neighbours(wooded):
+    with pytest.raises(TrustboError, match=r"no bound leads from \(3, 0\) to \(1, 2\)"):
+        wooded.posts(A, NEXT)
