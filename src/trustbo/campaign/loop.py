@@ -11,7 +11,7 @@ from tqdm import tqdm
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.history import LEARNED
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.campaign.replanning import require_bounds, run_replanning, takes
+from trustbo.campaign.replanning import require_bounds, run_replanning
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import (
     Stop,
@@ -26,6 +26,7 @@ from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Policy
 from trustbo.simulation import KinematicSimulator, Simulator
+from trustbo.simulation.protocol import takes
 from trustbo.workspace import Workspace
 
 _log = logging.getLogger(__name__)

@@ -1,7 +1,6 @@
 """A mission whose path is planned again after each bound."""
 
-import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from trustbo.errors import TrustboError
 from trustbo.models import TrustFilter, TrustModel, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
+from trustbo.simulation.protocol import takes
 from trustbo.stacking import fill_awareness
 
 THRESHOLD = 0.01
@@ -117,11 +117,6 @@ def _run_bound(simulator: Any, k: int, cell: Cell, ahead: Cell | None) -> Bound:
     """Run a bound; a simulator that takes `next_cell`, which is optional, gets it."""
     known = {"next_cell": ahead} if takes(simulator.run_bound, "next_cell") else {}
     return simulator.run_bound(k, cell, **known)
-
-
-def takes(function: Callable[..., object], name: str) -> bool:
-    """Whether a function has a parameter of that name."""
-    return name in inspect.signature(function).parameters
 
 
 def _known(campaign: Campaign, left: Cell, bound: Bound) -> np.ndarray:

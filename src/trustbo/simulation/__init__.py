@@ -6,8 +6,9 @@ from trustbo.simulation.mujoco import MujocoSimulator
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import BoundSimulator, Simulator
 from trustbo.simulation.replay import ReplaySimulator
+from trustbo.simulation.truth import Truth
 
 __all__ = [
     "BoundSimulator", "Degradation", "KinematicSimulator", "ModelSimulator", "MujocoSimulator",
-    "ReplaySimulator", "Simulator", "Threat",
+    "ReplaySimulator", "Simulator", "Threat", "Truth",
 ]  # fmt: skip

@@ -15,7 +15,7 @@ LOOKAHEAD = 1.5
 ARRIVED = 0.5
 """Distance from its goal at which a robot stops, m."""
 _LEAST_STEPS = 5
-_compiled = njit(cache=True, error_model="numpy")
+_compiled = njit(cache=True, nogil=True, error_model="numpy")
 _STATUS = ("ok", "stuck", "tipped", "timeout")
 
 

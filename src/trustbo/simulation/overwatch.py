@@ -1,8 +1,8 @@
 """Kinematic simulator of bounding overwatch: movements and contacts, bound by bound."""
 
 import copy
+import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 
 import numpy as np
 import xarray as xr
@@ -105,7 +105,7 @@ class KinematicSimulator:
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
-        team = {} if self.team == self.workspace.team else {"team": asdict(self.team)}
+        team = {} if self.team == self.workspace.team else {"team": dataclasses.asdict(self.team)}
         true = {} if self.terrain is None else {"terrain": digest_of(self.terrain)}
         return {
             "simulator": type(self).__name__,
@@ -117,8 +117,8 @@ class KinematicSimulator:
             "formation_radius": self.workspace.formation_radius,
             "bound_timeout": self.bound_timeout,
             "lost_contact_after": self.lost_contact_after,
-            "threats": [asdict(threat) for threat in self.threats],
-            "degradations": [asdict(degradation) for degradation in self.degradations],
+            "threats": [dataclasses.asdict(threat) for threat in self.threats],
+            "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],
             "realtime": sorted(self.realtime),
             **team,
             **true,
@@ -201,6 +201,46 @@ class KinematicSimulator:
         """End the mission that runs bound by bound."""
         self._state = None
 
+    def run_ahead(
+        self,
+        way: tuple[Cell, Cell],
+        ahead: Sequence[Cell | None],
+        rng: np.random.Generator,
+        state: State | None = None,
+    ) -> list[tuple[np.ndarray, str, State]]:
+        """Run a successive bound once for each cell that may follow it, the lead's move shared.
+
+        It leads from a cell to the next, from a state of the team there, by default in position.
+        Returns for each the contact rate (robot,), the status and the state after it. The rate is
+        the mean probability of contact over the ticks where looks are independent; where tracks
+        outlast misses, or lost contact ends a mission, that of simulated looks.
+        """
+        max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
+        state = self._start(way[0], 0, cell) if state is None else state
+        lead, status = self._phase(0, state.poses, state.stops, way, None, max_ticks, rng)
+        drives = [Drive(lead, np.ones(len(lead), bool), status, way, state.stops)]
+        for next_cell in ahead if status == "ok" else ():
+            left = max_ticks - len(lead)
+            t2, ended = self._phase(1, lead[-1], state.stops, way, next_cell, left, rng)
+            stops = np.concatenate([self._goals(i, cell, next_cell) for i in (0, 1)])
+            drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell), stops))
+        seen, *others = detections(self._now, self.sight, self.team, drives)
+        lidars = self.team.lead, *self.team.robots
+        independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
+        outcomes = []
+        for closing, found in zip(drives[1:], others, strict=True):
+            after = dataclasses.replace(
+                state, cells=closing.cells, poses=closing.poses[-1], stops=closing.stops
+            )
+            after.tracks, status = state.tracks.copy(), closing.status
+            probability = np.concatenate([seen, found])
+            if not independent or self.lost_contact_after is not None:
+                moves = np.concatenate([drives[0].lead_moves, closing.lead_moves])
+                both = closing._replace(lead_moves=moves)
+                probability, status = self._contact(after, both, probability, rng)
+            outcomes.append((probability.mean(0), status, after))
+        return outcomes or [(seen.mean(0), status, state)] * len(ahead)
+
     def calibration(self, n_bounds: int = 300, seed: int = 0) -> dict[str, xr.Dataset]:
         """Simulate random bounds, without threats, to fit `CompositeIndex.realtime` on.
 
@@ -280,27 +320,49 @@ class KinematicSimulator:
         self, state: State, k: int, cell: Cell, next_cell: Cell | None, rng: np.random.Generator
     ) -> Drive:
         """Drive the lead, then T2; or only one of them, by turns."""
-        posts, cells, status = self._ways.posts, list(state.cells), "ok"
-        poses, lead_moves, stops = [state.poses[None]], [], state.stops.copy()
+        cells, status, stops = list(state.cells), "ok", state.stops.copy()
+        poses, lead_moves = [state.poses[None]], []
         ticks_left = round(self.bound_timeout / self.tick)
         for mover in turns(self.bounding, k, next_cell is None):
             i, members = (0, slice(0, 1)) if mover == "lead" else (1, slice(1, None))
-            goals = posts.at(cell, next_cell) if i else posts.waypoint(cell)[None]
-            now, way = poses[-1][-1], (cells[i], cell)
-            window = posts.window(*way)
-            routes = self._routes(i, stops[members], goals, now[members], window)
-            robots = self.team.robots if i else (self.team.lead,)
-            moved, status = self._move(now[members], robots, routes, window, ticks_left, rng)
-            part = np.repeat(now[None], len(moved), axis=0)
-            part[:, members] = moved
+            way, now = (cells[i], cell), poses[-1][-1]
+            part, status = self._phase(i, now, stops, way, next_cell, ticks_left, rng)
             poses.append(part)
-            lead_moves.append(np.full(len(moved), mover == "lead"))
-            ticks_left -= len(moved)
+            lead_moves.append(np.full(len(part), i == 0))
+            ticks_left -= len(part)
             if status != "ok":
                 break
-            cells[i], stops[members] = cell, goals
+            cells[i], stops[members] = cell, self._goals(i, cell, next_cell)
         moves = np.concatenate(lead_moves)
         return Drive(np.concatenate(poses[1:]), moves, status, (cells[0], cells[1]), stops)
+
+    def _goals(self, i: int, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+        """Where the lead (i = 0) or T2 is to stop in a cell, shape (robot, 2)."""
+        posts = self._ways.posts
+        return posts.at(cell, next_cell) if i else posts.waypoint(cell)[None]
+
+    def _phase(
+        self,
+        i: int,
+        now: np.ndarray,
+        stops: np.ndarray,
+        way: tuple[Cell, Cell],
+        next_cell: Cell | None,
+        max_ticks: int,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, str]:
+        """Drive the lead (i = 0) or T2 while the others stand: poses (tick, 1 + robot, 3), status.
+
+        Their ways begin at the `stops` that were planned, the robots where they are now.
+        """
+        members = slice(1, None) if i else slice(0, 1)
+        robots = self.team.robots if i else (self.team.lead,)
+        window, goals = self._ways.posts.window(*way), self._goals(i, way[1], next_cell)
+        routes = self._routes(i, stops[members], goals, now[members], window)
+        moved, status = self._move(now[members], robots, routes, window, max_ticks, rng)
+        part = np.repeat(now[None], len(moved), axis=0)
+        part[:, members] = moved
+        return part, status
 
     def _routes(
         self,

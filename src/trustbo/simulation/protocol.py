@@ -1,6 +1,7 @@
 """Protocols of simulators: whole missions, or one bound after the other."""
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from trustbo.data import Bound, Cell, Mission
@@ -9,9 +10,9 @@ from trustbo.data import Bound, Cell, Mission
 class Simulator(Protocol):
     """Simulator that runs a path: one of this package, a user's own, or real robots.
 
-    Two more methods are optional: `describe() -> dict` gives settings that a campaign records,
-    `regret(plan) -> float` the regret of a plan for its history. A simulator whose world changes
-    takes the number of the mission as a keyword `mission` of `run` (and of `reset`).
+    One more method is optional: `describe() -> dict` gives settings that a campaign records. A
+    simulator whose world changes takes the number of the mission as a keyword `mission` of `run`
+    (and of `reset`).
     """
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
@@ -37,3 +38,8 @@ class BoundSimulator(Simulator, Protocol):
     def close(self) -> None:
         """End the mission."""
         ...
+
+
+def takes(function: Callable[..., object], name: str) -> bool:
+    """Whether a function has a parameter of that name."""
+    return name in inspect.signature(function).parameters

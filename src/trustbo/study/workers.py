@@ -9,6 +9,8 @@ from pathlib import Path
 
 import jax
 
+from trustbo.files import cache_folder
+
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _ready = False
 
@@ -79,6 +81,5 @@ def keep_compiled_code() -> None:
     `JAX_COMPILATION_CACHE_DIR`, is used instead.
     """
     if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(cache / "trustbo" / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

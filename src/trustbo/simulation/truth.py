@@ -1,0 +1,318 @@
+"""Truth of a simulator: expected contact of paths, the best of them, and regret."""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Cell
+from trustbo.errors import (
+    DamagedFileError,
+    TrustboError,
+    require_choice,
+    require_positive,
+    require_whole,
+)
+from trustbo.files import FilePath, cache_folder, require_folder, to_json
+from trustbo.logs.netcdf import read_tree, write_tree
+from trustbo.planning import Plan
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.simulation.bound_table import BoundTable, tabulate
+from trustbo.simulation.events import acts_in
+from trustbo.simulation.model import ModelSimulator
+from trustbo.simulation.model_contact import ModelContact
+from trustbo.simulation.overwatch import KinematicSimulator
+from trustbo.simulation.protocol import takes
+from trustbo.simulation.replicates import KinematicReplicates, PlainReplicates
+from trustbo.terrain.dataset import digest_of
+from trustbo.workspace import Workspace
+
+OBJECTIVES = ("lost_contact", "mean")
+"""Objectives that a truth has a best path for."""
+
+
+class PathContact(NamedTuple):
+    """What a path gives."""
+
+    lost: float
+    """Expected contact lost, in bounds: the sum over bounds of 1 - contact, mean over robots."""
+    mean: float
+    """Expected contact rate, mean over bounds and robots."""
+    p_arrive: float
+    """Probability that no bound fails."""
+
+
+class Contact(Protocol):
+    """What a truth is made of: a table of bounds, a model's recursion, or the user's own."""
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the contact of a bound."""
+        ...
+
+    def contact(self, path: Sequence[Cell]) -> np.ndarray:
+        """Expected contact rates of the bounds of a path, shape (bound, robot)."""
+        ...
+
+    def failure(self, path: Sequence[Cell]) -> np.ndarray:
+        """Chance to fail of the bounds of a path, shape (bound,)."""
+        ...
+
+    def best(self, paths: AdmissiblePaths, objective: str) -> tuple[Cell, ...]:
+        """Best admissible path."""
+        ...
+
+
+class Truth:
+    """Expected contact of every path of a simulator, in the world of a mission.
+
+    Contact is expected given that no bound fails; `PathContact.p_arrive` says how probable that is.
+
+    Attributes:
+        workspace: Workspace of the paths.
+        bounds: Expected contact of bounds: a `BoundTable`, whose `data` has it all, or a
+            `ModelContact`.
+    """
+
+    def __init__(
+        self, workspace: Workspace, bounds: Contact, at: "Callable[[int], Truth] | None" = None
+    ) -> None:
+        """Hold what bounds give; `at(mission)` is the truth of another mission's world."""
+        self.workspace, self.bounds, self._at = workspace, bounds, at
+        self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
+
+    @classmethod
+    def of(
+        cls,
+        simulator: Any,
+        *,
+        seed: int = 0,
+        standard_error: float = 0.005,
+        mission: int = 0,
+        folder: FilePath | None = None,
+        progress: bool = False,
+    ) -> Self:
+        """Find the truth of a simulator.
+
+        Of a `ModelSimulator` it is known in closed form. Of another, every bound, followed by each
+        that can follow it, is replicated until the standard error is reached; what was found is
+        kept on disk, and found again by a hash of the simulator's `describe()`, the workspace and
+        the code.
+
+        Args:
+            simulator: Simulator with a `workspace`, and with `reset` and `run_bound`.
+            seed: Seed of the replicates.
+            standard_error: Standard error of the contact of a bound, mean over robots.
+            mission: Number of the mission, where the world changes.
+            folder: Folder to keep it in; by default `truth` in trustbo's cache, which is
+                `$XDG_CACHE_HOME/trustbo`.
+            progress: Whether to show a progress bar.
+
+        Raises:
+            TrustboError: A simulator without a workspace or bounds, or whose bounds depend on
+                whose turn it is; a standard error that is not positive.
+        """
+        workspace = getattr(simulator, "workspace", None)
+        if not isinstance(workspace, Workspace):
+            raise TrustboError(
+                f"truth needs a simulator with a workspace; {type(simulator).__name__} has none."
+            )
+        if isinstance(simulator, ModelSimulator):
+            bounds = ModelContact(simulator.model, simulator.params, simulator.awareness)
+            return cls(workspace, bounds)
+        numbers = require_whole("seed", seed, 0), require_positive("standard_error", standard_error)
+        known: dict[object, Self] = {}
+
+        def at(number: int) -> Self:
+            world = _world(simulator, require_whole("mission", number, 0))
+            if world not in known:
+                table = _table(simulator, number, world, *numbers, folder, progress)
+                known[world] = cls(workspace, table, at)
+            return known[world]
+
+        return at(mission)
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the contact of a bound, mean over robots: root mean square over all."""
+        return self.bounds.standard_error
+
+    def at(self, mission: int) -> "Truth":
+        """Truth of the world of another mission, counted from 0."""
+        return self if self._at is None else self._at(mission)
+
+    def best(
+        self,
+        start: Cell,
+        goal: Cell,
+        objective: str = "lost_contact",
+        max_bounds: int | str = "shortest+4",
+        *,
+        connectivity: int = 8,
+    ) -> tuple[Cell, ...]:
+        """Find the best admissible path, exactly.
+
+        Args:
+            start: First cell.
+            goal: Last cell.
+            objective: `"lost_contact"`, the least contact lost, or `"mean"`, the largest mean rate.
+            max_bounds: Admissible paths, and
+            connectivity: moves, both as for `Planner`.
+
+        Raises:
+            TrustboError: An unknown name; a cell off the grid, or impassable.
+            NoPathError: The goal cannot be reached.
+        """
+        require_choice("objective of a truth", objective, OBJECTIVES)
+        key = tuple(start), tuple(goal), objective, max_bounds, connectivity
+        if key not in self._best:
+            paths = AdmissiblePaths(self.workspace, start, goal, connectivity, max_bounds, True)
+            self._best[key] = self.bounds.best(paths, objective)
+        return self._best[key]
+
+    def value(self, path: Plan | Sequence[Cell]) -> PathContact:
+        """Expected contact of a path, or of a plan's, and its probability to arrive.
+
+        Raises:
+            TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
+        """
+        cells = self._cells(path)
+        rates = self.bounds.contact(cells).mean(1)
+        arrives = float(np.prod(1.0 - self.bounds.failure(cells)))
+        return PathContact(float((1.0 - rates).sum()), float(rates.mean()), arrives)
+
+    def regret(
+        self,
+        path: Plan | Sequence[Cell],
+        objective: str = "lost_contact",
+        max_bounds: int | str = "shortest+4",
+        *,
+        connectivity: int = 8,
+    ) -> float:
+        """Regret of a path, or of a plan's, in % of the contact that the best path keeps.
+
+        100 (contact lost on it - lost on the best) / contact kept on the best, both in bounds; for
+        `"mean"` of mean rates. The best path is that of `best`, with the same ends; negative if
+        the path is better than all those admissible.
+
+        Raises:
+            TrustboError: See `best` and `value`.
+        """
+        cells = self._cells(path)
+        best_path = self.best(cells[0], cells[-1], objective, max_bounds, connectivity=connectivity)
+        best, own = self.value(best_path), self.value(cells)
+        if objective == "mean":
+            return _percent(best.mean - own.mean, best.mean)
+        return _percent(own.lost - best.lost, len(best_path) - 1 - best.lost)
+
+    def require_workspace(self, workspace: Workspace) -> None:
+        """Refuse another workspace than that of the truth; its features may differ.
+
+        Raises:
+            TrustboError: The grid, passable cells or terrain differ.
+        """
+        for name, own, other in _differences(self.workspace, workspace):
+            raise TrustboError(
+                f"the truth is of another workspace: its {name} is {own}, the campaign's {other}; "
+                "make it with Truth.of(simulator) of this workspace's simulator."
+            )
+
+    def _cells(self, path: Plan | Sequence[Cell]) -> tuple[Cell, ...]:
+        cells = path.path if isinstance(path, Plan) else path
+        cells = tuple(self.workspace.require_cell(f"path[{k}]", c) for k, c in enumerate(cells))
+        if len(cells) < 2:
+            raise TrustboError(f"a path needs at least two cells; got {cells}.")
+        return cells
+
+
+def _percent(lacking: float, of: float) -> float:
+    return 100.0 * lacking / of if of > 0.0 else np.nan
+
+
+def _world(simulator: Any, mission: int) -> object:
+    """Identity of the world of a mission: which events act in it."""
+    if isinstance(simulator, KinematicSimulator):
+        events = (*simulator.threats, *simulator.degradations)
+        return tuple(i for i, event in enumerate(events) if acts_in(event, mission))
+    begin = getattr(simulator, "reset", None)
+    return mission if begin is not None and takes(begin, "mission") else 0
+
+
+def _table(
+    simulator: Any,
+    mission: int,
+    world: object,
+    seed: int,
+    standard_error: float,
+    folder: FilePath | None,
+    progress: bool,
+) -> BoundTable:
+    """Table of a simulator, from disk if it is known."""
+    describe = getattr(simulator, "describe", None)
+    file = None
+    if describe is not None:  # else nobody knows whether it is the same
+        about = [describe(), world, seed, standard_error, version("trustbo"), _code()]
+        kept = cache_folder("truth") if folder is None else require_folder(folder)
+        digest = hashlib.sha256(to_json(about).encode())
+        for part in _content(simulator):
+            digest.update(part)
+        file = kept / f"{digest.hexdigest()[:20]}.nc"
+        if file.exists():
+            try:
+                return BoundTable(read_tree(file)["bounds"].to_dataset())
+            except (DamagedFileError, KeyError):
+                pass  # found anew
+    kind = type(simulator) is KinematicSimulator
+    source = (KinematicReplicates if kind else PlainReplicates)(simulator, mission, seed)
+    table = tabulate(simulator.workspace, source, standard_error=standard_error, progress=progress)
+    if file is not None:
+        write_tree(file, xr.DataTree.from_dict({"bounds": table.data}))
+    return table
+
+
+def _content(simulator: Any) -> list[bytes]:
+    """What the contact of a simulator depends on besides its description."""
+    workspace: Workspace = simulator.workspace
+    own = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
+    parts = [to_json(own).encode(), _bytes(workspace.passable)]
+    if workspace.terrain is None or workspace.pixels is None:
+        return [*parts, _bytes(workspace.awareness)]
+    pixels = [_bytes(workspace.pixels[name]) for name in ("traversability", "passable")]
+    return [*parts, digest_of(workspace.terrain).encode(), *pixels]
+
+
+def _bytes(array: xr.DataArray) -> bytes:
+    return np.ascontiguousarray(array.values).tobytes()
+
+
+@cache
+def _code() -> str:
+    """Hash of the code that decides what a simulator gives, for work on it between versions."""
+    digest, root = hashlib.sha256(), Path(__file__).parents[1]
+    for room in ("simulation", "terrain", "workspace"):
+        for file in sorted((root / room).glob("*.py")):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _differences(a: Workspace, b: Workspace) -> list[tuple[str, object, object]]:
+    """Names of what differs, with both values in words."""
+    if a.grid != b.grid:
+        return [("grid", a.grid, b.grid)]
+    if not np.array_equal(a.passable.values, b.passable.values):
+        n, other = (f"{int(w.passable.sum())} passable cells" for w in (a, b))
+        return [("passability", n, other)]
+    if a.terrain is None or b.terrain is None:
+        return []
+    found = []
+    for name in ("dem", "dsm"):
+        own, theirs = a.terrain[name].values, b.terrain[name].values
+        if own.shape != theirs.shape or not np.array_equal(own, theirs, equal_nan=True):
+            mean, other = (f"of mean height {np.nanmean(h):.2f} m" for h in (own, theirs))
+            found.append((name, mean, other))
+    return found
