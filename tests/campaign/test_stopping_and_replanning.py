@@ -9,9 +9,11 @@ import pytest
 from simulators import TRUTH, ModelSimulator
 
 import trustbo as tb
+from trustbo import simulation
 from trustbo.campaign.replanning import better_rest, weighted_mean
 from trustbo.campaign.stopping import reason_to_stop
 from trustbo.data import Bound
+from trustbo.errors import TrustboError
 from trustbo.models import TrustFilter, sample_prior
 from trustbo.models.params import params_of
 from trustbo.planning import Planner
@@ -171,16 +173,22 @@ def test_the_generator_gives_each_mission_as_it_is_learned(workspace):
     assert table.loc[1, "status"] == "ok"
 
 
-def test_regret_is_recorded_where_the_truth_is_known(workspace):
-    class Oracle(ModelSimulator):
-        def regret(self, plan):
-            planner = Planner(self.workspace, *ENDS)
-            best = planner.plan(TRUTH).value
-            return best - planner.evaluate(plan.path, TRUTH).value
-
-    result = iterate(workspace, n_iterations=2, simulator=Oracle(workspace))
+def test_true_regret_goes_into_the_history(workspace):
+    simulator = simulation.ModelSimulator(workspace, TRUTH)
+    truth = simulation.Truth.of(simulator)
+    result = iterate(workspace, n_iterations=2, simulator=simulator, truth=truth)
     regret = result.history["regret"].values
-    assert (regret >= -1e-12).all()
+    paths = [mission.path for mission in result.missions]
+    best = truth.value(truth.best(*ENDS, max_bounds="shortest+2"))
+    for path, value in zip(paths, regret, strict=True):
+        n_best = len(truth.best(*ENDS, max_bounds="shortest+2")) - 1
+        lacking = truth.value(path).lost - best.lost
+        assert value == pytest.approx(100.0 * lacking / (n_best - best.lost), abs=1e-9)
+    assert (regret >= -1e-9).all()
+    larger = tb.Workspace.from_awareness(np.full((3, 5, 5, 2), 0.5))
+    other = simulation.Truth.of(simulation.ModelSimulator(larger, TRUTH))
+    with pytest.raises(TrustboError, match="the truth is of another workspace: its grid is"):
+        iterate(workspace, simulator=simulator, truth=other)
 
 
 def test_progress_is_a_line_and_the_log_has_it_too(workspace, capsys, caplog):
