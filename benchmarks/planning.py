@@ -99,7 +99,7 @@ def many_draws(n, n_networkx):
         )
     )
     line("the same without computing u from the draws", search)
-    costs = entry_cost(planner.paths.passable, dynamics)
+    costs = entry_cost(planner.paths.passable, dynamics)[:, 0]
     matrix = csr_of(planner.paths)
 
     def scipy_loop():
@@ -165,7 +165,7 @@ def large(n, kind):
     ours, plan = seconds(trustbo_plan), trustbo_plan()
     line("trustbo, stationary, Planner and plan", ours, None, f"{len(plan.path)} cells")
     planner = Planner(*ends, "stationary")
-    cost = entry_cost(planner.paths.passable, planner.dynamics(params))
+    cost = entry_cost(planner.paths.passable, planner.dynamics(params))[0]
     start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
 
     def scipy_plan():

@@ -126,6 +126,24 @@ def path_value(objective, path, u, beta0, x0):
     }[objective]()
 
 
+def of_bounds(u):
+    """Drift by the cells left and entered, (robot, cell, cell), of (robot, [move], row, col).
+
+    Moves are in the order of rows, then of columns; NaN between cells that are no neighbours.
+    """
+    n_robots, (rows, cols) = len(u), u.shape[-2:]
+    cells = list(itertools.product(range(rows), range(cols)))
+    moves = [move for move in itertools.product((-1, 0, 1), repeat=2) if move != (0, 0)]
+    pairs = np.full((n_robots, len(cells), len(cells)), np.nan)
+    for i, left in enumerate(cells):
+        for m, (down, right) in enumerate(moves):
+            entered = left[0] + down, left[1] + right
+            if entered in cells:
+                known = u[:, *entered] if u.ndim == 3 else u[:, m, *entered]
+                pairs[:, i, cells.index(entered)] = known
+    return pairs
+
+
 def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", toll=None):
     """Values of many paths at once; the recursion is that of equation (1).
 
@@ -133,7 +151,7 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
         objective: Its name.
         paths: Flat indices of cells, shape (path, length), start first, filled up with anything.
         n_cells: Cells of each path, shape (path,).
-        u: Drift, shape (robot, cell).
+        u: Drift of bounds, shape (robot, cell left, cell entered); see `of_bounds`.
         transition: B0, shape (robot, robot).
         x0: Trust at the start.
         team: "mean" or "min".
@@ -141,21 +159,24 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
     """
     combine = np.mean if team == "mean" else np.min
     x = np.full((len(paths), len(u)), x0)
-    settled_in = np.zeros(u.shape[1])
+    settled_in = np.zeros(u.shape[1:])
     if objective == "stationary":
-        settled_in = combine(np.linalg.solve(np.eye(len(u)) - transition, u), axis=0)
+        settled_in = combine(
+            np.linalg.solve(np.eye(len(u)) - transition, u.reshape(len(u), -1)), axis=0
+        ).reshape(u.shape[1:])
     toll = np.zeros(len(paths)) if toll is None else toll
     total, success, least, stationary, last = (np.zeros(len(paths)) for _ in range(5))
     least[:] = np.inf
     for k in range(1, paths.shape[1]):
         on = k < n_cells
-        x = x @ transition.T + u[:, paths[:, k]].T
+        bound = paths[:, k - 1], paths[:, k]
+        x = x @ transition.T + u[:, *bound].T
         trust = combine(x, axis=1)
         last = np.where(on, trust, last)
         total += np.where(on, trust, 0.0)
         least = np.where(on, np.minimum(least, trust), least)
         success += np.where(on, np.log1p(np.exp(-trust)), 0.0)
-        stationary += np.where(on, np.log1p(np.exp(-settled_in[paths[:, k]])), 0.0)
+        stationary += np.where(on, np.log1p(np.exp(-settled_in[bound])), 0.0)
     return {
         "terminal": 1.0 / (1.0 + np.exp(toll - last)),
         "mean": total / (n_cells - 1) - toll,

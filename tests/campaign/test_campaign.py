@@ -127,7 +127,7 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
         ({"policy": "bold"}, "unknown policy 'bold'; choose one of greedy, optimistic"),
         ({"objective": "best"}, "unknown objective 'best'"),
         ({"sampler": "gibbs"}, "unknown sampler 'gibbs'; choose one of nuts, exact"),
-        ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_draw, prior_mean"),
+        ({"initial": "zero"}, "unknown initial 'zero'; choose one of prior_mean, prior_draw"),
     ):
         with pytest.raises(TrustboError, match=message):
             Campaign(workspace, *ENDS, **options)

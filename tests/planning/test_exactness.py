@@ -5,11 +5,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from references import path_values, walks
+from references import of_bounds, path_values, walks
 
 from trustbo.models import CoupledParams, RobotParams, TrustParams
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVES
 
 BETA0 = {
     "terminal": (-0.8, 0.0, 0.3, 0.7, 1.0, 1.3),
@@ -58,35 +59,41 @@ def admissible(objective, n, connectivity):
     return extra, extra, ()
 
 
-def random_problem(model, n, n_robots, beta0, rng):
-    """Awareness and parameters; drift and transition by their definitions."""
-    z = rng.uniform(size=(n_robots, n, n, 2))
+def random_problem(model, n, n_robots, beta0, rng, *, moves=()):
+    """Awareness of cells, or of bounds with 8 moves; drift and transition by their definitions."""
+    z = rng.uniform(size=(n_robots, *moves, n, n, 2))
     noise = 0.1 * np.eye(n_robots)
     if model == "pooled":
         beta, b = rng.normal(size=2), rng.normal(-0.3, 0.5)
         params = TrustParams(beta0, beta, b, 0.1, 0.1)
-        return z, params, (z @ beta + b).reshape(n_robots, -1), beta0 * np.eye(n_robots)
+        return z, params, of_bounds(z @ beta + b), beta0 * np.eye(n_robots)
     if model == "hierarchical":
         own = beta0 * rng.uniform(0.7, 1.0, n_robots)
         beta, b = rng.normal(size=(n_robots, 2)), rng.normal(-0.3, 0.5, n_robots)
         params = RobotParams(own, beta, b, np.full(n_robots, 0.1), np.full(n_robots, 0.1))
         u = np.stack([z[i] @ beta[i] + b[i] for i in range(n_robots)])
-        return z, params, u.reshape(n_robots, -1), np.diag(own)
+        return z, params, of_bounds(u), np.diag(own)
     B0 = beta0 * np.eye(n_robots) + rng.normal(0.0, 0.1, (n_robots, n_robots)) * (
         1 - np.eye(n_robots)
     )
     B, b = rng.normal(size=(2, n_robots, n_robots)), rng.normal(-0.3, 0.5, n_robots)
-    u = sum(np.tensordot(B[m], z[..., m], 1) for m in range(2)) + b[:, None, None]
-    return z, CoupledParams(B0, B, b, noise, noise), u.reshape(n_robots, -1), B0
+    u = np.moveaxis(sum(np.moveaxis(z[..., m], 0, -1) @ B[m].T for m in range(2)) + b, -1, 0)
+    return z, CoupledParams(B0, B, b, noise, noise), of_bounds(u), B0
 
 
-def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weight=0.0):
-    """Planners with either engine, parameters, and the value of every admissible path."""
+def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weight=0.0, more=None):
+    """Planners with either engine, parameters, and the value of every admissible path.
+
+    `more` bounds than the fewest, without U-turns, in place of what `admissible` says.
+    """
     rng = np.random.default_rng([seed, n, connectivity, int(10 * abs(beta0))])
     extra, cap, kind = admissible(objective, n, connectivity)
+    if more is not None:
+        extra, cap, kind = more, f"shortest+{more}", (("u_turns", False),)
     passable, shortest, paths, n_cells, length = random_map(n, connectivity, seed % 3, extra, kind)
     n_robots = (1, 3)[seed % 2] if model == "pooled" else 3
-    z, params, u, transition = random_problem(model, n, n_robots, beta0, rng)
+    moves = (8,) if seed else ()  # all seeds but 0 have a drift for each bound
+    z, params, u, transition = random_problem(model, n, n_robots, beta0, rng, moves=moves)
     workspace = Workspace.from_awareness(z, passable, CELL)
     values = path_values(
         objective, paths, n_cells, u, transition, 0.5, team=team, toll=weight * length
@@ -152,7 +159,8 @@ def naive(planner, params):
             return planner.evaluate(path, params).value
         done.add(cell)  # it extends only the most trusting label
         for other in planner.graph.successors(cell):
-            after = beta0 * x + u[other]
+            m = MOVES[8].index((other[0] - cell[0], other[1] - cell[1])) if len(u) > 1 else 0
+            after = beta0 * x + u[m, *other]
             heapq.heappush(queue, (-after, other, after, (*path, other)))
     return None
 
@@ -185,6 +193,19 @@ def test_vector_trust_is_planned_exactly_too(objective, model, team):
     for seed in range(4):
         for beta0 in (0.3, 0.7):
             check(*plan_and_best(objective, model, 4, 8, seed, beta0, team=team))
+
+
+@pytest.mark.parametrize("more", range(7))
+@pytest.mark.parametrize("objective", ["terminal", "mean", "success"])
+def test_any_number_of_bounds_more_than_the_fewest_is_planned_exactly(objective, more):
+    for connectivity, seed in ((4, 1), (8, 2)):
+        for beta0 in (0.3, 0.9):
+            case = objective, "pooled", 3, connectivity, seed, beta0
+            plans, best = plan_and_best(*case, more=more)
+            check(plans, best)
+            for plan in plans:
+                assert plan.revisits == len(plan.path) - len(set(plan.path))
+                assert plan.revisits == 0 or more > 2
 
 
 @pytest.mark.parametrize("objective", ["terminal", "mean", "stationary"])

@@ -12,6 +12,7 @@ from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.params import CoupledParams
 from trustbo.planning.dynamics import transition
 from trustbo.planning.information import information_gain, rate_noise
+from trustbo.workspace.moves import along
 
 PATH = [(0, 0), (0, 1), (1, 2), (2, 2)]
 
@@ -53,7 +54,7 @@ def only_b_is_unknown(b):
 
 def test_one_unknown_mean_has_a_closed_form():
     b = np.random.default_rng(7).standard_normal(50)
-    params, awareness = only_b_is_unknown(b), np.full((3, 3, 3, 2), 0.5)
+    params, awareness = only_b_is_unknown(b), np.full((3, 1, 3, 3, 2), 0.5)
     gains = information_gain(params, awareness, [PATH, PATH[:2]])
     n_rates = np.array([9, 3])
     np.testing.assert_allclose(gains, 0.5 * np.log1p(n_rates * b.var() / 0.05), rtol=1e-9)
@@ -61,10 +62,10 @@ def test_one_unknown_mean_has_a_closed_form():
 
 def test_one_unknown_weight_is_learned_where_awareness_is_high():
     rng = np.random.default_rng(8)
-    awareness, weight = rng.uniform(size=(2, 3, 3, 2)), rng.standard_normal(40)
+    awareness, weight = rng.uniform(size=(2, 8, 3, 3, 2)), rng.standard_normal(40)
     params = only_b_is_unknown(np.zeros(40))
     params = params._replace(beta=np.stack([weight, np.zeros(40)], axis=1))
-    z = awareness[:, *zip(*PATH[1:], strict=True), 0]
+    z = along(awareness, PATH)[..., 0]
     expected = 0.5 * np.log1p((z**2).sum() * weight.var() / 0.05)
     np.testing.assert_allclose(information_gain(params, awareness, [PATH]), [expected], rtol=1e-9)
     # With a map for each draw, what varies with the map counts too.
@@ -74,14 +75,14 @@ def test_one_unknown_weight_is_learned_where_awareness_is_high():
 
 def test_who_is_certain_learns_nothing():
     params = sample_prior(PooledTrust(), 2, 1, seed=9)
-    awareness = np.random.default_rng(9).uniform(size=(3, 3, 3, 2))
+    awareness = np.random.default_rng(9).uniform(size=(3, 1, 3, 3, 2))
     np.testing.assert_allclose(information_gain(params, awareness, [PATH]), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust(), CoupledTrust()])
 def test_every_further_bound_teaches_more(model):
     params = prior_draws(model)
-    awareness = np.random.default_rng(10).uniform(size=(2, 3, 3, 2))
+    awareness = np.random.default_rng(10).uniform(size=(2, 1, 3, 3, 2))
     gains = information_gain(params, awareness, [PATH[: k + 1] for k in range(1, len(PATH))])
     assert gains[0] > 0.0
     assert (np.diff(gains) > 0.0).all()
@@ -90,7 +91,7 @@ def test_every_further_bound_teaches_more(model):
 def test_maps_and_draws_go_in_pairs():
     params = sample_prior(PooledTrust(), 2, 5, seed=0)
     with pytest.raises(ShapeError, match="4 maps of awareness need as many draws"):
-        information_gain(params, np.full((4, 1, 3, 3, 2), 0.5), [PATH])
+        information_gain(params, np.full((4, 1, 1, 3, 3, 2), 0.5), [PATH])
 
 
 # --- rates that are not trust plus noise ---
@@ -118,7 +119,7 @@ def test_a_change_tells_nothing_of_where_trust_began():
     params = TrustParams(
         np.ones(n), np.zeros((n, 2)), np.zeros(n), np.full(n, 0.1), np.full(n, 0.1), x0, np.zeros(n)
     )
-    awareness = np.full((1, 3, 3, 2), 0.5)
+    awareness = np.full((1, 1, 3, 3, 2), 0.5)
     of_change = information_gain(params, awareness, [PATH], lag=1.0)
     np.testing.assert_allclose(of_change, 0.0, atol=1e-12)
     assert information_gain(params, awareness, [PATH]) > 1.0
@@ -147,7 +148,7 @@ def test_moments_of_a_rate_are_those_of_simulated_ones(name, trust):
 def test_counts_teach_less_where_nearly_all_or_none_are_in_contact():
     """The same spread of logits moves rates less at an end; so the policy must not see logits."""
     rng = np.random.default_rng(2)
-    awareness = np.full((1, 3, 3, 2), 0.5)
+    awareness = np.full((1, 1, 3, 3, 2), 0.5)
 
     def gain(level, family):
         params = only_b_is_unknown(level + 0.3 * rng.standard_normal(200))

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from references import path_values, walks
+from references import of_bounds, path_values, walks
 
 from trustbo.errors import TrustboError
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams, sample_prior
@@ -11,6 +11,7 @@ from trustbo.planning import POLICIES, Planner, policies
 from trustbo.planning.dynamics import drift
 from trustbo.planning.policies import resolve_policy
 from trustbo.workspace import AwarenessBelief, Workspace
+from trustbo.workspace.moves import along
 
 ENDS = ((3, 0), (0, 3))
 N_DRAWS = 60
@@ -21,7 +22,7 @@ def workspace():
     rng = np.random.default_rng(0)
     passable = np.ones((4, 4), bool)
     passable[1, 1] = False
-    return Workspace.from_awareness(rng.uniform(size=(2, 4, 4, 2)), passable)
+    return Workspace.from_awareness(rng.uniform(size=(2, 8, 4, 4, 2)), passable)
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def brute_force(planner, draws, objective="terminal"):
     values = []
     for d in range(draws.leading[0]):
         one = draws.draw(d)
-        u = drift(one, planner.awareness).reshape(2, -1)
+        u = of_bounds(drift(one, planner.awareness))
         values.append(path_values(objective, flat, n_cells, u, one.beta0 * np.eye(2), one.x0_mean))
     return paths, np.stack(values)
 
@@ -166,7 +167,7 @@ def test_optimistic_is_drawn_to_cells_it_knows_nothing_of(workspace):
 
 def test_thompson_goes_by_the_map_of_its_draw(planner):
     draws = prior_draws(n_draws=4)
-    maps = np.random.default_rng(3).uniform(size=(2, 2, 4, 4, 2))
+    maps = np.random.default_rng(0).uniform(size=(2, 2, 4, 4, 2))
     one_of = [planner.with_awareness(z) for z in maps]
     right = {one_of[i % 2].plan(draws.draw(i)).path for i in range(4)}
     wrong = {one_of[1 - i % 2].plan(draws.draw(i)).path for i in range(4)}
@@ -182,9 +183,9 @@ def test_information_takes_the_path_that_teaches_most(planner):
     zeros, noise = np.zeros(N_DRAWS), np.full(N_DRAWS, 0.1)
     draws = TrustParams(zeros, weights, zeros, noise, noise)
     plan = policies.information(jax.random.key(0), draws, planner, n_random=2000)
-    z = planner.workspace.awareness.values
+    z = planner.workspace.bound_maps
     paths, _ = brute_force(planner, draws)
-    teaches = {p: (z[:, *zip(*p[1:], strict=True), 0] ** 2).sum() for p in paths}
+    teaches = {p: (along(z, p)[..., 0] ** 2).sum() for p in paths}
     np.testing.assert_allclose(teaches[plan.path], max(teaches.values()), rtol=1e-12)
 
 

@@ -6,8 +6,9 @@ from references import walks
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models import HierarchicalTrust, PooledTrust, sample_prior
-from trustbo.planning import NoPathError, Planner, roll_trust
+from trustbo.planning import NoPathError, Planner, problem, roll_trust
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import along
 
 N = 4
 
@@ -151,6 +152,9 @@ def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
     np.testing.assert_allclose(
         float(rest.trust_map(params, x0=plan.trust[0])[0, 3]), plan.trust[-1].mean(), rtol=1e-12
     )
+    longer = Planner(workspace, (3, 0), (0, 3), max_bounds="shortest+5")
+    rest = longer.onward([(3, 0), (3, 1), (2, 1)])  # one bound of five was spent
+    assert (rest.max_bounds, rest.longest, rest.paths.u_turns) == ("shortest+4", 6, False)
     with pytest.raises(TrustboError, match=r"the mission began at \(0, 0\)"):
         planner.onward([(0, 0), (1, 0)])
     with pytest.raises(NoPathError, match=r"it takes 3 bounds, but 2 are left"):
@@ -174,3 +178,31 @@ def test_awareness_of_its_own_goes_with_each_draw(workspace, draws):
     maps[3, 0, 0, 0, 1] = np.nan
     with pytest.raises(TrustboError, match=r"awareness of the passable cell \(0, 0\) is NaN"):
         planner.with_awareness(maps)
+
+
+@pytest.mark.parametrize("connectivity", [4, 8])
+@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
+def test_what_cells_are_believed_to_differ_in_goes_to_all_bounds_into_them(
+    model, connectivity, monkeypatch
+):
+    monkeypatch.setattr(problem, "_ENTRIES", 2000)  # a few draws at a time
+    rng = np.random.default_rng(8)
+    workspace = Workspace.from_awareness(rng.uniform(size=(2, 8, N, N, 2)))
+    draws = sample_prior(model, 2, 30, seed=4, n_robots=2)
+    maps = rng.uniform(size=(7, 2, N, N, 2))
+    planner = Planner(workspace, (3, 0), (0, 3), connectivity=connectivity).with_awareness(maps)
+    drawn = planner.plan_draws(draws)
+    bounds, cells = workspace.bound_maps, workspace.awareness.values
+    for d in (0, 13, 29):
+        believed = np.clip(bounds + (maps[d % 7] - cells)[:, None], 0.0, 1.0)
+        own = Planner(workspace.with_bounds(believed), (3, 0), (0, 3), connectivity=connectivity)
+        alone = own.plan(draws.draw(d))
+        np.testing.assert_allclose(drawn.values[d], alone.value, rtol=1e-12)
+        assert planner.of_draw(d).plan(draws.draw(d)).path == alone.path
+        bands = planner.evaluate(alone.path, draws).bands
+    everyone = np.clip(bounds + (maps - cells)[:, :, None], 0.0, 1.0)
+    rolled = [
+        roll_trust(draws.draw(d), np.swapaxes(along(everyone[d % 7], alone.path), 0, 1))
+        for d in range(30)
+    ]
+    np.testing.assert_allclose(bands[-1], np.quantile(rolled, 0.95, axis=0), rtol=1e-12)

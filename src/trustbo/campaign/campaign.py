@@ -112,9 +112,9 @@ class Campaign:
         self._believed: Planner | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
-        sizes = workspace.awareness.sizes
+        n_robots, seed_of_prior = len(workspace.team.robots), self.seed_of("prior")
         self._prior: Params = self._learning.prior_belief(
-            self.options.initial, sizes["robot"], sizes["feature"], self.seed_of("prior")
+            self.options.initial, n_robots, workspace.features, seed_of_prior
         )
         self.belief = self._prior
         own_policy = not isinstance(policy, str)
@@ -558,17 +558,17 @@ class Campaign:
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
         """Awareness expected in the bounds of a path, shape (robot, bound, feature)."""
-        return along(self.planner_now().mean_awareness[:, None], path)
+        return along(self.planner_now().mean_awareness, path)
 
     def _believed_awareness(self) -> xr.Dataset | None:
         """`Result.believed`."""
-        if self.awareness is None:
+        like, problem = self.workspace.awareness, self.planner_now().problem
+        if problem.cells is None:
             return None
-        like, planner = self.workspace.awareness, self.planner_now()
         # Single precision: they are written after every mission.
-        maps = planner.awareness[:_N_KEPT].astype(np.float32)
+        maps = problem.cells[:_N_KEPT].astype(np.float32)
         draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
-        return xr.Dataset({"mean": like.copy(data=planner.mean_awareness), "draws": draws})
+        return xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
 
     def seed_of(self, stream: str) -> int:
         """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""

@@ -1,6 +1,7 @@
 """Learning of a campaign: its model, its sampler, and the weight of a mission."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -77,7 +78,7 @@ class Learning:
         Raises:
             CannotLearnError: Every attempt failed.
         """
-        model, weights = self.model, None
+        model, weights = self.model.for_features(missions[0].features), None
         if self.update == "moment_matched":
             priors = model.priors
             if last is not None:
@@ -112,14 +113,17 @@ class Learning:
             return attempts
         return [*attempts, (other, 2 * _N_DRAWS, 2)]
 
-    def prior_belief(self, initial: str, n_robots: int, n_features: int, seed: int) -> Params:
+    def prior_belief(
+        self, initial: str, n_robots: int, features: Sequence[str], seed: int
+    ) -> Params:
         """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
-        if initial == "prior_mean" and self.model.priors_are_independent:
-            priors = self.model.priors
+        model, n_features = self.model.for_features(features), len(features)
+        if initial == "prior_mean" and model.priors_are_independent:
+            priors = model.priors
             x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
             mean = TrustParams(**priors.mean(n_features), **x0)
         else:
             # The mean of parameters that robots share has no closed form.
             n_draws = 1 if initial == "prior_draw" else 1000
-            mean = sample_prior(self.model, n_features, n_draws, seed, n_robots=n_robots).mean()
+            mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
         return type(mean)(*(np.asarray(value, dtype=float)[None] for value in mean))

@@ -41,12 +41,12 @@ class CampaignOptions:
 
     Attributes:
         connectivity: Number of directions of a bound: 8, or 4 for no diagonal bounds.
-        max_bounds: Admissible paths: shortest, shortest+2, or the most bounds allowed. See
+        max_bounds: Admissible paths: shortest, shortest+n, or the most bounds allowed. See
             `Planner`, also for the default.
         team: Trust of the team, the mean or the min of its robots'.
         length_weight: Cost of a metre of the path, in units of the objective. See `Planner`.
-        initial: Source of the first plan: prior_draw (one random draw of the prior, as in the
-            paper) or prior_mean.
+        initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,
+            as in the paper).
         update: Missions that a posterior is fitted to: refit (all so far) or, for comparison with
             the 2023 code, moment_matched (the last). The prior of the latter has the mean and sd of
             the posterior before, which is not exact.
@@ -68,7 +68,7 @@ class CampaignOptions:
     max_bounds: int | str | None = field(default=None, metadata=_of(PLANNING))
     team: str = field(default="mean", metadata=_of(PLANNING, "mean", "min"))
     length_weight: float = field(default=0.0, metadata=_of(PLANNING))
-    initial: str = field(default="prior_draw", metadata=_of(LEARNING, "prior_draw", "prior_mean"))
+    initial: str = field(default="prior_mean", metadata=_of(LEARNING, "prior_mean", "prior_draw"))
     update: str = field(default="refit", metadata=_of(LEARNING, "refit", "moment_matched"))
     forgetting: float = field(default=1.0, metadata=_of(LEARNING))
     awareness: "str | AwarenessBelief" = field(

@@ -38,10 +38,11 @@ class CoupledTrust(TrustModel):
         if self.inter_robot == "full":
             return self._sample_full(n_robots, n_features)
         priors, robot = self.priors, (n_robots,)
+        beta0 = sample("beta0", priors.beta0, robot)
         sites = {
-            "beta0": sample("beta0", priors.beta0, robot),
-            "beta": sample("beta", priors.beta, (n_robots, n_features)),
-            "b": sample("b", priors.b, robot),
+            "beta0": beta0,
+            "beta": sample("beta", priors.weights(beta0), (n_robots, n_features)),
+            "b": sample("b", priors.intercept(beta0), robot),
             "delta_w": sample("delta_w", priors.delta_w, robot),
             "delta_v": sample("delta_v", priors.delta_v, robot),
         }
@@ -53,17 +54,15 @@ class CoupledTrust(TrustModel):
 
     def _sample_full(self, n_robots: int, n_features: int) -> CoupledParams:
         priors, off = self.priors, n_robots * (n_robots - 1)
-        B0 = _matrix(
-            sample("B0_diagonal", priors.beta0, (n_robots,)),
-            sample("B0_coupling", priors.coupling, (off,)),
-        )
+        beta0 = sample("B0_diagonal", priors.beta0, (n_robots,))
+        B0 = _matrix(beta0, sample("B0_coupling", priors.coupling, (off,)))
         # (robot, feature): a prior that differs by feature has it last.
-        own = sample("B_diagonal", priors.beta, (n_robots, n_features)).T
+        own = sample("B_diagonal", priors.weights(beta0), (n_robots, n_features)).T
         B = _matrix(own, sample("B_coupling", priors.coupling, (n_features, off)))
         return CoupledParams(
             B0=numpyro.deterministic("B0", B0),
             B=numpyro.deterministic("B", B),
-            b=sample("b", priors.b, (n_robots,)),
+            b=sample("b", priors.intercept(beta0), (n_robots,)),
             Delta_w=self._covariance("w", priors.delta_w, n_robots),
             Delta_v=self._covariance("v", priors.delta_v, n_robots),
             x0_mean=priors.x0_mean,

@@ -80,6 +80,7 @@ def fit(
     require_model(model)
     require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
     batch = stack_missions(missions)
+    model = model.for_features(missions[0].features)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)

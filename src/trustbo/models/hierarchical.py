@@ -28,11 +28,12 @@ class HierarchicalTrust(TrustModel):
     def sample_params(self, n_robots: int, n_features: int) -> RobotParams:
         """Sample statements of means, spreads, and each robot's deviation."""
         priors, unit = self.priors, dist.Normal(0.0, 1.0)
+        mean_beta0 = sample("mean_beta0", priors.beta0)
         params = self.assemble(
             {
-                "mean_beta0": sample("mean_beta0", priors.beta0),
-                "mean_beta": sample("mean_beta", priors.beta, (n_features,)),
-                "mean_b": sample("mean_b", priors.b),
+                "mean_beta0": mean_beta0,
+                "mean_beta": sample("mean_beta", priors.weights(mean_beta0), (n_features,)),
+                "mean_b": sample("mean_b", priors.intercept(mean_beta0)),
                 "tau_beta0": sample("tau_beta0", priors.tau),
                 "tau_beta": sample("tau_beta", priors.tau, (n_features,)),
                 "tau_b": sample("tau_b", priors.tau),

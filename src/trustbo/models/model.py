@@ -40,7 +40,8 @@ class TrustModel(ABC):
     """A trust model; itself a numpyro model, so that `MCMC(NUTS(model))` works.
 
     Attributes:
-        priors: Prior of each parameter; by default those of the family of observations.
+        priors: Prior of each parameter; by default those of the family of observations and of the
+            names of the features, see `Priors.of`.
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
             trust being a logit.
@@ -113,6 +114,15 @@ class TrustModel(ABC):
     def partial_pooling(self) -> "HierarchicalTrust | None":
         """The model, if its robots' coefficients are drawn from a common distribution."""
         return None
+
+    def for_features(self, features: Sequence[str]) -> Self:
+        """The model with the default priors of features of these names; its own, if it has any.
+
+        See `Priors.of`. `fit` and campaigns do this by themselves.
+        """
+        if self.priors is not Priors.default(self.observation) or self.lag:
+            return self
+        return replace(self, priors=Priors.of(tuple(features), self.observation))
 
     def at_resolution(self, ticks: Mapping[float, float]) -> Self:
         """The model whose delta_v is no less than the resolution of rates of so many ticks.

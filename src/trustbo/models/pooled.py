@@ -17,10 +17,11 @@ class PooledTrust(TrustModel):
     def sample_params(self, n_robots: int, n_features: int) -> TrustParams:
         """Sample statements of beta0, beta, b, delta_w and delta_v."""
         priors = self.priors
+        beta0 = sample("beta0", priors.beta0)
         return TrustParams(
-            beta0=sample("beta0", priors.beta0),
-            beta=sample("beta", priors.beta, (n_features,)),
-            b=sample("b", priors.b),
+            beta0=beta0,
+            beta=sample("beta", priors.weights(beta0), (n_features,)),
+            b=sample("b", priors.intercept(beta0)),
             delta_w=sample("delta_w", priors.delta_w),
             delta_v=sample("delta_v", priors.delta_v),
             x0_mean=priors.x0_mean,

@@ -1,6 +1,6 @@
 """Draws of parameters, and of contact rates, from the priors alone."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import jax
 import numpy as np
@@ -24,6 +24,7 @@ def prior_predictive(
     awareness: ArrayLike,
     *,
     n_ticks: ArrayLike | None = None,
+    features: Sequence[str] = (),
     n_draws: int = 500,
     seed: int = 0,
 ) -> xr.DataTree:
@@ -33,6 +34,8 @@ def prior_predictive(
         model: Trust model.
         awareness: Shape (mission, bound, robot, feature).
         n_ticks: Ticks, broadcast to (mission, bound, robot); the beta-binomial family needs them.
+        features: Names of the features, by which default priors go; by default traversability,
+            visibility, z3, ...
         n_draws: Number of draws.
         seed: Seed of the draws.
 
@@ -49,7 +52,12 @@ def prior_predictive(
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
     ticks = broadcast_ticks(model.family, n_ticks, z.shape[:3])
     require_whole("n_draws", n_draws, 1)
-    model = model.at_resolution(weigh_ticks(MissionBatch(z, np.zeros(z.shape[:3]), ticks)))
+    names = tuple(features) or default_features(z.shape[3])
+    if len(names) != z.shape[3]:
+        raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
+    model = model.for_features(names).at_resolution(
+        weigh_ticks(MissionBatch(z, np.zeros(z.shape[:3]), ticks))
+    )
     with own_settings():
         keys = jax.random.split(jax.random.key(seed), n_draws)
         drawn = {k: np.asarray(v)[None] for k, v in prior_draws(model, z, ticks, keys).items()}
@@ -60,7 +68,7 @@ def prior_predictive(
         "bound": np.arange(1, z.shape[1] + 1),
         "robot": robots,
         "robot_": robots,
-        "feature": list(default_features(z.shape[3])),
+        "feature": list(names),
     }
 
     def group(names: Iterable[str]) -> xr.Dataset:
@@ -96,7 +104,8 @@ def draw_sites(
     if model.priors_are_independent:
         rng, priors = np.random.default_rng(seed), model.priors
         sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
-        return {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
+        drawn = {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
+        return priors.of_stationary(drawn)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
         drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)

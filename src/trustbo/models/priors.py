@@ -1,12 +1,14 @@
 """Priors of the trust models' parameters."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from functools import cache
+from typing import Any, Self, cast
 
 import jax
 import numpy as np
 import numpyro.distributions as dist
+from jax import Array
 from numpyro.distributions import Distribution, constraints
 
 from trustbo import zheng2023
@@ -41,10 +43,13 @@ class Priors:
         concentration: Concentration of the LKJ prior of noise correlations, coupled model.
         x0_mean: Mean of trust before the first bound.
         x0_sd: Its standard deviation; 0 fixes it.
+        stationary: True if `beta` and `b`, both Normal, are priors of the weights and intercept of
+            stationary trust, beta / (1 - beta0) and b / (1 - beta0), to which features that stay
+            as they are lead in the end.
 
     Raises:
-        TrustboError: A prior is no such distribution, a noise or tau can be negative, or `x0_sd`
-            is negative.
+        TrustboError: A prior is no such distribution, a noise or tau can be negative, `x0_sd` is
+            negative, or priors of stationary trust are not Normal, or beta0's not on (0, 1).
     """
 
     # Built on demand: importing trustbo must create no JAX array.
@@ -58,6 +63,7 @@ class Priors:
     concentration: float = 2.0
     x0_mean: float = 0.5
     x0_sd: float = 0.5
+    stationary: bool = False
 
     def __post_init__(self) -> None:
         with own_settings():
@@ -91,15 +97,58 @@ class Priors:
             raise TrustboError(f"Priors.x0_mean must be finite; got {self.x0_mean!r}.")
         if not 0.0 <= self.x0_sd < np.inf:
             raise TrustboError(f"Priors.x0_sd must be finite, not negative; got {self.x0_sd!r}.")
+        if self.stationary:
+            normal = all(isinstance(p, dist.Normal) for p in (self.beta, self.b))
+            if not normal or self.beta0.support is not constraints.unit_interval:
+                raise TrustboError(
+                    "priors of stationary trust need Normal beta and b, and beta0 on (0, 1); got "
+                    f"{self.beta!r}, {self.b!r} and {self.beta0!r}."
+                )
 
     @classmethod
     def default(cls, observation: str = "gaussian") -> Self:
-        """Default priors of a family of observations.
+        """Default priors of a family of observations, always the same object.
 
         Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
         """
-        return cls(**FAMILIES[observation].priors())
+        return cast(Self, _default(observation))
+
+    @classmethod
+    def of(cls, features: Sequence[str], observation: str = "gaussian") -> Self:
+        """Default priors for features of these names.
+
+        `line_of_sight` is a predicted contact rate: stationary trust has slope 1 in it, or in the
+        mean of n of them (`line_of_sight_1`, ...), and little else. beta_los / (1 - beta0) ~
+        N(1 / n, 0.3^2 / n), other weights N(0, 0.25^2), and b / (1 - beta0) ~ N(0, 0.15^2), so that
+        most rates drawn from the prior lie in [0, 1]. Counts, whose trust is a logit, have five
+        times these, for rates around one half. With no such feature, `default`.
+        """
+        is_sight = np.array([name.startswith("line_of_sight") for name in features])
+        default, n = cls.default(observation), max(int(is_sight.sum()), 1)
+        if not is_sight.any():
+            return default
+        unit, centre = FAMILIES[observation].line_of_sight
+        with own_settings():
+            sd = np.where(is_sight, 0.3 / np.sqrt(n), 0.25)
+            return replace(
+                default,
+                beta=dist.Normal(unit * is_sight / n, unit * sd),
+                b=dist.Normal(-unit * centre, unit * 0.15),
+                stationary=True,
+            )
+
+    def weights(self, beta0: Array) -> Distribution:
+        """Prior of the weights given beta0, of batch shape (..., feature) for beta0 (...)."""
+        return self._given((1.0 - beta0)[..., None], self.beta) if self.stationary else self.beta
+
+    def intercept(self, beta0: Array) -> Distribution:
+        """Prior of the intercept given beta0, of batch shape (...) as beta0."""
+        return self._given(1.0 - beta0, self.b) if self.stationary else self.b
+
+    @staticmethod
+    def _given(rest: Array, prior: Any) -> Distribution:
+        return dist.Normal(prior.loc * rest, prior.scale * rest)
 
     @classmethod
     def zheng2023(cls) -> Self:
@@ -122,22 +171,40 @@ class Priors:
             value = np.asarray(getattr(self, name).mean, dtype=float)
             shape = (n_features,) if name == "beta" else ()
             means[name] = np.broadcast_to(np.where(np.isfinite(value), value, 0.0), shape)
-        return means
+        return self.of_stationary(means)
+
+    def of_stationary(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Parameters of values whose `beta` and `b` are drawn from the priors of these names."""
+        if not self.stationary:
+            return values
+        rest = 1.0 - values["beta0"]
+        return values | {"beta": values["beta"] * rest[..., None], "b": values["b"] * rest}
 
     def describe(self) -> dict[str, str]:
         """Each prior as text, for the record kept with a result."""
-        return {f.name: _as_text(getattr(self, f.name)) for f in fields(self)}
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        if not named.pop("stationary"):
+            return {name: _as_text(value) for name, value in named.items()}
+        return {name: _as_text(value) for name, value in named.items()} | {"stationary": "True"}
 
 
-def _flatten(priors: Priors) -> tuple[tuple[object, ...], None]:
-    return tuple(getattr(priors, f.name) for f in fields(priors)), None
+@cache
+def _default(observation: str) -> Priors:
+    return Priors(**FAMILIES[observation].priors())
 
 
-def _unflatten(_: None, children: Iterable[object]) -> Priors:
+def _flatten(priors: Priors) -> tuple[tuple[object, ...], bool]:
+    names = [f.name for f in fields(priors) if f.name != "stationary"]
+    return tuple(getattr(priors, name) for name in names), priors.stationary
+
+
+def _unflatten(stationary: bool, children: Iterable[object]) -> Priors:
     # Not through __init__: in a compiled program the values are tracers, which no check can read.
     priors = object.__new__(Priors)
-    for f, child in zip(fields(Priors), children, strict=True):
-        object.__setattr__(priors, f.name, child)
+    names = [f.name for f in fields(Priors) if f.name != "stationary"]
+    for name, child in zip(names, children, strict=True):
+        object.__setattr__(priors, name, child)
+    object.__setattr__(priors, "stationary", stationary)
     return priors
 
 

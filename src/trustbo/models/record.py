@@ -1,5 +1,6 @@
 """A model's settings as a record that JSON can hold, and the model again."""
 
+from dataclasses import replace
 from typing import Any
 
 from trustbo.errors import TrustboError
@@ -13,8 +14,10 @@ _MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, C
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Class, options, and priors as text."""
-    return {"class": type(model).__name__, **model.options(), "priors": model.priors.describe()}
+    """Class, options, and priors as text; whether they go by the names of the features."""
+    own = {"class": type(model).__name__, **model.options(), "priors": model.priors.describe()}
+    by_feature = model.priors is Priors.default(model.observation)
+    return own | ({"by_feature": True} if by_feature else {})
 
 
 def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -> TrustModel:
@@ -28,10 +31,12 @@ def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -
                 f"the campaign's model is {record}; the one given is {model_to_record(given)}."
             )
         return given
-    options = {name: value for name, value in record.items() if name not in ("class", "priors")}
+    ours = ("class", "priors", "by_feature")
+    options = {name: value for name, value in record.items() if name not in ours}
     kind = _MODELS.get(record["class"])
     if kind is not None:
-        for priors in (None, Priors.zheng2023()):
+        fixed = replace(Priors.default(record["observation"]))
+        for priors in (None, fixed, Priors.zheng2023()):
             model = kind(priors=priors, **options)  # pyright: ignore[reportArgumentType]
             if model_to_record(model) == record:
                 return model

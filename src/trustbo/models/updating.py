@@ -79,4 +79,5 @@ def moment_matched(params: TrustParams, priors: Priors) -> Priors:
             b=match_moments(flat.b, priors.b),
             delta_w=match_moments(flat.delta_w, priors.delta_w),
             delta_v=match_moments(flat.delta_v, priors.delta_v),
+            stationary=False,
         )

@@ -1,24 +1,30 @@
 """Recursion of expected trust: one linear form for every model, and its roll along a path."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
+from trustbo.data import Cell
 from trustbo.errors import ShapeError
 from trustbo.models.params import CoupledParams, Params, RobotParams, check_params
+from trustbo.workspace.moves import move_indices, moves_along
 
 TEAMS = ("mean", "min")
 """Trust of the team: mean or least of the trust of its robots."""
 
 
 class Dynamics(NamedTuple):
-    """Expected trust x_k = transition x_{k-1} + drift(cell), x_0 = start; leading axes (...,).
+    """Expected trust x_k = transition x_{k-1} + drift(bound), x_0 = start; leading axes (...,).
 
-    Fields: transition (..., state, state), drift (..., state, row, col), start (..., state), and
-    views (view, state): trust of the team is the least of `views @ x`. States are the robots; one
-    state, their mean, suffices where all have one beta0 and trust of the team is the mean.
+    Fields: transition (..., state, state), drift (..., state, move, row, col), start (..., state),
+    and views (view, state): trust of the team is the least of `views @ x`. States are the robots;
+    one state, their mean, suffices where all have one beta0 and trust of the team is the mean.
+
+    Drift is that of the bound into (row, col) by a move of `MOVES`, of 4 or 8; the axis of moves
+    has length 1 where it is that of the cell entered, whichever way. NaN where there is no bound.
     """
 
     transition: np.ndarray
@@ -41,16 +47,24 @@ class Dynamics(NamedTuple):
         def one(value: np.ndarray, core: int) -> np.ndarray:
             return value.reshape(-1, *value.shape[value.ndim - core :])
 
-        return Dynamics(one(self.transition, 2), one(self.drift, 3), one(self.start, 1), self.views)
+        return Dynamics(one(self.transition, 2), one(self.drift, 4), one(self.start, 1), self.views)
+
+    def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
+        """Select the bounds of a path: drift (..., state, 1, 1, bound)."""
+        rows, cols = np.asarray(path)[1:].T
+        moves, n_moves = 0, self.drift.shape[-3]
+        if n_moves > 1:
+            moves = np.searchsorted(move_indices(n_moves), moves_along(path))
+        return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def steady_state(self) -> np.ndarray:
-        """Limit of the team's trust if it stayed in each cell, shape (..., row, col)."""
+        """Limit of the team's trust if all bounds were as each one, shape (..., move, row, col)."""
         if self.is_scalar:
-            return self.drift[..., 0, :, :] / (1.0 - self.transition)
+            return self.drift[..., 0, :, :, :] / (1.0 - self.transition[..., None])
         n_states = self.start.shape[-1]
         gain = np.linalg.inv(np.eye(n_states) - self.transition)
-        levels = np.einsum("vs,...st,...trc->...vrc", self.views, gain, self.drift)
-        return levels.min(-3)
+        levels = np.einsum("vs,...st,...tmrc->...vmrc", self.views, gain, self.drift)
+        return levels.min(-4)
 
 
 def trust_dynamics(
@@ -58,12 +72,13 @@ def trust_dynamics(
 ) -> Dynamics:
     """Build the recursion of expected trust under parameters with leading axes (...,).
 
-    Awareness has shape (robot, row, col, feature), or (draw, robot, row, col, feature) with one map
-    for each draw. `x0`, expected trust before the first bound, () or (robot,), with leading axes or
-    not, is by default `params.x0_mean`. ShapeError: other numbers of robots or features.
+    Awareness has shape (robot, move, row, col, feature), or (draw, robot, move, row, col, feature)
+    with one map for each draw; its moves are those of the drift. `x0`, expected trust before the
+    first bound, () or (robot,), with leading axes or not, is by default `params.x0_mean`.
+    ShapeError: other numbers of robots or features.
     """
     z = np.asarray(awareness, dtype=float)
-    n_robots, leading = z.shape[-4], params.leading
+    n_robots, leading = z.shape[-5], params.leading
     start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
     if x0 is None:
         start = start[..., None]
@@ -75,7 +90,7 @@ def trust_dynamics(
         return Dynamics(transition(params, n_robots), drift(params, z), start, views)
     beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
     # The mean over robots obeys the same equation.
-    u = drift(params, z.mean(-4, keepdims=True) if n_robots > 1 else z)
+    u = drift(params, z.mean(-5, keepdims=True) if n_robots > 1 else z)
     return Dynamics(
         np.broadcast_to(beta0, (*leading, 1, 1)), u, start.mean(-1, keepdims=True), np.eye(1)
     )
@@ -92,28 +107,32 @@ def transition(params: Params, n_robots: int) -> np.ndarray:
 
 
 def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
-    """Increment of trust by one bound, u = sum_m beta_m z_m + b, shape (..., robot, row, col).
+    """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
 
-    Awareness (robot, row, col, feature), or with a leading axis (draw,) like the parameters'.
+    Awareness (robot, move, row, col, feature), or with a leading axis (draw,) like the parameters'.
     ShapeError: other numbers of robots, features or draws than the parameters'.
     """
     z = np.asarray(awareness, dtype=float)
-    check_params(params, z.shape[-4], z.shape[-1])
-    if z.ndim == 5 and params.leading != z.shape[:1]:
+    check_params(params, z.shape[-5], z.shape[-1])
+    if z.ndim == 6 and params.leading != z.shape[:1]:
         raise ShapeError(
             f"{z.shape[0]} maps of awareness need as many draws of the parameters; got "
             f"{params.leading}."
         )
     b = np.asarray(params.b, dtype=float)
     if isinstance(params, CoupledParams):
-        u = np.einsum("...mai,...ircm->...arc", np.asarray(params.B, dtype=float), z)
+        u = np.einsum("...mai,...idrcm->...adrc", np.asarray(params.B, dtype=float), z)
     elif isinstance(params, RobotParams):
-        u = np.einsum("...im,...ircm->...irc", np.asarray(params.beta, dtype=float), z)
+        u = np.einsum("...im,...idrcm->...idrc", np.asarray(params.beta, dtype=float), z)
     else:
         beta = np.asarray(params.beta, dtype=float)
-        u = np.tensordot(beta, z, (-1, -1)) if z.ndim == 4 else np.einsum("dm,dircm->dirc", beta, z)
+        u = (
+            np.tensordot(beta, z, (-1, -1))
+            if z.ndim == 5
+            else np.einsum("nm,nidrcm->nidrc", beta, z)
+        )
         b = b[..., None]
-    u += b[..., None, None]  # in place: over many draws and cells this is large
+    u += b[..., None, None, None]  # in place: over many draws and cells this is large
     return u
 
 
@@ -134,14 +153,18 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         ShapeError: The number of robots or features differs from that of the parameters.
     """
     z = np.asarray(awareness, dtype=float)
-    along = np.moveaxis(z, -3, -2)[..., None, :]  # (..., robot, bound, 1, feature): a map, one wide
-    dynamics = trust_dynamics(params, along, "min", x0)
-    return roll(dynamics.transition, dynamics.drift[..., 0], dynamics.start)
+    return roll(trust_dynamics(params, as_map(z), "min", x0))
 
 
-def roll(transition: np.ndarray, drift: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Roll the recursion: drift (..., state, bound) to x of shape (..., bound, state)."""
-    leading, (n_states, n_bounds) = drift.shape[:-2], drift.shape[-2:]
+def as_map(awareness: np.ndarray) -> np.ndarray:
+    """Awareness of a path's bounds as a map: (..., bound, robot, feature) to one of one row."""
+    return np.swapaxes(awareness, -3, -2)[..., None, None, :, :]
+
+
+def roll(along: Dynamics) -> np.ndarray:
+    """Roll the recursion along the bounds of a path (see `Dynamics.along`), (..., bound, state)."""
+    transition, drift, start, _ = along
+    leading, (n_states, _, _, n_bounds) = drift.shape[:-4], drift.shape[-4:]
     trust = np.empty((*leading, n_bounds, n_states))
     _roll(
         np.broadcast_to(transition, (*leading, n_states, n_states)).reshape(-1, n_states, n_states),

@@ -8,6 +8,7 @@ from trustbo.data import Cell
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params
 from trustbo.planning.dynamics import roll_trust, transition
+from trustbo.workspace.moves import along
 
 GAUSSIAN = FAMILIES["gaussian"]
 
@@ -24,14 +25,14 @@ def information_gain(
     Mutual information of the parameters and the contact rates of a mission, both taken as jointly
     normal: 1/2 log det(I + N^-1 C), with C the covariance over draws of the expected rates (bound,
     robot), and N the covariance of the rates' noise at the mean of the draws. Params have the axis
-    (draw,), awareness (robot, row, col, feature), or with a leading axis (draw,). Rates of `family`
-    measure trust, or, with lag 1, its change over the bound.
+    (draw,), awareness of bounds (robot, move, row, col, feature), or with a leading axis (draw,).
+    Rates of `family` measure trust, or, with lag 1, its change over the bound.
     """
     mean = params.mean()
     gains = []
     for path in paths:
-        along = np.swapaxes(awareness[..., *np.array(path[1:]).T, :], -3, -2)
-        levels = _levels(params, roll_trust(params, along), lag)
+        z = np.swapaxes(along(awareness, path), -3, -2)
+        levels = _levels(params, roll_trust(params, z), lag)
         rates, _, _ = family.rate_moments(levels, _noise_sd(params))
         flat = rates.reshape(len(rates), -1)
         L = np.linalg.cholesky(rate_noise(mean, levels.mean(0), family, lag))

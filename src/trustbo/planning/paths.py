@@ -2,6 +2,7 @@
 
 import itertools
 import operator
+import re
 from collections.abc import Sequence
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import networkx as nx
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
+from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.planning.engines.layers import Layers, build_layers
 from trustbo.planning.graph import (
     NoPathError,
@@ -24,17 +25,18 @@ from trustbo.workspace.moves import MOVES, require_connectivity
 DEFAULT_EXTRA = 8
 """Bounds beyond the fewest possible that `success` and `bottleneck` may take by default."""
 
-SIMPLE = ("shortest", "shortest+1", "shortest+2")
-"""Values of `max_bounds` that forbid U-turns; their paths enter no cell twice."""
+SIMPLE_EXTRA = 2
+"""Bounds beyond the fewest possible up to which a path without U-turns enters no cell twice."""
+_SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
 class AdmissiblePaths:
     """Start, goal and the admissible paths between them, with the tables that engines need.
 
     A path ends on entering the goal, and has `shortest` to `longest` bounds; `max_bounds` is the
-    limit as `Planner` takes it. With `u_turns` a bound may lead back to the cell that the last one
-    left, with `revisit` a path may enter a cell twice. `steps` are the moves to neighbouring cells,
-    shape (move, 2), `lengths` theirs in metres, shape (move,).
+    limit as `Planner` takes it. With `u_turns`, where it is a number, a bound may lead back to the
+    cell that the last one left; with `revisit` a path may enter a cell twice. `steps` are the moves
+    to neighbouring cells, shape (move, 2), `lengths` theirs in metres, shape (move,).
     """
 
     def __init__(
@@ -103,6 +105,9 @@ class AdmissiblePaths:
     def onward(self, done: Sequence[Cell]) -> "AdmissiblePaths":
         """Restrict to the rest of a mission that entered the cells `done` so far, start first.
 
+        Extra bounds that were not used are left, and U-turns stay forbidden; but the first bound of
+        the rest may lead anywhere.
+
         TrustboError: they begin at another cell, or end at the goal. NoPathError: too few bounds
         are left to reach the goal.
         """
@@ -117,7 +122,7 @@ class AdmissiblePaths:
             )
         max_bounds = left
         if not self.u_turns:
-            max_bounds = SIMPLE[min(left - fewest, len(SIMPLE) - 1)]
+            max_bounds = f"shortest+{left - fewest}"
         return AdmissiblePaths(
             self.workspace, here, self.goal, self.connectivity, max_bounds, revisit=self.revisit
         )
@@ -162,9 +167,13 @@ class AdmissiblePaths:
     def _most_bounds(self, max_bounds: int | str | None) -> int:
         if max_bounds is None:
             return self.shortest + DEFAULT_EXTRA
-        named = {name: self.shortest + extra for extra, name in enumerate(SIMPLE)}
         if isinstance(max_bounds, str):
-            return named[require_choice("max_bounds", max_bounds, named)]
+            if (named := _SHORTEST.fullmatch(max_bounds)) is None:
+                raise TrustboError(
+                    f"unknown max_bounds {max_bounds!r}; choose shortest, shortest+n for n bounds "
+                    "more without U-turns, such as shortest+2, or a number of bounds."
+                )
+            return self.shortest + int(named[1] or 0)
         if require_whole("max_bounds", max_bounds, 1) < self.shortest:
             raise TrustboError(
                 f"max_bounds = {max_bounds} is below the fewest possible from {self.start} to "

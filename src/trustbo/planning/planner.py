@@ -43,8 +43,6 @@ class Planner:
         connectivity: 4 or 8.
         objective: Name of the objective.
         team: `"mean"` or `"min"`.
-        awareness: Shape (robot, row, col, feature), or with a leading axis (draw,) if uncertain.
-        mean_awareness: Mean over draws, shape (robot, row, col, feature).
         engine: `"auto"`, `"networkx"` or `"numba"`.
     """
 
@@ -74,8 +72,9 @@ class Planner:
             objective: `"terminal"`, `"mean"`, `"success"`, `"bottleneck"` or `"stationary"`.
             connectivity: 4, or 8 to allow diagonal bounds too.
             max_bounds: Limit on the number of bounds. `"shortest"`: the fewest possible;
-                `"shortest+2"` (default for terminal and mean): up to two more, without U-turns,
-                which keeps paths simple. An int: walks of at most that many bounds (default for
+                `"shortest+n"`: up to n more, without U-turns, which keeps paths simple for n up to
+                2 (default for terminal and mean); `Plan.revisits` counts cells entered again
+                beyond. An int: walks of at most that many bounds (default for
                 success and bottleneck: shortest + 8). Without effect on stationary, whose
                 admissible paths are all simple paths.
             revisit: True if walks of success and bottleneck may enter a cell twice.
@@ -103,10 +102,7 @@ class Planner:
         if max_bounds is None and objective not in LABELLED:
             max_bounds = "shortest+2"
         paths = AdmissiblePaths(workspace, start, goal, connectivity, max_bounds, revisit)
-        awareness = workspace.awareness.values
-        self._hold(
-            PlanningProblem(paths, Objective(objective, length_weight), team, awareness, awareness)
-        )
+        self._hold(PlanningProblem(paths, Objective(objective, length_weight), team))
 
     def _hold(self, problem: PlanningProblem) -> None:
         paths = problem.paths
@@ -115,7 +111,6 @@ class Planner:
         self.shortest, self.longest = paths.shortest, paths.longest
         self.max_bounds, self.connectivity = paths.max_bounds, paths.connectivity
         self.objective, self.team = problem.objective.name, problem.team
-        self.awareness, self.mean_awareness = problem.awareness, problem.mean_awareness
 
     def _with(self, problem: PlanningProblem) -> Self:
         other = copy(self)
@@ -127,12 +122,22 @@ class Planner:
         """Graph of passable cells; nodes with `x`, `y` (CRS metres), edges with `length` (m)."""
         return self.paths.graph
 
+    @property
+    def awareness(self) -> np.ndarray:
+        """Awareness of bounds; see `PlanningProblem.awareness`."""
+        return self.problem.awareness
+
+    @property
+    def mean_awareness(self) -> np.ndarray:
+        """Expected awareness of bounds, shape (robot, move, row, col, feature)."""
+        return self.problem.mean_awareness
+
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
         """Return a path as a tuple of cells; refuse a broken one, or one between other ends."""
         return self.paths.require_path(path)
 
     def with_awareness(self, awareness: ArrayLike, mean: ArrayLike | None = None) -> Self:
-        """Return the planner with other awareness; see `PlanningProblem.with_awareness`."""
+        """Return the planner with other awareness of cells; see `PlanningProblem`."""
         return self._with(self.problem.with_awareness(awareness, mean))
 
     def of_draw(self, index: int) -> Self:

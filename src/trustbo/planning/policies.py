@@ -40,7 +40,7 @@ def thompson(key: Array, posterior: Params, planner: Planner) -> Plan:
 
 
 def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: float = 0.9) -> Plan:
-    """Best path under the upper quantile over draws of each cell's drift u."""
+    """Best path under the upper quantile over draws of each bound's drift u."""
     params, chosen = choose_draws(posterior, 1000, _seed(key))
     dynamics = planner.dynamics(params, draws=chosen)
     best = Dynamics(

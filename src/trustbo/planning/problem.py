@@ -15,15 +15,20 @@ from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
 from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import along, move_indices
+
+_ALL = slice(None)
+_ENTRIES = 1 << 22  # of awareness of bounds at a time
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningProblem:
     """Workspace, admissible paths, objective and awareness: the data of a `Planner`.
 
-    Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. Awareness has shape
-    (robot, row, col, feature), with a leading axis (draw,) where it is uncertain, and a mean over
-    these.
+    Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. Where the awareness
+    is not the workspace's, `cells` has that of cells, (robot, row, col, feature), with a leading
+    axis (draw,) where it is uncertain, and `mean_cells` the mean over these. What cells differ in
+    from the workspace's is added to the awareness of all bounds into them.
 
     TrustboError: unknown team or objective; a length weight that is negative, or for success or
     bottleneck.
@@ -32,8 +37,8 @@ class PlanningProblem:
     paths: AdmissiblePaths
     objective: Objective
     team: str
-    awareness: np.ndarray
-    mean_awareness: np.ndarray
+    cells: np.ndarray | None = None
+    mean_cells: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         name, length_weight = self.objective
@@ -51,8 +56,48 @@ class PlanningProblem:
         """Workspace of the admissible paths."""
         return self.paths.workspace
 
+    @property
+    def awareness(self) -> np.ndarray:
+        """Awareness of bounds, shape (robot, move, row, col, feature), see `Workspace.bound_maps`.
+
+        With a leading axis (draw,) where it is uncertain: 8 times as large as the maps of cells.
+        """
+        return self._of_bounds(self.cells)
+
+    @property
+    def mean_awareness(self) -> np.ndarray:
+        """Mean over draws of `cells`, as awareness of bounds (robot, move, row, col, feature)."""
+        return self._of_bounds(self.mean_cells)
+
+    def awareness_along(self, path: Sequence[Cell] | np.ndarray, params: Params) -> np.ndarray:
+        """Awareness of a path's bounds, shape (bound, robot, feature).
+
+        With a leading axis (draw,) where it is uncertain, and the parameters have draws.
+        """
+        cells = self.cells if params.leading else self.mean_cells
+        if cells is None or self.workspace.of_bounds is None:
+            z = along(self.workspace.bound_maps if cells is None else _any_move(cells), path)
+        else:
+            rows, cols = np.asarray(path)[1:].T
+            z = along(self.workspace.bound_maps, path)
+            error = cells[..., rows, cols, :] - self.workspace.awareness.values[:, rows, cols]
+            z = np.clip(z + error, 0.0, 1.0)
+        if z.ndim == 4:
+            z = z[np.arange(params.leading[0]) % len(z)]
+        return np.swapaxes(z, -3, -2)
+
+    def _of_bounds(self, cells: np.ndarray | None, moves: slice | np.ndarray = _ALL) -> np.ndarray:
+        """Awareness of bounds out of that of cells, of all or some moves."""
+        if cells is None:
+            maps = self.workspace.bound_maps
+            return maps if maps.shape[1] == 1 else maps[:, moves]
+        if self.workspace.of_bounds is None:
+            return _any_move(cells)
+        error = cells - self.workspace.awareness.values
+        return np.clip(self.workspace.bound_maps[:, moves] + _any_move(error), 0.0, 1.0)
+
     def with_awareness(self, awareness: ArrayLike, mean: ArrayLike | None = None) -> Self:
-        """Return the problem with another awareness map, or one map for each draw.
+        """Return the problem with another awareness of cells, or one map for each draw.
 
         Shape (robot, row, col, feature) or (draw, robot, row, col, feature); `mean` is the map for
         parameters without draws, by default the mean. ShapeError: other numbers of robots, cells or
@@ -69,7 +114,7 @@ class PlanningProblem:
                 f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
             )
         mean = z.reshape(-1, *expected).mean(0) if mean is None else np.asarray(mean)
-        return replace(self, awareness=z, mean_awareness=mean)
+        return replace(self, cells=z, mean_cells=mean)
 
     def onward(self, done: Sequence[Cell]) -> Self:
         """Return the problem of the rest of a mission that entered the cells `done`, start first.
@@ -82,9 +127,9 @@ class PlanningProblem:
 
     def of_draw(self, index: int) -> Self:
         """Return the problem with the awareness map of one draw, where awareness is uncertain."""
-        if self.awareness.ndim == 4:
+        if self.cells is None or self.cells.ndim == 4:
             return self
-        return self.with_awareness(self.awareness[index % len(self.awareness)])
+        return self.with_awareness(self.cells[index % len(self.cells)])
 
     def dynamics(
         self,
@@ -99,14 +144,27 @@ class PlanningProblem:
         `x0` is by default `params.x0_mean`, `draws` (indices in the posterior) 0, 1, 2, ..., and
         `team` the problem's.
         """
-        z = self.awareness
-        if z.ndim == 5:
-            if params.leading:
-                n = params.leading[0]
-                z = z[(np.arange(n) if draws is None else draws) % len(z)]
-            else:
-                z = self.mean_awareness
-        return trust_dynamics(params, z, team or self.team, x0)
+        cells, team = self.cells, team or self.team
+        moves = move_indices(self.paths.connectivity)
+        if cells is None or cells.ndim == 4 or not params.leading:
+            cells = cells if params.leading else self.mean_cells
+            return trust_dynamics(params, self._of_bounds(cells, moves), team, x0)
+        which = (np.arange(params.leading[0]) if draws is None else draws) % len(cells)
+        if self.workspace.of_bounds is None:
+            return trust_dynamics(params, _any_move(cells[which]), team, x0)
+        # Awareness of all robots, moves and features is large: only drift is kept for all draws.
+        whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0)
+        n = max(1, _ENTRIES // (len(moves) * cells[0].size))
+        for part in (slice(i, i + n) for i in range(0, len(which), n)):
+            z = self._of_bounds(cells[which[part]], moves)
+            some: Params = params.draw(part)  # pyright: ignore[reportArgumentType]
+            whole.drift[part] = trust_dynamics(some, z, team).drift
+        return whole
+
+
+def _any_move(cells: np.ndarray) -> np.ndarray:
+    """Awareness of cells with an axis of moves of length 1."""
+    return cells[..., None, :, :, :]
 
 
 def draws_of(posterior: Params | xr.DataTree) -> Params:

@@ -11,9 +11,9 @@ from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.compiled import plan_compiled
 from trustbo.planning.engines.reachable_trust import best_trust
 from trustbo.planning.objectives import Objective
-from trustbo.planning.paths import SIMPLE, AdmissiblePaths
+from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.values import trust_along
+from trustbo.planning.values import team_trust
 
 
 def trust_map(
@@ -65,7 +65,7 @@ def _of_robot(dynamics: Dynamics, robot: int) -> Dynamics:
 
 def _largest_trust(admissible: AdmissiblePaths, dynamics: Dynamics) -> np.ndarray:
     """Largest trust of every draw and cell, shape (draw, row, col); NaN if out of reach."""
-    extra = min(2, admissible.longest - admissible.shortest)
+    extra = min(SIMPLE_EXTRA, admissible.longest - admissible.shortest)
     fewest = admissible.bounds_from_start
     if dynamics.is_scalar:
         beta0, x0 = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
@@ -83,9 +83,14 @@ def _trust_at(
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
     there = AdmissiblePaths(
-        admissible.workspace, admissible.start, cell, admissible.connectivity, SIMPLE[extra], True
+        admissible.workspace,
+        admissible.start,
+        cell,
+        admissible.connectivity,
+        f"shortest+{extra}",
+        True,
     )
     paths = plan_compiled(there, dynamics, Objective("terminal")).paths
     return np.array(
-        [trust_along(dynamics.take(d), there.cells(path))[-1] for d, path in enumerate(paths)]
+        [team_trust(dynamics.take(d).along(there.cells(path)))[-1] for d, path in enumerate(paths)]
     )

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics, roll, roll_trust
+from trustbo.planning.dynamics import Dynamics, as_map, roll, roll_trust, trust_dynamics
 from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
@@ -22,22 +22,22 @@ def path_value(
     dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
 ) -> np.ndarray:
     """Value of one path, shape (...,) as the leading axes of `dynamics`."""
-    path = np.asarray(path)
-    trust = trust_along(dynamics, path)
+    length_cost = objective.length_weight * path_length(admissible, path)
+    return _value(dynamics.along(path), objective, length_cost)
+
+
+def _value(along: Dynamics, objective: Objective, length_cost: float) -> np.ndarray:
+    """Value (...,) of the path whose bounds `along` has."""
+    trust = team_trust(along)
     steady_state = np.full(trust.shape, np.nan)
     if objective.name == "stationary":
-        rows, cols = path[1:].T
-        along = dynamics._replace(drift=dynamics.drift[..., rows, cols][..., None, :])
-        steady_state = along.steady_state()[..., 0, :]
-    length_cost = objective.length_weight * path_length(admissible, path)
+        steady_state = along.steady_state()[..., 0, 0, :]
     return OBJECTIVES[objective.name](PathTrust(trust, steady_state, length_cost))
 
 
-def trust_along(dynamics: Dynamics, path: Path) -> np.ndarray:
-    """Expected trust of the team after each bound of a path, shape (..., bound)."""
-    rows, cols = np.asarray(path)[1:].T
-    states = roll(dynamics.transition, dynamics.drift[..., rows, cols], dynamics.start)
-    return (states @ dynamics.views.T).min(-1)
+def team_trust(along: Dynamics) -> np.ndarray:
+    """Expected trust of the team after each bound of a path, see `Dynamics.along`; (..., bound)."""
+    return (roll(along) @ along.views.T).min(-1)
 
 
 def path_length(admissible: AdmissiblePaths, path: Path) -> float:
@@ -48,8 +48,10 @@ def path_length(admissible: AdmissiblePaths, path: Path) -> float:
 
 
 def entry_cost(passable: np.ndarray, dynamics: Dynamics) -> np.ndarray:
-    """Cost of entering each cell for `stationary`, (..., row, col); inf if impassable."""
-    return np.where(passable, softplus(-dynamics.steady_state()), np.inf)
+    """Cost of each bound for `stationary`, shape (..., move, row, col); inf where there is none."""
+    trust = dynamics.steady_state()
+    possible = passable & ~np.isnan(trust)
+    return np.where(possible, softplus(-np.where(possible, trust, 0.0)), np.inf)
 
 
 def evaluate(
@@ -59,17 +61,14 @@ def evaluate(
     flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
-    z = problem.awareness if params.leading else problem.mean_awareness
-    along = z[..., rows[1:], cols[1:], :]  # ([draw], robot, bound, feature)
-    if along.ndim == 4:
-        along = along[np.arange(params.leading[0]) % len(along)]
-    draws = roll_trust(params, np.swapaxes(along, -3, -2), x0)
+    z = problem.awareness_along(cells, params)
+    draws = roll_trust(params, z, x0)
     draws = draws.reshape(-1, *draws.shape[-2:])
     trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
     team = trust.mean(1) if problem.team == "mean" else trust.min(1)
     if objective.name == "stationary":
-        dynamics = problem.dynamics(params, x0)
-        value = path_value(dynamics, objective, problem.paths, cells).mean()
+        along = trust_dynamics(params, as_map(z), problem.team, x0)
+        value = _value(along, objective, objective.length_weight * length).mean()
     else:
         cost = objective.length_weight * length
         value = OBJECTIVES[objective.name](PathTrust(team, team, cost))

@@ -104,13 +104,13 @@ def test_cheapest_paths_equal_scipy_s_however_uneven_the_costs(spread):
     # With a spread of 20 most cells cost less than 1e-6 of the dearest: the heap's share of work.
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        level = rng.normal(3.0, spread, (1, 30, 40))
+        level = rng.normal(3.0, spread, (1, 1, 30, 40))
         passable = rng.uniform(size=(30, 40)) > 0.15
         passable[0, 0] = passable[29, 39] = True
         totals, paths = best_stationary(
             level.__getitem__, 1, passable, np.zeros(8), np.array(MOVES[8]), 0, 30 * 40 - 1
         )
-        cost = np.where(passable, np.logaddexp(0.0, -level[0]), np.inf)
+        cost = np.where(passable, np.logaddexp(0.0, -level[0, 0]), np.inf)
         best = dijkstra(grid_matrix(cost), indices=0)[-1]
         np.testing.assert_allclose(totals[0], best, rtol=1e-12)
         if np.isfinite(best):

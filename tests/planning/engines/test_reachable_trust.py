@@ -32,19 +32,25 @@ def test_it_is_the_best_of_all_paths(seed, connectivity, slack):
     rng, shape = np.random.default_rng(seed), (3, 3)
     passable = rng.uniform(size=shape) < 0.85
     passable[start := (2, 0)] = True
-    drift, x0 = rng.normal(size=(3, *shape)), rng.normal(size=3)
+    # Seed 0 has a drift for each cell, others for each bound.
+    drift, x0 = (
+        rng.normal(size=(3, len(MOVES[connectivity]) if seed else 1, *shape)),
+        rng.normal(size=3),
+    )
     beta0 = np.array([0.7, -0.9, 1.1])
     fewest = fewest_bounds(passable, start, connectivity)
     moves = MOVES[connectivity]
-    expected = np.full(drift.shape, np.nan)
+    expected = np.full((3, *shape), np.nan)
     for walk in walks(shape, passable, start, moves, int(fewest.max()) + slack):
         cell, n = walk[-1], len(walk) - 1
         if n > fewest[cell] + slack:
             continue
         for d in range(3):
             trust = x0[d]
-            for entered in walk[1:]:
-                trust = beta0[d] * trust + drift[d][entered]
+            for left, entered in itertools.pairwise(walk):
+                step = entered[0] - left[0], entered[1] - left[1]
+                m = moves.index(step) if seed else 0
+                trust = beta0[d] * trust + drift[d, m, *entered]
             expected[d][cell] = np.fmax(expected[d][cell], trust)
     found = best_trust(drift, beta0, x0, fewest, np.array(moves), slack)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
@@ -55,7 +61,11 @@ def test_many_draws_are_as_each_by_itself():
     passable = rng.uniform(size=shape) < 0.8
     passable[5, 0] = True
     fewest, steps = fewest_bounds(passable, (5, 0), 8), np.array(MOVES[8])
-    drift, beta0, x0 = rng.normal(size=(150, *shape)), rng.uniform(-1, 1, 150), rng.normal(size=150)
+    drift, beta0, x0 = (
+        rng.normal(size=(150, 1, *shape)),
+        rng.uniform(-1, 1, 150),
+        rng.normal(size=150),
+    )
     together = best_trust(drift, beta0, x0, fewest, steps, 2)
     alone = [
         best_trust(drift[d : d + 1], beta0[d : d + 1], x0[d : d + 1], fewest, steps, 2)[0]

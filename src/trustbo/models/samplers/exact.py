@@ -88,16 +88,20 @@ class _Target(NamedTuple):
         beta0, delta_w, delta_v, log_jacobian = self.constrain(z)
         theta = np.stack([beta0, delta_w**2, delta_v**2], axis=1)
         quadratic = self.statistics.evaluate(theta, self.priors.x0_sd)
-        factor = _cholesky((quadratic.P + np.diag(self.precision)).transpose(1, 2, 0))
-        half = _forward(factor, (quadratic.h + self.precision * self.mean).T)
-        misfit = quadratic.alpha + self.precision @ self.mean**2 - (half**2).sum(0)
+        # Of the coefficients, or of those of stationary trust, which are 1 / (1 - beta0) as large.
+        rest = (1.0 - beta0)[:, None] if self.priors.stationary else np.ones((len(z), 1))
+        mean, precision = self.mean * rest, self.precision / rest**2
+        diagonal = precision[:, :, None] * np.eye(len(self.mean))
+        factor = _cholesky((quadratic.P + diagonal).transpose(1, 2, 0))
+        half = _forward(factor, (quadratic.h + precision * mean).T)
+        misfit = quadratic.alpha + (precision * mean**2).sum(1) - (half**2).sum(0)
         log_det = 2.0 * np.log(np.einsum("ccn->cn", factor)).sum(0)
         log_likelihood = -0.5 * (
             misfit
             + quadratic.log_det
             + self.statistics.n_measured * np.log(2.0 * np.pi)
             + log_det
-            - np.log(self.precision).sum()
+            - np.log(precision).sum(1)
         )
         log_prior = (
             log_prob(self.priors.beta0, beta0)

@@ -155,9 +155,11 @@ class Coordinates:
         x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
         params = TrustParams(**others, beta=site["beta"], b=site["b"], **x0)
 
+        weights, intercept = (of(others["beta0"]) for of in (priors.weights, priors.intercept))
+
         def each(name: str) -> Array:
-            of_beta = jnp.broadcast_to(getattr(priors.beta, name), site["beta"].shape)
-            return jnp.append(of_beta, getattr(priors.b, name))
+            of_beta = jnp.broadcast_to(getattr(weights, name), site["beta"].shape)
+            return jnp.append(of_beta, getattr(intercept, name))
 
         sums: Spectrum = self.target.data.spectrum  # pyright: ignore[reportAssignmentType]
         mean, L = coefficients(params, sums, self.model.lag, each("loc"), each("scale") ** -2.0)

@@ -1,4 +1,4 @@
-"""Shortest paths on grids with a cost per cell entered: the objective `stationary`, compiled.
+"""Shortest paths on grids with a cost per bound: the objective `stationary`, compiled.
 
 Method: Dijkstra's algorithm with cyclic buckets (Dial 1969) of real width delta, in which a cell
 may be scanned again: sequential delta-stepping (Meyer and Sanders 2003).
@@ -41,11 +41,12 @@ def best_stationary(
     start: int,
     goal: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the path of every draw with the least sum of softplus(-steady_state) over its cells.
+    """Find the path of every draw with the least sum of softplus(-steady_state) over its bounds.
 
-    `steady_state` maps a slice of the draws to the team's trust if it stayed in each cell, (draw,
-    row, col). A move of `steps` (move, 2) adds its `length_cost` (move,) to that of the cell
-    entered, which must be `passable` (row, col). `start` and `goal` are flat indices.
+    `steady_state` maps a slice of the draws to the team's trust if all bounds were as each one,
+    (draw, move, row, col), of one move where all into a cell are alike. A move of `steps` (move, 2)
+    adds its `length_cost` (move,), and must enter a `passable` cell (row, col). `start` and `goal`
+    are flat indices.
 
     Returns costs (draw,), inf where there is no path; and paths, flat indices of cells, shape
     (draw, length), filled with -1.
@@ -74,20 +75,20 @@ def best_stationary(
 
 
 def _with_margin(trust: np.ndarray, passable: np.ndarray) -> np.ndarray:
-    """softplus(-trust), inf in impassable cells and in a margin around the grid; (draw, cell).
+    """softplus(-trust), inf into impassable cells and a margin around them; (draw, move, cell).
 
     The margin saves the test whether a move leaves the grid. Written out, since NumPy's
     `logaddexp` takes five times as long.
     """
     rows, cols = passable.shape
-    cost = np.full((len(trust), rows + 2, cols + 2), np.inf)
+    cost = np.full((*trust.shape[:2], rows + 2, cols + 2), np.inf)
     inside = np.abs(trust)
     np.negative(inside, out=inside)
     np.exp(inside, out=inside)
     np.log1p(inside, out=inside)
     inside -= np.minimum(trust, 0.0)
-    np.copyto(cost[:, 1:-1, 1:-1], inside, where=passable)
-    return cost.reshape(len(trust), (rows + 2) * (cols + 2))
+    np.copyto(cost[..., 1:-1, 1:-1], inside, where=passable)
+    return cost.reshape(*trust.shape[:2], (rows + 2) * (cols + 2))
 
 
 @_compiled
@@ -97,20 +98,33 @@ def _settle_draws(costs, length_cost, steps, cols, start, goal, totals, n_cells,
     offset = steps[:, 0] * width + steps[:, 1]
     a = (start // cols + 1) * width + start % cols + 1
     b = (goal // cols + 1) * width + goal % cols + 1
-    n_all = costs.shape[1]
+    n_drifts, n_all = costs.shape[1:]
+    # Index of a bound's cost, less that of the cell entered.
+    plane = np.arange(len(steps)) * (n_all if n_drifts > 1 else 0)
     distance, by = np.empty(n_all), np.empty(n_all, np.int8)
     previous, following = np.empty(n_all, np.int32), np.empty(n_all, np.int32)
     for d in range(len(costs)):
-        cost, high = costs[d], 0.0
+        cost, high = costs[d].ravel(), 0.0
         for c in cost:
             high = max(high, c) if c < np.inf else high
         largest = high + length_cost.max()
         # Wide enough that few are empty, narrow enough that few cells are scanned twice.
         delta = max(_usual(cost) + length_cost.min(), largest / (_MAX_BUCKETS - 3), 1e-300)
         if not _settle(
-            cost, length_cost, offset, a, b, delta, largest, distance, by, previous, following
+            cost,
+            plane,
+            length_cost,
+            offset,
+            a,
+            b,
+            delta,
+            largest,
+            distance,
+            by,
+            previous,
+            following,
         ):
-            _settle_by_heap(cost, length_cost, offset, a, b, distance, by)
+            _settle_by_heap(cost, plane, length_cost, offset, a, b, distance, by)
         totals[d] = distance[b]
         n_cells[d] = _trace(distance, by, offset, width, cols, a, b, paths[d])
 
@@ -126,7 +140,7 @@ def _usual(cost):
 
 @_compiled
 def _settle(
-    cost, length_cost, offset, start, goal, delta, largest, distance, by, previous, following
+    cost, plane, length_cost, offset, start, goal, delta, largest, distance, by, previous, following
 ):
     """Compute all distances up to that of the goal; False if it takes too many scans."""
     per_cost, n_buckets = 1.0 / delta, 4
@@ -138,7 +152,7 @@ def _settle(
     distance[start], by[start] = 0.0, -1
     previous[start], following[start] = -1, -1
     heads[0], tails[0] = start, start
-    waiting, scans, k = 1, _MAX_SCANS * len(cost), 0
+    waiting, scans, k = 1, _MAX_SCANS * len(distance), 0
     while waiting > 0:
         at = k & mask
         while heads[at] >= 0:
@@ -155,7 +169,7 @@ def _settle(
             for m in range(len(offset)):
                 other = c + offset[m]
                 near = np.uint64(other)  # unsigned: no test for a negative index
-                reach = so_far + cost[near] + length_cost[m]
+                reach = so_far + cost[np.uint64(other + plane[m])] + length_cost[m]
                 if not reach < distance[near]:
                     continue
                 to = int(reach * per_cost) & mask
@@ -194,7 +208,7 @@ def _remove(c, bucket, heads, tails, previous, following):
 
 
 @_compiled
-def _settle_by_heap(cost, length_cost, offset, start, goal, distance, by):
+def _settle_by_heap(cost, plane, length_cost, offset, start, goal, distance, by):
     """Compute distances up to that of the goal with a binary heap."""
     distance[:] = np.inf
     distance[start] = 0.0
@@ -207,7 +221,7 @@ def _settle_by_heap(cost, length_cost, offset, start, goal, distance, by):
             continue
         for m in range(len(offset)):
             other = c + offset[m]
-            reach = total + cost[other] + length_cost[m]
+            reach = total + cost[other + plane[m]] + length_cost[m]
             if reach < distance[other]:
                 distance[other], by[other] = reach, m
                 heapq.heappush(queue, (reach, np.int64(other)))

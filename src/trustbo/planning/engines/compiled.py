@@ -48,7 +48,7 @@ def plan_compiled(
         )
     else:
         weights = additive_weights(dynamics, dynamics.views[0], objective.name, admissible.longest)
-        drift = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
+        drift = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
         paths = _best_of_lengths(admissible, drift, weights, length_cost)
     return BestPaths(paths, np.zeros(len(paths)))
 
@@ -59,15 +59,15 @@ def expected_path(
     """Find the path with the best *expectation* over draws of terminal trust, or of mean trust.
 
     Both are linear in u with weights that do not depend on the path, so the expectation of weight
-    times u, per cell and bounds left, replaces them: exact, with no assumption on the posterior.
+    times u, per bound and bounds left, replaces them: exact, with no assumption on the posterior.
 
     Returns:
         Flat indices of cells, filled with -1.
     """
     weights = additive_weights(dynamics, dynamics.views[0], objective.name, admissible.longest)
-    u = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
-    # E[w_j . u(c)] for every number of bounds left j and cell c: one state for every j.
-    gain = np.einsum("djs,dsc->jc", weights.per_bound, np.nan_to_num(u)) / len(u)
+    u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
+    # E[w_j . u] for every number of bounds left j, move and cell: one state for every j.
+    gain = np.einsum("djs,dsmc->jmc", weights.per_bound, np.nan_to_num(u)) / len(u)
     pick = np.eye(admissible.longest + 1)[None]
     averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
     length_cost = objective.length_weight * admissible.lengths
@@ -136,7 +136,7 @@ def _label_search(
     return LabelSearch(
         MODES[objective.name],
         np.ascontiguousarray(dynamics.transition),
-        dynamics.drift.reshape(len(dynamics.start), -1),
+        dynamics.drift.reshape(*dynamics.drift.shape[:2], -1),
         np.ascontiguousarray(dynamics.start),
         dynamics.views,
         dominance_tests(dynamics, n_bounds),

@@ -65,14 +65,17 @@ def build_heuristic(
     gains = np.full((len(views), longest + 1, n_cells), -np.inf)
     powers[:, 0] = views
     gains[:, 0] = np.where(np.arange(n_cells) == goal, 0.0, -np.inf) if at_goal else 0.0
-    u = np.nan_to_num(dynamics.drift.reshape(n_states, n_cells), nan=-np.inf)
-    open_cell = np.isfinite(u).all(0)
-    u = np.where(open_cell, u, 0.0)
+    n_drifts = dynamics.drift.shape[1]  # 1 where all moves into a cell are alike
+    by_move = np.arange(n_drifts)  # with length 1 the same for all moves
+    u = np.nan_to_num(dynamics.drift.reshape(n_states, n_drifts * n_cells), nan=-np.inf)
+    is_open = np.isfinite(u).all(0)
+    u = np.where(is_open, u, 0.0)
+    padded = np.full((len(views), n_drifts, n_cells + 1), -np.inf)  # the last: no cell
     for j in range(1, longest + 1):
         powers[:, j] = powers[:, j - 1] @ dynamics.transition
-        entered = np.where(open_cell, powers[:, j - 1] @ u + gains[:, j - 1], -np.inf)
+        gained = np.where(is_open, powers[:, j - 1] @ u, -np.inf).reshape(-1, n_drifts, n_cells)
+        padded[..., :-1] = gained + gains[:, j - 1, None]
         if j > 1:  # the goal ends a path
-            entered[:, goal] = -np.inf
-        padded = np.concatenate([entered, np.full((len(views), 1), -np.inf)], axis=1)
-        gains[:, j] = padded[:, neighbours].max(2)
+            padded[..., goal] = -np.inf
+        gains[:, j] = padded[:, by_move, neighbours].max(2)
     return Heuristic(powers, gains)

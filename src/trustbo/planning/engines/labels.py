@@ -40,7 +40,7 @@ class LabelSearch(NamedTuple):
 
     mode: int
     transition: np.ndarray  # (state, state)
-    drift: np.ndarray  # (state, cell)
+    drift: np.ndarray  # (state, move, cell); one move where all into a cell are alike
     start_state: np.ndarray  # (state,)
     views: np.ndarray  # (view, state)
     tests: np.ndarray  # (test, state)
@@ -75,11 +75,9 @@ def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchRes
 
 @_compiled
 def _search(problem, tolerance, max_labels):
-    mode, u_turns, revisit, most = (
-        problem.mode, problem.u_turns, problem.revisit, problem.max_bounds,
-    )  # fmt: skip
-    neighbours, to_goal, goal = problem.neighbours, problem.to_goal, problem.goal
-    n_cells, n_moves = neighbours.shape
+    mode, revisit, most, goal = problem.mode, problem.revisit, problem.max_bounds, problem.goal
+    neighbours, to_goal, u_turns = problem.neighbours, problem.to_goal, problem.u_turns
+    (n_cells, n_moves), by_move = neighbours.shape, problem.drift.shape[1] > 1
     fixed, n_before = mode >= TERMINAL, 1 if u_turns else n_moves + 1
     heads = np.full(n_cells * n_before * (most + 1 if fixed else 1), -1, np.int64)
     size = min(max_labels, 1024)
@@ -123,7 +121,7 @@ def _search(problem, tolerance, max_labels):
                 labels, cost = np.concatenate((labels, labels)), np.concatenate((cost, cost))
                 state, tested = np.concatenate((state, state)), np.concatenate((tested, tested))
                 seen = np.concatenate((seen, seen))
-            x = problem.transition @ state[label] + problem.drift[:, other]
+            x = problem.transition @ state[label] + problem.drift[:, m * by_move, other]
             total = _add_cost(mode, cost[label], (problem.views @ x).min(), problem.length_cost[m])
             left = most - n_bounds - 1 if fixed else to_goal[other]
             reach = _estimate(mode, problem.heuristic, x, total, other, left)

@@ -3,9 +3,9 @@
 Method: dynamic programming backwards over the time-expanded graph (Bellman 1958; Ahuja, Magnanti
 and Orlin 1993, chapter 4), for all admissible lengths in one pass.
 
-Unrolled, x^K = B0^K x^0 + sum_k B0^{K-k} u(path[k]). With j = K - k bounds left after cell c is
-entered, c adds w_j . u(c) to the value, w_j = view . B0^j for `terminal` and the sum of these up to
-j for `mean`: a weight that depends on j alone, not on the path nor on its length K.
+Unrolled, x^K = B0^K x^0 + sum_k B0^{K-k} u(bound k). With j = K - k bounds left after a bound, it
+adds w_j . u to the value, w_j = view . B0^j for `terminal` and the sum of these up to j for `mean`:
+a weight that depends on j alone, not on the path nor on its length K.
 
 State: node (j, c), if the goal can be reached from c in j bounds and c from the start in at most
 `longest` - j. Edges lead from (j, c) to (j - 1, c') for each move c -> c'. The goal is node j = 0.
@@ -145,7 +145,8 @@ def best_additive(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the best path of every draw over admissible numbers of bounds, `lengths`.
 
-    Drift u (draw, state, cell) and its weights, cost of each move (move,). Returns scores (draw,),
+    Drift u (draw, state, move, cell), of one move where all into a cell are alike, and its weights,
+    cost of each move (move,). Returns scores (draw,),
     -inf where there is no path; and paths, flat indices of cells, (draw, length), filled with -1.
     """
     n_draws = len(drift)
@@ -171,9 +172,10 @@ class _Best(NamedTuple):
 
 @_compiled
 def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, begin, end):
-    n_nodes, n_states = len(layers.cell), drift.shape[1]
+    n_nodes, (n_states, n_drifts) = len(layers.cell), drift.shape[1:3]
     left, cell, per_bound = layers.left, layers.cell, weights.per_bound
-    gain, costly = np.empty(n_nodes), length_cost.max() > 0.0
+    # By the move that enters a node, if that matters.
+    gain, costly = np.empty((n_nodes, n_drifts)), length_cost.max() > 0.0
     found = _Best(
         np.empty(n_nodes),
         np.empty(n_nodes),
@@ -182,10 +184,11 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
     )
     for d in range(begin, end):
         for n in range(n_nodes):
-            total = 0.0
-            for s in range(n_states):
-                total += per_bound[d, left[n], s] * drift[d, s, cell[n]]
-            gain[n] = total
+            for m in range(n_drifts):
+                total = 0.0
+                for s in range(n_states):
+                    total += per_bound[d, left[n], s] * drift[d, s, m, cell[n]]
+                gain[n, m] = total
         _pass_back(layers, gain, length_cost, costly, found)
         chosen = -1
         for length in lengths:
@@ -202,7 +205,7 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
 def _pass_back(layers, gain, length_cost, costly, found):
     """Compute the best and second-best sum of every node, in the order of the bounds left."""
     left, first, head, move = layers.left, layers.first, layers.head, layers.move
-    n_moves, u_turns = layers.n_moves, layers.u_turns
+    n_moves, u_turns, by_move = layers.n_moves, layers.u_turns, 1 if gain.shape[1] > 1 else 0
     best, second, edge, by = found
     for n in range(len(left)):
         if left[n] == 0:
@@ -212,7 +215,7 @@ def _pass_back(layers, gain, length_cost, costly, found):
         for e in range(first[n], first[n + 1]):
             b, m = head[e], move[e]
             on = best[b] if u_turns or by[b] != n_moves - 1 - m else second[b]
-            value = gain[b] + on
+            value = gain[b, m * by_move] + on
             if costly:
                 value -= length_cost[m]
             if value > high:
@@ -228,6 +231,7 @@ def _trace(layers, gain, length_cost, found, node, path):
     """Write down the path from a start node; second-best edges are searched again."""
     cell, first, head, move = layers.cell, layers.first, layers.head, layers.move
     best, second, edge, by = found
+    by_move = 1 if gain.shape[1] > 1 else 0
     k, came = 0, -1
     path[0] = cell[node]
     while edge[node] >= 0:
@@ -239,8 +243,9 @@ def _trace(layers, gain, length_cost, found, node, path):
                 if m == by[node]:
                     continue
                 on = best[b] if by[b] != layers.n_moves - 1 - m else second[b]
-                if gain[b] + on - length_cost[m] > high:
-                    high, e = gain[b] + on - length_cost[m], x
+                value = gain[b, m * by_move] + on - length_cost[m]
+                if value > high:
+                    high, e = value, x
         node, came = head[e], move[e]
         k += 1
         path[k] = cell[node]

@@ -9,8 +9,8 @@ the move that gave it, the largest by any other move, and the same of minus the 
 
 Invariant: states are processed in the order of k, so those of all predecessors are final.
 
-Exact because x -> beta0 x + u(c) is monotone: the largest trust on entering c by a move comes out
-of the largest in the cell left if beta0 >= 0, and out of the least if beta0 < 0. U-turns are
+Exact because x -> beta0 x + u is monotone: the largest trust on entering c by a move comes out of
+the largest in the cell left if beta0 >= 0, and out of the least if beta0 < 0. U-turns are
 forbidden: a predecessor entered by the reverse move is excluded, which is one move, so the best and
 the best by another are enough.
 
@@ -37,15 +37,16 @@ def best_trust(
 ) -> np.ndarray:
     """Compute the largest expected trust with which each cell can be reached without U-turns.
 
-    Drift u (draw, row, col); beta0 and x0, trust at the start, (draw,); `fewest` bounds from the
-    start (row, col), -1 where there is no way; moves `steps` (move, 2), each the reverse of the one
-    as far from the other end; `extra` bounds beyond the fewest possible, 0 to 2. Returns shape
-    (draw, row, col), NaN where a cell cannot be reached.
+    Drift u (draw, move, row, col), of one move where all into a cell are alike; beta0 and x0, trust
+    at the start, (draw,); `fewest` bounds from the start (row, col), -1 where there is no way;
+    moves `steps` (move, 2), each the reverse of the one as far from the other end; `extra` bounds
+    beyond the fewest possible, 0 to 2. Returns (draw, row, col), NaN where a cell cannot be
+    reached.
     """
     order = np.argsort(fewest, axis=None, kind="stable")
     order = order[np.searchsorted(fewest.ravel()[order], 0) :]
     first = np.searchsorted(fewest.ravel()[order], np.arange(fewest.max() + 2))
-    best = np.full(u.shape, np.nan)
+    best = np.full((len(u), fewest.size), np.nan)
     # A border of cells without a way: the kernel needs no test of rows and columns.
     bordered = np.pad(np.where(fewest < 0, _NO_WAY, fewest), 1, constant_values=_NO_WAY)
     width = bordered.shape[1]
@@ -53,21 +54,19 @@ def best_trust(
     grid = bordered.ravel(), steps @ (width, 1), *cells, first
 
     # One memory layout, so that the kernel is compiled once.
-    drift, beta0, x0 = (
-        np.ascontiguousarray(values) for values in (u.reshape(len(u), -1), beta0, x0)
-    )
+    drift, beta0, x0 = (np.ascontiguousarray(v) for v in (u.reshape(*u.shape[:2], -1), beta0, x0))
 
     def work(begin: int, end: int) -> None:
         some = slice(begin, end)
-        _reach(drift[some], beta0[some], x0[some], best.reshape(drift.shape)[some], *grid, extra)
+        _reach(drift[some], beta0[some], x0[some], best[some], *grid, extra)
 
     over_rows(work, len(u)) if len(u) > 1 else work(0, 1)
-    return best
+    return best.reshape(len(u), *fewest.shape)
 
 
 @_compiled
 def _reach(u, beta0, x0, best, fewest, offsets, order, place, first, extra):
-    n_moves = len(offsets)
+    n_moves, by_move = len(offsets), 1 if u.shape[1] > 1 else 0
     # Of trust (0) and minus trust (1), per extra and place: the largest, its move, and the largest
     # by another move. Places are indices of cells in `fewest`, `order` has those in `u`.
     top = np.full((2, extra + 1, len(fewest)), -np.inf)
@@ -83,7 +82,7 @@ def _reach(u, beta0, x0, best, fewest, offsets, order, place, first, extra):
                 for n in range(first[k - s], first[k - s + 1]):
                     for side in range(2 if turns else 1):
                         source = 1 - side if turns else side
-                        increment = -u[d, order[n]] if side else u[d, order[n]]
+                        sign = -1.0 if side else 1.0
                         most, next_most, move = -np.inf, -np.inf, _NO_MOVE
                         for m in range(n_moves):
                             before = place[n] - offsets[m]
@@ -93,7 +92,7 @@ def _reach(u, beta0, x0, best, fewest, offsets, order, place, first, extra):
                             known = top[source, e, before]
                             if by[source, e, before] == n_moves - 1 - m:
                                 known = second[source, e, before]
-                            value = size * known + increment
+                            value = size * known + sign * u[d, m * by_move, order[n]]
                             if value > most:
                                 most, next_most, move = value, most, m
                             elif value > next_most:

@@ -19,7 +19,8 @@ from trustbo.planning.engines.dominance import dominance_tests
 from trustbo.planning.engines.layers import additive_weights
 from trustbo.planning.objectives import LABELLED, Objective, softplus
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.values import entry_cost, path_length, trust_along
+from trustbo.planning.values import entry_cost, path_length, team_trust
+from trustbo.workspace.moves import MOVES
 
 Path = tuple[Cell, ...]
 _dijkstra: Any = nx.dijkstra_path  # annotations of networkx exclude `backend=None`
@@ -41,14 +42,14 @@ def plan_networkx(
     weights = additive_weights(
         dynamics.flat(), dynamics.views[0], objective.name, admissible.longest
     )
-    gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, row, col)
+    gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, move, row, col)
     for n_bounds in range(admissible.shortest, admissible.longest + 1):
         if len(dynamics.views) > 1:  # the least of several views is no sum of weights
             path = best_layered(admissible, dynamics, objective, n_bounds)
         else:
 
-            def gain(k: int, cell: Cell, n: int = n_bounds) -> float:
-                return float(gains[n - k, *cell] / weights.scale[n])
+            def gain(k: int, before: Cell, cell: Cell, n: int = n_bounds) -> float:
+                return float(_of_bound(gains[n - k], before, cell) / weights.scale[n])
 
             path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
         if path is not None:
@@ -56,27 +57,37 @@ def plan_networkx(
     return max(paths, key=lambda path: _score(dynamics, objective, admissible, path))
 
 
+def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:
+    """Value of the bound into a cell from the one before, out of (..., move, row, col)."""
+    n_moves = values.shape[-3]
+    step = cell[0] - before[0], cell[1] - before[1]
+    return values[..., MOVES[n_moves].index(step) if n_moves > 1 else 0, *cell]
+
+
 def _score(
     dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
 ) -> float:
     """Score of a path for `terminal` or `mean` in trust, as its sigma rounds to 1 beyond 40."""
-    trust = trust_along(dynamics, path)
+    trust = team_trust(dynamics.along(path))
     score = float(trust[-1] if objective.name == "terminal" else trust.mean())
     return score - objective.length_weight * path_length(admissible, path)
 
 
 def best_additive(
     admissible: AdmissiblePaths,
-    gain: Callable[[int, Cell], float],
+    gain: Callable[[int, Cell, Cell], float],
     n_bounds: int,
     length_weight: float = 0.0,
     backend: str | None = None,
 ) -> Path | None:
-    """Find the path, if any, of exactly `n_bounds` bounds with the largest sum of gain(k, path[k]).
+    """Find the path, if any, of exactly `n_bounds` bounds with the largest sum of gains.
 
-    The cells are unrolled over the bounds into a layered DAG. All paths through it are equally
-    long, so each layer's weights may be shifted to be non-negative: Dijkstra then applies, whatever
-    the signs of the gains. `length_weight` is the cost of a metre, `backend` networkx's.
+    That of bound k is gain(k, path[k-1], path[k]), `length_weight` the cost of a metre, and
+    `backend` networkx's.
+
+    The grid is unrolled over the bounds into a layered DAG. All paths through it are equally long,
+    so each layer's weights may be shifted to be non-negative: Dijkstra then applies, whatever the
+    signs of the gains.
     """
     graph, dag = admissible.graph, nx.DiGraph()
     source, sink = (0, None, admissible.start), "goal"
@@ -95,12 +106,14 @@ def best_additive(
                 entered.setdefault(target, []).append(node)
         if not entered:
             return None
-        gains = {target: gain(k, target[2]) for target in entered}
+        bounds = {(node[2], target[2]) for target in entered for node in entered[target]}
+        gains = {(a, c): gain(k, a, c) for a, c in bounds}
         most = max(gains.values())
         for target, sources in entered.items():
             for node in sources:
-                length = graph.edges[node[2], target[2]]["length"]
-                dag.add_edge(node, target, weight=most - gains[target] + length_weight * length)
+                bound = node[2], target[2]
+                length_cost = length_weight * graph.edges[bound]["length"]
+                dag.add_edge(node, target, weight=most - gains[bound] + length_cost)
         layer = list(entered)
     for node in layer:
         dag.add_edge(node, sink, weight=0.0)
@@ -142,7 +155,7 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: st
                 continue
             if other == before:
                 continue
-            reached = dynamics.transition @ x + dynamics.drift[:, *other]
+            reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
             trust = float((dynamics.views @ reached).min())
             label = (combine(cost, trust), n_bounds + 1, next(order), reached)
             heapq.heappush(queue, (*label, (*path, other), seen))
@@ -173,7 +186,7 @@ def best_layered(
                 length_cost = per_metre * graph.edges[cell, other]["length"]
                 at = new.setdefault((None if admissible.u_turns else cell, other), [])
                 for _, score, x, path in here:
-                    reached = dynamics.transition @ x + dynamics.drift[:, *other]
+                    reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
                     trust = float((dynamics.views @ reached).min())
                     gained = trust if objective.name == "mean" or k == n_bounds else 0.0
                     score_now = score + gained - length_cost
@@ -200,10 +213,10 @@ def _keep(at: list[Any], label: Any) -> None:
 def best_stationary(
     admissible: AdmissiblePaths, cost: np.ndarray, length_weight: float, backend: str | None
 ) -> Path:
-    """Find the simple path with the least cost of its cells, shape (row, col), and its metres."""
+    """Find the simple path with the least cost of bounds, (move, row, col), and its metres."""
     weighted = nx.DiGraph()
     weighted.add_weighted_edges_from(
-        (a, b, float(cost[b]) + length_weight * length)
+        (a, b, float(_of_bound(cost, a, b)) + length_weight * length)
         for a, b, length in admissible.graph.edges(data="length")
     )
     ends = admissible.start, admissible.goal

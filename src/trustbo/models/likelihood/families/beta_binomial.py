@@ -32,6 +32,11 @@ class BetaBinomial(Linearised):
     rounds: ClassVar[bool] = False
     correlates: ClassVar[bool] = False
 
+    @property
+    def line_of_sight(self) -> tuple[float, float]:
+        """See `Family.line_of_sight`: the logit, a line through it at .5 and at .92."""
+        return 5.0, 0.5
+
     def priors(self) -> dict[str, Any]:
         """See `Family.priors`: trust is a logit, so all are wider."""
         with own_settings():

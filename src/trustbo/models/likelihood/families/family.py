@@ -103,6 +103,11 @@ class Family(ABC):
         is known to .005.
         """
 
+    @property
+    def line_of_sight(self) -> tuple[float, float]:
+        """Trust that a line of sight of 1 is worth, and the line of sight of trust 0."""
+        return 1.0, 0.0
+
     def priors(self) -> dict[str, Any]:
         """Default priors that differ from those of `Priors()`, by name."""
         return {}
