@@ -57,7 +57,7 @@ def test_nuts_starts_at_both_modes_and_knows_their_mass():
 
     @jax.jit
     def search(data):
-        target = reparametrise(model, data, complete=True)
+        target = reparametrise(model, data, complete=True, collapse=True)
         found = find_modes(
             target.profile,
             lambda theta: -target.potential({"theta": theta}),
@@ -69,8 +69,8 @@ def test_nuts_starts_at_both_modes_and_knows_their_mass():
     with own_settings():
         beta0, share = map(np.asarray, search(run.nuts_data(model, batch, weight)))
     assert (share > 0.0).sum() == 2
-    # Laplace's error, as measured: posteriors are skewed in the ratio of the noises.
-    assert abs(share[beta0 < truth.valley()].sum() - truth.below(truth.valley())) < 0.04
+    # Laplace's error, as measured, is .003: the noises, which are skewed, are alike at both.
+    assert abs(share[beta0 < truth.valley()].sum() - truth.below(truth.valley())) < 0.01
 
 
 @pytest.mark.slow  # its program compiles for this alone
