@@ -73,7 +73,7 @@ def run(
         ground = terrain.read_terrain(
             dem, dsm, **place, max_pixels=_MOST_PIXELS, progress=not quiet
         )
-        workspace = Workspace.from_terrain(ground, rows_cols, team)
+        workspace = Workspace.from_terrain(ground, rows_cols, team, sight=sight)
         result = iterate(
             workspace,
             *cells,
@@ -82,7 +82,7 @@ def run(
             policy=policy,
             objective=objective,
             sampler=sampler,
-            simulator=simulation.KinematicSimulator(workspace, sight=sight),
+            simulator=simulation.KinematicSimulator(workspace),
             stop=stop,
             checkpoint=out,
             seed=seed,
