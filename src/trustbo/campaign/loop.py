@@ -65,7 +65,7 @@ def iterate(
         simulator: Simulator with `run(path, *, seed) -> Mission`; by default
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`: the regret of each plan
-            goes into the history, in %; see `true_regret`.
+            goes into the history, in % of the contact that the best admissible path keeps.
         stop: Rules to end before `n_iterations`: a `RegretBound`, `Seconds`, a callable
             `stop(campaign) -> reason or None`, or several of them.
         checkpoint: Folder in which everything is kept as it goes, replacing another campaign in it.
@@ -198,13 +198,16 @@ def missions(
     return _missions(campaign, runner, n_iterations, truth, rules, progress)
 
 
-def true_regret(truth: Truth, planner: Planner, path: Plan | Sequence[Cell]) -> float:
-    """Regret of a path, in %, against the best of the planner's admissible paths.
+def path_class(planner: Planner) -> dict[str, Any]:
+    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths.
 
-    In mean contact if that is the planner's objective, else in contact lost; see `Truth.regret`.
+    The objective is contact lost, or mean contact where that is the planner's.
     """
-    objective = "mean" if planner.objective == "mean" else "lost_contact"
-    return truth.regret(path, objective, planner.max_bounds, connectivity=planner.connectivity)
+    return {
+        "objective": "mean" if planner.objective == "mean" else "lost_contact",
+        "max_bounds": planner.max_bounds,
+        "connectivity": planner.connectivity,
+    }
 
 
 def _missions(
@@ -225,7 +228,7 @@ def _missions(
             extra = {}
             if truth is not None:
                 now = truth.at(len(campaign.missions))
-                extra["regret"] = true_regret(now, campaign.planner, plan)
+                extra["regret"] = now.regret(plan, **path_class(campaign.planner))
             # Another path is the loop's own doing, and so is a simulator that repeats itself.
             campaign.tell(mission, other_path=True, again=True, **extra)
             bar.set_postfix_str(_report(campaign), refresh=False)

@@ -35,15 +35,14 @@ class ModelContact:
     standard_error = 0.0
 
     def __init__(self, model: TrustModel, params: Params, awareness: np.ndarray) -> None:
-        """Take one draw of parameters, and awareness ([robot, move], row, col, feature).
+        """Take one draw of parameters, and awareness as `Workspace.bound_maps`.
 
         TrustboError: rates that measure the change of trust, which is no contact.
         """
         if model.lag:
             raise TrustboError('response="change" measures changes of trust; contact has no truth.')
         self._counts = model.family.needs_ticks
-        self._awareness = awareness if awareness.ndim == 5 else awareness[:, None]
-        self._params, n_robots = params, len(awareness)
+        self._awareness, self._params, n_robots = awareness, params, len(awareness)
         self._transition = transition(params, n_robots)
         if isinstance(params, CoupledParams):
             process, observed = np.asarray(params.Delta_w), np.diagonal(params.Delta_v)
@@ -54,8 +53,7 @@ class ModelContact:
 
     def contact(self, path: Sequence[Cell]) -> np.ndarray:
         """Expected contact rates of the bounds of a path, shape (bound, robot)."""
-        z = np.swapaxes(along(self._awareness, path), 0, 1)
-        trust = roll_trust(self._params, z)
+        trust = roll_trust(self._params, np.swapaxes(along(self._awareness, path), 0, 1))
         return self._rate(trust, self._spread(len(trust)))
 
     def failure(self, path: Sequence[Cell]) -> np.ndarray:
