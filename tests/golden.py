@@ -49,7 +49,10 @@ NUTS = {
     "apart nuts": {"model": ("CoupledTrust", {"inter_robot": "none"})},
 }
 
-FEW = ("pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan")
+FEW = (
+    "pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan",
+    "objective lost_contact",
+)  # fmt: skip
 
 
 def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:

@@ -31,6 +31,7 @@ class BetaBinomial(Linearised):
     allows_change: ClassVar[bool] = False
     rounds: ClassVar[bool] = False
     correlates: ClassVar[bool] = False
+    expected_rate: ClassVar[str] = "logistic"
 
     def priors(self) -> dict[str, Any]:
         """See `Family.priors`: trust is a logit, so all are wider."""
