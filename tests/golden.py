@@ -51,14 +51,9 @@ NUTS = {
 }
 
 FEW = (
-    "pooled exact",
-    "apart exact",
-    "policy cvar",
-    "objective success",
-    "belief",
-    "replan",
-    "bounds",
-)
+    "pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan",
+    "objective lost_contact", "bounds",
+)  # fmt: skip
 
 
 def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:

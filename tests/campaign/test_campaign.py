@@ -196,7 +196,9 @@ def test_a_campaign_with_censored_rates(workspace, monkeypatch):
 @pytest.mark.parametrize("initial", ["prior_draw", "prior_mean"])
 @pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
 def test_every_model_can_be_planned_with(workspace, model, initial):
-    campaign = Campaign(workspace, *ENDS, model=model, team="min", initial=initial)
+    campaign = Campaign(
+        workspace, *ENDS, model=model, objective="terminal", team="min", initial=initial
+    )
     plan = campaign.ask()
     assert plan.trust.shape[1] == 3
     assert plan.value == pytest.approx(1.0 / (1.0 + np.exp(-plan.trust[-1].min())))

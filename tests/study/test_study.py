@@ -425,7 +425,7 @@ def test_regret_curves_show_each_policy_s_median(serial):
         ({"policies": ["gredy"]}, "unknown policy 'gredy'; choose one of greedy"),
         ({"policies": ["greedy", "greedy"]}, "policies must be at least one, and distinct"),
         ({"policies": []}, "policies must be at least one"),
-        ({"objectives": ["best"]}, "unknown objective 'best'; choose one of terminal"),
+        ({"objectives": ["best"]}, "unknown objective 'best'; choose one of lost_contact"),
         ({"seeds": -1}, "seeds .* must be a whole number from 1 on; got -1"),
         ({"seeds": [0, "a"]}, "seed must be a whole number from 0 on; got 'a'"),
         ({"n_iterations": 0}, "n_iterations must be a whole number from 1 on; got 0"),
