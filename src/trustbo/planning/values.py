@@ -94,6 +94,7 @@ def evaluate(
         revisits=len(path) - len(set(path)),
         engine="given",
         seconds=0.0,
+        workspace=problem.workspace,
     )
 
 
