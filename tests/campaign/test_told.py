@@ -220,7 +220,9 @@ def test_robots_and_features_are_put_in_order_by_their_names(workspace):
             getattr(shuffled.missions[0], name), getattr(campaign.missions[0], name)
         )
     stranger = Mission.from_arrays(DIAGONAL, z, y, robots=["r1", "r2", "r9"])
-    with pytest.raises(tb.ShapeError, match=r"has robots \('r1', 'r2', 'r9'\), not \('r1', 'r2', 'r3'\)"):
+    with pytest.raises(
+        tb.ShapeError, match=r"has robots \('r1', 'r2', 'r9'\), not \('r1', 'r2', 'r3'\)"
+    ):
         campaign.tell(stranger, other_path=True)
 
 

@@ -310,6 +310,15 @@ class Workspace:
         moves_along([a, c])
         return a, c
 
+    def along(self, path: Sequence[Cell]) -> np.ndarray:
+        """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
+
+        Raises:
+            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
+        """
+        cells = [self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
+        return np.swapaxes(along(self.bound_maps, cells), 0, 1)
+
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the order of the workspace's.
 
@@ -329,10 +338,7 @@ class Workspace:
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
         """
-        for k, cell in enumerate(mission.path):
-            self.require_cell(f"path[{k}]", cell)
-        own = self.in_order(mission)
-        return fill_awareness(own, along(self.bound_maps, own.path))
+        return fill_awareness(self.in_order(mission), np.swapaxes(self.along(mission.path), 0, 1))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""
