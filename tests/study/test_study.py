@@ -95,7 +95,7 @@ def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
     same = {
         "terrains": {"renamed": cells | {"shape": (5, 5), "start": [4, 0], "n_robots": 3}},
         "simulators": {"renamed": truth | {"x0_mean": 0.5, "n_ticks": None}},
-        "objectives": "terminal",
+        "objectives": "lost_contact",
         "seeds": [0, 1, 2],
     }
     assert keys(**same) == keys()

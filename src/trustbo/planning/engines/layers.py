@@ -201,11 +201,11 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
         np.empty(n_nodes, np.int8),
     )
     for d in range(begin, end):
-        for i in range(len(gain)):
-            total = 0.0
-            for s in range(n_states):
-                total += per_bound[d, gain_left[i], s] * u[d, s, gain_drift[i]]
-            gain[i] = total
+        gain[:] = 0.0
+        for s in range(n_states):
+            w, u_s = per_bound[d, :, s], u[d, s]
+            for i in range(len(gain)):
+                gain[i] += w[gain_left[i]] * u_s[gain_drift[i]]
         _pass_back(layers, gain, length_cost, costly, by_edge, found)
         chosen = -1
         for length in lengths:
