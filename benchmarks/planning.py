@@ -138,6 +138,7 @@ def many_draws(n, n_networkx):
     ours = seconds(lambda: planner.plan_draws(draws))
     print()
     line("trustbo, terminal, shortest + 2 bounds", ours)
+    contact_lost(ends, n)
     if n > 10:
         return
     by_networkx, few = Planner(*ends, "terminal", engine="networkx"), 20
@@ -145,6 +146,16 @@ def many_draws(n, n_networkx):
     compiled = planner.plan_draws(draws, n_draws=few)
     np.testing.assert_allclose(compiled.values, drawn.values, rtol=1e-9)
     line("our reference on networkx (layered graph)", took * 1000 / few, ours)
+
+
+def contact_lost(ends, n):
+    """1000 draws by lost_contact, for rates that are linear in trust, and for counts."""
+    for family, most in (("gaussian", 5), ("beta_binomial", 50)):
+        planner = Planner(*ends, observation=family)
+        draws = sample_prior(PooledTrust(observation=family), 2, 1000, seed=0)
+        took = seconds(lambda p=planner, d=draws: p.plan_draws(d))
+        note = "" if n > 10 else f"target {most} ms: {'yes' if took <= most * 1e-3 else 'NO'}"
+        line(f"trustbo, lost_contact, {family}", took, None, note)
 
 
 def target(ratio, least):

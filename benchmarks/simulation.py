@@ -23,7 +23,6 @@ import numpy as np
 import xarray as xr
 
 import trustbo as tb
-from trustbo.simulation.world import Worlds
 from trustbo.workspace.sight import Sight, detection_probability
 
 N_PAIRS, N_SIDE, REACH, EYE = 100_000, 1000, 100.0, 1.0
@@ -54,8 +53,9 @@ def scene(terrain):
     """Surface of a terrain and random pairs on it, (pair, 2) each, m from its upper left pixel."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        workspace = tb.Workspace.from_terrain(terrain, (20, 20))
-    surface = Worlds(workspace, Sight(), 8.0).surface
+        workspace = tb.Workspace.from_terrain(terrain, (20, 20), bounds=False)
+    surface = workspace.surface
+    assert surface is not None
     rng = np.random.default_rng(0)
     a = rng.uniform(REACH + 1, N_SIDE - REACH - 2, (N_PAIRS, 2))
     angle, far = rng.uniform(0, 2 * np.pi, N_PAIRS), REACH * np.sqrt(rng.uniform(size=N_PAIRS))

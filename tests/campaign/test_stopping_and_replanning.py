@@ -9,15 +9,19 @@ import pytest
 from simulators import TRUTH, ModelSimulator
 
 import trustbo as tb
+from trustbo import simulation
 from trustbo.campaign.replanning import better_rest, weighted_mean
 from trustbo.campaign.stopping import reason_to_stop
 from trustbo.data import Bound
+from trustbo.errors import TrustboError
 from trustbo.models import TrustFilter, sample_prior
 from trustbo.models.params import params_of
 from trustbo.planning import Planner
 
 ENDS = ((3, 0), (0, 3))
 QUIET = {"sampler": "exact", "progress": False}
+
+TERMINAL = {"objective": "terminal"}
 
 
 @pytest.fixture(scope="module")
@@ -32,11 +36,13 @@ def iterate(workspace, **options):
 
 
 def test_a_campaign_stops_when_the_recommended_path_is_nearly_the_best(workspace):
-    result = iterate(workspace, n_iterations=12, stop=tb.RegretBound(eps=0.2, delta=0.2))
+    result = iterate(
+        workspace, n_iterations=12, stop=tb.RegretBound(eps=0.2, delta=0.2), **TERMINAL
+    )
     assert 3 <= len(result.missions) < 12
     assert result.stop_reason.startswith("regret_bound: P(regret <= 0.2) = ")
     # What the rule says, counted by hand: every draw's best of all paths against the recommended.
-    planner = Planner(workspace, *ENDS)
+    planner = Planner(workspace, *ENDS, **TERMINAL)
     draws = params_of(result.posterior)
     drawn = planner.plan_draws(draws, n_draws=500)
     shares = []
@@ -44,14 +50,16 @@ def test_a_campaign_stops_when_the_recommended_path_is_nearly_the_best(workspace
         best = planner.plan(draws.draw(int(d)))
         own = planner.evaluate(result.path, draws.draw(int(d))).value
         shares.append((best.value - own) / best.value <= 0.2)
-    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact", **TERMINAL)
     for mission in result.missions:
         campaign.tell(mission)
     assert tb.RegretBound(eps=0.2).probability(campaign, len(result.missions)) == np.mean(shares)
 
 
 def test_it_does_not_stop_while_paths_differ_by_more(workspace):
-    result = iterate(workspace, n_iterations=3, stop=tb.RegretBound(eps=1e-6, delta=0.01))
+    result = iterate(
+        workspace, n_iterations=3, stop=tb.RegretBound(eps=1e-6, delta=0.01), **TERMINAL
+    )
     assert result.stop_reason == "n_iterations"
 
 
@@ -171,26 +179,32 @@ def test_the_generator_gives_each_mission_as_it_is_learned(workspace):
     assert table.loc[1, "status"] == "ok"
 
 
-def test_regret_is_recorded_where_the_truth_is_known(workspace):
-    class Oracle(ModelSimulator):
-        def regret(self, plan):
-            planner = Planner(self.workspace, *ENDS)
-            best = planner.plan(TRUTH).value
-            return best - planner.evaluate(plan.path, TRUTH).value
-
-    result = iterate(workspace, n_iterations=2, simulator=Oracle(workspace))
+def test_true_regret_goes_into_the_history(workspace):
+    simulator = simulation.ModelSimulator(workspace, TRUTH)
+    truth = simulation.Truth.of(simulator)
+    result = iterate(workspace, n_iterations=2, simulator=simulator, truth=truth)
     regret = result.history["regret"].values
-    assert (regret >= -1e-12).all()
+    paths = [mission.path for mission in result.missions]
+    best = truth.value(truth.best(*ENDS, max_bounds="shortest+2"))
+    for path, value in zip(paths, regret, strict=True):
+        n_best = len(truth.best(*ENDS, max_bounds="shortest+2")) - 1
+        lacking = truth.value(path).lost - best.lost
+        assert value == pytest.approx(100.0 * lacking / (n_best - best.lost), abs=1e-9)
+    assert (regret >= -1e-9).all()
+    larger = tb.Workspace.from_awareness(np.full((3, 5, 5, 2), 0.5))
+    other = simulation.Truth.of(simulation.ModelSimulator(larger, TRUTH))
+    with pytest.raises(TrustboError, match="the truth is of another workspace: its grid is"):
+        iterate(workspace, simulator=simulator, truth=other)
 
 
 def test_progress_is_a_line_and_the_log_has_it_too(workspace, capsys, caplog):
     with caplog.at_level(logging.INFO, logger="trustbo"):
         iterate(workspace, n_iterations=2)
     assert capsys.readouterr() == ("", "")
-    assert "mission 2: objective 0." in caplog.text
+    assert "mission 2: objective -" in caplog.text
     iterate(workspace, n_iterations=2, progress=True)
     line = capsys.readouterr().err.splitlines()[-1]  # no carriage returns in a file
-    assert line.startswith("mission 2/2: objective 0.")
+    assert line.startswith("mission 2/2: objective -")
     assert "k-hat" in line
     assert "ok" in line
 

@@ -18,8 +18,9 @@ def result():
     awareness = workspace.awareness * np.array([1.0, 0.8, 0.5])[:, None, None, None]
     workspace = dataclasses.replace(workspace, passable=passable, awareness=awareness)
     return tb.iterate(
-        workspace, (2, 0), (0, 3), n_iterations=2, sampler="exact", seed=3, progress=False
-    )
+        workspace, (2, 0), (0, 3), objective="terminal", n_iterations=2, sampler="exact", seed=3,
+        progress=False,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")

@@ -284,9 +284,7 @@ def test_a_model_s_truth_is_the_mean_of_its_missions(name):
 def test_a_model_s_best_path_is_that_of_enumeration(name, objective, max_bounds):
     for seed in range(3):
         workspace = grid((3, 4), walls=[(1, 1)], n_robots=2, seed=seed)
-        known = Truth(
-            workspace, ModelContact(MODELS[name], PARAMS[name], workspace.awareness.values)
-        )
+        known = Truth(workspace, ModelContact(MODELS[name], PARAMS[name], workspace.bound_maps))
         ends = (2, 0), (0, 3)
         best = known.best(*ends, objective, max_bounds)
         paths = AdmissiblePaths(workspace, *ends, 8, max_bounds, True)

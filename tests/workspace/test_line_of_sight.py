@@ -228,6 +228,7 @@ def test_missing_awareness_of_a_mission_is_filled(wooded):
     expected = wooded.bound_awareness.sel(move="ne", feature="line_of_sight")
     np.testing.assert_array_equal(filled.awareness[0, :, 2], expected.sel(row=2, col=1))
     np.testing.assert_array_equal(filled.awareness[..., :2], mission.awareness[..., :2])
+    np.testing.assert_array_equal(wooded.along(mission.path)[..., 2], filled.awareness[..., 2])
 
 
 @pytest.mark.parametrize(

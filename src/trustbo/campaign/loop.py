@@ -24,8 +24,8 @@ from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
-from trustbo.planning import Plan, Policy
-from trustbo.simulation import KinematicSimulator, Simulator
+from trustbo.planning import Plan, Planner, Policy
+from trustbo.simulation import KinematicSimulator, Simulator, Truth
 from trustbo.simulation.protocol import takes
 from trustbo.workspace import Workspace
 
@@ -43,6 +43,7 @@ def iterate(
     objective: str = OBJECTIVE,
     sampler: str = SAMPLER,
     simulator: Simulator | None = None,
+    truth: Truth | None = None,
     stop: Stop | Sequence[Stop] | None = None,
     checkpoint: FilePath | None = None,
     seed: int = 0,
@@ -58,12 +59,13 @@ def iterate(
         n_iterations: Largest number of missions.
         model: Trust model; by default `PooledTrust()`.
         policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
-        objective: `"terminal"` (the paper's), `"mean"`, `"success"`, `"bottleneck"` or
-            `"stationary"`; see `Planner`.
+        objective: `"lost_contact"`, `"terminal"` (the paper's), `"mean"`, `"success"`,
+            `"bottleneck"` or `"stationary"`; see `Planner`.
         sampler: `"nuts"`, `"exact"` or `"joint"`; see `trustbo.models.fit`.
         simulator: Simulator with `run(path, *, seed) -> Mission`; by default
-            `KinematicSimulator(workspace)`. If it also has `regret(plan) -> float`, the truth being
-            known, that goes into the history.
+            `KinematicSimulator(workspace)`.
+        truth: Truth of the simulator, `simulation.Truth.of(simulator)`: the regret of each plan
+            goes into the history, in % of the contact that the best admissible path keeps.
         stop: Rules to end before `n_iterations`: a `RegretBound`, `Seconds`, a callable
             `stop(campaign) -> reason or None`, or several of them.
         checkpoint: Folder in which everything is kept as it goes, replacing another campaign in it.
@@ -91,7 +93,9 @@ def iterate(
         seed=seed,
         options=CampaignOptions.of(options, iterate),
     )
-    steps = missions(campaign, simulator, n_iterations=n_iterations, stop=stop, progress=progress)
+    steps = missions(
+        campaign, simulator, n_iterations=n_iterations, truth=truth, stop=stop, progress=progress
+    )
     with campaign:
         if checkpoint is not None:
             campaign.keep(checkpoint)
@@ -104,6 +108,7 @@ def resume(
     directory: FilePath,
     *,
     simulator: Simulator | None = None,
+    truth: Truth | None = None,
     n_iterations: int | None = None,
     model: TrustModel | None = None,
     policy: Policy | None = None,
@@ -118,6 +123,7 @@ def resume(
     Args:
         directory: Folder of its checkpoint.
         simulator: The same simulator, unless it was the default.
+        truth: Its truth, see `iterate`.
         n_iterations: Number of missions in all; by default as many as it was begun for.
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
@@ -138,7 +144,9 @@ def resume(
             return campaign.result()
         rules = rules_of(log.notes.get("stop", [])) if stop is None else require_stops(stop)
         before = dict(log.notes)
-        steps = missions(campaign, simulator, n_iterations=total, stop=rules, progress=progress)
+        steps = missions(
+            campaign, simulator, n_iterations=total, truth=truth, stop=rules, progress=progress
+        )
         _require_same(before, log.notes)
         reason = reason_to_stop(rules, campaign) if done and not ended else None
         if reason is not None:  # the rule's verdict came too late to be written
@@ -154,6 +162,7 @@ def missions(
     simulator: Simulator | None = None,
     *,
     n_iterations: int = 8,
+    truth: Truth | None = None,
     stop: Stop | Sequence[Stop] | None = None,
     progress: bool = False,
 ) -> Iterator[tuple[Plan, Mission]]:
@@ -163,6 +172,7 @@ def missions(
         campaign: Campaign, new or under way.
         simulator: Simulator as in `iterate`.
         n_iterations: Largest number of missions in all.
+        truth: Truth as in `iterate`.
         stop: Rules as in `iterate`.
         progress: Whether to show a progress bar.
 
@@ -178,16 +188,35 @@ def missions(
         raise TrustboError(f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}.")
     if campaign.options.replan == "bound":
         require_bounds(runner, campaign.model)
+    if truth is not None:
+        truth.require_workspace(campaign.workspace)
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     # As a file gives them back: tuples are lists there, and arrays too.
     simulated = json.loads(to_json(describe()))
     campaign.log.notes = {**simulated, "n_iterations": n_iterations, "stop": rules_to_record(rules)}
-    return _missions(campaign, runner, n_iterations, rules, progress)
+    return _missions(campaign, runner, n_iterations, truth, rules, progress)
+
+
+def path_class(planner: Planner) -> dict[str, Any]:
+    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths.
+
+    The objective is contact lost, or mean contact where that is the planner's.
+    """
+    return {
+        "objective": "mean" if planner.objective == "mean" else "lost_contact",
+        "max_bounds": planner.max_bounds,
+        "connectivity": planner.connectivity,
+    }
 
 
 def _missions(
-    campaign: Campaign, runner: Any, n_iterations: int, rules: list[Stop], progress: bool
+    campaign: Campaign,
+    runner: Any,
+    n_iterations: int,
+    truth: Truth | None,
+    rules: list[Stop],
+    progress: bool,
 ) -> Iterator[tuple[Plan, Mission]]:
     done = len(campaign.missions)
     silent = not progress or not sys.stderr.isatty()  # carriage returns are for a terminal
@@ -196,8 +225,10 @@ def _missions(
         while len(campaign.missions) < n_iterations:
             plan = campaign.ask()
             mission = _run(campaign, runner, plan)
-            oracle = getattr(runner, "regret", None)
-            extra = {"regret": float(oracle(plan))} if oracle else {}
+            extra = {}
+            if truth is not None:
+                now = truth.at(len(campaign.missions))
+                extra["regret"] = now.regret(plan, **path_class(campaign.planner))
             # Another path is the loop's own doing, and so is a simulator that repeats itself.
             campaign.tell(mission, other_path=True, again=True, **extra)
             bar.set_postfix_str(_report(campaign), refresh=False)
@@ -230,7 +261,7 @@ def _run(campaign: Campaign, runner: Any, plan: Plan) -> Mission:
 def _report(campaign: Campaign) -> str:
     """Describe the last mission in a line."""
     row = campaign.log.entries[-1].row
-    regret = f", regret {row['regret']:.3f}" if "regret" in row else ""
+    regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
     name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
     learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]
     return f"objective {row['objective']:.3f}{regret}, {learned}, {row['status']}"

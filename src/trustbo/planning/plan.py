@@ -28,7 +28,8 @@ class Plan:
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over draws of the parameters, shape (quantile, bound,
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
-        value: Value of the objective, to be maximised (see `OBJECTIVES`).
+        value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
+            the bounds' worth of contact expected to be lost, with trust capped at 1.
         success: Product over the bounds of sigma(team's trust): the probability that all succeed.
         objective: Name of the objective.
         exact: True if no admissible path is better.

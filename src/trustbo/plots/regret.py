@@ -26,7 +26,6 @@ def regret_curves(
     by: str = "policy",
     panels: str | None = None,
     variable: str = "regret",
-    relative: bool = False,
 ) -> np.ndarray:
     """Draw the regret of a study after each mission: its median and its spread over the runs.
 
@@ -38,7 +37,6 @@ def regret_curves(
         by: Coordinate of the runs with a value for each curve.
         panels: Coordinate of the runs with a value for each panel, such as `"terrain"`.
         variable: Variable to draw, `"regret"` or `"regret_followed"`.
-        relative: Whether to divide by the value of the best path.
 
     Returns:
         Axes, shape (panel,).
@@ -52,10 +50,10 @@ def regret_curves(
         require_choice(
             "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]
         )
-    regret = dataset[variable] / abs(dataset["oracle"]) if relative else dataset[variable]
+    regret = dataset[variable]
     if not np.isfinite(regret).any():
         raise TrustboError(
-            'no regret is known: only simulators of the kind "model" know the truth.'
+            'no regret is known: use simulators of the kind "model", or known_truth of others.'
         )
     names = list(dict.fromkeys(dataset[by].values.tolist()))
     values = [None] if panels is None else list(dict.fromkeys(dataset[panels].values.tolist()))
@@ -69,8 +67,7 @@ def regret_curves(
         counted = "-".join(str(n) for n in sorted({min(n_runs), max(n_runs)}))
         title = "" if value is None else f"{panels} {value}, "
         ax.set_title(f"{title}{counted} runs each", fontsize=9, loc="left")
-    what = "share of the best value" if relative else "in units of the objective"
-    axes[0].set_ylabel(f"{_MEANING[variable]},\n{what}")
+    axes[0].set_ylabel(f"{_MEANING[variable]},\n% of the contact that the best keeps")
     axes[0].set_ylim(bottom=-0.03 * axes[0].get_ylim()[1])  # shows markers at 0 whole
     # Beside the panels, so that it covers no curve.
     figure.legend(

@@ -71,7 +71,7 @@ def history_table(result: Result) -> Table:
         "path": _change,
     }
     for name, label, places in (
-        ("regret", "regret", 3), ("r_hat", "R-hat", 3), ("ess_bulk", "bulk ESS", 0),
+        ("regret", "regret (%)", 1), ("r_hat", "R-hat", 3), ("ess_bulk", "bulk ESS", 0),
         ("divergences", "divergences", 0), ("k_hat", "k-hat", 2), ("kish", "Kish size", 0),
     ):  # fmt: skip
         if name in history:

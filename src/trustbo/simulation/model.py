@@ -12,6 +12,7 @@ from trustbo.models import PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVES, along
 
 _BUCKET = 8  # bounds: missions of about the same length share compiled code
 
@@ -39,8 +40,9 @@ class ModelSimulator:
             params: True parameters, one draw of them.
             model: Trust model with these parameters; by default `PooledTrust()`. Gaussian rates are
                 clipped to [0, 1]: where many are, the data no longer follow the model.
-            awareness: True awareness, shape (robot, row, col, feature), if it differs from the
-                workspace's map; missions measure it along their path.
+            awareness: True awareness, if it differs from the workspace's, of cells (robot, row,
+                col, feature) or of bounds (robot, move, row, col, feature); missions measure it
+                along their path.
             n_ticks: Ticks of each bound, for `"beta_binomial"`.
 
         Raises:
@@ -50,9 +52,13 @@ class ModelSimulator:
         self.workspace, self.params = workspace, params
         self.model = PooledTrust() if model is None else model
         shape = workspace.awareness.shape
-        self.awareness = workspace.awareness.values if awareness is None else np.asarray(awareness)
-        if self.awareness.shape != shape:
-            raise ShapeError(f"awareness must be {shape}; got shape {self.awareness.shape}.")
+        given = workspace.bound_maps if awareness is None else np.asarray(awareness)
+        self.awareness = given[:, None] if given.ndim == 4 else given
+        if self.awareness.shape not in ((shape[0], n, *shape[1:]) for n in (1, len(MOVES[8]))):
+            raise ShapeError(
+                f"awareness must be {shape}, or with an axis of 8 moves behind the robots; got "
+                f"shape {given.shape}."
+            )
         if params.leading:
             raise ShapeError(f"give one draw of params; they have leading axes {params.leading}.")
         check_params(params, shape[0], shape[3])
@@ -63,7 +69,7 @@ class ModelSimulator:
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
         """Run a path; the same seed gives the same mission."""
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
-        z = np.swapaxes(self.awareness[:, *zip(*cells[1:], strict=True)], 0, 1)
+        z = np.swapaxes(along(self.awareness, cells), 0, 1)
         n_bounds = len(z)
         padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
         with own_settings():  # else the caller's flags decide what is drawn

@@ -20,7 +20,7 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.models import TrustModel
 from trustbo.models.params import CoupledParams, Params
-from trustbo.planning.dynamics import drift, roll, transition
+from trustbo.planning.dynamics import drift, roll_trust, transition
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.workspace.moves import MOVES, along, move_indices
 
@@ -35,15 +35,14 @@ class ModelContact:
     standard_error = 0.0
 
     def __init__(self, model: TrustModel, params: Params, awareness: np.ndarray) -> None:
-        """Take one draw of parameters, and awareness ([robot, move], row, col, feature).
+        """Take one draw of parameters, and awareness as `Workspace.bound_maps`.
 
         TrustboError: rates that measure the change of trust, which is no contact.
         """
         if model.lag:
             raise TrustboError('response="change" measures changes of trust; contact has no truth.')
         self._counts = model.family.needs_ticks
-        self._awareness = awareness if awareness.ndim == 5 else awareness[:, None]
-        self._params, n_robots = params, len(awareness)
+        self._awareness, self._params, n_robots = awareness, params, len(awareness)
         self._transition = transition(params, n_robots)
         if isinstance(params, CoupledParams):
             process, observed = np.asarray(params.Delta_w), np.diagonal(params.Delta_v)
@@ -54,9 +53,7 @@ class ModelContact:
 
     def contact(self, path: Sequence[Cell]) -> np.ndarray:
         """Expected contact rates of the bounds of a path, shape (bound, robot)."""
-        z = along(self._awareness, path)[:, None]  # (robot, 1, bound, feature)
-        start = np.full(len(z), self._params.x0_mean, float)
-        trust = roll(self._transition, drift(self._params, z)[:, 0], start)
+        trust = roll_trust(self._params, np.swapaxes(along(self._awareness, path), 0, 1))
         return self._rate(trust, self._spread(len(trust)))
 
     def failure(self, path: Sequence[Cell]) -> np.ndarray:
@@ -109,9 +106,8 @@ class ModelContact:
 
     def _drift_maps(self) -> np.ndarray:
         """Drift of the bounds into each cell, shape (robot, move or 1, cell)."""
-        n_robots, n_moves, rows, cols, n_features = self._awareness.shape
-        z = self._awareness.reshape(n_robots, n_moves * rows, cols, n_features)
-        return drift(self._params, z).reshape(n_robots, n_moves, rows * cols)
+        u = drift(self._params, self._awareness)
+        return u.reshape(*u.shape[:2], -1)
 
     def _spread(self, n_bounds: int) -> np.ndarray:
         """Standard deviation of what a rate measures, shape (bound, robot)."""

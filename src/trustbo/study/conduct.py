@@ -86,13 +86,15 @@ def load_study(directory: FilePath) -> xr.Dataset:
     Returns:
         Dataset with dims run and mission (1, 2, ...). For each mission: `value` (expected objective
         of its plan), `path` and `recommended` (row and col of each step, -1 after the goal),
-        `regret` (the value that the path recommended after it lacks to the best one, under the true
-        parameters, in units of the objective), `regret_followed` (the same for the path it
-        followed), `contact_rate` (mean), `status`, diagnostics of the posterior (see
-        `models.diagnostics`), and seconds. For each run: `oracle` (true value of the best path),
-        `seconds` and `seconds_cpu` (of its process). NaN where the truth is unknown, or where there
-        is no such mission. Coordinates of run: its key, and its label along each axis of the study.
-        Attributes: the study's number of runs, `n_runs`, and of failed ones, `n_failed`.
+        `regret` (true regret of the path recommended after it, in % of the contact that the best
+        path keeps, see `Truth.regret`), `lost` (contact that it loses, in bounds), `p_arrive` (its
+        probability to arrive), the same with `_followed` for the path it followed, `contact_rate`
+        (mean), `status`, diagnostics of the posterior (see `models.diagnostics`), and seconds. For
+        each run: `oracle` (contact lost on the best path), the three numbers with `_before` for the
+        path recommended before the first mission, `seconds` and `seconds_cpu` (of its process). NaN
+        where the truth is unknown, or where there is no such mission. Coordinates of run: its key,
+        and its label along each axis of the study. Attributes: the study's number of runs,
+        `n_runs`, and of failed ones, `n_failed`.
 
     Raises:
         TrustboError: The folder holds no study, or no run of it has ended.

@@ -137,21 +137,34 @@ class Simulating(Part):
         """Make the simulator."""
         raise NotImplementedError
 
+    def truth(self, workspace: Workspace) -> simulation.Truth | None:
+        """Find its truth; None where nobody asked for it."""
+        return simulation.Truth.of(self.simulator(workspace))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Kinematic(Simulating):
-    """Settings of `simulation.KinematicSimulator`, which needs a terrain."""
+    """Settings of `simulation.KinematicSimulator`, which needs a terrain.
+
+    By default sight is the workspace's; `known_truth` asks for true regret, see `simulation.Truth`.
+    """
 
     kind = "kinematic"
-    sight: str = "transmittance"
+    sight: str | None = None
     tick: float = 0.5
-    formation_radius: float = 8.0
     bound_timeout: float = 600.0
     bounding: str = "successive"
+    known_truth: bool = False
 
     def simulator(self, workspace: Workspace) -> simulation.Simulator:
         """Make the simulator."""
-        return simulation.KinematicSimulator(workspace, **asdict(self))
+        own = asdict(self)
+        del own["known_truth"]
+        return simulation.KinematicSimulator(workspace, **own)
+
+    def truth(self, workspace: Workspace) -> simulation.Truth | None:
+        """Find its truth; None where nobody asked for it."""
+        return super().truth(workspace) if self.known_truth else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,9 +21,7 @@ from trustbo.campaign.loop import missions
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError
-from trustbo.planning import Planner
-from trustbo.simulation import ModelSimulator, Simulator
+from trustbo.simulation import Truth
 from trustbo.study import workers
 from trustbo.study.parts import Model, Simulating
 from trustbo.study.terrains import Terrain
@@ -71,15 +69,14 @@ class Run:
         text = json.dumps(_canonical(self.identity), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:20]
 
-    def begin(self, *callbacks: Any) -> tuple[Campaign, Iterator[object], Simulator]:
-        """Set up the campaign, its missions, of which none has been run yet, and the simulator.
+    def begin(self, *callbacks: Any) -> tuple[Campaign, Iterator[object]]:
+        """Set up the campaign, and its missions, of which none has been run yet.
 
         TrustboError: impossible settings.
         """
         options = dict(self.options)
         stop = options.pop("stop", None)
         workspace = self.terrain.workspace()
-        simulator = self.simulator.simulator(workspace)
         campaign = Campaign(
             workspace,
             *self.terrain.ends,
@@ -92,8 +89,16 @@ class Run:
             **options,
         )
         rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
-        steps = missions(campaign, simulator, n_iterations=self.n_iterations, stop=rule)
-        return campaign, steps, simulator
+        simulator = self.simulator.simulator(workspace)
+        return campaign, missions(campaign, simulator, n_iterations=self.n_iterations, stop=rule)
+
+    def truth(self) -> Truth | None:
+        """Truth of the simulator, where it is known."""
+        return self.simulator.truth(self.terrain.workspace())
+
+    def recommend(self, campaign: Campaign) -> tuple[Cell, ...]:
+        """Path that is recommended now."""
+        return campaign.recommend().path
 
     def __str__(self) -> str:
         return ", ".join(f"{name}={value}" for name, value in self.labels.items())
@@ -101,23 +106,37 @@ class Run:
 
 @dataclass
 class _Referee:
-    """Compares each mission with the best path, where the truth is known."""
+    """Compares the path recommended after each mission, and its own, with the best one."""
 
-    simulator: object = None
+    run: Run
+    truth: Truth | None
     rows: list[dict[str, Any]] = field(default_factory=list)
-    oracle: float = math.nan
 
     def __call__(self, campaign: Campaign, mission: Mission) -> None:
-        recommended = campaign.recommend().path
-        row: dict[str, Any] = {"recommended": [list(cell) for cell in recommended]}
-        truth = self.simulator
-        if isinstance(truth, ModelSimulator):
-            planner = campaign.planner.with_awareness(truth.awareness)
-            if math.isnan(self.oracle):
-                self.oracle = planner.plan(truth.params).value
-            row["regret"] = self.oracle - _value(planner, recommended, truth)
-            row["regret_followed"] = self.oracle - _value(planner, mission.path, truth)
-        self.rows.append(row)
+        followed = self.judge(campaign, mission.path)
+        row = self.recommended(campaign)
+        self.rows.append(row | {f"{name}_followed": value for name, value in followed.items()})
+
+    def recommended(self, campaign: Campaign) -> dict[str, Any]:
+        """Path that is recommended now, and how good it is."""
+        path = self.run.recommend(campaign)
+        return {"recommended": [list(cell) for cell in path], **self.judge(campaign, path)}
+
+    def judge(self, campaign: Campaign, path: tuple[Cell, ...]) -> dict[str, float]:
+        """Regret in % and contact lost in bounds; NaN if it does not lead from start to goal."""
+        ends = campaign.planner.start, campaign.planner.goal
+        if self.truth is None or (path[0], path[-1]) != ends:
+            return {"regret": math.nan, "lost": math.nan, "p_arrive": math.nan}
+        value = self.truth.value(path)
+        regret = self.truth.regret(path, **self.run.terrain.judged_by(campaign.planner))
+        return {"regret": regret, "lost": value.lost, "p_arrive": value.p_arrive}
+
+    def oracle(self, campaign: Campaign) -> float:
+        """Contact lost on the best path, in bounds; NaN where the truth is not known."""
+        if self.truth is None:
+            return math.nan
+        judged_by = self.run.terrain.judged_by(campaign.planner)
+        return self.truth.value(self.truth.best(*self.run.terrain.ends, **judged_by)).lost
 
 
 def execute(run: Run, caller: tuple[str, int]) -> dict[str, Any]:
@@ -147,14 +166,16 @@ def execute(run: Run, caller: tuple[str, int]) -> dict[str, Any]:
 
 
 def _missions(run: Run) -> dict[str, Any]:
-    referee = _Referee()
-    campaign, steps, referee.simulator = run.begin(referee)
+    referee = _Referee(run, run.truth())
+    campaign, steps = run.begin(referee)
+    before = referee.recommended(campaign)
     for _ in steps:
         pass
     result = campaign.result()
     return {
         "missions": _rows(result, referee.rows),
-        "oracle": referee.oracle,
+        "oracle": referee.oracle(campaign),
+        **{f"{name}_before": before[name] for name in ("regret", "lost", "p_arrive")},
         "stop_reason": result.stop_reason,
     }
 
@@ -170,14 +191,6 @@ def _rows(result: Result, refereed: list[dict[str, Any]]) -> list[dict[str, Any]
         row["value"] = row.pop("objective")
         rows.append(row | refereed[i])
     return rows
-
-
-def _value(planner: Planner, path: tuple[Cell, ...], truth: ModelSimulator) -> float:
-    """Value of a path under the truth; NaN if it does not lead from start to goal."""
-    try:
-        return planner.evaluate(path, truth.params).value
-    except TrustboError:
-        return math.nan
 
 
 def _canonical(value: Any) -> Any:

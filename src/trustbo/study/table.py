@@ -11,6 +11,8 @@ from trustbo.errors import require_choice
 
 _TEXT = ("status", "state", "reason")
 _PATHS = ("path", "recommended")
+BEFORE = ("regret_before", "lost_before", "p_arrive_before")
+"""Variables of the path recommended before the first mission."""
 _NOT_AXES = ("key", "seed")
 
 
@@ -41,10 +43,8 @@ def to_dataset(
             for i, j, row in cells:
                 numbers[i, j] = np.nan if row.get(name) is None else row[name]
             variables[name] = (dims, numbers)
-    for name in ("regret", "regret_followed"):
-        variables.setdefault(name, (dims, np.full(shape, np.nan)))
-    for name in ("oracle", "seconds", "seconds_cpu"):
-        values = [np.nan if run[name] is None else run[name] for run in runs]
+    for name in ("oracle", *BEFORE, "seconds", "seconds_cpu"):
+        values = [np.nan if run.get(name) is None else run[name] for run in runs]
         variables[name] = ("run", np.array(values, dtype=float))
     coords: dict[str, Any] = {"mission": np.arange(1, shape[1] + 1), "axis": ["row", "col"]}
     coords["key"] = ("run", list(records))

@@ -9,8 +9,10 @@ from typing import Any, cast
 import numpy as np
 
 from trustbo import terrain
+from trustbo.campaign.loop import path_class
 from trustbo.data import Cell, Team
 from trustbo.errors import TrustboError, require_pair, require_whole
+from trustbo.planning import Planner
 from trustbo.study.parts import Part
 from trustbo.workspace import Workspace
 
@@ -52,6 +54,10 @@ class Terrain(Part):
     def make(self) -> Workspace:
         """Make the workspace anew."""
         raise NotImplementedError
+
+    def judged_by(self, planner: Planner) -> dict[str, Any]:
+        """Paths that regret is held against, see `path_class`."""
+        return path_class(planner)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from trustbo.terrain.pixel_feature import PixelFeature
 from trustbo.workspace.awareness import FeatureSpec, cell_maps, feature_specs
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
+    is_line_of_sight,
     of_bounds,
     require_sight,
     sight_features,
@@ -309,6 +310,26 @@ class Workspace:
         moves_along([a, c])
         return a, c
 
+    def along(self, path: Sequence[Cell]) -> np.ndarray:
+        """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
+
+        Raises:
+            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
+        """
+        cells = [self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
+        return np.swapaxes(along(self.bound_maps, cells), 0, 1)
+
+    def in_order(self, mission: Mission) -> Mission:
+        """Return a mission with its robots and features in the order of the workspace's.
+
+        A mission need not have a line of sight, which is predicted, not measured: it is NaN then.
+
+        Raises:
+            ShapeError: It has other robots or features.
+        """
+        predicted = [name for name in self.features if is_line_of_sight(name)]
+        return mission.in_order(self.team.names, self.features, predicted)
+
     def fill(self, mission: Mission) -> Mission:
         """Fill awareness that a mission did not measure (NaN) with that of its bounds.
 
@@ -317,10 +338,7 @@ class Workspace:
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
         """
-        for k, cell in enumerate(mission.path):
-            self.require_cell(f"path[{k}]", cell)
-        own = mission.in_order(self.team.names, self.features)
-        return fill_awareness(own, along(self.bound_maps, own.path))
+        return fill_awareness(self.in_order(mission), np.swapaxes(self.along(mission.path), 0, 1))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""

@@ -1,0 +1,109 @@
+"""Line of sight of bounds: beside whole simulated bounds without noise, and its time.
+
+For each terrain and sight mode: correlation, bias and rmse of `line_of_sight` with the share of
+contact of 200 bounds, simulated with the chances of detection instead of detections, mean over four
+next cells; and R2 of the team's contact. Then seconds for all bounds of a terrain of 500 x 500
+pixels, beside `from_terrain(bounds=False)` in the same run.
+
+    python benchmarks/line_of_sight.py [mode ...]
+"""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from trustbo import Team, Workspace
+from trustbo.simulation import KinematicSimulator
+from trustbo.simulation.sensing import detections
+from trustbo.terrain import read_terrain, synthetic_terrain
+from trustbo.workspace.moves import MOVES, existing_bounds
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+N_BOUNDS, N_NEXT = 200, 4
+
+
+def terrains() -> Iterator[tuple[str, xr.Dataset]]:
+    """Made terrains, and real ones where they are."""
+    for seed in range(3):
+        yield f"synthetic {seed}", synthetic_terrain((500.0, 500.0), seed=seed)
+    for name in ("wellington", "tahoe", "bcts", "topography"):
+        files = [DATA / name / f"{kind}.tif" for kind in ("dem", "dsm")]
+        if not files[0].is_file():
+            print(f"{name:12s} skipped: there is no {files[0]}")
+            continue
+        terrain = read_terrain(*files)
+        if name == "bcts":  # the fullest 250 m of a strip
+            rows = round(250.0 / abs(float(terrain["y"][1] - terrain["y"][0])))
+            known = np.isfinite(terrain["dem"].values).sum(1)
+            first = int(np.argmax(np.convolve(known, np.ones(rows), "valid")))
+            terrain = terrain.isel(y=slice(first, first + rows))
+        yield name, terrain
+
+
+def compared(workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
+    """Line of sight and simulated contact of some bounds, each (bound, robot)."""
+    rng, simulator = np.random.default_rng(0), KinematicSimulator(workspace)
+    passable = workspace.passable.values
+    index = np.argwhere(existing_bounds(passable))
+    expected, simulated = [], []
+    for m, row, col in index[rng.permutation(len(index))[:N_BOUNDS]].tolist():
+        a, c = (row - MOVES[8][m][0], col - MOVES[8][m][1]), (row, col)
+        near = [(row + i, col + j) for i, j in MOVES[8]]
+        ahead = [
+            n
+            for n in near
+            if n != a and 0 <= n[0] < len(passable) and 0 <= n[1] < passable.shape[1]
+            and passable[n]
+        ]  # fmt: skip
+        drives = []
+        for k in rng.permutation(len(ahead))[:N_NEXT]:
+            state = simulator._start(a, 0, c)
+            drives.append(simulator._drive(state, 1, c, ahead[k], np.random.default_rng(0)))
+        drives = [drive for drive in drives if drive.status == "ok"]
+        if drives:
+            found = detections(simulator._now, simulator.sight, simulator.team, drives)
+            simulated.append(np.mean([f.mean(0) for f in found], axis=0))
+            expected.append(workspace.bound_awareness.values[:, m, row, col, -1])
+    return np.array(expected), np.array(simulated)
+
+
+def seconds(make: Callable[[], object], n: int = 3) -> float:
+    """Median of some runs, after one to compile."""
+    make()
+    times = []
+    for _ in range(n):
+        started = time.perf_counter()
+        make()
+        times.append(time.perf_counter() - started)
+    return float(np.median(times))
+
+
+def main() -> None:
+    """Print both tables."""
+    print("terrain       sight            r      bias    rmse   R2 of the team's contact")
+    for name, terrain in terrains():
+        for mode in sys.argv[1:] or ["transmittance", "wall", "bare"]:
+            workspace = Workspace.from_terrain(terrain, (10, 10), sight=mode)
+            los, rate = compared(workspace)
+            r = np.corrcoef(los.ravel(), rate.ravel())[0, 1]
+            team = np.corrcoef(los.mean(1), rate.mean(1))[0, 1] ** 2
+            off = los - rate
+            print(
+                f"{name:13s} {mode:14s} {r:6.3f}  {off.mean():+.3f}   "
+                f"{np.sqrt((off**2).mean()):.3f}   {team:.3f}"
+            )
+    terrain, team = synthetic_terrain((500.0, 500.0), seed=0), Team(n_robots=4)
+    for shape in ((10, 10), (50, 50)):
+        plain = seconds(lambda s=shape: Workspace.from_terrain(terrain, s, team, bounds=False))
+        whole = seconds(lambda s=shape: Workspace.from_terrain(terrain, s, team))
+        print(
+            f"{shape[0]} x {shape[1]} cells, 4 robots: {whole:.2f} s, {plain:.2f} s without bounds"
+        )
+
+
+if __name__ == "__main__":
+    main()
