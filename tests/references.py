@@ -2,8 +2,10 @@
 
 import itertools
 import math
+import struct
 
 import numpy as np
+import shapely
 from scipy.stats import norm
 
 
@@ -262,3 +264,11 @@ def pooled_posterior(missions, n_points=(60, 30), reach=0.12, floor=0.0, power=1
     weight /= weight.sum()
     marginals = [weight.sum(axes) for axes in ((1, 2), (0, 2), (0, 1))]
     return list(zip((beta0, deltas, floor + deltas), marginals, strict=True)), (mean, sd, weight)
+
+
+def geometry_of_blob(blob):
+    """A GeoPackage's geometry: a header, by whose flags an envelope follows, then WKB."""
+    magic, version, flags, srs = struct.unpack("<2sBBi", blob[:8])
+    assert (magic, version, flags & 1) == (b"GP", 0, 1)
+    doubles = {0: 0, 1: 4, 2: 6, 3: 6, 4: 8}[flags >> 1 & 7]
+    return srs, shapely.from_wkb(blob[8 + 8 * doubles :])

@@ -27,3 +27,13 @@ class ModelSimulator:
             z = np.full_like(z, np.nan)
         rates = np.clip(sample.contact_rate[0], 0.0, 1.0)
         return Mission.from_arrays(path, z, rates, duration=np.full(len(z), 30.0), status=status)
+
+
+class Steady:
+    """Random numbers of a world without chance: no slip, and every look finds what it may."""
+
+    def standard_normal(self, size):
+        return np.zeros(size)
+
+    def random(self, size):
+        return np.full(size, 0.5)

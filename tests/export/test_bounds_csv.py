@@ -24,7 +24,7 @@ def test_there_is_a_row_per_mission_bound_and_robot(result, tmp_path):
         assert (row["status"], row["mission_status"]) == (bound.status, mission.status)
         for name in ("contact_rate", "duration", "n_ticks"):
             assert float(row[name]) == getattr(bound, name)[i]
-        z = [float(row[name]) for name in ("traversability", "visibility")]
+        z = [float(row[name]) for name in ("traversability", "visibility", "line_of_sight")]
         np.testing.assert_array_equal(z, bound.awareness[i])
         place = {"mission": int(row["mission"]), "bound": int(row["bound"]), "robot": row["robot"]}
         for name in ("trust_mean", "trust_sd"):

@@ -19,7 +19,7 @@ FILES = {
     "geojson": ["path.geojson"],
     "gpx": ["path.gpx"],
     "geopackage": ["path.gpkg"],
-    "csv": ["bounds.csv", "path.csv"],
+    "csv": ["bounds.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm"],
     "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],
@@ -132,8 +132,8 @@ def test_what_is_in_the_way_is_named_before_anything_is_written(result, tmp_path
 def test_names_that_a_format_cannot_hold_are_refused_before_anything_is_written(result, tmp_path):
     workspace = result.workspace
     team = tb.Team(3, names=("R1", "r1", "r2"))
-    awareness = workspace.awareness.assign_coords(robot=list(team.names), feature=["a/b", "x"])
-    odd = dataclasses.replace(workspace, team=team, awareness=awareness)
+    awareness = workspace.awareness.assign_coords(robot=list(team.names), feature=["a/b", "x", "y"])
+    odd = dataclasses.replace(workspace, team=team, awareness=awareness, of_bounds=None)
     odd = dataclasses.replace(result, workspace=odd)
     with pytest.raises(TrustboError, match=r"does not tell capitals .* \('R1', 'r1', 'r2'\)"):
         export_result(odd, tmp_path, ["geojson", "geopackage"])

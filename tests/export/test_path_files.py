@@ -3,14 +3,13 @@
 import csv
 import json
 import sqlite3
-import struct
 from dataclasses import replace
 
 import gpxpy
 import numpy as np
 import pytest
-import shapely
 from pyproj import Transformer
+from references import geometry_of_blob
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
@@ -66,7 +65,10 @@ def test_geojson_is_in_degrees_on_the_right_place(result, centers, tmp_path):
     write_path(tmp_path / "path.geojson", result)
     collection = json.loads((tmp_path / "path.geojson").read_text())
     assert set(collection) == {"type", "features"}  # RFC 7946 knows no "crs"
-    line, *points = collection["features"]
+    of_layer = {"path": [], "bounds": [], "posts": [], "ways": []}
+    for feature in collection["features"]:
+        of_layer[feature["properties"].pop("layer")].append(feature)
+    (line,), points = of_layer["path"], of_layer["bounds"]
     assert line["geometry"]["type"] == "LineString"
     assert {point["geometry"]["type"] for point in points} == {"Point"}
     positions = line["geometry"]["coordinates"]
@@ -91,7 +93,8 @@ def test_gpx_is_a_route_over_the_ground(result, centers, tmp_path):
     write_path(tmp_path / "path.gpx", result.plan, result.workspace)
     gpx = gpxpy.parse((tmp_path / "path.gpx").read_text(), version="1.1")
     assert gpx.version == "1.1"
-    (route,), n = gpx.routes, len(centers)
+    assert [route.name for route in gpx.routes[1:]] == ["lead", *ROBOTS]
+    route, n = gpx.routes[0], len(centers)
     assert route.name == "most trustworthy path"
     between = [f"bound {k}" for k in range(1, n - 1)]
     assert between
@@ -112,20 +115,12 @@ def test_gpx_says_no_elevation_where_the_ground_is_not_known(result, nowhere, tm
     lost = result.workspace.terrain.copy()
     lost["dem"] = lost["dem"].where(lost["x"] > 380030.0)  # the first column of cells
     write_path(tmp_path / "path.gpx", result.plan, replace(result.workspace, terrain=lost))
-    (route,) = gpxpy.parse((tmp_path / "path.gpx").read_text()).routes
+    route, *_ = gpxpy.parse((tmp_path / "path.gpx").read_text()).routes
     known = [point.elevation is not None for point in route.points]
     assert known == [col > 0 for _, col in result.path]
     placed = replace(nowhere.workspace, grid=result.workspace.grid)
     write_path(tmp_path / "path.gpx", result.plan, placed)
     assert "<ele>" not in (tmp_path / "path.gpx").read_text()
-
-
-def geometry(blob):
-    """A GeoPackage's geometry: a header, by whose flags an envelope follows, then WKB."""
-    magic, version, flags, srs = struct.unpack("<2sBBi", blob[:8])
-    assert (magic, version, flags & 1) == (b"GP", 0, 1)
-    doubles = {0: 0, 1: 4, 2: 6, 3: 6, 4: 8}[flags >> 1 & 7]
-    return srs, shapely.from_wkb(blob[8 + 8 * doubles :])
 
 
 def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, centers, tmp_path):
@@ -134,11 +129,12 @@ def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, cent
     base = sqlite3.connect(tmp_path / "path.gpkg")
     base.row_factory = sqlite3.Row
     layers = base.execute("SELECT table_name, data_type FROM gpkg_contents").fetchall()
-    assert {tuple(layer) for layer in layers} == {("path", "features"), ("bounds", "features")}
+    names = {"path", "bounds", "posts", "ways"}
+    assert {tuple(layer) for layer in layers} == {(name, "features") for name in names}
     kinds = base.execute("SELECT table_name, geometry_type_name FROM gpkg_geometry_columns")
-    assert {tuple(k) for k in kinds} == {("path", "LINESTRING"), ("bounds", "POINT")}
+    assert {("path", "LINESTRING"), ("bounds", "POINT")} <= {tuple(k) for k in kinds}
     (line,) = base.execute("SELECT * FROM path").fetchall()
-    srs, way = geometry(line["geom"])
+    srs, way = geometry_of_blob(line["geom"])
     place = base.execute(
         "SELECT organization_coordsys_id AS code FROM gpkg_spatial_ref_sys WHERE srs_id = ?", [srs]
     ).fetchone()
@@ -149,7 +145,7 @@ def test_a_geopackage_has_a_layer_of_the_line_and_one_of_the_bounds(result, cent
     points = base.execute("SELECT * FROM bounds ORDER BY bound").fetchall()
     base.close()
     for k, (point, center, cell) in enumerate(zip(points, centers, result.path, strict=True)):
-        np.testing.assert_array_equal(geometry(point["geom"])[1].coords, [center])
+        np.testing.assert_array_equal(geometry_of_blob(point["geom"])[1].coords, [center])
         assert (point["bound"], point["row"], point["col"]) == (k, *cell)
         for robot in ROBOTS:
             found = [point[f"trust_{robot}{end}"] for end in ("", "_low", "_high")]
@@ -175,6 +171,7 @@ def test_a_table_has_degrees_where_there_are_any(result, nowhere, centers, tmp_p
             else:
                 assert found == ["", "", ""]
     assert tables["bare"] == tables["path"]
+    assert not (tmp_path / "bare_posts.csv").exists()
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, tmp_path):
@@ -186,8 +183,6 @@ def test_what_cannot_be_written_is_refused_before_anything_is(result, nowhere, t
     for name in ("path.geojson", "path.gpx", "path.gpkg"):
         with pytest.raises(TrustboError, match=r"has a CRS; use Workspace\.from_t"):
             write_path(tmp_path / name, nowhere)
-    with pytest.raises(TrustboError, match="a plan has no workspace; give the workspace"):
-        write_path(tmp_path / "path.csv", plan)
     alone = tb.Workspace.from_awareness(np.full((1, 3, 4, 2), 0.5))
     with pytest.raises(ShapeError, match=r"the plan has 3 robots, the workspace \('r1',\)"):
         write_path(tmp_path / "path.csv", plan, alone)
@@ -206,4 +201,4 @@ def test_a_file_is_replaced_whole(result, tmp_path):
         file.write_text("an older file " * 100_000)
         write_path(file, result)
         assert b"an older file" not in file.read_bytes()
-    assert len(list(tmp_path.iterdir())) == 4
+    assert len(list(tmp_path.iterdir())) == 6  # with tables of posts and of ways

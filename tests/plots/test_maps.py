@@ -59,8 +59,11 @@ def test_a_map_s_top_row_is_north(result):
 
 def test_terrain_maps_show_surface_traversability_and_visibility(result):
     axes = tb.plots.terrain_maps(result.workspace)
-    assert [ax.get_title() for ax in axes] == ["surface (DSM)", "traversability", "visibility"]
+    names = ["traversability", "visibility", "line_of_sight"]
+    assert [ax.get_title() for ax in axes] == ["surface (DSM)", *names]
     np.testing.assert_allclose(axes[2].images[0].get_array(), result.workspace.pixels["visibility"])
+    seen = result.workspace.awareness.sel(feature="line_of_sight").mean("robot")
+    np.testing.assert_allclose(axes[3].images[0].get_array(), seen)
     bare = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
     with pytest.raises(tb.TrustboError, match=r"Workspace\.from_terrain"):
         tb.plots.terrain_maps(bare)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulators import Steady
 
 from trustbo.data import Robot, Team
 from trustbo.errors import TerrainError, TrustboError
@@ -171,16 +172,6 @@ def test_what_is_planned_is_what_is_driven(wooded, slip, tolerance, monkeypatch)
             track = bound.poses[:, i, :2]
             gap = np.linalg.norm(track[:, None] - fine, axis=-1).min(1)
             assert gap.max() <= tolerance
-
-
-class Steady:
-    """Random numbers of a world without chance: no slip, and every look finds what it may."""
-
-    def standard_normal(self, size):
-        return np.zeros(size)
-
-    def random(self, size):
-        return np.full(size, 0.5)
 
 
 def test_robots_differ():

@@ -45,7 +45,7 @@ def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
         columns[f"trust_{robot}"] = np.insert(plan.trust[:, i], 0, np.nan)
         for end, q in _BAND.items():
             columns[f"trust_{robot}_{end}"] = np.insert(plan.bands[q, :, i], 0, np.nan)
-    return _frame(plan, pd.DataFrame(columns), shapely.points(x, y))
+    return _frame(plan, columns, x, y)
 
 
 def posts_layer(plan: Plan) -> gpd.GeoDataFrame:
@@ -60,8 +60,8 @@ def posts_layer(plan: Plan) -> gpd.GeoDataFrame:
     }  # fmt: skip
     columns = {name: np.repeat(values, n_robots) for name, values in of_bound.items()}
     columns |= {"robot": np.tile(plan.workspace.team.names, n_bounds), "x": x, "y": y}
-    order = ["bound", "robot", "row", "col", "x", "y", "lead_x", "lead_y"]
-    return _frame(plan, pd.DataFrame(columns)[order], shapely.points(x, y))
+    order = ("bound", "robot", "row", "col", "x", "y", "lead_x", "lead_y")
+    return _frame(plan, {name: columns[name] for name in order}, x, y)
 
 
 def ways_layer(plan: Plan) -> gpd.GeoDataFrame:
@@ -74,8 +74,9 @@ def ways_layer(plan: Plan) -> gpd.GeoDataFrame:
         if way is not None
     ]
     bound, robot, lines = zip(*rows, strict=True) if rows else ((), (), ())
-    columns = {"bound": bound, "robot": robot, "length_m": shapely.length(np.array(lines))}
-    return _frame(plan, pd.DataFrame(columns), np.array(lines, dtype=object))
+    lengths = [line.length for line in lines]
+    table = pd.DataFrame({"bound": bound, "robot": robot, "length_m": lengths})
+    return gpd.GeoDataFrame(table, geometry=list(lines), crs=_crs(plan))
 
 
 def way_points(plan: Plan) -> pd.DataFrame:
@@ -109,6 +110,11 @@ def _required[T](plan: Plan, values: T | None) -> T:
     return values
 
 
-def _frame(plan: Plan, table: pd.DataFrame, geometry: np.ndarray) -> gpd.GeoDataFrame:
+def _frame(plan: Plan, columns: dict, x: np.ndarray, y: np.ndarray) -> gpd.GeoDataFrame:
+    points = gpd.points_from_xy(x, y)
+    return gpd.GeoDataFrame(pd.DataFrame(columns), geometry=points, crs=_crs(plan))
+
+
+def _crs(plan: Plan) -> str | None:
     crs = find_crs(plan.workspace)
-    return gpd.GeoDataFrame(table, geometry=geometry, crs=None if crs is None else crs.to_wkt())
+    return None if crs is None else crs.to_wkt()

@@ -183,9 +183,9 @@ def _write_csv(file: Path, plan: Plan) -> None:
     for own, table in tables.items():
         if (crs := find_crs(plan.workspace)) is not None:
             place = gpd.points_from_xy(table["x"], table["y"], crs=crs.to_wkt()).to_crs(_WGS84)
-            after = table.columns.get_loc("y")
-            table.insert(after + 1, "longitude", place.x)
-            table.insert(after + 2, "latitude", place.y)
+            after = 1 + list(table.columns).index("y")
+            table.insert(after, "longitude", place.x)
+            table.insert(after + 1, "latitude", place.y)
         write_text(own, table.to_csv(index=False, lineterminator="\n"))
 
 

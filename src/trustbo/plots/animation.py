@@ -16,8 +16,8 @@ from scipy.ndimage import uniform_filter1d
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.files import FilePath, write_file
-from trustbo.plots.layout import as_text, extent_of, grid_lines, plain
-from trustbo.plots.maps import draw_hillshade, draw_path, draw_scale, draw_scale_of
+from trustbo.plots.layout import as_text, extent_of, plain
+from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
 from trustbo.workspace import Workspace
 
 SEEN, UNSEEN = "#009e73", "#d55e00"
@@ -27,7 +27,6 @@ _SECONDS = 12.0  # default length of an animation
 _EVEN = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]
 """Even numbers of pixels, and a pixel format that every player supports."""
 _STEADY = 21  # number of ticks over which the position of the camera is averaged
-_GROWN = 0.5  # least height of vegetation above the ground, m
 _DASHED, _DOTTED = (0, (3, 2)), (0, (1, 2))
 _MARKERS = "osDv^Pp8hH"
 
@@ -205,7 +204,7 @@ class _Team:
             Line2D([], [], color=SEEN, label="in contact"),
             Line2D([], [], color=UNSEEN, linestyle=_DASHED, label="no contact"),
             Line2D([], [], color="0.3", linestyle=_DOTTED, linewidth=1.0, label="planned path"),
-            Patch(facecolor="0.78", label="vegetation"),
+            Patch(facecolor=VEGETATION, label="vegetation"),
         ]
         ax.legend(handles=[*own, *lines], loc="upper left", fontsize=7, framealpha=0.85)
 
@@ -230,15 +229,8 @@ def _window(film: Film, workspace: Workspace) -> tuple[np.ndarray, float]:
 
 
 def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
-    left, right, bottom, top = extent = extent_of(workspace.grid)
-    terrain = workspace.terrain
-    if terrain is None or workspace.pixels is None:
-        ax.set_facecolor("0.92")
-        grid_lines(ax, workspace.grid)
-    else:
-        grown = (terrain["dsm"] - terrain["dem"]).values > _GROWN
-        ax.imshow(grown, cmap="Greys", vmin=0.0, vmax=3.0, extent=extent, interpolation="nearest")
-        draw_hillshade(ax, workspace, "dsm", exaggerate=3.0)
+    left, right, bottom, top = extent_of(workspace.grid)
+    draw_ground(ax, workspace)
     cells = np.array([workspace.grid.center(cell) for cell in mission.path])
     ax.plot(*(cells - workspace.grid.corner).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])

@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from trustbo.data import Cell
-from trustbo.plots.layout import as_text, colour_bar, extent_of, label_maps, map_panels, tallness
+from trustbo.plots.layout import (
+    as_text,
+    colour_bar,
+    extent_of,
+    grid_lines,
+    label_maps,
+    map_panels,
+    tallness,
+)
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Grid, Workspace
 
@@ -22,6 +30,8 @@ SHADOW = 0.55
 """Opacity of the darkest shadow of the hillshade."""
 CLOSED = "0.75"
 """Grey of impassable cells and pixels."""
+VEGETATION = "0.78"
+_GROWN = 0.5  # least height of vegetation above the ground, m
 
 
 def trust_maps(
@@ -180,6 +190,22 @@ def draw_hillshade(
     ax.imshow(shadow, extent=extent_of(workspace.grid), interpolation="bilinear")
 
 
+def draw_ground(ax: Axes, workspace: Workspace, heights: str = "dsm") -> None:
+    """Draw vegetation in grey under the hillshade, or the grid without a terrain.
+
+    The hillshade is that of the surface, `"dsm"`, or of the ground, `"dem"`.
+    """
+    terrain, grid = workspace.terrain, workspace.grid
+    if terrain is None or workspace.pixels is None:
+        ax.set_facecolor("0.92")
+        grid_lines(ax, grid)
+        return
+    grown = (terrain["dsm"] - terrain["dem"]).values > _GROWN
+    extent = extent_of(grid)
+    ax.imshow(grown, cmap="Greys", vmin=0.0, vmax=3.0, extent=extent, interpolation="nearest")
+    draw_hillshade(ax, workspace, heights, exaggerate=3.0)
+
+
 def draw_scale(ax: Axes, grid: Grid) -> None:
     """Draw a bar of a round number of metres in the lower right corner of a map."""
     draw_scale_of(ax, grid.shape[1] * grid.cell_width)
@@ -191,10 +217,10 @@ def draw_scale_of(ax: Axes, width: float) -> None:
     length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
     x, y = 0.96 - length / width, 0.045  # of the axes
     (bar,) = ax.plot([x, x + length / width], [y, y], color="black", transform=ax.transAxes)
-    bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=_outlined(4.0))
+    bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=outlined(4.0))
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     text = ax.text(x, y + 0.02, label, fontsize=7, transform=ax.transAxes)
-    text.set_path_effects(_outlined(2.5))
+    text.set_path_effects(outlined(2.5))
 
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
@@ -202,12 +228,13 @@ def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     centers = np.array([grid.center(cell) for cell in path]) - grid.corner
     x, y = centers[:, 0], centers[:, 1]
     (line,) = ax.plot(x, y, color="white", linewidth=1.6, solid_joinstyle="round")
-    line.set_path_effects(_outlined(3.2, "black"))
+    line.set_path_effects(outlined(3.2, "black"))
     ax.plot(x[0], y[0], "wo", markeredgecolor="black", markersize=6)
     ax.plot(x[-1], y[-1], "w*", markeredgecolor="black", markersize=11)
 
 
-def _outlined(width: float, colour: str = "white") -> list[patheffects.AbstractPathEffect]:
+def outlined(width: float, colour: str = "white") -> list[patheffects.AbstractPathEffect]:
+    """Return the effect of an outline, `width` points with the line."""
     return [patheffects.withStroke(linewidth=width, foreground=colour)]
 
 

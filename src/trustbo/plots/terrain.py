@@ -29,6 +29,9 @@ AGREES, OPPOSES = "#0072b2", "#d55e00"
 def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.ndarray:
     """Draw the surface and the index of each feature, Fig. 4 of the paper.
 
+    A feature of bounds, such as line of sight, is the mean over robots and over the bounds into a
+    cell.
+
     Args:
         workspace: Workspace made from a terrain in memory.
         n_columns: Panels per row; by default all in one.
@@ -57,10 +60,10 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
     surface.imshow(dsm, cmap="cividis", norm=heights, extent=extent)
     surface.set_title("surface (DSM)", fontsize=9)
     colour_bar(figure, ScalarMappable(heights, "cividis"), surface, "height (m)")
+    of_cells = workspace.awareness.mean("robot")
     for ax, name in zip(indices, names, strict=True):
-        of_cells = workspace.awareness.sel(feature=name).mean("robot")
-        values = pixels[name] if name in pixels else of_cells  # line of sight is that of bounds
-        ax.imshow(values.values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
+        index = pixels[name] if name in pixels else of_cells.sel(feature=name)
+        ax.imshow(index.values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
         ax.set_title(as_text(name), fontsize=9)
     steep = np.isfinite(dsm) & ~pixels["passable"].values
     closed = np.where(steep, 1.0, np.nan)

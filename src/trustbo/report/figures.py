@@ -48,6 +48,20 @@ def trust_maps(result: Result) -> Picture:
     )
 
 
+def orders(result: Result) -> Picture:
+    """Draw what robots are to do along the recommended path."""
+    names = joined(result.workspace.team.names)
+    return picture(
+        lambda n_columns: plots.plan_map(result.plan, n_columns=n_columns),
+        f"A map of the path and one of each of its {counted(len(result.path) - 1, 'bound')}: stops "
+        f"and way of the lead, posts of {names}, their sight lines and ways.",
+        "In each bound, the lead drives between its stops (stars) while the others watch it from "
+        "their posts; then they close up on the dashed ways to their next posts (hollow).",
+        phone_columns=2,
+        shrink=True,
+    )
+
+
 def path_posterior(result: Result) -> Picture:
     """Draw the probability of each cell to be on the best path."""
     share = result.planner.path_posterior(result.posterior)

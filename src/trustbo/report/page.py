@@ -48,7 +48,9 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
 def _sections(result: Result) -> Iterator[Section]:
     """Yield the sections of the page, the most important first."""
     yield Section("maps", "Trust maps", "", [figures.trust_maps(result)])
-    yield Section("path", "The recommended path", "", [tables.bounds_table(result)])
+    on_terrain = result.workspace.ground is not None
+    orders = [figures.orders(result)] if on_terrain else []
+    yield Section("path", "The recommended path", "", [tables.bounds_table(result), *orders])
     yield Section(
         "certainty",
         "Certainty of the path",
@@ -57,7 +59,7 @@ def _sections(result: Result) -> Iterator[Section]:
         [figures.path_posterior(result)],
     )
     yield Section("cost", "Cost per robot", "", [figures.robot_costs(result)])
-    if result.workspace.terrain is not None and result.workspace.pixels is not None:
+    if on_terrain:
         yield Section("terrain", "Terrain", "", [figures.terrain(result)])
     yield Section(
         "learned",

@@ -1,0 +1,118 @@
+"""A plan on its terrain, bound by bound: stops of the lead, posts of T2, sight lines and ways."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from trustbo.errors import TrustboError
+from trustbo.planning import Plan
+from trustbo.plots.layout import MARKERS, as_text, extent_of, small_multiples
+from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
+"""Colours of Okabe and Ito (2008), by robot; in grey, markers tell robots apart."""
+_DASHED = (0, (3, 1.5))
+
+
+def plan_map(
+    plan: Plan, *, bounds: Sequence[int] | None = None, n_columns: int | None = None
+) -> np.ndarray:
+    """Draw what robots are to do, an overview of the path, then each bound.
+
+    Of a bound, the lead's way between its stops, T2's posts with their sight lines to where the
+    lead stops, and the ways on which T2 then closes up to its next posts (hollow). Vegetation is
+    grey; each panel has its own scale.
+
+    Args:
+        plan: Plan on a terrain in memory, such as `Result.plan`.
+        bounds: Numbers of the bounds to draw, from 1; by default all.
+        n_columns: Panels per row; by default three, or two if there are four.
+
+    Returns:
+        Axes, shape (1 + bound,).
+
+    Raises:
+        TrustboError: The workspace has no terrain in memory, or there is no such bound.
+    """
+    if plan.waypoints is None:
+        raise TrustboError(
+            "plan_map needs a plan on a workspace made with Workspace.from_terrain of a terrain in "
+            "memory."
+        )
+    n_bounds = len(plan.path) - 1
+    shown = list(range(1, n_bounds + 1)) if bounds is None else list(bounds)
+    if not set(shown) <= set(range(1, n_bounds + 1)):
+        raise TrustboError(f"bounds must be some of 1..{n_bounds}; got {bounds!r}.")
+    figure, _, panels = small_multiples(1 + len(shown), n_columns, (2.3, 2.5))
+    whole, *others = panels
+    _stage(whole, plan, f"path of {n_bounds} bounds")
+    draw_path(whole, plan.path, plan.workspace.grid)
+    draw_scale(whole, plan.workspace.grid)
+    for ax, k in zip(others, shown, strict=True):
+        (a, b), (c, d) = plan.path[k - 1 : k + 1]
+        _stage(ax, plan, f"bound {k}: {a},{b} to {c},{d}")
+        _draw_bound(ax, plan, k - 1)
+    handles = _legend(plan.workspace.team.names)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return panels
+
+
+def _stage(ax: Axes, plan: Plan, title: str) -> None:
+    draw_ground(ax, plan.workspace, "dem")
+    left, right, bottom, top = extent_of(plan.workspace.grid)
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+    ax.set_title(title, fontsize=9)
+
+
+def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
+    """Draw the bound of index k, and show what is around it."""
+    waypoints, posts, ways = plan.waypoints, plan.posts, plan.ways
+    assert waypoints is not None and posts is not None and ways is not None  # noqa: S101, PT018
+    corner = np.array(plan.workspace.grid.corner)
+    lead, *closing = [None if way is None else way - corner for way in ways[k]]
+    stops = waypoints[k : k + 2] - corner
+    seen = [stops, posts[k] - corner, *(way for way in (lead, *closing) if way is not None)]
+    if lead is not None:
+        ax.plot(*lead.T, color="black", linewidth=2.6, zorder=3)
+    for i, (post, way) in enumerate(zip(posts[k] - corner, closing, strict=True)):
+        colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
+        if way is not None:
+            ax.plot(*way.T, color="white", linewidth=2.2, zorder=4)
+            ax.plot(*way.T, color=colour, linewidth=1.4, linestyle=_DASHED, zorder=4)
+            ax.plot(*way[-1], marker, **_open(colour), zorder=6)
+        ax.plot(*np.stack([post, stops[1]]).T, color=colour, linewidth=0.8, zorder=5)
+        ax.plot(*post, marker, **_filled(colour), zorder=7)
+    ax.plot(*stops.T, "*", **_filled("black", 11), linestyle="none", zorder=6)
+    low, high = (f(np.concatenate(seen), axis=0) for f in (np.min, np.max))
+    half, (x, y) = 0.56 * float((high - low).max()) + 2.0, (low + high) / 2.0
+    ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    draw_scale_of(ax, 2.0 * half)
+
+
+def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
+    black = _filled("black", 11)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], marker="*", linewidth=2.6, label="lead: stops, way", **black)
+    ]
+    for i, name in enumerate(names):
+        marker, style = MARKERS[i % len(MARKERS)], _filled(COLOURS[i % len(COLOURS)])
+        label = f"{as_text(name)}: post, way"
+        handles.append(Line2D([], [], marker=marker, linestyle=_DASHED, label=label, **style))
+    return [
+        *handles,
+        Line2D([], [], marker="o", linestyle="none", label="next post", **_open("0.3")),
+        Line2D([], [], color="0.3", linewidth=0.8, label="sight line"),
+        Patch(facecolor=VEGETATION, label="vegetation"),
+    ]
+
+
+def _filled(colour: str, size: float = 6.0) -> dict[str, Any]:
+    return {"color": colour, "markersize": size, "markeredgecolor": "white", "markeredgewidth": 0.7}
+
+
+def _open(colour: str) -> dict[str, Any]:
+    return {"markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": colour}

@@ -1,0 +1,287 @@
+"""Posts and ways in every format, read back by readers that are not the writers, and driven."""
+
+import csv
+import itertools
+import json
+import math
+import sqlite3
+from dataclasses import replace
+
+import gpxpy
+import numpy as np
+import pytest
+import shapely
+from pyproj import Transformer
+from references import geometry_of_blob
+from simulators import Steady
+
+import trustbo as tb
+from trustbo.errors import TrustboError
+from trustbo.export import path_frame, write_path, write_ros_bag
+
+ROBOTS = ("lead", "r1", "r2", "r3")
+FROM_DEGREES = Transformer.from_crs(4326, 32616, always_xy=True)
+MILLIMETRE = 2e-3  # the last of eight digits of a degree, and rounding
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    return tb.Workspace.from_terrain(terrain, (3, 4))
+
+
+@pytest.fixture(scope="module")
+def planner(workspace):
+    return tb.planning.Planner(workspace, (2, 0), (0, 3), max_bounds="shortest+2")
+
+
+@pytest.fixture(scope="module")
+def params():
+    return tb.models.TrustParams(0.5, np.array([0.1, 0.1, 0.4]), 0.1, 0.1, 0.1, 0.5, 0.5)
+
+
+@pytest.fixture
+def plan(planner, params):
+    return planner.plan(params)
+
+
+def metres(degrees):
+    return np.transpose(FROM_DEGREES.transform(*np.transpose(degrees)))
+
+
+def read_geojson(file):
+    posts, ways = {}, {}
+    for feature in json.loads(file.read_text())["features"]:
+        said, place = feature["properties"], feature["geometry"]
+        if said["layer"] == "posts":
+            assert place["type"] == "Point"
+            posts[said["bound"], said["robot"]] = metres([place["coordinates"]])[0]
+        elif said["layer"] == "ways":
+            assert place["type"] == "LineString"
+            ways[said["bound"], said["robot"]] = metres(place["coordinates"])
+    return posts, ways
+
+
+def read_gpkg(file):
+    base = sqlite3.connect(file)
+    kinds = dict(
+        base.execute("SELECT table_name, geometry_type_name FROM gpkg_geometry_columns").fetchall()
+    )
+    assert kinds == {
+        "path": "LINESTRING",
+        "bounds": "POINT",
+        "posts": "POINT",
+        "ways": "LINESTRING",
+    }
+    found = []
+    for layer in ("posts", "ways"):
+        rows = base.execute(f"SELECT bound, robot, geom FROM {layer}").fetchall()
+        found.append({(k, robot): np.array(geometry_of_blob(g)[1].coords) for k, robot, g in rows})
+    base.close()
+    return {key: xy[0] for key, xy in found[0].items()}, found[1]
+
+
+def read_csv(file):
+    tables = []
+    for name in ("posts", "ways"):
+        with file.with_name(f"path_{name}.csv").open(newline="") as stream:
+            tables.append(list(csv.DictReader(stream)))
+        for row in tables[-1]:
+            place = metres([(float(row["longitude"]), float(row["latitude"]))])[0]
+            np.testing.assert_allclose(place, (float(row["x"]), float(row["y"])), atol=1e-6)
+    posts, ways = tables
+    of_bound = {}
+    for row in ways:
+        key = int(row["bound"]), row["robot"]
+        own = of_bound.setdefault(key, [])
+        assert int(row["point"]) == len(own)
+        own.append((float(row["x"]), float(row["y"])))
+    where = {(int(r["bound"]), r["robot"]): (float(r["x"]), float(r["y"])) for r in posts}
+    return where, {key: np.array(points) for key, points in of_bound.items()}
+
+
+def read_gpx(file):
+    """Routes, cut where points have names."""
+    posts, ways = {}, {}
+    _, *routes = gpxpy.parse(file.read_text(), version="1.1").routes
+    for route in routes:
+        places = metres([(point.longitude, point.latitude) for point in route.points])
+        stops = [n for n, point in enumerate(route.points) if point.name]
+        for k, n in enumerate(stops, start=1):
+            if route.points[n].name == f"post {k}":
+                posts[k, route.name] = places[n]
+        for k, (n, m) in enumerate(itertools.pairwise(stops), start=1):
+            ways[k, route.name] = places[n : m + 1]
+    return posts, ways
+
+
+READERS = {"geojson": read_geojson, "gpkg": read_gpkg, "csv": read_csv, "gpx": read_gpx}
+
+
+def assert_is_planned(posts, ways, workspace, path, *, thinned=0.0):
+    """Each post and each way is that of its bound and robot, within millimetres."""
+    n = len(path) - 1
+    assert set(posts) == set(itertools.product(range(1, n + 1), ROBOTS[1:]))
+    assert set(ways) == set(itertools.product(range(1, n + 1), ROBOTS))
+    for k, (a, c) in enumerate(itertools.pairwise(path), start=1):
+        ahead = path[k + 1] if k < n else None
+        for robot, post in zip(ROBOTS[1:], workspace.posts(a, c), strict=True):
+            np.testing.assert_allclose(posts[k, robot], post, atol=MILLIMETRE)
+        for robot, way in zip(ROBOTS, workspace.ways(a, c, ahead), strict=True):
+            found = ways[k, robot]
+            np.testing.assert_allclose(found[[0, -1]], way[[0, -1]], atol=MILLIMETRE)
+            if thinned:
+                lines = shapely.LineString(found), shapely.LineString(way)
+                assert shapely.hausdorff_distance(*lines, densify=0.1) <= thinned + MILLIMETRE
+                assert len(found) < len(way)
+            else:
+                np.testing.assert_allclose(found, way, atol=MILLIMETRE)
+
+
+def faults(plan):
+    """What an export may confuse, as plans that say it."""
+    swapped = [tuple(way[:, ::-1] for way in ways) for ways in plan.ways]
+    others = [(ways[0], *ways[:0:-1]) for ways in plan.ways]
+    return {
+        "x and y of posts": {"posts": plan.posts[..., ::-1]},
+        "robots of posts": {"posts": plan.posts[:, ::-1]},
+        "bounds of posts": {"posts": np.roll(plan.posts, 1, axis=0)},
+        "x and y of ways": {"ways": tuple(swapped)},
+        "robots of ways": {"ways": tuple(others)},
+        "bounds of ways": {"ways": (*plan.ways[1:], plan.ways[0])},
+    }
+
+
+@pytest.mark.parametrize("suffix", READERS)
+def test_a_file_has_the_posts_and_ways_of_each_bound_and_robot(plan, workspace, suffix, tmp_path):
+    file, thinned = tmp_path / f"path.{suffix}", 0.5 if suffix == "gpx" else 0.0
+    write_path(file, plan)
+    assert_is_planned(*READERS[suffix](file), workspace, plan.path, thinned=thinned)
+    for wrong in faults(plan).values():
+        broken = replace(plan)
+        vars(broken).update(waypoints=plan.waypoints, posts=plan.posts, ways=plan.ways)
+        vars(broken).update(wrong)
+        write_path(file, broken)
+        with pytest.raises(AssertionError):
+            assert_is_planned(*READERS[suffix](file), workspace, plan.path, thinned=thinned)
+
+
+def test_a_post_says_what_it_watches(plan, workspace):
+    frame = path_frame(plan, layer="posts", crs=None)
+    for row in frame.to_dict("records"):
+        k = row["bound"]
+        assert (row["row"], row["col"]) == plan.path[k - 1]
+        watched = workspace.ground.posts.waypoint(plan.path[k])
+        np.testing.assert_array_equal((row["lead_x"], row["lead_y"]), watched)
+        np.testing.assert_array_equal((row["geometry"].x, row["geometry"].y), (row["x"], row["y"]))
+    ways = path_frame(plan, layer="ways", crs=None)
+    np.testing.assert_allclose(ways["length_m"], ways.length)
+    assert path_frame(plan, layer="ways").crs.to_epsg() == 4326
+    with pytest.raises(
+        TrustboError, match="unknown layer 'post'; choose one of bounds, posts, ways"
+    ):
+        path_frame(plan, layer="post")
+
+
+def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
+    plan, planner, params, workspace, tmp_path
+):
+    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    def read(folder):
+        with (folder / "path.mcap").open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            return {c.topic: (s.name, m) for s, c, _, m in reader.iter_decoded_messages()}
+
+    def poses(found, topic, kind):
+        name, message = found[f"/trustbo/{topic}"]
+        assert name == kind
+        assert message.header.frame_id == "map"
+        own = [pose.pose if kind.endswith("Path") else pose for pose in message.poses]
+        turns = [2.0 * math.atan2(p.orientation.z, p.orientation.w) for p in own]
+        return np.array([(p.position.x, p.position.y) for p in own]), np.array(turns)
+
+    def assert_says_what_is_planned(found):
+        stops, _ = poses(found, "lead/waypoints", "geometry_msgs/msg/PoseArray")
+        points = [workspace.ground.posts.waypoint(cell) for cell in plan.path]
+        np.testing.assert_array_equal(stops, points)
+        bounds = list(itertools.pairwise(plan.path))
+        for i, robot in enumerate(ROBOTS[1:]):
+            where, turns = poses(found, f"{robot}/posts", "geometry_msgs/msg/PoseArray")
+            own = np.array([workspace.posts(a, c)[i] for a, c in bounds])
+            np.testing.assert_array_equal(where, own)
+            x, y = (stops[1:] - own).T
+            np.testing.assert_allclose(np.exp(1j * turns), (x + 1j * y) / np.hypot(x, y))
+        for i, robot in enumerate(ROBOTS):
+            way, turns = poses(found, f"{robot}/way", "nav_msgs/msg/Path")
+            own = [
+                workspace.ways(a, c, ahead)[i]
+                for (a, c), ahead in zip(bounds, (*plan.path[2:], None), strict=True)
+            ]
+            whole = np.concatenate([own[0][:1], *(part[1:] for part in own)])
+            np.testing.assert_array_equal(way, whole)
+            x, y = np.diff(whole, axis=0).T
+            np.testing.assert_allclose(np.exp(1j * turns[:-1]), (x + 1j * y) / np.hypot(x, y))
+
+    cost = planner.cost_map(params)
+    write_ros_bag(tmp_path / "path", plan, cost, workspace)
+    assert_says_what_is_planned(read(tmp_path / "path"))
+    for n, wrong in enumerate(faults(plan).values()):
+        broken = replace(plan)
+        vars(broken).update(waypoints=plan.waypoints, posts=plan.posts, ways=plan.ways)
+        vars(broken).update(wrong)
+        write_ros_bag(tmp_path / str(n) / "path", broken, cost, workspace)
+        with pytest.raises(AssertionError):
+            assert_says_what_is_planned(read(tmp_path / str(n) / "path"))
+    named = replace(workspace, team=tb.Team(3, names=("r 1", "r2", "r3")))
+    with pytest.raises(TrustboError, match="robot 'r 1' cannot be in a topic"):
+        write_ros_bag(tmp_path / "new", plan, cost, named)
+
+
+def test_where_a_robot_has_no_way_it_has_no_line_and_its_route_ends(plan, tmp_path):
+    lead, r1, _, r3 = plan.ways[1]
+    broken = replace(plan)
+    vars(broken)["ways"] = (plan.ways[0], (lead, r1, None, r3), *plan.ways[2:])
+    for suffix in ("geojson", "gpkg", "csv"):
+        write_path(tmp_path / f"path.{suffix}", broken)
+        _, ways = READERS[suffix](tmp_path / f"path.{suffix}")
+        assert {robot for k, robot in ways if k == 2} == {"lead", "r1", "r3"}
+        assert (3, "r2") in ways
+    write_path(tmp_path / "path.gpx", broken)
+    routes = {r.name: r for r in gpxpy.parse((tmp_path / "path.gpx").read_text()).routes}
+    assert routes["r2"].points[-1].name == "post 2"
+    assert routes["r2"].description.endswith("; it has no way in bound 2")
+    assert routes["r1"].points[-1].name == "goal"
+
+
+@pytest.mark.parametrize("slip", [False, True])
+def test_what_is_exported_is_what_is_driven(plan, workspace, slip, tmp_path, monkeypatch):
+    """Within a pixel of 1 m, and .5 m more with slip."""
+    if not slip:
+        of_simulator = "trustbo.simulation.overwatch.np.random.default_rng"
+        monkeypatch.setattr(of_simulator, lambda *_: Steady())
+    mission = tb.simulation.KinematicSimulator(workspace).run(plan.path, seed=0)
+    assert mission.status == "ok"
+    for suffix in ("geojson", "csv"):
+        write_path(tmp_path / f"path.{suffix}", plan)
+        posts, ways = READERS[suffix](tmp_path / f"path.{suffix}")
+        for k, bound in enumerate(mission.bounds, start=1):
+            for i, robot in enumerate(ROBOTS):
+                track = shapely.points(bound.poses[:, i, :2])
+                gap = shapely.distance(track, shapely.LineString(ways[k, robot])).max()
+                assert gap <= (1.5 if slip else 1.0)
+                if i:  # it stands there while the lead runs the bound
+                    post = posts[k, robot]
+                    assert np.linalg.norm(bound.poses[0, i, :2] - post) <= (1.5 if slip else 1.0)
+
+
+def test_a_robot_called_as_the_lead_is_refused(plan, workspace, tmp_path):
+    named = replace(workspace, team=tb.Team(3, names=("lead", "r2", "r3")))
+    with pytest.raises(TrustboError, match="a robot is called 'lead', as the lead is"):
+        write_path(tmp_path / "path.geojson", plan, named)
+    bare = tb.Workspace.from_awareness(np.full((3, 3, 4, 2), 0.5))
+    with pytest.raises(TrustboError, match="posts and ways where its workspace was made from a"):
+        path_frame(plan, bare, layer="ways", crs=None)
+    assert list(tmp_path.iterdir()) == []

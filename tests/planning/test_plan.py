@@ -1,0 +1,63 @@
+"""A plan's waypoints, posts and ways are the workspace's, also of one read from a record."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.planning.plan import plan_from_record, plan_to_record
+
+PARAMS = tb.models.TrustParams(0.5, np.array([0.1, 0.1, 0.4]), 0.1, 0.1, 0.1, 0.5, 0.5)
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    return tb.Workspace.from_terrain(terrain, (3, 4), tb.Team(n_robots=2))
+
+
+@pytest.fixture(scope="module")
+def plan(workspace):
+    return tb.planning.Planner(workspace, (2, 0), (0, 3)).plan(PARAMS)
+
+
+def assert_is_of_its_path(plan, workspace):
+    path = plan.path
+    assert plan.posts.shape == (len(path) - 1, 2, 2)
+    for k, (a, c) in enumerate(itertools.pairwise(path)):
+        np.testing.assert_array_equal(plan.posts[k], workspace.posts(a, c))
+        ways = workspace.ways(a, c, path[k + 2] if k + 2 < len(path) else None)
+        for found, way in zip(plan.ways[k], ways, strict=True):
+            np.testing.assert_array_equal(found, way)
+        np.testing.assert_array_equal(plan.ways[k][0][[0, -1]], plan.waypoints[k : k + 2])
+    assert len(plan.ways) == len(path) - 1
+
+
+def test_a_plan_has_what_each_robot_is_to_do(plan, workspace):
+    assert_is_of_its_path(plan, workspace)
+    assert plan.posts is plan.posts  # computed once
+
+
+def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):
+    assert_is_of_its_path(plan, workspace)  # they are known now
+    record = json.loads(json.dumps(plan_to_record(plan)))
+    assert not {"waypoints", "posts", "ways", "workspace"} & set(record)
+    assert_is_of_its_path(plan_from_record(record, workspace), workspace)
+
+
+def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
+    campaign = tb.Campaign(workspace, (2, 0), (0, 3), sampler="exact", seed=0)
+    asked = campaign.ask()
+    campaign.save(tmp_path / "campaign")
+    again = tb.Campaign.load(tmp_path / "campaign")
+    assert again.ask().path == asked.path
+    assert_is_of_its_path(again.ask(), workspace)
+    again.close()
+
+
+def test_without_a_terrain_there_are_none():
+    bare = tb.Workspace.from_awareness(np.full((2, 3, 3, 3), 0.5))
+    plan = tb.planning.Planner(bare, (2, 0), (0, 2)).plan(PARAMS)
+    assert (plan.waypoints, plan.posts, plan.ways) == (None, None, None)
