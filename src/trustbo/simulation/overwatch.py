@@ -119,8 +119,8 @@ class KinematicSimulator:
             "threats": [dataclasses.asdict(threat) for threat in self.threats],
             "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],
             "realtime": sorted(self.realtime),
-            "team": None if same else dataclasses.asdict(self.team),
-            "terrain": None if self.terrain is None else digest_of(self.terrain),
+            "true_team": None if same else dataclasses.asdict(self.team),
+            "true_terrain": None if self.terrain is None else digest_of(self.terrain),
         }
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
