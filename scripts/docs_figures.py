@@ -33,6 +33,7 @@ def main() -> None:
         ],
         "robot_maps": plots.robot_maps(cost, workspace, result.path, n_columns=3),
         "mission_trust": plots.mission_trust(result.posterior),
+        "plan_map": plots.plan_map(result.plan, bounds=[1, 2]),
         "plan_trust": plots.plan_trust(result.plan, workspace.team.names),
         "parameter_history": plots.parameter_history(result.posteriors),
         "campaign_history": plots.campaign_history(result.history),

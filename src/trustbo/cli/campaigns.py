@@ -50,10 +50,11 @@ def run(
     The same, with flags in a file: trustbo run --config mission.yaml --seed 2 --out out/second
 
     The folder gets report.html (read this first), maps.png, terrain.png, maps.tif
-    with its style maps.qml and path.geojson (for QGIS), posterior.nc (for ArviZ),
-    history.csv, and the other files that trustbo.load_result reads in Python.
-    After Ctrl-C or a power cut, trustbo resume goes on. A campaign in the folder
-    is not replaced: give another --out, or --overwrite.
+    with its style maps.qml and path.geojson (for QGIS; with each robot's posts and
+    ways), posterior.nc (for ArviZ), history.csv, and the other files that
+    trustbo.load_result reads in Python. After Ctrl-C or a power cut, trustbo
+    resume goes on. A campaign in the folder is not replaced: give another --out,
+    or --overwrite.
     """
     with one_line_errors(debug, campaign=out):
         _require_names(policy, objective, model, sampler, sight, iterations=iterations, seed=seed)
