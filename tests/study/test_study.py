@@ -543,7 +543,7 @@ def test_the_model_s_simulator_measures_the_true_awareness_and_counts():
     assert (mission.n_ticks == 20).all()
     with pytest.raises(tb.TrustboError, match="counts ticks: give n_ticks"):
         tb.simulation.ModelSimulator(workspace, truth, model)
-    with pytest.raises(tb.ShapeError, match=r"awareness must be \(2, 3, 3, 1\), or .*; got shape \(2,\)"):
+    with pytest.raises(tb.ShapeError, match=r"must be \(2, 3, 3, 1\), or .*; got shape \(2,\)"):
         tb.simulation.ModelSimulator(workspace, truth, awareness=[1.0, 2.0])
     many = truth._replace(beta=np.ones((4, 1)), beta0=np.full(4, 0.5))
     with pytest.raises(tb.ShapeError, match="give one draw of params"):
