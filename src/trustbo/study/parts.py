@@ -130,7 +130,7 @@ MODELS = (Pooled, Hierarchical, Coupled)
 
 
 class Place(Protocol):
-    """What a simulator needs to know of the terrain of a run."""
+    """Terrain of a run, as far as a simulator needs to know it."""
 
     def workspace(self) -> Workspace:
         """Workspace of the paths."""

@@ -35,9 +35,9 @@ class World:
 
     Attributes:
         name: Name of the world.
-        kind: What is special about it: `"right"` (the assumed is the true), `"wall"` or `"bare"`
-            (so too, in another sight mode), `"aged"` (an old DSM is assumed), `"canopy"` (a wrong
-            model of the canopy is assumed), `"slopes"` (robots that stand little slope).
+        kind: `"right"`, the assumed is the true; `"wall"` or `"bare"`, so too, in another sight
+            mode; `"aged"`, an old DSM is assumed; `"canopy"`, a wrong model of the canopy is
+            assumed; `"slopes"`, robots that stand little slope.
         ground: `"synthetic-N"`, the synthetic terrain of seed N, or a name in `REAL`.
         sight: True model of sight.
         assumed: Assumed model of sight; None for the true one.
