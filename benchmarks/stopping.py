@@ -47,7 +47,7 @@ def world(seed, noise):
 
 
 def regret(workspace, truth, path):
-    planner = Planner(workspace, *ENDS)
+    planner = Planner(workspace, *ENDS, "terminal")
     return 1.0 - planner.evaluate(path, truth).value / planner.plan(truth).value
 
 
@@ -62,6 +62,7 @@ def main():
             result = tb.iterate(
                 workspace, *ENDS, n_iterations=MOST, simulator=ModelSimulator(workspace, truth),
                 sampler="exact", stop=tb.RegretBound(eps, delta), seed=seed, progress=False,
+                objective="terminal",
             )  # fmt: skip
             if result.stop_reason != "n_iterations":
                 stopped += 1

@@ -34,6 +34,7 @@ EXACT = {
     "moment matched": {"update": "moment_matched"},
     "length": {"length_weight": 1e-4, "connectivity": 4},
     "prior mean": {"initial": "prior_mean"},
+    "bounds": {"initial": "prior_mean", "bounds": True},
 }
 NUTS = {
     "pooled nuts": {"sampler": "nuts"},
@@ -49,16 +50,20 @@ NUTS = {
     "apart nuts": {"model": ("CoupledTrust", {"inter_robot": "none"})},
 }
 
-FEW = ("pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan")
+FEW = (
+    "pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan",
+    "objective lost_contact", "bounds",
+)  # fmt: skip
 
 
 def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:
     """Numbers of one seeded campaign."""
     terrain = tb.terrain.synthetic_terrain(size=(150.0, 150.0), resolution=2.0, seed=3)
-    workspace = tb.Workspace.from_terrain(terrain, shape=(5, 5), team=tb.Team(n_robots=2))
-    options = dict(options)
+    options, team = dict(options), tb.Team(n_robots=2)
+    bounds = options.pop("bounds", False)
+    workspace = tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=bounds)
     name, fields = options.pop("model", ("PooledTrust", {}))
-    options = {"sampler": sampler, "objective": "mean"} | options
+    options = {"sampler": sampler, "objective": "mean", "initial": "prior_draw"} | options
     result = tb.iterate(
         workspace,
         (4, 0),

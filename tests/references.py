@@ -4,6 +4,7 @@ import itertools
 import math
 
 import numpy as np
+from scipy.stats import norm
 
 
 def dense_log_likelihood(beta0, beta, b, delta_w, delta_v, x0_mean, x0_sd, awareness, contact_rate):
@@ -144,7 +145,21 @@ def of_bounds(u):
     return pairs
 
 
-def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", toll=None):
+def expected_rate(family, x, sd):
+    """E[contact rate] given trust, for rates of a family with noise sd."""
+    if family == "beta_binomial":
+        return 1.0 / (1.0 + np.exp(-x))
+    if family == "gaussian":
+        return x
+    # Of a normal cut to [0, 1]: the integral over t in [0, 1] of P(it is above t).
+    ends = np.stack([x, x - 1.0]) / sd
+    integral = sd * (ends * norm.cdf(ends) + norm.pdf(ends))
+    return integral[0] - integral[1]
+
+
+def path_values(
+    objective, paths, n_cells, u, transition, x0, *, team="mean", toll=None, rates=("gaussian", 0.1)
+):
     """Values of many paths at once; the recursion is that of equation (1).
 
     Args:
@@ -156,7 +171,11 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
         x0: Trust at the start.
         team: "mean" or "min".
         toll: What each path's metres cost, shape (path,).
+        rates: Family of the rates, and their noise sd.
     """
+    if objective == "lost_contact" and rates[0] == "gaussian":  # trust is capped at 1
+        u = np.minimum(u, 1.0 - transition.sum(1)[:, None, None])
+        x0 = min(x0, 1.0)
     combine = np.mean if team == "mean" else np.min
     x = np.full((len(paths), len(u)), x0)
     settled_in = np.zeros(u.shape[1:])
@@ -165,7 +184,7 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
             np.linalg.solve(np.eye(len(u)) - transition, u.reshape(len(u), -1)), axis=0
         ).reshape(u.shape[1:])
     toll = np.zeros(len(paths)) if toll is None else toll
-    total, success, least, stationary, last = (np.zeros(len(paths)) for _ in range(5))
+    total, success, least, stationary, last, lost = (np.zeros(len(paths)) for _ in range(6))
     least[:] = np.inf
     for k in range(1, paths.shape[1]):
         on = k < n_cells
@@ -174,10 +193,12 @@ def path_values(objective, paths, n_cells, u, transition, x0, *, team="mean", to
         trust = combine(x, axis=1)
         last = np.where(on, trust, last)
         total += np.where(on, trust, 0.0)
+        lost += np.where(on, 1.0 - expected_rate(rates[0], trust, rates[1]), 0.0)
         least = np.where(on, np.minimum(least, trust), least)
         success += np.where(on, np.log1p(np.exp(-trust)), 0.0)
         stationary += np.where(on, np.log1p(np.exp(-settled_in[bound])), 0.0)
     return {
+        "lost_contact": -lost - toll,
         "terminal": 1.0 / (1.0 + np.exp(toll - last)),
         "mean": total / (n_cells - 1) - toll,
         "success": np.exp(-success),

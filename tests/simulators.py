@@ -20,7 +20,9 @@ class ModelSimulator:
         status = "ok"
         if self.fail_at is not None:
             z, status = z[: self.fail_at], "stuck"
-        sample = PooledTrust().simulate(jax.random.key(seed), self.truth, z[None])
+        sample = PooledTrust().simulate(
+            jax.random.key(seed, impl="threefry2x32"), self.truth, z[None]
+        )
         if self.blind:
             z = np.full_like(z, np.nan)
         rates = np.clip(sample.contact_rate[0], 0.0, 1.0)

@@ -300,22 +300,35 @@ class Mission:
         )
         return cls(cells, bounds, status, tuple(features), tuple(robots))
 
-    def in_order(self, robots: Sequence[str], features: Sequence[str]) -> Self:
+    def in_order(
+        self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
+    ) -> Self:
         """The mission with its robots and features in the order of these names.
+
+        Args:
+            robots: Names of the robots.
+            features: Names of the features.
+            unmeasured: Those of the features that the mission may lack; they are NaN then.
 
         Raises:
             ShapeError: It has other robots or features.
         """
         if (tuple(robots), tuple(features)) == (self.robots, self.features):
             return self
-        if (sorted(robots), sorted(features)) != (sorted(self.robots), sorted(self.features)):
-            raise ShapeError(
-                f"the mission has robots {self.robots} and features {self.features}; they cannot "
-                f"be put in the order {tuple(robots)} and {tuple(features)}."
-            )
+        lacks = [name for name in features if name in unmeasured and name not in self.features]
+        own_features = (*self.features, *lacks)
+        for what, own, wanted in (
+            ("robots", self.robots, robots),
+            ("features", own_features, features),
+        ):
+            if sorted(own) != sorted(wanted):
+                raise ShapeError(
+                    f"the mission has {what} {getattr(self, what)}, not {tuple(wanted)}; give "
+                    f"{what}= these names, or use the workspace of this team."
+                )
         i, m = (
             [own.index(n) for n in names]
-            for own, names in ((self.robots, robots), (self.features, features))
+            for own, names in ((self.robots, robots), (own_features, features))
         )
         bounds = []
         for b in self.bounds:
@@ -325,7 +338,8 @@ class Mission:
                 "states": None if b.states is None else b.states[:, i],
             }
             rates = {n: getattr(b, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
-            bounds.append(replace(b, awareness=b.awareness[np.ix_(i, m)], **rates, **optional))
+            z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
+            bounds.append(replace(b, awareness=z[np.ix_(i, m)], **rates, **optional))
         names = {"robots": tuple(robots), "features": tuple(features)}
         return replace(self, bounds=tuple(bounds), **names)
 

@@ -41,10 +41,10 @@ def test_ask_is_the_same_until_told(workspace):
 
 
 def test_the_first_plan_is_from_one_draw_of_the_prior_or_from_its_mean(workspace):
-    first = [Campaign(workspace, *ENDS, seed=s).belief for s in range(2)]
+    first = [Campaign(workspace, *ENDS, initial="prior_draw", seed=s).belief for s in range(2)]
     assert np.shape(first[0].beta) == (1, 2)
     assert first[0].beta0[0] != first[1].beta0[0]
-    mean = Campaign(workspace, *ENDS, initial="prior_mean").belief
+    mean = Campaign(workspace, *ENDS).belief
     assert mean.beta0.tolist() == [0.5]
     assert mean.beta.tolist() == [[0.0, 0.0]]
 
@@ -196,7 +196,9 @@ def test_a_campaign_with_censored_rates(workspace, monkeypatch):
 @pytest.mark.parametrize("initial", ["prior_draw", "prior_mean"])
 @pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
 def test_every_model_can_be_planned_with(workspace, model, initial):
-    campaign = Campaign(workspace, *ENDS, model=model, team="min", initial=initial)
+    campaign = Campaign(
+        workspace, *ENDS, model=model, objective="terminal", team="min", initial=initial
+    )
     plan = campaign.ask()
     assert plan.trust.shape[1] == 3
     assert plan.value == pytest.approx(1.0 / (1.0 + np.exp(-plan.trust[-1].min())))

@@ -74,7 +74,7 @@ def test_it_learns_the_truth_and_finds_the_oracle_s_path(workspace):
     planner = Planner(workspace, *ENDS)
     oracle = planner.plan(TRUTH)
     found = planner.evaluate(result.path, TRUTH)
-    assert found.value >= 0.98 * oracle.value
+    assert found.value >= oracle.value - 0.02 * (len(oracle.path) - 1 + oracle.value)  # kept
 
 
 def test_the_same_seed_gives_the_same_result(result, workspace):
@@ -110,7 +110,7 @@ def test_the_progress_bar_shows_objective_and_r_hat_and_can_be_silenced(workspac
     run(workspace, n_iterations=1, progress=True)
     shown = capsys.readouterr().err
     assert "1/1" in shown
-    assert "objective 0." in shown
+    assert "objective -" in shown
     assert "R-hat 1.0" in shown
     run(workspace, n_iterations=1)
     assert capsys.readouterr() == ("", "")

@@ -285,7 +285,7 @@ def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):
     assert list(result.plan.path) == result.path
     with tb.Campaign.load(tmp_path / "kept") as campaign:
         assert campaign.options == tb.CampaignOptions(
-            team="min", max_bounds="shortest", replan="bound"
+            team="min", max_bounds="shortest", initial="prior_draw", replan="bound"
         )
         assert (campaign.settings["policy"], campaign.seed) == ("thompson", 3)
         assert [mission.path for mission in campaign.missions] == [tuple(result.path)]

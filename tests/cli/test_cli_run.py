@@ -126,7 +126,7 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--goal", "2,0"), "start and goal are the same cell (2, 0)"),
         (("--start", "2;0"), "--start must be two whole numbers as 9,0; got '2;0'"),
         (("--policy", "bold"), "unknown policy 'bold'; choose one of greedy, optimistic, thompson"),
-        (("--objective", "best"), "unknown objective 'best'; choose one of terminal, mean"),
+        (("--objective", "best"), "unknown objective 'best'; choose one of lost_contact, terminal"),
         (("--model", "own"), "unknown model 'own'; choose one of pooled, hierarchical, coupled"),
         (("--sampler", "gibbs"), "unknown sampler 'gibbs'; choose one of nuts, exact, joint"),
         (("--observation", "odd"), "unknown observation 'odd'; choose one of gaussian, censored"),

@@ -13,7 +13,7 @@ from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.models import PooledTrust, Priors, diagnostics, fit, params_of
 from trustbo.models.samplers import run
-from trustbo.models.samplers.nuts import run_nuts
+from trustbo.models.samplers.nuts import NutsSettings, run_nuts
 from trustbo.stacking import stack_missions
 
 SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]
@@ -131,14 +131,36 @@ def test_missing_rates_are_predicted_through(with_a_gap):
 
 
 def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypatch):
-    """A limit that no run meets, rather than short ones that would be compiled for nothing else."""
+    """A limit that no run meets; the longer run takes the short one's length, and its program."""
     assert (run.MAX_RHAT, run.MIN_ESS) == (1.01, 400.0)
+    tried = []
+
+    def short(settings, *args, **options):
+        tried.append(settings)
+        return run_nuts(NutsSettings(), *args, **options)
+
+    monkeypatch.setattr(run, "run_nuts", short)
     monkeypatch.setattr(run, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
         fit(missions)
-    assert error.value.posterior["posterior"].sizes["draw"] == 2000  # after one longer retry
+    assert tried == [NutsSettings(), NutsSettings(600, 2000, 4, 0.98, collapse=True)]
+    assert error.value.posterior.attrs["retries"] == 1
     assert fit(missions, check=False).attrs["retries"] == 0
+
+
+@pytest.mark.slow  # its program compiles for this alone
+def test_the_longer_run_samples_the_same_posterior(missions, posterior, monkeypatch):
+    monkeypatch.setattr(run, "MIN_ESS", 1e6)
+    with pytest.raises(PosteriorError) as error:
+        fit(missions)
+    longer = error.value.posterior["posterior"]
+    assert longer.sizes["draw"] == 2000
+    for name in SITES:
+        a, b = (p[name].values.reshape(-1, p[name].values[0, 0].size) for p in
+                (longer, posterior["posterior"]))  # fmt: skip
+        # ESS above 1000 in each: the difference of means has sd < 0.045 sd; 4 of these.
+        assert (np.abs(a.mean(0) - b.mean(0)) < 0.18 * b.std(0)).all(), name
 
 
 def test_params_come_out_of_the_posterior_and_go_through_its_draws(posterior):

@@ -13,6 +13,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
 BETA0 = {
+    "lost_contact": (0.0, 0.3, 0.7, 1.0, 1.3),
     "terminal": (-0.8, 0.0, 0.3, 0.7, 1.0, 1.3),
     "mean": (-0.8, 0.0, 0.3, 0.7, 1.0, 1.3),
     "success": (0.0, 0.3, 0.7, 1.0, 1.3),
@@ -51,7 +52,7 @@ def random_map(n, connectivity, seed, extra, kind):
 
 def admissible(objective, n, connectivity):
     """What `max_bounds` is, and which walks these are: what can be enumerated."""
-    if objective in ("terminal", "mean"):
+    if objective in ("lost_contact", "terminal", "mean"):
         return 2, "shortest+2", (("u_turns", False),)
     if objective == "stationary":
         return None, None, (("simple", True),)
@@ -81,7 +82,19 @@ def random_problem(model, n, n_robots, beta0, rng, *, moves=()):
     return z, CoupledParams(B0, B, b, noise, noise), of_bounds(u), B0
 
 
-def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weight=0.0, more=None):
+def problem(
+    objective,
+    model,
+    n,
+    connectivity,
+    seed,
+    beta0,
+    *,
+    team="mean",
+    weight=0.0,
+    more=None,
+    family="gaussian",
+):
     """Planners with either engine, parameters, and the value of every admissible path.
 
     `more` bounds than the fewest, without U-turns, in place of what `admissible` says.
@@ -95,8 +108,11 @@ def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weig
     moves = (8,) if seed else ()  # all seeds but 0 have a drift for each bound
     z, params, u, transition = random_problem(model, n, n_robots, beta0, rng, moves=moves)
     workspace = Workspace.from_awareness(z, passable, CELL)
+    if model == "pooled" and team == "mean":  # one state, whose drift is capped for lost_contact
+        u, transition = u.mean(0, keepdims=True), transition[:1, :1]
+    rates = family, np.sqrt(0.1) if model == "coupled" else 0.1
     values = path_values(
-        objective, paths, n_cells, u, transition, 0.5, team=team, toll=weight * length
+        objective, paths, n_cells, u, transition, 0.5, team=team, toll=weight * length, rates=rates
     )
     cap = cap if isinstance(cap, str) or cap is None else shortest + cap
     planners = [
@@ -110,6 +126,7 @@ def problem(objective, model, n, connectivity, seed, beta0, *, team="mean", weig
             team=team,
             length_weight=weight,
             engine=engine,
+            observation=family,
         )
         for engine in ("networkx", "numba")
     ]
@@ -125,9 +142,12 @@ def plan_and_best(*case, **options):
 def check(plans, best):
     for plan in plans:
         assert plan.exact
-        np.testing.assert_allclose(plan.value, best, rtol=1e-9, atol=1e-300)
-    # Cell by cell: no two paths of these maps are worth the same, but by their least trust.
-    assert plans[0].path == plans[1].path or plans[0].objective == "bottleneck"
+        lost = plan.objective == "lost_contact"  # may be nothing, with trust capped at 1
+        np.testing.assert_allclose(plan.value, best, rtol=1e-9, atol=1e-12 if lost else 1e-300)
+    # Cell by cell: no two paths of these maps are worth the same, but by their least trust, or
+    # where trust is capped.
+    ties = plans[0].objective in ("bottleneck", "lost_contact")
+    assert plans[0].path == plans[1].path or ties
 
 
 @pytest.mark.parametrize(
@@ -195,6 +215,29 @@ def test_vector_trust_is_planned_exactly_too(objective, model, team):
             check(*plan_and_best(objective, model, 4, 8, seed, beta0, team=team))
 
 
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+@pytest.mark.parametrize(
+    ("model", "team"), [("pooled", "mean"), ("pooled", "min"), ("hierarchical", "mean")]
+)
+def test_contact_lost_by_counts_and_censored_rates_is_the_least_of_all_paths(model, team, family):
+    for n, connectivity in ((4, 8), (5, 4)):
+        for seed in range(4):
+            for beta0, weight in ((0.0, 0.0), (0.4, 0.0), (0.9, 0.002), (1.2, 0.0)):
+                case = "lost_contact", model, n, connectivity, seed, beta0
+                check(*plan_and_best(*case, team=team, family=family, weight=weight))
+
+
+@pytest.mark.parametrize("more", range(7))
+@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
+def test_contact_lost_is_the_least_of_longer_paths_too_and_loops_never_pay_capped(family, more):
+    for connectivity, seed in ((4, 1), (4, 2), (8, 1)):
+        for beta0 in (0.0, 0.3, 0.9):
+            case = "lost_contact", "pooled", 3, connectivity, seed, beta0
+            plans, best = plan_and_best(*case, more=more, family=family)
+            check(plans, best)
+            assert family != "gaussian" or not any(plan.revisits for plan in plans)
+
+
 @pytest.mark.parametrize("more", range(7))
 @pytest.mark.parametrize("objective", ["terminal", "mean", "success"])
 def test_any_number_of_bounds_more_than_the_fewest_is_planned_exactly(objective, more):
@@ -208,14 +251,14 @@ def test_any_number_of_bounds_more_than_the_fewest_is_planned_exactly(objective,
                 assert plan.revisits == 0 or more > 2
 
 
-@pytest.mark.parametrize("objective", ["terminal", "mean", "stationary"])
+@pytest.mark.parametrize("objective", ["lost_contact", "terminal", "mean", "stationary"])
 @pytest.mark.parametrize("team", ["mean", "min"])
 def test_a_length_weight_is_paid_per_metre(objective, team):
     for seed in range(4):
         check(*plan_and_best(objective, "pooled", 4, 8, seed, 0.7, team=team, weight=0.004))
 
 
-@pytest.mark.parametrize("objective", ["terminal", "mean"])
+@pytest.mark.parametrize("objective", ["lost_contact", "terminal", "mean"])
 def test_a_length_weight_is_paid_per_metre_by_three_robots_on_larger_maps(objective):
     """The networkx engine once paid a mean's length by the bound: 24 % of these were not best."""
     for seed in range(1, 21, 2):  # odd seeds have three robots
@@ -239,6 +282,6 @@ def test_terminal_compares_trust_where_its_sigma_rounds(engine, team, b):
             x = 0.7 * x + u[:, cell]
         best = max(best, x.mean() if team == "mean" else x.min())
     workspace = Workspace.from_awareness(z, passable, CELL)
-    plan = Planner(workspace, (3, 0), (0, 3), team=team, engine=engine).plan(params)
+    plan = Planner(workspace, (3, 0), (0, 3), "terminal", team=team, engine=engine).plan(params)
     trust = plan.trust[-1].mean() if team == "mean" else plan.trust[-1].min()
     np.testing.assert_allclose(trust, best, rtol=1e-12)

@@ -40,7 +40,7 @@ def test_the_graph_is_networkx_s_with_positions_and_lengths(workspace):
 
 
 def test_a_plan_says_what_it_is(workspace):
-    planner = Planner(workspace, (4, 0), (0, 5))
+    planner = Planner(workspace, (4, 0), (0, 5), "terminal")
     plan = planner.plan(PARAMS)
     assert plan.path[0] == (4, 0)
     assert plan.path[-1] == (0, 5)
@@ -77,7 +77,7 @@ def test_the_cost_map_is_the_paper_s_f_of_the_trust_map(workspace):
 
 
 def test_the_goal_s_trust_is_that_of_the_terminal_plan(workspace):
-    planner = Planner(workspace, (4, 0), (0, 5))
+    planner = Planner(workspace, (4, 0), (0, 5), "terminal")
     plan = planner.plan(PARAMS)
     np.testing.assert_allclose(float(planner.trust_map(PARAMS)[0, 5]), plan.trust[-1].mean())
 
@@ -114,7 +114,7 @@ def test_an_unreachable_goal_says_how_far_one_gets():
 def test_bad_options_list_the_good_ones(workspace):
     ends = (workspace, (4, 0), (0, 5))
     with pytest.raises(
-        TrustboError, match="unknown objective 'best'; choose one of terminal, mean"
+        TrustboError, match="unknown objective 'best'; choose one of lost_contact, terminal"
     ):
         Planner(*ends, "best")
     with pytest.raises(TrustboError, match="connectivity must be 4 or 8; got 6"):
@@ -158,7 +158,7 @@ def test_random_walks_long_corridors(draws):
 
 def test_random_draws_every_admissible_path_equally_often(draws):
     workspace = Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
-    planner = Planner(workspace, (2, 0), (0, 2))
+    planner = Planner(workspace, (2, 0), (0, 2), "terminal")
     admissible = list(walks(np.ones((3, 3), bool).tolist(), (2, 0), (0, 2), 4, u_turns=False))
     n_draws = 2000
     counts = dict.fromkeys(admissible, 0)

@@ -27,7 +27,7 @@ def workspace():
 
 @pytest.fixture
 def planner(workspace):
-    return Planner(workspace, *ENDS)
+    return Planner(workspace, *ENDS, "terminal")
 
 
 def prior_draws(model=None, n_draws=N_DRAWS):

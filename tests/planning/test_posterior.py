@@ -39,7 +39,7 @@ def terminal_trust(workspace, draws, path):
 @pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
 def test_the_expected_plan_has_the_best_expectation_of_all_paths(workspace, model):
     draws = sample_prior(model, 2, 200, seed=4, n_robots=2)
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     plan = planner.plan_expected(draws)
     assert plan.exact
     expected = {p: terminal_trust(workspace, draws, p).mean() for p in all_paths(workspace)}
@@ -58,12 +58,12 @@ def test_the_expected_plan_has_the_best_expectation_of_all_paths(workspace, mode
 
 
 def test_expectations_are_planned_for_linear_objectives_only(workspace, draws):
-    with pytest.raises(TrustboError, match="is planned exactly for 'terminal' and 'mean'"):
+    with pytest.raises(TrustboError, match="is planned exactly for 'terminal', 'mean' and"):
         Planner(workspace, (3, 0), (0, 3), "success").plan_expected(draws)
 
 
 def test_regret_and_the_value_of_information_are_what_enumeration_says(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     drawn = planner.plan_draws(draws)
     paths = all_paths(workspace)
     values = 1.0 / (
@@ -84,7 +84,7 @@ def test_regret_and_the_value_of_information_are_what_enumeration_says(workspace
 
 
 def test_the_path_posterior_is_the_share_of_best_paths(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     share = planner.path_posterior(draws, n_draws=None)
     count = np.zeros((N, N))
     for d in range(200):
@@ -94,7 +94,7 @@ def test_the_path_posterior_is_the_share_of_best_paths(workspace, draws):
 
 
 def test_bands_are_quantiles_of_rolled_trust(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     plan = planner.evaluate(planner.plan(draws.mean()).path, draws)
     z = np.swapaxes(workspace.awareness.values[:, *zip(*plan.path[1:], strict=True)], 0, 1)
     rolled = roll_trust(draws, z)
@@ -111,7 +111,7 @@ def test_bands_are_quantiles_of_rolled_trust(workspace, draws):
 
 
 def test_the_summary_is_over_the_trust_maps_of_draws(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     summary = planner.trust_summary(draws, n_draws=200)
     maps = np.stack([planner.trust_map(draws.draw(d)).values for d in range(200)])
     np.testing.assert_allclose(summary["mean"].values, maps.mean(0))
@@ -124,7 +124,7 @@ def test_the_summary_is_over_the_trust_maps_of_draws(workspace, draws):
 @pytest.mark.parametrize("team", ["mean", "min"])
 def test_trust_maps_of_vector_trust_are_the_best_of_all_paths(workspace, team):
     draws = sample_prior(HierarchicalTrust(), 2, 200, seed=4, n_robots=2)
-    planner = Planner(workspace, (3, 0), (0, 3), team=team)
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal", team=team)
     params = draws.draw(0)
     found = planner.trust_map(params)
     passable = workspace.passable.values.tolist()
@@ -141,7 +141,7 @@ def test_trust_maps_of_vector_trust_are_the_best_of_all_paths(workspace, team):
 
 
 def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     params = draws.mean()
     plan = planner.plan(params)
     rest = planner.onward(plan.path[:2])
@@ -162,7 +162,7 @@ def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
 
 
 def test_awareness_of_its_own_goes_with_each_draw(workspace, draws):
-    planner = Planner(workspace, (3, 0), (0, 3))
+    planner = Planner(workspace, (3, 0), (0, 3), "terminal")
     rng = np.random.default_rng(0)
     maps = rng.uniform(size=(200, 2, N, N, 2))
     uncertain = planner.with_awareness(maps)
@@ -190,12 +190,16 @@ def test_what_cells_are_believed_to_differ_in_goes_to_all_bounds_into_them(
     workspace = Workspace.from_awareness(rng.uniform(size=(2, 8, N, N, 2)))
     draws = sample_prior(model, 2, 30, seed=4, n_robots=2)
     maps = rng.uniform(size=(7, 2, N, N, 2))
-    planner = Planner(workspace, (3, 0), (0, 3), connectivity=connectivity).with_awareness(maps)
+    planner = Planner(
+        workspace, (3, 0), (0, 3), "terminal", connectivity=connectivity
+    ).with_awareness(maps)
     drawn = planner.plan_draws(draws)
     bounds, cells = workspace.bound_maps, workspace.awareness.values
     for d in (0, 13, 29):
         believed = np.clip(bounds + (maps[d % 7] - cells)[:, None], 0.0, 1.0)
-        own = Planner(workspace.with_bounds(believed), (3, 0), (0, 3), connectivity=connectivity)
+        own = Planner(
+            workspace.with_bounds(believed), (3, 0), (0, 3), "terminal", connectivity=connectivity
+        )
         alone = own.plan(draws.draw(d))
         np.testing.assert_allclose(drawn.values[d], alone.value, rtol=1e-12)
         assert planner.of_draw(d).plan(draws.draw(d)).path == alone.path
@@ -206,3 +210,41 @@ def test_what_cells_are_believed_to_differ_in_goes_to_all_bounds_into_them(
         for d in range(30)
     ]
     np.testing.assert_allclose(bands[-1], np.quantile(rolled, 0.95, axis=0), rtol=1e-12)
+
+
+def test_the_expected_contact_lost_is_planned_without_the_cap_and_valued_so(workspace, draws):
+    planner = Planner(workspace, (3, 0), (0, 3), max_bounds="shortest+2")
+    plan = planner.plan_expected(draws)
+    z = workspace.bound_maps
+    lost = {
+        p: (1.0 - roll_trust(draws, np.swapaxes(along(z, p), 0, 1)).mean(-1)).sum(-1).mean()
+        for p in all_paths(workspace)
+    }
+    np.testing.assert_allclose(plan.value, -min(lost.values()), rtol=1e-12)
+    np.testing.assert_allclose(lost[plan.path], min(lost.values()), rtol=1e-12)
+    counts = Planner(workspace, (3, 0), (0, 3), observation="beta_binomial")
+    with pytest.raises(TrustboError, match=r"got 'lost_contact' of 'beta_binomial' rates"):
+        counts.plan_expected(draws)
+
+
+def test_regret_is_a_share_of_the_contact_that_the_best_path_keeps(workspace, draws):
+    planner = Planner(workspace, (3, 0), (0, 3))
+    drawn = planner.plan_draws(draws)
+    path = planner.plan(draws.mean()).path
+    for d in range(20):
+        best, own = planner.plan(draws.draw(d)), planner.evaluate(path, draws.draw(d))
+        kept = len(best.path) - 1 + best.value
+        expected = (best.value - own.value) / kept if kept > 0.0 else np.inf
+        np.testing.assert_allclose(drawn.relative_regret(path)[d], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_contact_lost_by_rates_of_change_is_what_trust_does_not_gain(workspace, draws):
+    planner = Planner(workspace, (3, 0), (0, 3), response="change")
+    params = draws.draw(3)
+    plan = planner.plan(params)
+    gained = plan.trust[-1].mean() - 0.5
+    np.testing.assert_allclose(plan.value, gained - (len(plan.path) - 1), rtol=1e-12)
+    numba = Planner(workspace, (3, 0), (0, 3), response="change", engine="numba").plan(params)
+    np.testing.assert_allclose(plan.value, numba.value, rtol=1e-12)
+    with pytest.raises(TrustboError, match="of rates that measure the change of trust is for"):
+        Planner(workspace, (3, 0), (0, 3), response="change", team="min")

@@ -425,7 +425,7 @@ def test_regret_curves_show_each_policy_s_median(serial):
         ({"policies": ["gredy"]}, "unknown policy 'gredy'; choose one of greedy"),
         ({"policies": ["greedy", "greedy"]}, "policies must be at least one, and distinct"),
         ({"policies": []}, "policies must be at least one"),
-        ({"objectives": ["best"]}, "unknown objective 'best'; choose one of terminal"),
+        ({"objectives": ["best"]}, "unknown objective 'best'; choose one of lost_contact"),
         ({"seeds": -1}, "seeds .* must be a whole number from 1 on; got -1"),
         ({"seeds": [0, "a"]}, "seed must be a whole number from 0 on; got 'a'"),
         ({"n_iterations": 0}, "n_iterations must be a whole number from 1 on; got 0"),
@@ -543,7 +543,9 @@ def test_the_model_s_simulator_measures_the_true_awareness_and_counts():
     assert (mission.n_ticks == 20).all()
     with pytest.raises(tb.TrustboError, match="counts ticks: give n_ticks"):
         tb.simulation.ModelSimulator(workspace, truth, model)
-    with pytest.raises(tb.ShapeError, match=r"must be \(2, 3, 3, 1\), or .*; got shape \(2,\)"):
+    with pytest.raises(
+        tb.ShapeError, match=r"awareness must be \(2, 3, 3, 1\), or .*; got shape \(2,\)"
+    ):
         tb.simulation.ModelSimulator(workspace, truth, awareness=[1.0, 2.0])
     many = truth._replace(beta=np.ones((4, 1)), beta0=np.full(4, 0.5))
     with pytest.raises(tb.ShapeError, match="give one draw of params"):

@@ -468,14 +468,15 @@ class Campaign:
                 folder.read_workspace(), start, goal, model=learner, policy=chosen,
                 options=options, **named,
             )  # fmt: skip
-            campaign.log = History.from_state(state, measured, extras, kept)
+            workspace = campaign.workspace
+            campaign.log = History.from_state(state, measured, extras, kept, workspace)
             if campaign.awareness is not None:
                 for mission in campaign.log.measured:
                     campaign.awareness.update(mission)
             if (last := campaign.log.last_tree) is not None:
                 campaign.belief = params_of(last)
             suggested = state["suggested"]
-            campaign._plan = suggested and plan_from_record(suggested)
+            campaign._plan = suggested and plan_from_record(suggested, workspace)
             campaign._folder = folder
             for j in range(len(campaign.missions), len(measured)):
                 campaign._take(measured[j], extras[j])

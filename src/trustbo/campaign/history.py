@@ -19,6 +19,7 @@ from trustbo.models import complete
 from trustbo.models.posterior_groups import parameters_alone
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
+from trustbo.workspace import Workspace
 
 TOLD, LEARNED, SET_ASIDE = "told", "learned", "set aside"
 """States of a mission: on disk, in the posterior, or never to be."""
@@ -238,13 +239,14 @@ class History:
         measured: Sequence[Mission],
         extras: Sequence[dict[str, float]],
         kept: Kept | None,
+        workspace: Workspace,
     ) -> Self:
         """History of a state, of missions as they were told, and of a saved result."""
         entries: list[Entry] = []
         if kept is not None:
             n = state["n_missions"]
             maps = [kept.history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
-            plans = [plan_from_record(record) for record in state["plans"]]
+            plans = [plan_from_record(record, workspace) for record in state["plans"]]
             before = {"state": LEARNED, "reason": ""}  # of version 0.1, which had no other
             rows = [row if "state" in row else row | before for row in state["rows"]]
             columns = (

@@ -59,8 +59,8 @@ def iterate(
         n_iterations: Largest number of missions.
         model: Trust model; by default `PooledTrust()`.
         policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
-        objective: `"terminal"` (the paper's), `"mean"`, `"success"`, `"bottleneck"` or
-            `"stationary"`; see `Planner`.
+        objective: `"lost_contact"`, `"terminal"` (the paper's), `"mean"`, `"success"`,
+            `"bottleneck"` or `"stationary"`; see `Planner`.
         sampler: `"nuts"`, `"exact"` or `"joint"`; see `trustbo.models.fit`.
         simulator: Simulator with `run(path, *, seed) -> Mission`; by default
             `KinematicSimulator(workspace)`.

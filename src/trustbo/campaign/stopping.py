@@ -20,12 +20,14 @@ class RegretBound:
     """Stop when the recommended path is nearly the best, with high probability, twice in a row.
 
     Under each of `n_draws` posterior draws the best path is planned exactly; the regret of the
-    recommended path is the value it lacks under that draw, relative to the best. Stop when
-    P(regret <= eps) >= 1 - delta after each of the last `patience` missions. ("The path did not
-    change" would be the wrong test: near-ties change for ever.)
+    recommended path is the value it lacks under that draw, relative to the best path's: the contact
+    it loses more, as a share of what the best path keeps, for lost_contact, and a share of the best
+    path's value for other objectives. Stop when P(regret <= eps) >= 1 - delta after each of the
+    last `patience` missions. ("The path did not change" would be the wrong test: near-ties change
+    for ever.)
 
     Attributes:
-        eps: Regret that is good enough, as a share of the best path's value.
+        eps: Regret that is good enough, as a share; .05 is 5 %.
         delta: Probability of a larger regret.
         patience: Number of missions in a row after which it has to hold.
         min_missions: Least number of missions.
@@ -68,7 +70,7 @@ class RegretBound:
         planner, draws = campaign.planner_now(), params_of(posterior)
         path = planner.plan(draws.mean()).path
         drawn = planner.plan_draws(draws, n_draws=self.n_draws)
-        return float(np.mean(drawn.regret(path) <= self.eps * np.abs(drawn.values)))
+        return float(np.mean(drawn.relative_regret(path) <= self.eps))
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
 
 RESERVED = (
@@ -35,15 +35,9 @@ def require_mission(
     """
     if not isinstance(mission, Mission):
         raise TrustboError(f"tell takes a Mission; got {mission!r}.")
-    names = {d: [str(n) for n in workspace.awareness[d].values] for d in ("robot", "feature")}
-    for what, found in (("robot", mission.robots), ("feature", mission.features)):
-        if sorted(found) != sorted(names[what]):
-            raise ShapeError(
-                f"the mission has {what}s {found}, the workspace {tuple(names[what])}; give "
-                f"{what}s= the workspace's names, or use the workspace of this team."
-            )
-    _require_path(mission, list(path), workspace.grid.shape, other_path)
-    return mission.in_order(names["robot"], names["feature"])
+    own = workspace.in_order(mission)
+    _require_path(own, list(path), workspace.grid.shape, other_path)
+    return own
 
 
 def require_new(mission: Mission, earlier: Sequence[Mission]) -> None:

@@ -94,7 +94,7 @@ def run(
 
 def demo(
     policy: str = POLICY,
-    objective: str = "mean",
+    objective: str = OBJECTIVE,
     model: str = "pooled",
     sampler: str = SAMPLER,
     iterations: int = 8,
@@ -109,9 +109,9 @@ def demo(
 
     Example: trustbo demo --sampler exact --iterations 4 --out out/demo
 
-    Then open out/demo/report.html. The objective here is the mean trust on the
-    way, which every bound changes; the paper's, which is the default of run, is
-    trust at the goal, which depends on the last few bounds.
+    Then open out/demo/report.html. The objective is the contact lost on the way,
+    which every bound changes; the paper's, terminal, is trust at the goal, which
+    depends on the last few bounds.
     """
     from trustbo import terrain
     from trustbo.files import write_file

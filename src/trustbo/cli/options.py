@@ -29,8 +29,9 @@ Robots and sight
   sight MODE: Obstacles to sight: bare (the ground), wall (canopy too), transmittance (canopy dims
     it).
 Paths
-  objective NAME: Objective of a path: terminal (trust at the goal, as in the paper), mean (on the
-    way), success (of every bound), bottleneck (the least on the way), stationary.
+  objective NAME: Objective of a path: lost_contact (on the way), terminal (trust at the goal, as in
+    the paper), mean (on the way), success (of every bound), bottleneck (the least on the way),
+    stationary.
 Learning
   policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb, ei,
     epsilon_greedy, cvar, random.

@@ -11,6 +11,8 @@ from trustbo.errors import ShapeError, TrustboError
 from trustbo.workspace import Workspace
 
 Maps = xr.Dataset | xr.DataArray
+LEAD = "lead"
+"""Name of the lead among the robots."""
 
 
 def find_crs(workspace: Workspace) -> CRS | None:
@@ -65,6 +67,12 @@ def require_names_for_netcdf(names: Iterable[str]) -> None:
     for name in names:
         if "/" in name or name in ("x", "y", "spatial_ref"):
             raise TrustboError(f"a map in netCDF cannot be called {name!r}; rename it.")
+
+
+def require_lead_apart(robots: Sequence[str]) -> None:
+    """Refuse a robot of T2 that is called as the lead: TrustboError."""
+    if LEAD in robots:
+        raise TrustboError(f"a robot is called {LEAD!r}, as the lead is in exports; rename it.")
 
 
 def require_names_for_sql(robots: Sequence[str]) -> None:

@@ -10,10 +10,15 @@ import xarray as xr
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.export.checks import require_crs, require_names_for_netcdf, require_names_for_sql
-from trustbo.export.paths import write_path
+from trustbo.export.checks import (
+    require_crs,
+    require_lead_apart,
+    require_names_for_netcdf,
+    require_names_for_sql,
+)
+from trustbo.export.paths import tables_beside, write_path
 from trustbo.export.rasters import write_geotiff, write_netcdf
-from trustbo.export.ros import occupancy, write_ros_bag, write_ros_map
+from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
@@ -42,6 +47,12 @@ class _Format(NamedTuple):
     """Whether the format needs a CRS."""
     require: Callable[[Result], None] | None = None
     """Check that refuses a result the format cannot hold."""
+    on_terrain: tuple[str, ...] = ()
+    """More files, of posts and ways, that are written with a terrain in memory only."""
+
+    def files_in(self, folder: Path, result: Result) -> list[Path]:
+        more = () if result.workspace.ground is None else self.on_terrain
+        return [folder / name for name in (*self.files, *more)]
 
 
 def export_result(
@@ -86,7 +97,7 @@ def export_result(
         occupancy(content.maps["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
-    return [target / file for kind in chosen.values() for file in kind.files]
+    return [file for kind in chosen.values() for file in kind.files_in(target, result)]
 
 
 def left_out(result: Result, folder: FilePath) -> dict[str, str]:
@@ -109,13 +120,15 @@ def _require_possible(name: str, result: Result, target: Path) -> None:
     kind = _FORMATS[name]
     if kind.on_earth:
         require_crs(result.workspace)
+    if any(file.startswith("path") for file in kind.files):
+        require_lead_apart(result.workspace.team.names)
     if kind.require is not None:
         kind.require(result)
-    for file in kind.files:
+    for file in kind.files_in(target, result):
         if name in _BAGS:
-            require_new_bag(target / file, None)
+            require_new_bag(file, None)
         else:
-            require_file(target / file)
+            require_file(file)
 
 
 def _write_maps(content: _Content, file: Path) -> None:
@@ -174,26 +187,45 @@ _FORMATS = {
         require=_require_netcdf,
     ),
     "geojson": _Format(
-        "the path in longitude and latitude", ("path.geojson",), _write_path, on_earth=True
+        "path, posts and ways in longitude and latitude",
+        ("path.geojson",),
+        _write_path,
+        on_earth=True,
     ),
     "gpx": _Format(
-        "the path as a route for GPS receivers", ("path.gpx",), _write_path, on_earth=True
+        "the path, and each robot's way, as routes for GPS receivers",
+        ("path.gpx",),
+        _write_path,
+        on_earth=True,
     ),
     "geopackage": _Format(
-        "the path and its cells as layers for GIS",
+        "path, cells, posts and ways as layers for GIS",
         ("path.gpkg",),
         _write_path,
         on_earth=True,
         require=lambda result: require_names_for_sql(result.workspace.team.names),
     ),
     "csv": _Format(
-        "tables of all bounds and of the path", ("bounds.csv", "path.csv"), _write_tables
+        "tables of all bounds, of the path, its posts and its ways",
+        ("bounds.csv", "path.csv"),
+        _write_tables,
+        on_terrain=tuple(file.name for file in tables_beside(Path("path.csv"))),
     ),
     "ros_map": _Format(
         "the cost map for map_server and Nav2", ("cost_map.yaml", "cost_map.pgm"), _write_map
     ),
-    "ros1_bag": _Format("cost map and path as a bag of ROS 1", ("path.bag",), _write_bag),
-    "ros2_bag": _Format("cost map and path as a bag of ROS 2 (mcap)", ("path_ros2",), _write_bag),
+    "ros1_bag": _Format(
+        "cost map, path, posts and ways as a bag of ROS 1",
+        ("path.bag",),
+        _write_bag,
+        require=lambda result: require_robots(result.workspace),
+    ),
+    "ros2_bag": _Format(
+        "cost map, path, posts and ways as a bag of ROS 2 (mcap)",
+        ("path_ros2",),
+        _write_bag,
+        require=lambda result: require_robots(result.workspace),
+    ),
 }
 FORMATS = {name: kind.text for name, kind in _FORMATS.items()}
 """Descriptions of the formats of `export_result`, by name."""

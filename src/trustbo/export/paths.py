@@ -1,4 +1,4 @@
-"""The recommended path as GeoJSON, GPX, GeoPackage or CSV."""
+"""The recommended path, posts and ways as GeoJSON, GPX, GeoPackage or CSV."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,114 +6,111 @@ from typing import Any
 
 import geopandas as gpd
 import numpy as np
-import pandas as pd
+import shapely
 from pyproj.exceptions import CRSError
 from shapely import LineString
 
 from trustbo.campaign.result import Result
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.export.checks import find_crs, require_crs, require_names_for_sql
-from trustbo.export.gpx import gpx_route
+from trustbo.export.gpx import gpx_routes
+from trustbo.export.layers import bounds_layer, plan_of, posts_layer, way_points, ways_layer
 from trustbo.files import FilePath, require_file, to_json, write_file, write_text
 from trustbo.planning import Plan
-from trustbo.planning.plan import QUANTILES
 from trustbo.workspace import Workspace
 
-_BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 _WGS84 = "EPSG:4326"
 _NAME = "most trustworthy path"
+_LAYERS = {"bounds": bounds_layer, "posts": posts_layer, "ways": ways_layer}
 
 
 def path_frame(
-    plan: Plan | Result, workspace: Workspace | None = None, *, crs: Any = _WGS84
+    plan: Plan | Result,
+    workspace: Workspace | None = None,
+    *,
+    layer: str = "bounds",
+    crs: Any = _WGS84,
 ) -> gpd.GeoDataFrame:
-    """Return a path as points, one per cell.
+    """Return a path as points, one per cell, or the posts or the ways of its bounds.
 
-    Columns are `bound` (0 for the start), `row`, `col`, `x` and `y` (centre of the cell, metres in
-    the CRS of the grid); for each robot the expected trust after the bound, `trust_<robot>`, and
-    its 5 % and 95 % quantiles over the posterior, `trust_<robot>_low` and `_high`, NaN for bound 0;
-    `geometry` in `crs`.
+    ====== ==================================================================================
+    bounds Points at the centres of the cells: `bound` (0 for the start), `row`, `col`; for each
+           robot the expected trust after the bound, `trust_<robot>`, and its 5 % and 95 %
+           quantiles over the posterior, `trust_<robot>_low` and `_high`, NaN for bound 0.
+    posts  Points where T2 stands while the lead runs a bound: `bound` (from 1), `robot`, `row` and
+           `col` of the cell, and `lead_x`, `lead_y`, where the lead stops then.
+    ways   Lines: `bound` (from 1), `robot` ("lead" first, which drives first), `length_m`.
+    ====== ==================================================================================
+
+    `x` and `y` of points are metres in the CRS of the grid, `geometry` is in `crs`. Posts and ways
+    are those of successive bounding; a robot without a way in a bound has no line.
 
     Args:
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default that of the result.
+        workspace: Workspace of the plan; by default its own.
+        layer: "bounds", "posts" or "ways"; the last two need a terrain.
         crs: CRS of the geometry, anything that pyproj accepts; None for that of the grid, if any.
 
     Raises:
         ShapeError: The plan and the workspace differ in their numbers of robots.
-        TrustboError: The workspace has no CRS, `crs` is unknown, or the path leaves the workspace.
+        TrustboError: The layer or `crs` is unknown, the workspace has no CRS or no terrain, the
+            path leaves it, or a robot is called "lead".
     """
-    plan, workspace = plan_of(plan, workspace)
-    own = find_crs(workspace) if crs is None else require_crs(workspace)
-    table = _table(plan, workspace)
-    points = gpd.points_from_xy(table["x"], table["y"])
-    frame = gpd.GeoDataFrame(table, geometry=points, crs=None if own is None else own.to_wkt())
+    plan = plan_of(plan, workspace)
+    make = _LAYERS[require_choice("layer", layer, _LAYERS)]
     if crs is None:
-        return frame
+        return make(plan)
+    require_crs(plan.workspace)
     try:
-        return frame.to_crs(crs)
+        return make(plan).to_crs(crs)
     except CRSError:
         raise TrustboError(f"unknown crs {crs!r}; give e.g. 'EPSG:4326', or None.") from None
 
 
 def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None = None) -> None:
-    """Write a path in the format of the suffix.
+    """Write a path, with its posts and ways, in the format of the suffix.
 
     ======== ========================================================================
-    .geojson RFC 7946: a LineString from start to goal, then a Point per cell with
-             its `bound`, `cell` and trust; longitude and latitude on WGS 84.
-    .gpx     GPX 1.1: a route; its points are named start, bound 1, ..., goal; the
-             description is the trust, the elevation that of the ground above the
-             datum of the DEM, in metres, if the workspace has a terrain.
-    .gpkg    GeoPackage: layers `path` (LineString) and `bounds` (points), in the
-             terrain's CRS.
-    .csv     The points as a table, with longitude and latitude if there is a CRS.
+    .geojson RFC 7946, longitude and latitude on WGS 84: a LineString from start to
+             goal, a Point per cell with its `bound`, `cell` and trust, a Point per
+             post, a LineString per way; the property `layer` is "path", "bounds",
+             "posts" or "ways".
+    .gpx     GPX 1.1: a route along the centres of the cells; its points are named
+             start, bound 1, ..., goal; the description is the trust, the elevation
+             that of the ground above the datum of the DEM, in metres, if the
+             workspace has a terrain. Then a route of the lead, and one of each robot:
+             its ways, thinned by at most half a pixel; where it stops, points have
+             names.
+    .gpkg    GeoPackage: layers `path` (LineString), `bounds` (points), `posts` and
+             `ways`, in the terrain's CRS.
+    .csv     The points of cells as a table, with longitude and latitude if there is a
+             CRS; beside it, tables of posts, and of the points of ways, whose names
+             end in _posts.csv and _ways.csv.
     ======== ========================================================================
+
+    Columns and properties are those of `path_frame`. Posts and ways are left out where the
+    workspace has no terrain in memory; the route of a robot ends where it has no way.
 
     Args:
         path: File to write, or to replace.
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default that of the result. Without a terrain, only a
-            table can be written.
+        workspace: Workspace of the plan; by default its own. Without a terrain, only a table can
+            be written.
 
     Raises:
         ShapeError: The plan and the workspace differ in their numbers of robots.
         TrustboError: The suffix is unknown, the workspace has no CRS, the path leaves the
-            workspace, or the file cannot be written.
+            workspace, a robot is called "lead", or the file cannot be written.
     """
-    plan, workspace = plan_of(plan, workspace)
+    plan = plan_of(plan, workspace)
     suffix = require_choice("suffix", Path(path).suffix.lower(), _WRITERS)
-    _WRITERS[suffix](require_file(path), plan, workspace)
+    _WRITERS[suffix](require_file(path), plan)
 
 
-def plan_of(plan: Plan | Result, workspace: Workspace | None) -> tuple[Plan, Workspace]:
-    """Return a plan and its workspace.
-
-    ShapeError: they differ in their numbers of robots. TrustboError: no workspace, or the path
-    leaves it.
-    """
-    if isinstance(plan, Result):
-        plan, workspace = plan.plan, workspace or plan.workspace
-    if workspace is None:
-        raise TrustboError("a plan has no workspace; give the workspace too.")
-    for k, cell in enumerate(plan.path):
-        workspace.require_cell(f"path[{k}]", cell)
-    n_robots = plan.trust.shape[1]
-    if n_robots != len(workspace.team.names):
-        raise ShapeError(f"the plan has {n_robots} robots, the workspace {workspace.team.names}.")
-    return plan, workspace
-
-
-def _table(plan: Plan, workspace: Workspace) -> pd.DataFrame:
-    """Return the columns of `path_frame` without the geometry."""
-    row, col = np.array(plan.path).T
-    x, y = np.array([workspace.grid.center(cell) for cell in plan.path]).T
-    columns = {"bound": np.arange(len(row)), "row": row, "col": col, "x": x, "y": y}
-    for i, robot in enumerate(workspace.team.names):
-        columns[f"trust_{robot}"] = np.insert(plan.trust[:, i], 0, np.nan)
-        for end, q in _BAND.items():
-            columns[f"trust_{robot}_{end}"] = np.insert(plan.bands[q, :, i], 0, np.nan)
-    return pd.DataFrame(columns)
+def tables_beside(file: Path) -> tuple[Path, Path]:
+    """Return the files of posts and of ways that are written beside the table of a path."""
+    posts, ways = (file.with_name(f"{file.stem}_{name}{file.suffix}") for name in ("posts", "ways"))
+    return posts, ways
 
 
 def _facts(plan: Plan) -> dict[str, object]:
@@ -127,52 +124,77 @@ def _facts(plan: Plan) -> dict[str, object]:
     }
 
 
-def _write_geojson(file: Path, plan: Plan, workspace: Workspace) -> None:
-    frame = path_frame(plan, workspace)
-    lon, lat = frame.geometry.x, frame.geometry.y
-    # RFC 7946, 11.2: no more digits than the precision; the eighth is a millimetre.
-    positions = [[round(a, 8), round(b, 8)] for a, b in zip(lon, lat, strict=True)]
-    features = [_feature("LineString", positions, _facts(plan))]
-    trust = frame.filter(like="trust_").to_dict("records")
-    for k, (position, cell, of_robots) in enumerate(zip(positions, plan.path, trust, strict=True)):
-        known = {name: value for name, value in of_robots.items() if np.isfinite(value)}
-        features.append(_feature("Point", position, {"bound": k, "cell": list(cell), **known}))
+def _write_geojson(file: Path, plan: Plan) -> None:
+    bounds = path_frame(plan)
+    line = _feature("path", LineString(bounds.geometry.to_list()), _facts(plan))
+    features = [line, *_features("bounds", bounds)]
+    for layer in _of_terrain(plan):
+        features += _features(layer, path_frame(plan, layer=layer))
     write_text(file, to_json({"type": "FeatureCollection", "features": features}))
 
 
-def _feature(kind: str, coordinates: list, properties: dict[str, object]) -> dict[str, object]:
-    geometry = {"type": kind, "coordinates": coordinates}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+def _features(layer: str, frame: gpd.GeoDataFrame) -> list[dict[str, object]]:
+    """Return features with what is known, and with `cell` for row and column."""
+    features = []
+    rows = frame.drop(columns=["geometry", *frame.columns.intersection(["x", "y"])])
+    for row, place in zip(rows.to_dict("records"), frame.geometry, strict=True):
+        if "row" in row:
+            row["cell"] = [row.pop("row"), row.pop("col")]
+        known = {name: value for name, value in row.items() if value == value}
+        features.append(_feature(layer, place, known))
+    return features
 
 
-def _write_gpx(file: Path, plan: Plan, workspace: Workspace) -> None:
-    write_text(file, gpx_route(path_frame(plan, workspace), workspace, _NAME))
+def _feature(layer: str, place: Any, properties: dict[str, object]) -> dict[str, object]:
+    # RFC 7946, 11.2: no more digits than the precision; the eighth is a millimetre.
+    positions = np.round(shapely.get_coordinates(place), 8).tolist()
+    coordinates = positions if place.geom_type == "LineString" else positions[0]
+    geometry = {"type": place.geom_type, "coordinates": coordinates}
+    return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **properties}}
 
 
-def _write_geopackage(file: Path, plan: Plan, workspace: Workspace) -> None:
+def _write_gpx(file: Path, plan: Plan) -> None:
+    write_text(file, gpx_routes(plan, _NAME))
+
+
+def _write_geopackage(file: Path, plan: Plan) -> None:
+    workspace = plan.workspace
     require_crs(workspace)
     require_names_for_sql(workspace.team.names)
-    points = path_frame(plan, workspace, crs=None)
-    way = LineString(np.column_stack([points["x"], points["y"]]))
-    line = gpd.GeoDataFrame([_facts(plan)], geometry=[way], crs=points.crs)
+    bounds = bounds_layer(plan)
+    way = LineString(bounds.geometry.to_list())
+    layers = {"path": gpd.GeoDataFrame([_facts(plan)], geometry=[way], crs=bounds.crs)}
+    layers["bounds"] = bounds
+    layers |= {name: _LAYERS[name](plan) for name in _of_terrain(plan)}
 
     def write(temporary: Path) -> None:
-        line.to_file(temporary, layer="path", driver="GPKG", engine="pyogrio")
-        points.to_file(temporary, layer="bounds", driver="GPKG", engine="pyogrio", mode="a")
+        for name, layer in layers.items():
+            mode = "a" if temporary.exists() else "w"
+            layer.to_file(temporary, layer=name, driver="GPKG", engine="pyogrio", mode=mode)
 
     write_file(file, write)
 
 
-def _write_csv(file: Path, plan: Plan, workspace: Workspace) -> None:
-    table = _table(plan, workspace)
-    if find_crs(workspace) is not None:
-        place = path_frame(plan, workspace).geometry
-        table.insert(5, "longitude", place.x)
-        table.insert(6, "latitude", place.y)
-    write_text(file, table.to_csv(index=False, lineterminator="\n"))
+def _write_csv(file: Path, plan: Plan) -> None:
+    tables = {file: bounds_layer(plan).drop(columns="geometry")}
+    if _of_terrain(plan):
+        posts, ways = map(require_file, tables_beside(file))
+        tables |= {posts: posts_layer(plan).drop(columns="geometry"), ways: way_points(plan)}
+    for own, table in tables.items():
+        if (crs := find_crs(plan.workspace)) is not None:
+            place = gpd.points_from_xy(table["x"], table["y"], crs=crs.to_wkt()).to_crs(_WGS84)
+            after = table.columns.get_loc("y")
+            table.insert(after + 1, "longitude", place.x)
+            table.insert(after + 2, "latitude", place.y)
+        write_text(own, table.to_csv(index=False, lineterminator="\n"))
 
 
-_WRITERS: dict[str, Callable[[Path, Plan, Workspace], None]] = {
+def _of_terrain(plan: Plan) -> tuple[str, ...]:
+    """Names of the layers that a plan has on a terrain in memory only."""
+    return () if plan.workspace.ground is None else ("posts", "ways")
+
+
+_WRITERS: dict[str, Callable[[Path, Plan], None]] = {
     ".geojson": _write_geojson,
     ".gpx": _write_gpx,
     ".gpkg": _write_geopackage,

@@ -16,11 +16,11 @@ import yaml
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
-from trustbo.export.checks import require_maps
-from trustbo.export.paths import plan_of
+from trustbo.export.checks import LEAD, require_maps
+from trustbo.export.layers import plan_of, routes_of
 from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.logs.bagfile import STORAGES, Record, require_new_bag, write_messages
-from trustbo.logs.messages import GRID, PATH, Messages
+from trustbo.logs.messages import GRID, PATH, POSES, Messages, require_topic_names
 from trustbo.planning import Plan
 from trustbo.workspace import Workspace
 
@@ -135,10 +135,20 @@ def write_ros_bag(
     resolution: float | None = None,
     origin: tuple[float, float] | None = None,
 ) -> None:
-    """Write a cost map and a path as a ROS bag, for RViz and Foxglove.
+    """Write a cost map, a path, and all robots' posts and ways as a ROS bag.
 
-    `/trustbo/cost` has one nav_msgs/OccupancyGrid, `/trustbo/path` one nav_msgs/Path through the
-    centres of the cells, each pose towards the next; both are latched (transient local).
+    All messages are latched (transient local), for RViz, Foxglove and drivers:
+
+    ======================== ===================== ===========================================
+    /trustbo/cost            nav_msgs/OccupancyGrid cost map
+    /trustbo/path            nav_msgs/Path          centres of the cells, each towards the next
+    /trustbo/<robot>/way     nav_msgs/Path          ways of all bounds, also of the `lead`
+    /trustbo/<robot>/posts   geometry_msgs/PoseArray where it stands while the lead runs each
+                                                    bound, towards the lead's next stop
+    /trustbo/lead/waypoints  geometry_msgs/PoseArray stops of the lead, each towards the next
+    ======================== ===================== ===========================================
+
+    Ways, posts and waypoints need a terrain in memory; the way of a robot ends where it has none.
 
     Args:
         path: New `.bag` file for ROS 1, or new folder for ROS 2.
@@ -152,15 +162,18 @@ def write_ros_bag(
 
     Raises:
         ShapeError: The dims, or the number of cells or robots, differ.
-        TrustboError: rosbags is not installed; the path exists, or is of the other version; or an
-            argument is refused by `write_ros_map`.
+        TrustboError: rosbags is not installed; the path exists, or is of the other version; a name
+            of a robot is none of ROS, or "lead"; or an argument is refused by `write_ros_map`.
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
     of_path = require_new_bag(target, version)
-    plan, workspace = plan_of(plan, workspace)
+    plan = plan_of(plan, workspace)
+    require_robots(workspace)
     raster = _raster(cost, workspace, resolution, origin)
-    poses = _poses(plan, workspace, raster.shift)
+    topics = _topics(plan, raster.shift)
+
+    of_kind = {PATH: Messages.path, POSES: Messages.poses}
 
     def records(make: Messages) -> list[Record]:
         corner = np.array([*raster.corner, 0.0])
@@ -168,7 +181,10 @@ def write_ros_bag(
         grid = make.grid(now, raster.values, raster.resolution, corner)
         return [
             Record(now, "/trustbo/cost", GRID, grid),
-            Record(now, "/trustbo/path", PATH, make.path(now, poses)),
+            *(
+                Record(now, f"/trustbo/{name}", kind, of_kind[kind](make, now, poses))
+                for name, (kind, poses) in topics.items()
+            ),
         ]
 
     write_messages(target, of_path, storage, records, latched=True)
@@ -207,9 +223,35 @@ def _position(origin: tuple[float, float]) -> np.ndarray:
     return position
 
 
-def _poses(plan: Plan, workspace: Workspace, shift: np.ndarray) -> np.ndarray:
-    """Poses at the centres of the cells, towards the next centre, shape (cell, 3)."""
-    centers = np.array([workspace.grid.center(cell) for cell in plan.path]) + shift
-    steps = np.diff(centers, axis=0)
-    heading = np.arctan2(steps[:, 1], steps[:, 0])
-    return np.column_stack([centers, [*heading, heading[-1] if len(heading) else 0.0]])
+def require_robots(workspace: Workspace) -> None:
+    """Refuse names of robots that cannot be in topics, where they are: TrustboError."""
+    if workspace.ground is not None:
+        require_topic_names(LEAD, workspace.team.names)
+
+
+def _topics(plan: Plan, shift: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the type and the poses (pose, 3) of each topic, shifted into the frame `map`."""
+    centers = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
+    topics = {"path": (PATH, _onward(centers + shift))}
+    if plan.waypoints is None or plan.posts is None:
+        return topics
+    topics[f"{LEAD}/waypoints"] = POSES, _onward(plan.waypoints + shift)
+    for i, robot in enumerate(plan.workspace.team.names):
+        own = plan.posts[:, i]
+        topics[f"{robot}/posts"] = POSES, _towards(own + shift, plan.waypoints[1:] - own)
+    for robot, ways in routes_of(plan).items():
+        if ways:
+            # The end of a way is the start of the next.
+            points = np.concatenate([ways[0][:1], *(way[1:] for way in ways)])
+            topics[f"{robot}/way"] = PATH, _onward(points + shift)
+    return topics
+
+
+def _onward(positions: np.ndarray) -> np.ndarray:
+    """Poses at positions (point, 2), each towards the next, shape (point, 3)."""
+    steps = np.diff(positions, axis=0)
+    return _towards(positions, np.concatenate([steps, steps[-1:]]))
+
+
+def _towards(positions: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    return np.column_stack([positions, np.arctan2(steps[:, 1], steps[:, 0])])

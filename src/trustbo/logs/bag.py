@@ -13,7 +13,6 @@ published is NaN, which `Campaign.tell` takes from the map.
 """
 
 import json
-import re
 import time
 from collections.abc import Iterator, Sequence
 from datetime import datetime
@@ -37,6 +36,7 @@ from trustbo.logs.messages import (
     TEXT,
     Messages,
     Topics,
+    require_topic_names,
 )
 from trustbo.logs.netcdf import STATES
 from trustbo.logs.recording import Marker, Recording, Series
@@ -159,13 +159,7 @@ def _ns(start: datetime | float) -> int:
 
 def _require_names(mission: Mission, lead: str) -> None:
     """Check that topics and labels can hold the names of robots and features."""
-    for robot in (lead, *mission.robots):
-        if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", robot):
-            raise TrustboError(
-                f"robot {robot!r} cannot be in a topic: take a letter, then letters, digits, _."
-            )
-    if lead in mission.robots:
-        raise TrustboError(f"a robot is called as the lead, {lead!r}; see Topics.lead.")
+    require_topic_names(lead, mission.robots)
     for feature in mission.features:
         if "," in feature or feature != feature.strip():
             raise TrustboError(f"feature {feature!r} cannot be in a label joined by commas.")

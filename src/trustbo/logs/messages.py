@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ NUMBERS = "std_msgs/msg/Float64MultiArray"
 POSE = "geometry_msgs/msg/PoseStamped"
 GRID = "nav_msgs/msg/OccupancyGrid"
 PATH = "nav_msgs/msg/Path"
+POSES = "geometry_msgs/msg/PoseArray"
 
 MARKER_TYPES = (TEXT, "std_msgs/msg/Int32MultiArray")
 STATUS_TYPES = (TEXT,)
@@ -62,6 +64,17 @@ class Topics:
         return [getattr(self, kind).replace("{robot}", robot) for robot in robots]
 
 
+def require_topic_names(lead: str, robots: Sequence[str]) -> None:
+    """Refuse names of the lead and the robots that topics cannot hold: TrustboError."""
+    for robot in (lead, *robots):
+        if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", robot):
+            raise TrustboError(
+                f"robot {robot!r} cannot be in a topic: take a letter, then letters, digits, _."
+            )
+    if lead in robots:
+        raise TrustboError(f"a robot is called as the lead, {lead!r}; see Topics.lead.")
+
+
 class Messages:
     """Factory of messages of one version of ROS."""
 
@@ -93,6 +106,10 @@ class Messages:
         """Make a path through poses, shape (pose, 3), in the frame `map`."""
         stamped = [self.pose(time, pose) for pose in poses]
         return self._types[PATH](header=self._header(time), poses=stamped)
+
+    def poses(self, time: int, poses: np.ndarray) -> Any:
+        """Make an array of poses, shape (pose, 3), in the frame `map`."""
+        return self._types[POSES](header=self._header(time), poses=[self._pose(p) for p in poses])
 
     def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
         """Make a map in the frame `map` from int8 values (row, col), the southern row first.

@@ -20,8 +20,9 @@ class Dynamics(NamedTuple):
     """Expected trust x_k = transition x_{k-1} + drift(bound), x_0 = start; leading axes (...,).
 
     Fields: transition (..., state, state), drift (..., state, move, row, col), start (..., state),
-    and views (view, state): trust of the team is the least of `views @ x`. States are the robots;
-    one state, their mean, suffices where all have one beta0 and trust of the team is the mean.
+    views (view, state): trust of the team is the least of `views @ x`; and noise_sd (...,), delta_v
+    as the mean over robots. States are the robots; one state, their mean, suffices where all have
+    one beta0 and trust of the team is the mean.
 
     Drift is that of the bound into (row, col) by a move of `MOVES`, of 4 or 8; the axis of moves
     has length 1 where it is that of the cell entered, whichever way. NaN where there is no bound.
@@ -31,6 +32,7 @@ class Dynamics(NamedTuple):
     drift: np.ndarray
     start: np.ndarray
     views: np.ndarray
+    noise_sd: np.ndarray
 
     @property
     def is_scalar(self) -> bool:
@@ -39,15 +41,17 @@ class Dynamics(NamedTuple):
 
     def take(self, which: int | slice | np.ndarray) -> "Dynamics":
         """Select some of the draws; one, by its index, without its leading axis."""
-        return Dynamics(self.transition[which], self.drift[which], self.start[which], self.views)
+        transition, drift, start, views, sd = self
+        return Dynamics(transition[which], drift[which], start[which], views, sd[which])
 
     def flat(self) -> "Dynamics":
         """Reshape to exactly one leading axis (draw,), of length 1 if there is none."""
 
         def one(value: np.ndarray, core: int) -> np.ndarray:
-            return value.reshape(-1, *value.shape[value.ndim - core :])
+            return np.reshape(value, (-1, *np.shape(value)[np.ndim(value) - core :]))
 
-        return Dynamics(one(self.transition, 2), one(self.drift, 4), one(self.start, 1), self.views)
+        transition, drift, start, views, sd = self
+        return Dynamics(one(transition, 2), one(drift, 4), one(start, 1), views, one(sd, 0))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Dynamics":
         """Select the bounds of a path: drift (..., state, 1, 1, bound)."""
@@ -85,15 +89,23 @@ def trust_dynamics(
     elif not start.ndim:
         start = start[None]
     start = np.broadcast_to(start, (*leading, n_robots))
+    sd = rate_noise_sd(params)
+    sd = np.broadcast_to(sd.mean(-1) if params.n_robots else sd, leading)
     if isinstance(params, RobotParams | CoupledParams) or team == "min":
         views = np.eye(n_robots) if team == "min" else np.full((1, n_robots), 1.0 / n_robots)
-        return Dynamics(transition(params, n_robots), drift(params, z), start, views)
+        return Dynamics(transition(params, n_robots), drift(params, z), start, views, sd)
     beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
     # The mean over robots obeys the same equation.
     u = drift(params, z.mean(-5, keepdims=True) if n_robots > 1 else z)
-    return Dynamics(
-        np.broadcast_to(beta0, (*leading, 1, 1)), u, start.mean(-1, keepdims=True), np.eye(1)
-    )
+    start = start.mean(-1, keepdims=True)
+    return Dynamics(np.broadcast_to(beta0, (*leading, 1, 1)), u, start, np.eye(1), sd)
+
+
+def rate_noise_sd(params: Params) -> np.ndarray:
+    """Standard deviation of the rates' noise, delta_v, shape (...,) or (..., robot)."""
+    if isinstance(params, CoupledParams):
+        return np.sqrt(np.diagonal(params.Delta_v, axis1=-2, axis2=-1))
+    return np.asarray(params.delta_v, dtype=float)
 
 
 def transition(params: Params, n_robots: int) -> np.ndarray:
@@ -163,7 +175,7 @@ def as_map(awareness: np.ndarray) -> np.ndarray:
 
 def roll(along: Dynamics) -> np.ndarray:
     """Roll the recursion along the bounds of a path (see `Dynamics.along`), (..., bound, state)."""
-    transition, drift, start, _ = along
+    transition, drift, start, *_ = along
     leading, (n_states, _, _, n_bounds) = drift.shape[:-4], drift.shape[-4:]
     trust = np.empty((*leading, n_bounds, n_states))
     _roll(

@@ -7,7 +7,7 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params
-from trustbo.planning.dynamics import roll_trust, transition
+from trustbo.planning.dynamics import rate_noise_sd, roll_trust, transition
 from trustbo.workspace.moves import along
 
 GAUSSIAN = FAMILIES["gaussian"]
@@ -94,7 +94,5 @@ def _levels(params: Params, trust: np.ndarray, lag: float) -> np.ndarray:
 
 def _noise_sd(params: Params) -> np.ndarray:
     """Standard deviation of the rates' noise, over (..., bound, robot)."""
-    if isinstance(params, CoupledParams):
-        return np.sqrt(np.diagonal(params.Delta_v, axis1=-2, axis2=-1))[..., None, :]
-    sd = np.asarray(params.delta_v, dtype=float)
+    sd = rate_noise_sd(params)
     return sd[..., None, :] if params.n_robots else sd[..., None, None]

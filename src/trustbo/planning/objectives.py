@@ -1,4 +1,4 @@
-"""The five objectives: value of a path from the team's expected trust along it."""
+"""The six objectives: value of a path from the team's expected trust along it."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -7,13 +7,51 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
+from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.planning.dynamics import Dynamics
+
 
 class Objective(NamedTuple):
-    """An objective by name, and the weight of the path's length in it."""
+    """An objective by name, the weight of the path's length in it, and the law of the rates."""
 
     name: str
     length_weight: float = 0.0
-    """Cost of a metre of the path, in units of trust (or of log probability)."""
+    """Cost of a metre of the path, in units of trust, of lost bounds or of log probability."""
+    family: Family = FAMILIES["gaussian"]
+    """Family of the contact rates, and"""
+    lag: float = 0.0
+    """0 where they measure trust, 1 where they measure its change over a bound."""
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether it depends on a path's whole history, and needs beta0 >= 0."""
+        return self.name in LABELLED or (
+            self.name == "lost_contact" and self.family.expected_rate != "identity"
+        )
+
+    def capped(self, dynamics: Dynamics) -> Dynamics:
+        """Cap drift and start for `lost_contact` where rates are linear in trust.
+
+        u <= 1 - B0 1 and x0 <= 1 for each state (the mean of robots alike in all, else each robot),
+        so that trust is at most 1 if B0 >= 0: no bound gains contact, and a loop never pays. Other
+        dynamics are returned as they are.
+        """
+        if self.name != "lost_contact" or self.has_labels or self.lag:
+            return dynamics
+        most = 1.0 - dynamics.transition.sum(-1)[..., None, None, None]
+        drift, start = np.minimum(dynamics.drift, most), np.minimum(dynamics.start, 1.0)
+        return dynamics._replace(drift=drift, start=start)
+
+    def contact_lost(
+        self, trust: np.ndarray, before: ArrayLike, noise_sd: np.ndarray
+    ) -> np.ndarray:
+        """Expected contact lost in each bound, 1 - E[rate], shape (..., bound).
+
+        From the team's trust after each bound, that `before` the first (...,), and the sd of a rate
+        (...,). It is not negative, but where a linear rate of uncapped trust exceeds 1.
+        """
+        earlier = np.concatenate([np.asarray(before)[..., None], trust[..., :-1]], axis=-1)
+        return 1.0 - self.family.rate_moments(trust - self.lag * earlier, noise_sd[..., None])[0]
 
 
 class PathTrust(NamedTuple):
@@ -22,9 +60,11 @@ class PathTrust(NamedTuple):
     trust: np.ndarray
     """Expected trust of the team after each bound, shape (..., bound)."""
     steady_state: np.ndarray
-    """Limit of the team's trust if it stayed in each cell, u / (1 - beta0), likewise."""
+    """Limit of the team's trust if all bounds were as each one, u / (1 - beta0), likewise."""
     length_cost: np.ndarray | float = 0.0
     """Length of the path times `length_weight`."""
+    contact_lost: np.ndarray | float = np.nan
+    """Expected contact lost in each bound, 1 - E[rate given trust], likewise."""
 
 
 def softplus(x: ArrayLike) -> np.ndarray:
@@ -33,6 +73,7 @@ def softplus(x: ArrayLike) -> np.ndarray:
 
 
 OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = {
+    "lost_contact": lambda path: -np.sum(path.contact_lost, axis=-1) - path.length_cost,
     "terminal": lambda path: expit(path.trust[..., -1] - path.length_cost),
     "mean": lambda path: path.trust.mean(-1) - path.length_cost,
     "success": lambda path: np.exp(-softplus(-path.trust).sum(-1)),
@@ -41,12 +82,18 @@ OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = {
 }
 """Value of a path, to be maximised; the length cost is the path's metres times `length_weight`.
 
-terminal: sigma(x^K - length cost), one minus the paper's cost (6) without length cost. mean: mean
-trust over the bounds, less the length cost. success: product of sigma(x^k), the probability that
-every bound succeeds. bottleneck: least trust on the path. stationary: the product of sigma of each
-cell's steady-state trust, independent of history, times exp(-length cost).
+lost_contact: minus the contact that is expected to be lost on the way, in bounds (9 bounds with an
+expected rate of .9 lose .9), less the length cost. terminal: sigma(x^K - length cost), one minus
+the paper's cost (6) without length cost. mean: mean trust over the bounds, less the length cost.
+success: product of sigma(x^k), the probability that every bound succeeds. bottleneck: least trust
+on the path. stationary: the product of sigma of each bound's steady-state trust, independent of
+history, times exp(-length cost).
 """
-ADDITIVE = ("terminal", "mean", "stationary")
+ADDITIVE = ("lost_contact", "terminal", "mean", "stationary")
 """Objectives that admit a length weight."""
 LABELLED = ("success", "bottleneck")
-"""Objectives that depend on the whole history of a path, and need beta0 >= 0."""
+"""Objectives that depend on the whole history of a path, whatever the law of the rates."""
+DEFAULT_MAX_BOUNDS: Mapping[str, str | None] = {"lost_contact": "shortest+4"} | {
+    name: None for name in LABELLED
+}
+"""Limits of objectives on the number of bounds; that of others is "shortest+2"."""

@@ -1,11 +1,14 @@
-"""A plan: a path and its expected trust, value and exactness."""
+"""A plan: a path, its expected trust, value and exactness, and what robots are to do."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from trustbo.data import Cell
+from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantiles of `Plan.bands`: ends of the 90 % and of the 50 % band."""
@@ -15,6 +18,9 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 class Plan:
     """A path with its expected trust, value and exactness.
 
+    What robots are to do, `waypoints`, `posts` and `ways`, is that of successive bounding, in CRS
+    metres; it is the workspace's, computed on demand, and None without a terrain in memory.
+
     Attributes:
         path: Cells, start first.
         positions: Centres of the cells, shape (cell, 2), x and y in CRS metres.
@@ -22,7 +28,8 @@ class Plan:
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over draws of the parameters, shape (quantile, bound,
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
-        value: Value of the objective, to be maximised (see `OBJECTIVES`).
+        value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
+            the bounds' worth of contact expected to be lost, with trust capped at 1.
         success: Product over the bounds of sigma(team's trust): the probability that all succeed.
         objective: Name of the objective.
         exact: True if no admissible path is better.
@@ -31,6 +38,7 @@ class Plan:
         revisits: Number of bounds that enter a cell again.
         engine: Engine that found the path, "networkx" or "numba"; or "given".
         seconds: Time of the search, s.
+        workspace: Workspace of the path.
     """
 
     path: tuple[Cell, ...]
@@ -46,19 +54,44 @@ class Plan:
     revisits: int
     engine: str
     seconds: float
+    workspace: Workspace
+
+    @cached_property
+    def waypoints(self) -> np.ndarray | None:
+        """Stops of the lead in the cells of the path, shape (cell, 2)."""
+        if (ground := self.workspace.ground) is None:
+            return None
+        return np.stack([ground.posts.waypoint(cell) for cell in self.path])
+
+    @cached_property
+    def posts(self) -> np.ndarray | None:
+        """Posts where T2 stands while the lead runs each bound, shape (bound, robot, 2)."""
+        if (ground := self.workspace.ground) is None:
+            return None
+        return np.stack([ground.posts.at(a, c) for a, c in pairwise(self.path)])
+
+    @cached_property
+    def ways(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
+        """Ways of each bound: the lead's, then each of T2's, polylines of shape (point, 2).
+
+        T2 closes up to its posts for the next bound, at the goal around the lead. None for a robot
+        that has no way.
+        """
+        if (ground := self.workspace.ground) is None:
+            return None
+        bounds = zip(pairwise(self.path), (*self.path[2:], None), strict=True)
+        return tuple((ground.lead(a, c), *ground.closing(a, c, ahead)) for (a, c), ahead in bounds)
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
-    """Convert a plan to plain lists and numbers."""
-    return {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in vars(plan).items()
-    }
+    """Convert a plan, without its workspace, to plain lists and numbers."""
+    values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
+    return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}
 
 
-def plan_from_record(record: dict[str, Any]) -> Plan:
-    """Convert the record of `plan_to_record` to a plan."""
-    values: dict[str, Any] = dict(record)
+def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
+    """Convert the record of `plan_to_record` to a plan of a workspace."""
+    values: dict[str, Any] = {**record, "workspace": workspace}
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
     values["path"] = tuple((row, col) for row, col in record["path"])

@@ -18,7 +18,7 @@ from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
 from trustbo.planning import search
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.objectives import LABELLED, Objective
+from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.posterior import DrawnPaths, choose_draws
@@ -51,7 +51,7 @@ class Planner:
         workspace: Workspace,
         start: Cell,
         goal: Cell,
-        objective: str = "terminal",
+        objective: str = "lost_contact",
         *,
         connectivity: int = 8,
         max_bounds: int | str | None = None,
@@ -69,40 +69,44 @@ class Planner:
             workspace: Planning grid with awareness and passability.
             start: First cell.
             goal: Last cell.
-            objective: `"terminal"`, `"mean"`, `"success"`, `"bottleneck"` or `"stationary"`.
+            objective: `"lost_contact"`, `"terminal"`, `"mean"`, `"success"`, `"bottleneck"` or
+                `"stationary"`; see `OBJECTIVES`.
             connectivity: 4, or 8 to allow diagonal bounds too.
             max_bounds: Limit on the number of bounds. `"shortest"`: the fewest possible;
                 `"shortest+n"`: up to n more, without U-turns, which keeps paths simple for n up to
-                2 (default for terminal and mean); `Plan.revisits` counts cells entered again
-                beyond. An int: walks of at most that many bounds (default for
+                2 (default for terminal and mean; 4 for lost_contact); `Plan.revisits` counts cells
+                entered again beyond. An int: walks of at most that many bounds (default for
                 success and bottleneck: shortest + 8). Without effect on stationary, whose
                 admissible paths are all simple paths.
             revisit: True if walks of success and bottleneck may enter a cell twice.
             team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
-            length_weight: Cost of a metre of the path, for terminal, mean (in units of trust) and
-                stationary (in units of log probability).
+            length_weight: Cost of a metre of the path, for lost_contact (in bounds), terminal and
+                mean (in units of trust) and stationary (in units of log probability).
             engine: `"networkx"`, the reference; `"numba"`, compiled; or `"auto"`: networkx for
-                single plans on up to 50 x 50 cells; for success, bottleneck and `team="min"` up to
-                10 x 10. All find paths of the same value.
+                single plans on up to 50 x 50 cells; for success, bottleneck, `team="min"` and
+                lost_contact of other than Gaussian rates up to 10 x 10. All find paths of the same
+                value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
             observation: Family of the contact rates, and
-            response: quantity that they measure, both as of the trust model; the policy
-                `information` needs to know what a mission would teach.
+            response: quantity that they measure, both as of the trust model: for lost_contact,
+                and for the policy `information`.
 
         Raises:
             TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
                 `max_bounds` below the fewest possible; a length weight that is negative, or for
-                success or bottleneck.
+                success or bottleneck; lost_contact of rates that measure the change of trust, but
+                for Gaussian rates and `team="mean"`.
             NoPathError: The goal cannot be reached.
         """
         self.engine, self._engine = engine, search.Engine(engine, backend)
         self.family = FAMILIES[require_choice("observation", observation, FAMILIES)]
         self.lag = float(require_choice("response", response, RESPONSES) == "change")
         self._engine.choose(0, 1)
-        if max_bounds is None and objective not in LABELLED:
-            max_bounds = "shortest+2"
+        if max_bounds is None:
+            max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
         paths = AdmissiblePaths(workspace, start, goal, connectivity, max_bounds, revisit)
-        self._hold(PlanningProblem(paths, Objective(objective, length_weight), team))
+        chosen = Objective(objective, length_weight, self.family, self.lag)
+        self._hold(PlanningProblem(paths, chosen, team))
 
     def _hold(self, problem: PlanningProblem) -> None:
         paths = problem.paths
@@ -193,20 +197,23 @@ class Planner:
         return search.find_path(self.problem, dynamics, self._engine).path
 
     def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
-        """Find the path with the best expectation over draws of terminal trust, or of mean trust.
+        """Find the path with the best expectation over draws of terminal, mean or lost contact.
 
-        Exact for the given draws, correlations between parameters included, because both are linear
-        in the cells' drifts. `value` is that of the mean terminal trust, or the mean of mean trust.
+        Exact for the given draws, correlations between parameters included, because these are
+        linear in the bounds' drifts; for lost_contact, these are not capped here. `value` is that
+        of the mean terminal trust, the mean of mean trust, or minus the mean of lost contact.
 
         Args:
             posterior: Posterior of `fit`, or draws with leading axis (draw,).
 
         Raises:
-            TrustboError: Another objective, or `team="min"`.
+            TrustboError: Another objective, rates that are not linear in trust for lost_contact,
+                or `team="min"`.
         """
         started = time.perf_counter()
         params = draws_of(posterior)
-        plan = self.evaluate(search.find_expected(self.problem, self.dynamics(params)), params)
+        path = search.find_expected(self.problem, self.dynamics(params))
+        plan = evaluate(self.problem, path, params, cap=False)
         seconds = time.perf_counter() - started
         return replace(plan, exact=True, bound=plan.value, engine="numba", seconds=seconds)
 
@@ -237,7 +244,8 @@ class Planner:
         Args:
             path: Cells from start to goal, each a neighbour of the last.
             params: Draws of parameters, one or many, or a posterior; of many, `trust` and `value`
-                are those of mean trust, and `bands` its quantiles.
+                are those of mean trust, and `bands` its quantiles. For lost_contact and stationary,
+                `value` is the mean over draws.
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:

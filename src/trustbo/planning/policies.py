@@ -48,6 +48,7 @@ def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: flo
         np.quantile(dynamics.drift, quantile, axis=0),
         dynamics.start.mean(0),
         dynamics.views,
+        dynamics.noise_sd.mean(0),
     )
     return planner.evaluate(planner.best_path(best), posterior.mean())
 

@@ -13,6 +13,9 @@ from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.values import path_value
 
+_ROUNDING = 1e-12
+"""Difference of the values of two paths that may be the same."""
+
 
 @dataclass(frozen=True, eq=False)
 class DrawnPaths:
@@ -57,6 +60,19 @@ class DrawnPaths:
     def regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Value of each draw's best path less that of a given one, shape (draw,), >= 0."""
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
+
+    def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
+        """Regret of a path as a share of what each draw's best path is worth, shape (draw,).
+
+        For lost_contact, of the contact that the best path keeps, its bounds less those lost; for
+        other objectives, of the best path's value. Infinite where that is nothing.
+        """
+        worth = np.abs(self.values)
+        if self.problem.objective.name == "lost_contact":
+            worth = np.maximum(0.0, (self.paths >= 0).sum(1) - 1 + self.values)
+        regret = self.regret(path)
+        nothing = np.where(regret > _ROUNDING, np.inf, 0.0)
+        return np.divide(regret, worth, out=nothing, where=worth > 0.0)
 
     def expected_value_of_information(self) -> float:
         """Expected gain in value from knowing the parameters.

@@ -41,7 +41,7 @@ class PlanningProblem:
     mean_cells: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        name, length_weight = self.objective
+        name, length_weight, family, lag = self.objective
         require_choice("objective", name, OBJECTIVES)
         require_choice("team", self.team, TEAMS)
         if not 0.0 <= length_weight < np.inf:
@@ -49,6 +49,11 @@ class PlanningProblem:
         if length_weight and name not in ADDITIVE:
             raise TrustboError(
                 f"length_weight is for {', '.join(ADDITIVE)}; the objective is {name!r}."
+            )
+        if name == "lost_contact" and lag and (self.team == "min" or self.objective.has_labels):
+            raise TrustboError(
+                "'lost_contact' of rates that measure the change of trust is for Gaussian rates "
+                f"and team='mean'; got {family.name!r} and {self.team!r}. Use 'terminal' or 'mean'."
             )
 
     @property

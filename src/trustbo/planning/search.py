@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.compiled import expected_path, plan_compiled
 from trustbo.planning.engines.reference import plan_networkx
-from trustbo.planning.objectives import LABELLED
+from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
 
 ENGINES = ("auto", "networkx", "numba")
@@ -50,7 +50,8 @@ class FoundPath(NamedTuple):
 def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> FoundPath:
     """Find the best path under one draw, `dynamics` without leading axes."""
     paths, objective = problem.paths, problem.objective
-    require_valid(dynamics, objective.name)
+    require_valid(dynamics, objective)
+    dynamics = objective.capped(dynamics)
     name = engine.choose(paths.passable.size, 1, labels=_has_labels(problem))
     if name == "networkx":
         return FoundPath(plan_networkx(paths, dynamics, objective, engine.backend), 0.0, name)
@@ -59,8 +60,8 @@ def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> F
 
 
 def _has_labels(problem: PlanningProblem) -> bool:
-    name = problem.objective.name
-    return name in LABELLED or (problem.team == "min" and name != "stationary")
+    objective = problem.objective
+    return objective.has_labels or (problem.team == "min" and objective.name != "stationary")
 
 
 def find_paths(
@@ -68,7 +69,8 @@ def find_paths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the best path under every draw: flat indices (draw, length), padded by -1; and gaps."""
     paths, objective, n_draws = problem.paths, problem.objective, len(dynamics.start)
-    require_valid(dynamics, objective.name)
+    require_valid(dynamics, objective)
+    dynamics = objective.capped(dynamics)
     if engine.choose(paths.passable.size, n_draws, labels=_has_labels(problem)) == "numba":
         return plan_compiled(paths, dynamics, objective)
     found = [
@@ -81,31 +83,35 @@ def find_paths(
 
 
 def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, ...]:
-    """Find the path with the best expectation over draws of the objective.
+    """Find the path with the best expectation over draws of the objective, trust not capped.
 
-    TrustboError: another objective than terminal or mean, or `team="min"`.
+    TrustboError: another objective than terminal, mean or, where rates are linear in trust,
+    lost_contact; or `team="min"`.
     """
     paths, objective = problem.paths, problem.objective
-    if objective.name not in ("terminal", "mean") or len(dynamics.views) > 1:
+    linear = objective.name in ("terminal", "mean", "lost_contact") and not objective.has_labels
+    if not linear or len(dynamics.views) > 1:
         raise TrustboError(
-            "an expectation over draws is planned exactly for 'terminal' and 'mean' of a "
-            f"team's mean trust; got {objective.name!r} with team={problem.team!r}."
+            "an expectation over draws is planned exactly for 'terminal', 'mean' and, with rates "
+            "linear in trust, 'lost_contact' of a team's mean trust; got "
+            f"{objective.name!r} of {objective.family.name!r} rates with team={problem.team!r}."
         )
     return paths.cells(expected_path(paths, dynamics, objective))
 
 
-def require_valid(dynamics: Dynamics, objective: str) -> None:
+def require_valid(dynamics: Dynamics, objective: Objective) -> None:
     """Refuse dynamics for which an objective is undefined or not planned exactly.
 
-    TrustboError: success or bottleneck with beta0 < 0; stationary with abs(beta0) >= 1.
+    TrustboError: success, bottleneck or lost_contact with beta0 < 0; stationary with abs(beta0) >=
+    1.
     """
     own = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
-    if objective in LABELLED and (own < 0.0).any():
+    if (objective.has_labels or objective.name == "lost_contact") and (own < 0.0).any():
         raise TrustboError(
-            f"objective {objective!r} needs beta0 >= 0; got {own.min():g}. Use 'terminal' or "
+            f"objective {objective.name!r} needs beta0 >= 0; got {own.min():g}. Use 'terminal' or "
             "'mean'."
         )
-    if objective == "stationary":
+    if objective.name == "stationary":
         radius = np.abs(np.linalg.eigvals(dynamics.transition))
         if (radius >= 1.0).any():
             raise TrustboError(

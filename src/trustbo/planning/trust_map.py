@@ -57,9 +57,9 @@ def summary_of(trust: xr.DataArray) -> xr.Dataset:
 def _of_robot(dynamics: Dynamics, robot: int) -> Dynamics:
     """Dynamics viewed by one robot; its own state suffices where robots do not interact."""
     n_robots, one = dynamics.start.shape[-1], slice(robot, robot + 1)
-    transition, drift, start, _ = dynamics
+    transition, drift, start, _, sd = dynamics
     if (transition == transition * np.eye(n_robots)).all():
-        return Dynamics(transition[:, one, one], drift[:, one], start[:, one], np.eye(1))
+        return Dynamics(transition[:, one, one], drift[:, one], start[:, one], np.eye(1), sd)
     return dynamics._replace(views=np.eye(n_robots)[one])
 
 

@@ -23,16 +23,19 @@ def path_value(
 ) -> np.ndarray:
     """Value of one path, shape (...,) as the leading axes of `dynamics`."""
     length_cost = objective.length_weight * path_length(admissible, path)
-    return _value(dynamics.along(path), objective, length_cost)
+    return _value(objective.capped(dynamics.along(path)), objective, length_cost)
 
 
 def _value(along: Dynamics, objective: Objective, length_cost: float) -> np.ndarray:
     """Value (...,) of the path whose bounds `along` has."""
     trust = team_trust(along)
-    steady_state = np.full(trust.shape, np.nan)
+    steady_state = lost = np.full(trust.shape, np.nan)
     if objective.name == "stationary":
         steady_state = along.steady_state()[..., 0, 0, :]
-    return OBJECTIVES[objective.name](PathTrust(trust, steady_state, length_cost))
+    if objective.name == "lost_contact":
+        before = (along.start @ along.views.T).min(-1)
+        lost = objective.contact_lost(trust, before, along.noise_sd)
+    return OBJECTIVES[objective.name](PathTrust(trust, steady_state, length_cost, lost))
 
 
 def team_trust(along: Dynamics) -> np.ndarray:
@@ -55,9 +58,14 @@ def entry_cost(passable: np.ndarray, dynamics: Dynamics) -> np.ndarray:
 
 
 def evaluate(
-    problem: PlanningProblem, path: tuple[Cell, ...], params: Params, x0: ArrayLike | None = None
+    problem: PlanningProblem,
+    path: tuple[Cell, ...],
+    params: Params,
+    x0: ArrayLike | None = None,
+    *,
+    cap: bool = True,
 ) -> Plan:
-    """Evaluate a path that is not checked; see `Planner.evaluate`."""
+    """Evaluate a path that is not checked; see `Planner.evaluate` and `Objective.capped`."""
     flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
@@ -66,11 +74,11 @@ def evaluate(
     draws = draws.reshape(-1, *draws.shape[-2:])
     trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
     team = trust.mean(1) if problem.team == "mean" else trust.min(1)
-    if objective.name == "stationary":
+    cost = objective.length_weight * length
+    if objective.name in ("stationary", "lost_contact"):
         along = trust_dynamics(params, as_map(z), problem.team, x0)
-        value = _value(along, objective, objective.length_weight * length).mean()
+        value = _value(objective.capped(along) if cap else along, objective, cost).mean()
     else:
-        cost = objective.length_weight * length
         value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
     return Plan(
         path=path,
@@ -86,6 +94,7 @@ def evaluate(
         revisits=len(path) - len(set(path)),
         engine="given",
         seconds=0.0,
+        workspace=problem.workspace,
     )
 
 

@@ -58,7 +58,9 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
     surface.set_title("surface (DSM)", fontsize=9)
     colour_bar(figure, ScalarMappable(heights, "cividis"), surface, "height (m)")
     for ax, name in zip(indices, names, strict=True):
-        ax.imshow(pixels[name].values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
+        of_cells = workspace.awareness.sel(feature=name).mean("robot")
+        values = pixels[name] if name in pixels else of_cells  # line of sight is that of bounds
+        ax.imshow(values.values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
         ax.set_title(as_text(name), fontsize=9)
     steep = np.isfinite(dsm) & ~pixels["passable"].values
     closed = np.where(steep, 1.0, np.nan)

@@ -10,6 +10,7 @@ from trustbo.report.blocks import Fact
 from trustbo.report.numbers import cell_text, counted, joined, number
 
 _MEANS = {
+    "lost_contact": "minus the contact expected to be lost on the way, in bounds",
     "terminal": "the chance \N{GREEK SMALL LETTER SIGMA}(trust) at the goal, 1 minus the paper's "
     "cost (6)",
     "mean": "the mean of expected trust over the bounds",

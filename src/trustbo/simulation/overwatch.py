@@ -105,8 +105,7 @@ class KinematicSimulator:
 
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
-        team = {} if self.team == self.workspace.team else {"team": dataclasses.asdict(self.team)}
-        true = {} if self.terrain is None else {"terrain": digest_of(self.terrain)}
+        same = self.team == self.workspace.team
         return {
             "simulator": type(self).__name__,
             "sight": self.sight.mode,
@@ -120,8 +119,8 @@ class KinematicSimulator:
             "threats": [dataclasses.asdict(threat) for threat in self.threats],
             "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],
             "realtime": sorted(self.realtime),
-            **team,
-            **true,
+            "team": None if same else dataclasses.asdict(self.team),
+            "terrain": None if self.terrain is None else digest_of(self.terrain),
         }
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:

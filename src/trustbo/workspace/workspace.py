@@ -27,6 +27,7 @@ from trustbo.terrain.pixel_feature import PixelFeature
 from trustbo.workspace.awareness import FeatureSpec, cell_maps, feature_specs
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
+    is_line_of_sight,
     of_bounds,
     require_sight,
     sight_features,
@@ -309,6 +310,17 @@ class Workspace:
         moves_along([a, c])
         return a, c
 
+    def in_order(self, mission: Mission) -> Mission:
+        """Return a mission with its robots and features in the order of the workspace's.
+
+        A mission need not have a line of sight, which is predicted, not measured: it is NaN then.
+
+        Raises:
+            ShapeError: It has other robots or features.
+        """
+        predicted = [name for name in self.features if is_line_of_sight(name)]
+        return mission.in_order(self.team.names, self.features, predicted)
+
     def fill(self, mission: Mission) -> Mission:
         """Fill awareness that a mission did not measure (NaN) with that of its bounds.
 
@@ -319,7 +331,7 @@ class Workspace:
         """
         for k, cell in enumerate(mission.path):
             self.require_cell(f"path[{k}]", cell)
-        own = mission.in_order(self.team.names, self.features)
+        own = self.in_order(mission)
         return fill_awareness(own, along(self.bound_maps, own.path))
 
     def with_bounds(self, values: np.ndarray) -> Self:

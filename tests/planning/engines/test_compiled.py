@@ -15,7 +15,7 @@ from trustbo.planning.search import Engine
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
-OBJECTIVES = ("terminal", "mean", "success", "bottleneck", "stationary")
+OBJECTIVES = ("lost_contact", "terminal", "mean", "success", "bottleneck", "stationary")
 
 
 def random_workspace(seed, n=9, n_robots=2):
@@ -131,17 +131,17 @@ def test_a_plan_that_may_not_be_exact_says_by_how_much(monkeypatch):
     workspace = random_workspace(3, n=7, n_robots=3)
     params = random_params("hierarchical", 3, 3)
     ends = (workspace, (6, 0), (0, 6))
-    exact = Planner(*ends, team="min", engine="numba").plan(params)
+    exact = Planner(*ends, "terminal", team="min", engine="numba").plan(params)
     assert exact.exact
     assert exact.bound == exact.value
     # A coarse tolerance drops labels that might have been better.
     monkeypatch.setattr(engines, "_TOLERANCES", (0.5,))
-    rough = Planner(*ends, team="min", engine="numba").plan(params)
+    rough = Planner(*ends, "terminal", team="min", engine="numba").plan(params)
     assert rough.value <= exact.value + 1e-12 <= rough.bound + 2e-12
     assert rough.exact == (rough.bound <= rough.value + 1e-12)
     monkeypatch.setattr(engines, "_MAX_LABELS", 10)
     with pytest.raises(TrustboError, match="more than 10 partial paths are worth keeping; lower"):
-        Planner(*ends, team="min", engine="numba").plan(params)
+        Planner(*ends, "terminal", team="min", engine="numba").plan(params)
 
 
 def test_the_bound_holds_over_many_maps(monkeypatch):
@@ -164,7 +164,9 @@ def test_the_bound_holds_over_many_maps(monkeypatch):
 
 def test_length_weights_are_for_additive_objectives_only():
     ends = (random_workspace(0), (8, 0), (0, 8))
-    with pytest.raises(TrustboError, match="length_weight is for terminal, mean, stationary"):
+    with pytest.raises(
+        TrustboError, match="length_weight is for lost_contact, terminal, mean, stationary"
+    ):
         Planner(*ends, "success", length_weight=0.01)
     with pytest.raises(TrustboError, match=r"length_weight must be finite and >= 0; got -1"):
         Planner(*ends, length_weight=-1.0)

@@ -13,6 +13,8 @@ from numpyro.distributions import constraints
 from trustbo.models.likelihood.families import FAMILIES, Family, Observed
 from trustbo.models.params import Params
 
+_BATCH = 256  # draws computed at once
+
 
 class ContactRate(dist.Distribution):
     """Joint distribution of a batch of missions' contact rates.
@@ -103,7 +105,12 @@ def mission_log_likelihood(
         # The same innovations for every draw: comparisons do not differ by luck.
         return family.marginal_log_likelihood(p.ssm(awareness, lag), observed, key)
 
-    return lax.map(one, params, batch_size=256)
+    n_draws = len(params.b)
+    if n_draws < _BATCH:
+        return jax.vmap(one)(params)
+    # Whole batches: the rest would be compiled as a program of its own.
+    rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1)
+    return lax.map(one, jax.tree.map(lambda a: a[rows], params), batch_size=_BATCH)[:n_draws]
 
 
 def draw_missions(

@@ -1,7 +1,8 @@
 """Latent trust and predicted contact rates under posterior draws, compiled for all models."""
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ from trustbo.models.likelihood.contact_rate import draw_missions
 from trustbo.models.likelihood.families import Family, Observed
 from trustbo.models.params import Params
 from trustbo.stacking import MissionBatch
+
+_BATCH = 64  # draws computed at once
 
 
 class Latents(NamedTuple):
@@ -30,21 +33,13 @@ class TrustMoments(NamedTuple):
     sd: Array
 
 
-@partial(jax.jit, static_argnames=("family", "lag"))
 def trust_draws(
     family: Family, lag: float, params: Params, latents: Latents, batch: MissionBatch, key: Array
-) -> Array:
+) -> np.ndarray:
     """One exact joint draw of latent trust per parameter draw, (draw, mission, bound, robot)."""
-    observed = Observed.of(batch.contact_rate, batch.n_ticks, latents.linearisation)  # pyright: ignore
-
-    def one(inputs):
-        p, e, key = inputs
-        e = jnp.zeros_like(observed.y) if e is None else e
-        ssm = p.ssm(batch.awareness, lag)
-        return jnp.swapaxes(family.draw_trust(ssm, observed, e, key), 0, 1)
-
     keys = random.split(key, len(params.b))
-    return lax.map(one, (params, latents.innovations, keys), batch_size=64)
+    draw = partial(_trust_draws, family, lag, batch, latents.linearisation)
+    return _in_batches(draw, (params, latents.innovations, keys))
 
 
 @partial(jax.jit, static_argnames=("family", "lag"))
@@ -67,15 +62,49 @@ def trust_moments(
     return TrustMoments(jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1))
 
 
-@partial(jax.jit, static_argnames=("family", "lag"))
 def predictive(
     family: Family, lag: float, params: Params, batch: MissionBatch, key: Array
-) -> Array:
+) -> np.ndarray:
     """Contact rates of replicated missions, one set per draw: (draw, mission, bound, robot)."""
+    keys = random.split(key, len(params.b))
+    return _in_batches(partial(_predictive, family, lag, batch), (params, keys))
 
-    def one(inputs):
+
+@partial(jax.jit, static_argnames=("family", "lag"))
+def _trust_draws(
+    family: Family, lag: float, batch: MissionBatch, linearisation: Array | None, inputs: Any
+) -> Array:
+    observed = Observed.of(batch.contact_rate, batch.n_ticks, linearisation)  # pyright: ignore
+
+    def one(inputs: Any) -> Array:
+        p, e, key = inputs
+        e = jnp.zeros_like(observed.y) if e is None else e
+        ssm = p.ssm(batch.awareness, lag)
+        return jnp.swapaxes(family.draw_trust(ssm, observed, e, key), 0, 1)
+
+    return jax.vmap(one)(inputs)
+
+
+@partial(jax.jit, static_argnames=("family", "lag"))
+def _predictive(family: Family, lag: float, batch: MissionBatch, inputs: Any) -> Array:
+    def one(inputs: Any) -> Array:
         p, key = inputs
         _, rates = draw_missions(family, lag, p, batch.awareness, batch.n_ticks, key)  # pyright: ignore
         return jnp.swapaxes(rates, 0, 1)
 
-    return lax.map(one, (params, random.split(key, len(params.b))), batch_size=64)
+    return jax.vmap(one)(inputs)
+
+
+def _in_batches(compiled: Callable[[Any], Array], inputs: Any) -> np.ndarray:
+    """Results of a compiled function of draws, in batches of one size: one program for all.
+
+    Args:
+        compiled: Function of inputs with a leading axis (draw,).
+        inputs: Arrays with a leading axis (draw,).
+    """
+    n_draws = len(jax.tree.leaves(inputs)[0])
+    found = []
+    for first in range(0, n_draws, _BATCH):
+        rows = np.minimum(np.arange(first, first + _BATCH), n_draws - 1)
+        found.append(np.asarray(compiled(jax.tree.map(lambda a, rows=rows: a[rows], inputs))))
+    return np.concatenate(found)[:n_draws]

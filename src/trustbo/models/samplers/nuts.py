@@ -13,16 +13,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax, random
-from jax.scipy.linalg import solve_triangular
 from numpyro.infer.hmc import hmc
 
 from trustbo.models.model import TrustModel
-from trustbo.models.samplers.laplace import inverse_hessian, newton
+from trustbo.models.samplers.modes import Modes, find_modes
 from trustbo.models.samplers.reparam import reparametrise
 from trustbo.models.samplers.target import NutsData, innovations_shape
 
 _DRAWS_PER_UNKNOWN = 10  # of the warm-up, to learn a covariance from
-_SAME_MODE, _LEAST_LOG_MASS = 0.5, 5.0  # sd of the fit at a mode, and nats below the largest
 
 
 class NutsSettings(NamedTuple):
@@ -45,6 +43,10 @@ class NutsDraws(NamedTuple):
     """Innovations of latent trust, (chain, draw, bound, mission, robot), if it was sampled."""
     linearisation: Array | None
     """Linearisation point, of families that have one."""
+    theta: Array
+    """Draws in the coordinates of the modes, (chain, draw, unknown)."""
+    modes: Modes
+    params_at_modes: dict[str, Array]
 
 
 @partial(jax.jit, static_argnames=("settings", "complete"))
@@ -69,14 +71,11 @@ def run_nuts(
     joint, shape = not model.family.integrates_out, innovations_shape(data)
     zeros = {"innovations": jnp.zeros(shape)} if joint else {}
 
-    def search(start: Array) -> _Fit:
-        mode, hessian = newton(target.profile, start)
-        scale = jnp.linalg.cholesky(inverse_hessian(jnp, hessian, 0.1))
-        log_density = -target.potential({"theta": mode, **zeros})
-        return _Fit(mode, scale, log_density + jnp.log(jnp.diagonal(scale)).sum())
+    def log_density(theta: Array) -> Array:
+        return -target.potential({"theta": theta, **zeros})
 
+    modes = find_modes(target.profile, log_density, target.starts, target.longest)
     n_unknowns = target.starts.shape[1]
-    fits = _spread(lax.map(search, target.starts), settings.n_chains)
 
     # Innovations are close to standard normal by construction: their mass starts as the identity.
     mass = {("theta",): jnp.eye(n_unknowns)}
@@ -85,8 +84,8 @@ def run_nuts(
 
     adapt = joint or _DRAWS_PER_UNKNOWN * n_unknowns <= settings.n_warmup
 
-    def chain(inputs: tuple[Array, _Fit]):
-        key, (mode, scale, _) = inputs
+    def chain(inputs: tuple[Array, Array, Array]):
+        key, mode, scale = inputs
 
         # NUTS sees standard normal coordinates. With many unknowns it leaves them so: a covariance
         # learnt from the few hundred draws of a warm-up is then worse than Laplace's.
@@ -102,39 +101,14 @@ def run_nuts(
         if joint:
             z["innovations"] = random.normal(key_innovations, shape, mode.dtype)
         z, stats = _run_chain(settings, potential, z, mass, adapt, key_run)
-        params = jax.vmap(lambda x: target.constrain(theta_of(x)))(z["theta"])
-        return params, stats, z.get("innovations")
+        theta = jax.vmap(theta_of)(z["theta"])
+        return jax.vmap(target.constrain)(theta), stats, z.get("innovations"), theta
 
     # One chain after the other: vectorised chains would all wait for the longest trajectory.
     keys = random.split(key, settings.n_chains)
-    params, stats, drawn = lax.map(chain, (keys, fits))
-    return NutsDraws(params, stats, drawn, target.linearisation)
-
-
-class _Fit(NamedTuple):
-    """Gaussian fits at modes, with a leading axis (start,) or (chain,) where there are many."""
-
-    mode: Array
-    scale: Array  # Cholesky factor of the covariance
-    log_mass: Array
-
-
-def _spread(fits: _Fit, n_chains: int) -> _Fit:
-    """A fit for each chain: the distinct modes of noteworthy mass in turn, the largest first.
-
-    Chains that start at different modes and do not meet give an R-hat that says so.
-    """
-    log_mass = jnp.where(jnp.isnan(fits.log_mass), -jnp.inf, fits.log_mass)
-    order = jnp.argsort(-log_mass)
-    sorted_ = jax.tree.map(lambda a: a[order], fits)
-    gaps = sorted_.mode[:, None] - sorted_.mode[None]  # (other, start, unknown)
-    white = jax.vmap(lambda L, gap: solve_triangular(L, gap.T, lower=True))(sorted_.scale, gaps)
-    near = jnp.abs(white).max(1) < _SAME_MODE
-    again = jnp.triu(near, 1).any(0)  # as one of more mass
-    light = log_mass[order] < log_mass[order[0]] - _LEAST_LOG_MASS
-    kept = ~again & ~light
-    places = jnp.argsort(~kept, stable=True)[jnp.arange(n_chains) % kept.sum()]
-    return jax.tree.map(lambda a: a[places], sorted_)
+    params, stats, drawn, theta = lax.map(chain, (keys, *modes.spread(settings.n_chains)))
+    at_modes = jax.vmap(target.constrain)(modes.mode)
+    return NutsDraws(params, stats, drawn, target.linearisation, theta, modes, at_modes)
 
 
 def _run_chain(

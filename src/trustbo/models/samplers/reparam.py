@@ -46,6 +46,8 @@ class Reparametrisation(NamedTuple):
 
     starts: Array
     """Flat real vectors to start the search of modes from, (start, unknown)."""
+    longest: Array
+    """Longest step of the search in each unknown, (unknown,): finite where the starts differ."""
     constrain: Callable[[Array], Sites]
     """Parameters by name, from such a vector."""
     potential: Callable[[Sites], Array]
@@ -95,22 +97,28 @@ def reparametrise(
         n_locations = len(theta) - 2 * total.size
         return energy - n_locations * total.mean()
 
-    starts = _starts(model, target, space.means.scatter)
-    return Reparametrisation(starts, constrain, potential, profile, target.linearisation)
+    starts, longest = _starts(model, target, space.means.scatter)
+    return Reparametrisation(starts, longest, constrain, potential, profile, target.linearisation)
 
 
-def _starts(model: TrustModel, target: Target, scatter: Array) -> Array:
-    """The priors' means, and other autoregressions, where modes differ, at the rates' scatter."""
+def _starts(model: TrustModel, target: Target, scatter: Array) -> tuple[Array, Array]:
+    """Points to search modes from, and the longest step of the search in each unknown.
+
+    The priors' means, and other autoregressions, where modes differ, at the rates' scatter.
+    """
     site = target.unravel(target.start)
     unit = model.priors.beta0.support is constraints.unit_interval
-    others = (-4.0, -1.5, 2.0) if unit else (-0.2, 0.2, 0.8)  # logits, or values
-    starts = [target.start]
+    others, step = ((-4.0, -1.5, 2.0), 0.5) if unit else ((-0.2, 0.2, 0.8), 0.05)  # logits, values
+
+    def vector(autoregression: float, all_else: Sites) -> Array:
+        moved = {name: jnp.full_like(site[name], autoregression) for name in names}
+        return ravel_pytree(all_else | moved)[0]
+
+    names = _AUTOREGRESSIONS & site.keys()
     noise = {"delta_w": jnp.log(scatter) - 1.0, "delta_v": 0.0}  # (t, r), see above
-    site = site | {name: jnp.full_like(site[name], value) for name, value in noise.items()}
-    for value in others:
-        moved = {name: jnp.full_like(site[name], value) for name in _AUTOREGRESSIONS & site.keys()}
-        starts.append(ravel_pytree(site | moved)[0])
-    return jnp.stack(starts)
+    at_scatter = site | {name: jnp.full_like(site[name], value) for name, value in noise.items()}
+    starts = jnp.stack([target.start, *(vector(value, at_scatter) for value in others)])
+    return starts, vector(step, {name: jnp.full_like(site[name], jnp.inf) for name in site})
 
 
 class Coordinates:

@@ -14,11 +14,14 @@ from trustbo.models.likelihood.latent import Latents
 from trustbo.models.model import TrustModel
 from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
 from trustbo.models.samplers.exact import ExactDraws, sample_exact
-from trustbo.models.samplers.nuts import NutsSettings, run_nuts
+from trustbo.models.samplers.modes import visits
+from trustbo.models.samplers.nuts import NutsDraws, NutsSettings, run_nuts
 from trustbo.models.samplers.target import NutsData
 from trustbo.stacking import MissionBatch
 
 SAMPLERS = ("nuts", "exact", "joint")
+_VISITED = 0.1  # of the draws that a mode's mass promises; Laplace's masses are rough
+_MAX_SHARE_ERROR = 0.015  # Monte Carlo error of a mode's share of the draws
 
 
 class Draws(NamedTuple):
@@ -164,7 +167,7 @@ def _sample_nuts(
         innovations = None if raw.innovations is None else np.asarray(raw.innovations)
         latents = Latents(innovations, raw.linearisation)
         draws = Draws(params, stats, {"retries": retries}, name, latents)
-        return draws, _complaints(draws) if check else []
+        return draws, [*_complaints(draws), *_mode_complaints(raw)] if check else []
 
     draws, complaints = attempt(settings, 0)
     return attempt(longer, 1) if complaints else (draws, complaints)
@@ -190,3 +193,36 @@ def _complaints(draws: Draws) -> list[str]:
     if n_divergences:
         found.append(f"{n_divergences} divergences")
     return found
+
+
+def _mode_complaints(raw: NutsDraws) -> list[str]:
+    """Modes that chains left out, or whose share of the draws is not settled; empty if none."""
+    found, around = [], visits(raw.modes, np.asarray(raw.theta))
+    if len(around) == 1:
+        return found
+    shares = az.from_dict({"posterior": {str(i): each * 1.0 for i, each in around.items()}})
+    error = az.mcse(shares["posterior"].to_dataset())
+    for i, each in around.items():
+        mass, share = float(raw.modes.share[i]), each.mean()
+        mode = f"the mode where {_telling(raw, i)}"
+        if share < _VISITED * mass:
+            found.append(f"{share:.1%} of the draws are around {mode}, of some {mass:.0%} mass")
+        elif not error[str(i)] <= _MAX_SHARE_ERROR:
+            found.append(
+                f"the share of {mode} is {share:.2f} +- {float(error[str(i)]):.3f} (limit "
+                f"{_MAX_SHARE_ERROR})"
+            )
+    return found
+
+
+def _telling(raw: NutsDraws, i: int) -> str:
+    """The parameter that tells a mode from the largest other best, and its value there."""
+    gaps, other = [], int(np.argmax(np.delete(raw.modes.share, i)))
+    other += other >= i
+    for name, values in raw.params.items():
+        at = np.asarray(raw.params_at_modes[name])
+        gap = np.abs(at[i] - at[other]) / np.maximum(np.std(values, (0, 1)), 1e-12)
+        place = np.unravel_index(gap.argmax(), gap.shape)
+        index = f"[{', '.join(map(str, place))}]" if place else ""
+        gaps.append((gap[place], f"{name}{index} is {at[i][place]:.3g}"))
+    return max(gaps)[1]

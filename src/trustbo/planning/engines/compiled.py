@@ -8,10 +8,11 @@ from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.buckets import best_stationary
+from trustbo.planning.engines.contact_loss import LAWS, TINY_SD, least_loss
 from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
-from trustbo.planning.engines.labels import MODES, LabelSearch, search
+from trustbo.planning.engines.labels import TERMINAL, LabelSearch, mode_of, search
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
-from trustbo.planning.objectives import LABELLED, Objective
+from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 
 _TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
@@ -34,7 +35,10 @@ def plan_compiled(
 ) -> BestPaths:
     """Find the best path of every draw; `dynamics` with a leading axis (draw,)."""
     length_cost = objective.length_weight * admissible.lengths
-    if objective.name in LABELLED or (objective.name != "stationary" and len(dynamics.views) > 1):
+    if objective.name == "lost_contact" and objective.has_labels and dynamics.is_scalar:
+        if admissible.revisit:
+            return _least_loss(admissible, dynamics, objective, length_cost)
+    if objective.has_labels or (objective.name != "stationary" and len(dynamics.views) > 1):
         return _labelled(admissible, dynamics, objective, length_cost)
     if objective.name == "stationary":
         _, paths = best_stationary(
@@ -47,7 +51,7 @@ def plan_compiled(
             admissible.flat(admissible.goal),
         )
     else:
-        weights = additive_weights(dynamics, dynamics.views[0], objective.name, admissible.longest)
+        weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
         drift = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
         paths = _best_of_lengths(admissible, drift, weights, length_cost)
     return BestPaths(paths, np.zeros(len(paths)))
@@ -56,15 +60,15 @@ def plan_compiled(
 def expected_path(
     admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
 ) -> np.ndarray:
-    """Find the path with the best *expectation* over draws of terminal trust, or of mean trust.
+    """Find the path with the best *expectation* of terminal or mean trust, or of lost contact.
 
-    Both are linear in u with weights that do not depend on the path, so the expectation of weight
+    These are linear in u with weights that do not depend on the path, so the expectation of weight
     times u, per bound and bounds left, replaces them: exact, with no assumption on the posterior.
 
     Returns:
         Flat indices of cells, filled with -1.
     """
-    weights = additive_weights(dynamics, dynamics.views[0], objective.name, admissible.longest)
+    weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
     u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
     # E[w_j . u] for every number of bounds left j, move and cell: one state for every j.
     gain = np.einsum("djs,dsmc->jmc", weights.per_bound, np.nan_to_num(u)) / len(u)
@@ -89,6 +93,24 @@ def _best_of_lengths(
     return np.stack([tries[i][1][d] for d, i in enumerate(best)])
 
 
+def _least_loss(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
+) -> BestPaths:
+    losses, paths = least_loss(
+        admissible.layers,
+        dynamics.drift[:, 0].reshape(len(dynamics.start), dynamics.drift.shape[2], -1),
+        dynamics.transition[:, 0, 0],
+        dynamics.start[:, 0],
+        dynamics.noise_sd,
+        length_cost,
+        LAWS[objective.family.expected_rate],
+        _MAX_LABELS,
+    )
+    if np.isnan(losses).any():
+        raise _too_many_labels(admissible.longest)
+    return BestPaths(paths, np.zeros(len(paths)))
+
+
 def _labelled(
     admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
 ) -> BestPaths:
@@ -111,16 +133,17 @@ def _label_one(
 ) -> tuple[np.ndarray, float]:
     """Find the best path of one draw and its optimality gap."""
     lengths = [admissible.longest]
-    if objective.name not in LABELLED:
+    if not objective.has_labels:
         lengths = list(range(admissible.shortest, admissible.longest + 1))
     best, best_score, best_bound = np.empty(0, np.int64), -np.inf, -np.inf
     for n_bounds in lengths:
         scale = n_bounds if objective.name == "mean" else 1
         problem = _label_search(admissible, dynamics, objective, n_bounds, scale * length_cost)
         path, cost, bound = _search_within_limit(problem)
-        if len(path) and -cost / scale > best_score:
-            best, best_score = path, -cost / scale
-        best_bound = max(best_bound, -bound / scale)
+        each = n_bounds if objective.name == "lost_contact" and not objective.has_labels else 0
+        if len(path) and -cost / scale - each > best_score:
+            best, best_score = path, -cost / scale - each
+        best_bound = max(best_bound, -bound / scale - each)
     return best, best_bound - best_score
 
 
@@ -134,7 +157,7 @@ def _label_search(
     goal = admissible.flat(admissible.goal)
     at_goal = objective.name == "terminal"
     return LabelSearch(
-        MODES[objective.name],
+        mode_of(objective),
         np.ascontiguousarray(dynamics.transition),
         dynamics.drift.reshape(*dynamics.drift.shape[:2], -1),
         np.ascontiguousarray(dynamics.start),
@@ -148,16 +171,17 @@ def _label_search(
         goal,
         n_bounds,
         admissible.u_turns,
-        admissible.revisit or objective.name not in LABELLED,
+        admissible.revisit or not objective.has_labels,
+        max(float(dynamics.noise_sd), TINY_SD),
     )
 
 
 def _search_within_limit(problem: LabelSearch) -> tuple[np.ndarray, float, float]:
     """Search exactly, or with the least tolerance that stays within the limit on labels."""
-    if not len(problem.heuristic.powers) and problem.mode not in (MODES[name] for name in LABELLED):
+    if not len(problem.heuristic.powers) and problem.mode >= TERMINAL:
         raise TrustboError(
             f"a team's least trust over {problem.max_bounds} bounds on {len(problem.to_goal)} "
-            "cells is too much for 'terminal' and 'mean'; use larger cells, or team='mean'."
+            "cells is too much for sums over paths; use larger cells, or team='mean'."
         )
     if not problem.revisit:
         # If the best walk of all enters no cell twice, it is the best simple path too.
@@ -168,7 +192,11 @@ def _search_within_limit(problem: LabelSearch) -> tuple[np.ndarray, float, float
         found = search(problem, tolerance, _MAX_LABELS)
         if found.path is not None:
             return found.path, found.cost, found.bound
-    raise TrustboError(
+    raise _too_many_labels(problem.max_bounds)
+
+
+def _too_many_labels(longest: int) -> TrustboError:
+    return TrustboError(
         f"more than {_MAX_LABELS} partial paths are worth keeping; lower max_bounds = "
-        f"{problem.max_bounds}, use larger cells, or team='mean'."
+        f"{longest}, use larger cells, or team='mean'."
     )

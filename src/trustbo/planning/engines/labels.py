@@ -6,9 +6,10 @@ Method: best-first label setting for multi-criteria shortest paths, in the order
 State of a label: cell, number of bounds, expected trust x of all states, cost so far, parent; the
 last move where U-turns are forbidden; the set of cells entered where revisits are forbidden.
 
-Cost, to be minimised: `success` sum of softplus(-trust), `bottleneck` max of -trust, `terminal`
-last -trust, `mean` sum of -trust; the latter two over paths of exactly `max_bounds` bounds, with
-length costs added. None of them rises if trust rises at some bound.
+Cost, to be minimised: `success` sum of softplus(-trust), `bottleneck` max of -trust,
+`lost_contact` sum of 1 - E[rate given trust], `terminal` last -trust, `mean` sum of -trust. The
+latter two are over paths of exactly `max_bounds` bounds, and `lost_contact` is like `mean` where
+rates are linear in trust; to these three length costs are added. None rises if trust rises.
 
 Invariant: a label leaves the queue in the order of a lower bound on the cost of its completions
 (`Heuristic`). It is expanded unless an expanded label of the same cell dominates it (see
@@ -28,11 +29,21 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from trustbo.planning.engines.contact_loss import CLIPPED, LOGISTIC, expected_loss
 from trustbo.planning.engines.dominance import Heuristic
+from trustbo.planning.objectives import Objective
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
-SUCCESS, BOTTLENECK, TERMINAL, MEAN = range(4)
-MODES = {"success": SUCCESS, "bottleneck": BOTTLENECK, "terminal": TERMINAL, "mean": MEAN}
+SUCCESS, BOTTLENECK, LOGISTIC_LOSS, CLIPPED_LOSS, TERMINAL, MEAN = range(6)
+_LOSSES = {"identity": MEAN, "logistic": LOGISTIC_LOSS, "clipped": CLIPPED_LOSS}
+_MODES = {"success": SUCCESS, "bottleneck": BOTTLENECK, "terminal": TERMINAL, "mean": MEAN}
+
+
+def mode_of(objective: Objective) -> int:
+    """Mode of the search for an objective."""
+    if objective.name == "lost_contact":
+        return _LOSSES[objective.family.expected_rate]
+    return _MODES[objective.name]
 
 
 class LabelSearch(NamedTuple):
@@ -53,6 +64,7 @@ class LabelSearch(NamedTuple):
     max_bounds: int  # for TERMINAL and MEAN, the exact number
     u_turns: bool
     revisit: bool
+    noise_sd: float  # of a rate
 
 
 class SearchResult(NamedTuple):
@@ -122,9 +134,15 @@ def _search(problem, tolerance, max_labels):
                 state, tested = np.concatenate((state, state)), np.concatenate((tested, tested))
                 seen = np.concatenate((seen, seen))
             x = problem.transition @ state[label] + problem.drift[:, m * by_move, other]
-            total = _add_cost(mode, cost[label], (problem.views @ x).min(), problem.length_cost[m])
+            total = _add_cost(
+                mode,
+                cost[label],
+                (problem.views @ x).min(),
+                problem.length_cost[m],
+                problem.noise_sd,
+            )
             left = most - n_bounds - 1 if fixed else to_goal[other]
-            reach = _estimate(mode, problem.heuristic, x, total, other, left)
+            reach = _estimate(mode, problem.heuristic, x, total, other, left, problem.noise_sd)
             if reach < np.inf:
                 labels[n] = (other, n_bounds + 1, label, m, -1)
                 cost[n], state[n], seen[n] = total, x, seen[label]
@@ -134,8 +152,12 @@ def _search(problem, tolerance, max_labels):
 
 
 @_compiled
-def _add_cost(mode, cost, trust, length_cost):
+def _add_cost(mode, cost, trust, length_cost, noise_sd):
     """Cost of a label after one more bound."""
+    if mode == LOGISTIC_LOSS:
+        return cost + length_cost + expected_loss(LOGISTIC, trust, noise_sd)
+    if mode == CLIPPED_LOSS:
+        return cost + length_cost + expected_loss(CLIPPED, trust, noise_sd)
     if mode == SUCCESS:
         return cost + _softplus(-trust)
     if mode == BOTTLENECK:
@@ -144,7 +166,7 @@ def _add_cost(mode, cost, trust, length_cost):
 
 
 @_compiled
-def _estimate(mode, heuristic, x, cost, cell, left):
+def _estimate(mode, heuristic, x, cost, cell, left, noise_sd):
     """Lower bound on the cost of a label's completions."""
     if mode == TERMINAL:
         return cost - _max_trust(heuristic, x, left, cell)
@@ -152,7 +174,7 @@ def _estimate(mode, heuristic, x, cost, cell, left):
         return cost
     for j in range(1, left + 1):
         trust = _max_trust(heuristic, x, j, cell)
-        cost = _add_cost(mode, cost, trust, 0.0)
+        cost = _add_cost(mode, cost, trust, 0.0, noise_sd)
     return cost
 
 

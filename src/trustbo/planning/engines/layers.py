@@ -1,11 +1,11 @@
-"""Longest path in a layered DAG: `terminal` and `mean` of a scalar view of trust.
+"""Longest path in a layered DAG: `terminal`, `mean`, `lost_contact` of a scalar view of trust.
 
 Method: dynamic programming backwards over the time-expanded graph (Bellman 1958; Ahuja, Magnanti
 and Orlin 1993, chapter 4), for all admissible lengths in one pass.
 
 Unrolled, x^K = B0^K x^0 + sum_k B0^{K-k} u(bound k). With j = K - k bounds left after a bound, it
-adds w_j . u to the value, w_j = view . B0^j for `terminal` and the sum of these up to j for `mean`:
-a weight that depends on j alone, not on the path nor on its length K.
+adds w_j . u to the value, w_j = view . B0^j for `terminal` and the sum of these up to j for `mean`
+and `lost_contact`: a weight that depends on j alone, not on the path nor on its length K.
 
 State: node (j, c), if the goal can be reached from c in j bounds and c from the start in at most
 `longest` - j. Edges lead from (j, c) to (j - 1, c') for each move c -> c'. The goal is node j = 0.
@@ -25,6 +25,7 @@ from numba import njit
 
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.objectives import Objective
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
@@ -114,12 +115,15 @@ class Weights(NamedTuple):
     scale: np.ndarray  # (length,), divisor of a path's sum
 
 
-def additive_weights(dynamics: Dynamics, view: np.ndarray, objective: str, longest: int) -> Weights:
-    """Compute the weights of `terminal` or `mean` for one view (state,) of the states.
+def additive_weights(
+    dynamics: Dynamics, view: np.ndarray, objective: Objective, longest: int
+) -> Weights:
+    """Compute the weights of an additive objective for one view (state,) of the states.
 
     terminal: view . x^K = view . B0^K x0 + sum_j (view . B0^j) . u, with j bounds left. mean: the
-    average of view . x^k over k = 1..K. For dynamics with a leading axis (draw,), up to `longest`
-    bounds.
+    average of view . x^k over k = 1..K. lost_contact: their sum less K; where rates measure the
+    change of trust, view . (x^K - x0) - K. For dynamics with a leading axis (draw,), up to
+    `longest` bounds.
     """
     n_draws, n_states = dynamics.start.shape
     powers = np.empty((n_draws, longest + 1, n_states))
@@ -128,11 +132,17 @@ def additive_weights(dynamics: Dynamics, view: np.ndarray, objective: str, longe
         powers[:, j + 1] = (powers[:, j, None, :] @ dynamics.transition)[:, 0]
     constant = (powers @ dynamics.start[..., None])[..., 0]
     scale = np.ones(longest + 1)
-    if objective == "mean":
+    n_bounds = np.arange(longest + 1.0)
+    if objective.name == "lost_contact" and objective.lag:
+        constant = constant - constant[:, :1]
+    elif objective.name in ("mean", "lost_contact"):
         constant[:, 0] = 0.0
         constant = constant.cumsum(1)
         powers = powers.cumsum(1)
-        scale = np.maximum(1.0, np.arange(longest + 1.0))
+    if objective.name == "lost_contact":
+        constant = constant - n_bounds
+    elif objective.name == "mean":
+        scale = np.maximum(1.0, n_bounds)
     return Weights(powers, constant, scale)
 
 
@@ -174,8 +184,16 @@ class _Best(NamedTuple):
 def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, begin, end):
     n_nodes, (n_states, n_drifts) = len(layers.cell), drift.shape[1:3]
     left, cell, per_bound = layers.left, layers.cell, weights.per_bound
-    # By the move that enters a node, if that matters.
-    gain, costly = np.empty((n_nodes, n_drifts)), length_cost.max() > 0.0
+    u = drift.reshape(len(drift), n_states, n_drifts * drift.shape[3])
+    # Gain of each edge, or of each node where all edges into it are alike.
+    by_edge, costly = n_drifts > 1, length_cost.max() > 0.0
+    gain = np.empty(len(layers.head) if by_edge else n_nodes)
+    # Its bounds left, and the index of its drift; unsigned: no test for a negative index.
+    gain_left, gain_drift = np.empty(len(gain), np.uint64), np.empty(len(gain), np.uint64)
+    for i in range(len(gain)):
+        n = layers.head[i] if by_edge else i
+        gain_left[i] = left[n]
+        gain_drift[i] = cell[n] + (layers.move[i] * drift.shape[3] if by_edge else 0)
     found = _Best(
         np.empty(n_nodes),
         np.empty(n_nodes),
@@ -183,13 +201,12 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
         np.empty(n_nodes, np.int8),
     )
     for d in range(begin, end):
-        for n in range(n_nodes):
-            for m in range(n_drifts):
-                total = 0.0
-                for s in range(n_states):
-                    total += per_bound[d, left[n], s] * drift[d, s, m, cell[n]]
-                gain[n, m] = total
-        _pass_back(layers, gain, length_cost, costly, found)
+        for i in range(len(gain)):
+            total = 0.0
+            for s in range(n_states):
+                total += per_bound[d, gain_left[i], s] * u[d, s, gain_drift[i]]
+            gain[i] = total
+        _pass_back(layers, gain, length_cost, costly, by_edge, found)
         chosen = -1
         for length in lengths:
             node = layers.starts[length]
@@ -198,14 +215,14 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
                 if score > scores[d]:
                     scores[d], chosen = score, length
         if chosen >= 0:
-            _trace(layers, gain, length_cost, found, layers.starts[chosen], paths[d])
+            _trace(layers, gain, length_cost, by_edge, found, layers.starts[chosen], paths[d])
 
 
 @_compiled
-def _pass_back(layers, gain, length_cost, costly, found):
+def _pass_back(layers, gain, length_cost, costly, by_edge, found):
     """Compute the best and second-best sum of every node, in the order of the bounds left."""
     left, first, head, move = layers.left, layers.first, layers.head, layers.move
-    n_moves, u_turns, by_move = layers.n_moves, layers.u_turns, 1 if gain.shape[1] > 1 else 0
+    n_moves, u_turns = layers.n_moves, layers.u_turns
     best, second, edge, by = found
     for n in range(len(left)):
         if left[n] == 0:
@@ -215,7 +232,7 @@ def _pass_back(layers, gain, length_cost, costly, found):
         for e in range(first[n], first[n + 1]):
             b, m = head[e], move[e]
             on = best[b] if u_turns or by[b] != n_moves - 1 - m else second[b]
-            value = gain[b, m * by_move] + on
+            value = gain[e if by_edge else b] + on
             if costly:
                 value -= length_cost[m]
             if value > high:
@@ -227,11 +244,10 @@ def _pass_back(layers, gain, length_cost, costly, found):
 
 
 @_compiled
-def _trace(layers, gain, length_cost, found, node, path):
+def _trace(layers, gain, length_cost, by_edge, found, node, path):
     """Write down the path from a start node; second-best edges are searched again."""
     cell, first, head, move = layers.cell, layers.first, layers.head, layers.move
     best, second, edge, by = found
-    by_move = 1 if gain.shape[1] > 1 else 0
     k, came = 0, -1
     path[0] = cell[node]
     while edge[node] >= 0:
@@ -243,7 +259,7 @@ def _trace(layers, gain, length_cost, found, node, path):
                 if m == by[node]:
                     continue
                 on = best[b] if by[b] != layers.n_moves - 1 - m else second[b]
-                value = gain[b, m * by_move] + on - length_cost[m]
+                value = gain[x if by_edge else b] + on - length_cost[m]
                 if value > high:
                     high, e = value, x
         node, came = head[e], move[e]

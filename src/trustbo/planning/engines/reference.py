@@ -17,9 +17,9 @@ from trustbo.errors import TrustboError
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.dominance import dominance_tests
 from trustbo.planning.engines.layers import additive_weights
-from trustbo.planning.objectives import LABELLED, Objective, softplus
+from trustbo.planning.objectives import Objective, softplus
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.values import entry_cost, path_length, team_trust
+from trustbo.planning.values import entry_cost, path_length, path_value, team_trust
 from trustbo.workspace.moves import MOVES
 
 Path = tuple[Cell, ...]
@@ -36,12 +36,10 @@ def plan_networkx(
     if objective.name == "stationary":
         cost = entry_cost(admissible.passable, dynamics)
         return best_stationary(admissible, cost, objective.length_weight, backend)
-    if objective.name in LABELLED:
-        return best_labelled(admissible, dynamics, objective.name)
+    if objective.has_labels:
+        return best_labelled(admissible, dynamics, objective)
     paths = []
-    weights = additive_weights(
-        dynamics.flat(), dynamics.views[0], objective.name, admissible.longest
-    )
+    weights = additive_weights(dynamics.flat(), dynamics.views[0], objective, admissible.longest)
     gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, move, row, col)
     for n_bounds in range(admissible.shortest, admissible.longest + 1):
         if len(dynamics.views) > 1:  # the least of several views is no sum of weights
@@ -67,10 +65,11 @@ def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:
 def _score(
     dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
 ) -> float:
-    """Score of a path for `terminal` or `mean` in trust, as its sigma rounds to 1 beyond 40."""
-    trust = team_trust(dynamics.along(path))
-    score = float(trust[-1] if objective.name == "terminal" else trust.mean())
-    return score - objective.length_weight * path_length(admissible, path)
+    """Value of a path; for `terminal` trust, as its sigma rounds to 1 beyond 40."""
+    if objective.name != "terminal":
+        return float(path_value(dynamics, objective, admissible, path))
+    last = float(team_trust(dynamics.along(path))[-1])
+    return last - objective.length_weight * path_length(admissible, path)
 
 
 def best_additive(
@@ -121,24 +120,27 @@ def best_additive(
     return tuple(node[2] for node in nodes[:-1])
 
 
-def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: str) -> Path:
-    """Find the walk with the best `success` or `bottleneck`; TrustboError if none is short enough.
+def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective) -> Path:
+    """Find the walk with the best objective that has labels; TrustboError if none is short enough.
 
     Label setting: labels leave the queue in the order of their cost, which never falls along a
     walk. A later label at a cell is settled only if no earlier one dominates it (see `dominance`)
     with as few bounds and, without revisits, with a subset of its cells.
     """
-    combine: Callable[[float, float], float] = (
-        (lambda cost, x: cost + float(softplus(-x)))
-        if objective == "success"
-        else (lambda cost, x: max(cost, -x))
-    )
+
+    def combine(cost: float, x: float) -> float:
+        if objective.name == "bottleneck":
+            return max(cost, -x)
+        if objective.name == "success":
+            return cost + float(softplus(-x))
+        return cost + float(objective.contact_lost(np.array([x]), x, dynamics.noise_sd)[0])
+
     graph, to_goal, max_bounds = admissible.graph, admissible.to_goal, admissible.longest
     tests, u_turns = dominance_tests(dynamics, max_bounds), admissible.u_turns
     bit = {cell: 1 << i for i, cell in enumerate(graph)} if not admissible.revisit else {}
     settled: dict[object, list[tuple[np.ndarray, int, int]]] = {}
     order = itertools.count()  # equal costs leave in the order of entry: deterministic
-    first = -np.inf if objective == "bottleneck" else 0.0
+    first = -np.inf if objective.name == "bottleneck" else 0.0
     queue: list[Any] = [(first, 0, next(order), dynamics.start, (admissible.start,), 0)]
     while queue:
         cost, n_bounds, _, x, path, seen = heapq.heappop(queue)
@@ -157,7 +159,8 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: st
                 continue
             reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
             trust = float((dynamics.views @ reached).min())
-            label = (combine(cost, trust), n_bounds + 1, next(order), reached)
+            metres = objective.length_weight * graph.edges[cell, other]["length"]
+            label = (combine(cost, trust) + metres, n_bounds + 1, next(order), reached)
             heapq.heappush(queue, (*label, (*path, other), seen))
     raise TrustboError(f"no path has at most {max_bounds} bounds.")
 
@@ -165,7 +168,7 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: st
 def best_layered(
     admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, n_bounds: int
 ) -> Path | None:
-    """Find the path of `n_bounds` bounds with the best `terminal` or `mean` for `team="min"`.
+    """Find the path of `n_bounds` bounds with the best sum of trust for `team="min"`.
 
     Bound by bound, with all labels at each cell that no other dominates. Scores of `mean` are sums,
     divided by the number of bounds at the end, so each length costs as many times as much.
@@ -188,7 +191,7 @@ def best_layered(
                 for _, score, x, path in here:
                     reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
                     trust = float((dynamics.views @ reached).min())
-                    gained = trust if objective.name == "mean" or k == n_bounds else 0.0
+                    gained = trust if objective.name != "terminal" or k == n_bounds else 0.0
                     score_now = score + gained - length_cost
                     _keep(at, (tests @ reached, score_now, reached, (*path, other)))
         labels = new

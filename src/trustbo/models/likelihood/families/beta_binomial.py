@@ -31,6 +31,7 @@ class BetaBinomial(Linearised):
     allows_change: ClassVar[bool] = False
     rounds: ClassVar[bool] = False
     correlates: ClassVar[bool] = False
+    expected_rate: ClassVar[str] = "logistic"
 
     @property
     def line_of_sight(self) -> tuple[float, float]:

@@ -23,6 +23,7 @@ class Censored(Gaussian):
 
     name: ClassVar[str] = "censored"
     integrates_out: ClassVar[bool] = False
+    expected_rate: ClassVar[str] = "clipped"
 
     def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
         """See `Family.log_density`."""

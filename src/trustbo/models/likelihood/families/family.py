@@ -60,6 +60,10 @@ class Family(ABC):
     correlates: ClassVar[bool] = True
     """Observation noise may be correlated between robots."""
 
+    expected_rate: ClassVar[str] = "identity"
+    """E[rate | trust] as compiled planning knows it: `"identity"` (trust itself), `"logistic"`, or
+    `"clipped"` (of a normal with sd delta_v, cut to [0, 1]); the mean of `rate_moments`."""
+
     @abstractmethod
     def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
         """Log density of the rates, latent trust integrated out or weighted given innovations.

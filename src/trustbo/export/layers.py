@@ -1,0 +1,114 @@
+"""Layers of a plan as tables: its bounds, the posts of T2, and the ways of all robots."""
+
+from dataclasses import replace
+from itertools import takewhile
+
+import geopandas as gpd
+import numpy as np
+import pandas as pd
+import shapely
+
+from trustbo.campaign.result import Result
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.export.checks import LEAD, find_crs, require_lead_apart
+from trustbo.planning import Plan
+from trustbo.planning.plan import QUANTILES
+from trustbo.workspace import Workspace
+
+_BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
+
+
+def plan_of(plan: Plan | Result, workspace: Workspace | None) -> Plan:
+    """Return a plan, or that of a result, on a workspace; by default on its own.
+
+    ShapeError: they differ in their numbers of robots. TrustboError: the path leaves the workspace,
+    or a robot is called as the lead.
+    """
+    plan = plan.plan if isinstance(plan, Result) else plan
+    if workspace is not None and workspace is not plan.workspace:
+        plan = replace(plan, workspace=workspace)
+    for k, cell in enumerate(plan.path):
+        plan.workspace.require_cell(f"path[{k}]", cell)
+    n_robots, names = plan.trust.shape[1], plan.workspace.team.names
+    if n_robots != len(names):
+        raise ShapeError(f"the plan has {n_robots} robots, the workspace {names}.")
+    require_lead_apart(names)
+    return plan
+
+
+def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
+    """Return a point for each cell, the centre, with the trust after the bound into it."""
+    row, col = np.array(plan.path).T
+    x, y = np.array([plan.workspace.grid.center(cell) for cell in plan.path]).T
+    columns = {"bound": np.arange(len(row)), "row": row, "col": col, "x": x, "y": y}
+    for i, robot in enumerate(plan.workspace.team.names):
+        columns[f"trust_{robot}"] = np.insert(plan.trust[:, i], 0, np.nan)
+        for end, q in _BAND.items():
+            columns[f"trust_{robot}_{end}"] = np.insert(plan.bands[q, :, i], 0, np.nan)
+    return _frame(plan, pd.DataFrame(columns), shapely.points(x, y))
+
+
+def posts_layer(plan: Plan) -> gpd.GeoDataFrame:
+    """Return a point for each bound and robot of T2: where it stands, and what it watches."""
+    posts, waypoints = _required(plan, plan.posts), _required(plan, plan.waypoints)
+    n_bounds, n_robots = posts.shape[:2]
+    (row, col), (x, y) = np.array(plan.path[:-1]).T, posts.reshape(-1, 2).T
+    lead_x, lead_y = waypoints[1:].T
+    of_bound = {
+        "bound": np.arange(1, n_bounds + 1), "row": row, "col": col, "lead_x": lead_x,
+        "lead_y": lead_y,
+    }  # fmt: skip
+    columns = {name: np.repeat(values, n_robots) for name, values in of_bound.items()}
+    columns |= {"robot": np.tile(plan.workspace.team.names, n_bounds), "x": x, "y": y}
+    order = ["bound", "robot", "row", "col", "x", "y", "lead_x", "lead_y"]
+    return _frame(plan, pd.DataFrame(columns)[order], shapely.points(x, y))
+
+
+def ways_layer(plan: Plan) -> gpd.GeoDataFrame:
+    """Return a line for each bound and robot, the lead first; none for a robot without a way."""
+    names = (LEAD, *plan.workspace.team.names)
+    rows = [
+        (k, robot, shapely.LineString(way))
+        for k, ways in enumerate(_required(plan, plan.ways), start=1)
+        for robot, way in zip(names, ways, strict=True)
+        if way is not None
+    ]
+    bound, robot, lines = zip(*rows, strict=True) if rows else ((), (), ())
+    columns = {"bound": bound, "robot": robot, "length_m": shapely.length(np.array(lines))}
+    return _frame(plan, pd.DataFrame(columns), np.array(lines, dtype=object))
+
+
+def way_points(plan: Plan) -> pd.DataFrame:
+    """Return the points of `ways_layer`, a row for each; `point` counts from 0 on each way."""
+    layer = ways_layer(plan)
+    xy, line = shapely.get_coordinates(layer.geometry.to_numpy(), return_index=True)
+    points = layer.loc[line, ["bound", "robot"]].reset_index(drop=True)
+    points["point"] = points.groupby(["bound", "robot"]).cumcount()
+    return points.assign(x=xy[:, 0], y=xy[:, 1])
+
+
+def routes_of(plan: Plan) -> dict[str, list[np.ndarray]]:
+    """Return the ways of each robot, bound by bound, the lead first; the first one missing ends it.
+
+    Beyond it a robot must not drive: it has no way there.
+    """
+    names = (LEAD, *plan.workspace.team.names)
+    ways = zip(*_required(plan, plan.ways), strict=True)
+    return {
+        robot: [way for way in takewhile(lambda way: way is not None, own) if way is not None]
+        for robot, own in zip(names, ways, strict=True)
+    }
+
+
+def _required[T](plan: Plan, values: T | None) -> T:
+    if values is None:
+        raise TrustboError(
+            "a plan has posts and ways where its workspace was made from a terrain in memory; use "
+            "Workspace.from_terrain."
+        )
+    return values
+
+
+def _frame(plan: Plan, table: pd.DataFrame, geometry: np.ndarray) -> gpd.GeoDataFrame:
+    crs = find_crs(plan.workspace)
+    return gpd.GeoDataFrame(table, geometry=geometry, crs=None if crs is None else crs.to_wkt())
