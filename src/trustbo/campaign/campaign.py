@@ -59,6 +59,7 @@ class Campaign:
     Attributes:
         workspace: Workspace of the paths.
         options: Options of the campaign.
+        policy: Policy that chooses the paths.
         planner: Planner on the workspace's awareness map; see `planner_now`.
         log: Missions as measured, their states, plans, posteriors and failures (a `History`).
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
@@ -101,7 +102,7 @@ class Campaign:
             NoPathError: The goal cannot be reached.
         """
         self.options = CampaignOptions.of(options, Campaign.__init__)
-        self._policy = resolve_policy(policy)
+        self.policy = resolve_policy(policy)
         self._learning = self.options.learning(model, sampler)
         self.model, self.log = self._learning.model, History()
         law = self.model.observation, self.model.response
@@ -185,7 +186,7 @@ class Campaign:
             planner = self.planner_now()
             with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
                 key = random.key(self.seed_of("policy"), impl="threefry2x32")
-                plan = self._policy(key, self.belief, planner)
+                plan = self.policy(key, self.belief, planner)
             name = self.settings["policy"]
             if not isinstance(plan, Plan):
                 raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")

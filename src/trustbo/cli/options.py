@@ -40,6 +40,20 @@ Learning
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial.
   sampler NAME: Sampler of the posterior: nuts; exact (importance sampling, which need not compile;
     pooled only); joint (nuts, for other than gaussian).
+Benchmark
+  data FOLDER: Folder of the real terrains, wellington/dem.tif and so on; without it, synthetic ones
+    only.
+  world NAME: World, given once for each; by default all.
+  worlds.policy NAME: Policy, given once for each: a name as for [b]trustbo run[/b], or module:name;
+    by default greedy, optimistic, thompson.
+  worlds.model NAME: Model, given once for each: pooled, hierarchical, coupled, or module:name.
+  simulator NAME: Your own simulator of a world, module:name.
+  baseline NAME: Baseline, given once for each: random, shortest, paper, botorch, none; by default
+    all of them.
+  max_bounds NAME: Admissible paths: shortest, shortest+4, or the most bounds allowed.
+  by NAME: Rows of the table: contender, kind, world or course.
+  quick: Run three small worlds, one course and three missions only.
+  seeds N: Number of campaigns for each course.
 Missions
   iterations N: Number of missions to run and learn from.
   resume.iterations N: Number of missions in all; by default as many as it was begun for.
@@ -50,6 +64,7 @@ Program
   config FILE: Read flags from a YAML file, e.g. [b]max-slope: 30[/b]; flags given here win.
   out FOLDER: Folder for the results, made if need be; not one that holds a campaign.
   study.out FOLDER: Folder for the results, made if need be.
+  worlds.out FOLDER: Folder for the results, made if need be.
   report.out FILE: File of the page; by default report.html in the folder.
   export.out FOLDER: Folder for the files; by default the result's.
   overwrite: Replace the campaign that the folder holds.
@@ -72,6 +87,7 @@ Arguments
 """Flags by panel: name, placeholder and help; `command.name` where it differs by command."""
 _NAMES = {
     "overwrite": ("--overwrite",),  # without --no-overwrite
+    "quick": ("--quick",),
     "quiet": ("--quiet", "-q"),
     "debug": ("--debug",),
     "formats": ("--format",),

@@ -11,6 +11,7 @@ from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.options import with_flags
 from trustbo.cli.results import export, report
 from trustbo.cli.study import study
+from trustbo.cli.worlds import worlds
 
 EPILOG = """
 Exit codes: 0 done; 1 done, but some of a study's runs failed, or an
@@ -18,7 +19,11 @@ unforeseen error (with a traceback); 2 bad input; 3 a posterior was refused,
 measured missions are kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
-_PANELS = (("Campaigns", (demo, run, resume)), ("Results", (report, export)), ("Studies", (study,)))
+_PANELS = (
+    ("Campaigns", (demo, run, resume)),
+    ("Results", (report, export)),
+    ("Studies", (study, worlds)),
+)
 
 app = typer.Typer(
     no_args_is_help=True,

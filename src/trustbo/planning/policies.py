@@ -41,7 +41,7 @@ def thompson(key: Array, posterior: Params, planner: Planner) -> Plan:
 
 def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: float = 0.9) -> Plan:
     """Best path under the upper quantile over draws of each bound's drift u."""
-    params, chosen = choose_draws(posterior, 1000, _seed(key))
+    params, chosen = choose_draws(posterior, 1000, seed_of(key))
     dynamics = planner.dynamics(params, draws=chosen)
     best = Dynamics(
         dynamics.transition.mean(0),
@@ -89,11 +89,11 @@ def information(key: Array, posterior: Params, planner: Planner, *, n_random: in
 
     Candidates are the draws' best paths and `n_random` random ones.
     """
-    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=_seed(key))
-    rng = np.random.default_rng(_seed(key))
+    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=seed_of(key))
+    rng = np.random.default_rng(seed_of(key))
     sampler = path_sampler(planner.paths)
     paths = list(drawn.candidates) + [sampler.draw(rng) for _ in range(n_random)]
-    params, _ = choose_draws(posterior, N_DRAWS, _seed(key))
+    params, _ = choose_draws(posterior, N_DRAWS, seed_of(key))
     gains = information_gain(params, planner.mean_awareness, paths, planner.family, planner.lag)
     return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
 
@@ -116,7 +116,7 @@ def random(key: Array, posterior: Params, planner: Planner) -> Plan:
     Raises:
         TrustboError: Revisits are forbidden, and each of 10 000 walks drawn had one.
     """
-    path = path_sampler(planner.paths).draw(np.random.default_rng(_seed(key)))
+    path = path_sampler(planner.paths).draw(np.random.default_rng(seed_of(key)))
     return planner.evaluate(path, posterior.mean())
 
 
@@ -147,11 +147,12 @@ def _best_candidate(
     key: Array, posterior: Params, planner: Planner, score: Callable[[np.ndarray], np.ndarray]
 ) -> Plan:
     """Plan the path with the best score of its values (draw, path) among the draws' best paths."""
-    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=_seed(key))
+    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=seed_of(key))
     chosen = int(np.argmax(score(drawn.values_of(drawn.candidates))))
     return planner.evaluate(drawn.candidates[chosen], posterior.mean())
 
 
-def _seed(key: Array) -> int:
+def seed_of(key: Array) -> int:
+    """Seed for NumPy from a random key."""
     high, low = np.asarray(jax.random.key_data(key)).ravel()[:2].tolist()
     return (high << 32) + low

@@ -6,6 +6,7 @@ programming over bounds (cell left, cell entered) with the number of bounds that
 is exact, as the loss of a bound depends on the state and the decision only.
 """
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -104,7 +105,8 @@ def tabulate(
     """
     edges, tally = edges_of(workspace), _Tally(workspace)
     todo, number = edges, 0
-    with tqdm(desc="truth", unit=" bounds", disable=not progress) as bar:
+    silent = not progress or not sys.stderr.isatty()  # carriage returns are for a terminal
+    with tqdm(desc="truth", unit=" bounds", disable=silent) as bar:
         while todo:
             number += 1
             for edge, outcomes in zip(todo, replicates.run(todo, number), strict=True):

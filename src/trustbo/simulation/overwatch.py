@@ -336,7 +336,7 @@ class KinematicSimulator:
         return Drive(np.concatenate(poses[1:]), moves, status, (cells[0], cells[1]), stops)
 
     def _goals(self, i: int, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Where the lead (i = 0) or T2 is to stop in a cell, shape (robot, 2)."""
+        """Stops of the lead (i = 0) or T2 in a cell, shape (robot, 2)."""
         posts = self._ways.posts
         return posts.at(cell, next_cell) if i else posts.waypoint(cell)[None]
 

@@ -37,7 +37,7 @@ OBJECTIVES = ("lost_contact", "mean")
 
 
 class PathContact(NamedTuple):
-    """What a path gives."""
+    """Contact lost and kept on a path, and the chance to arrive."""
 
     lost: float
     """Expected contact lost, in bounds: the sum over bounds of 1 - contact, mean over robots."""
@@ -48,7 +48,7 @@ class PathContact(NamedTuple):
 
 
 class Contact(Protocol):
-    """What a truth is made of: a table of bounds, a model's recursion, or the user's own."""
+    """Source of a truth: a table of bounds, a model's recursion, or the user's own."""
 
     @property
     def standard_error(self) -> float:
@@ -276,7 +276,7 @@ def _table(
 
 
 def _content(simulator: Any) -> list[bytes]:
-    """What the contact of a simulator depends on besides its description."""
+    """Contents of the workspace on which contact depends, besides the simulator's settings."""
     workspace: Workspace = simulator.workspace
     own = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
     parts = [to_json(own).encode(), _bytes(workspace.passable)]

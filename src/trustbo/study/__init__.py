@@ -1,7 +1,13 @@
 """Studies: many campaigns as a table of runs, on as many cores as there are."""
 
+from trustbo.study.benchmark import run_worlds, worlds_table
 from trustbo.study.conduct import failures, load_study, run_study
 from trustbo.study.configuration import Study, read_study
 from trustbo.study.table import axes_of, summary
+from trustbo.study.world import World
+from trustbo.study.world_set import worlds
 
-__all__ = ["Study", "axes_of", "failures", "load_study", "read_study", "run_study", "summary"]
+__all__ = [
+    "Study", "World", "axes_of", "failures", "load_study", "read_study", "run_study", "run_worlds",
+    "summary", "worlds", "worlds_table",
+]  # fmt: skip

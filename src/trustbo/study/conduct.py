@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from os import PathLike
-from typing import Any
+from typing import Any, Protocol
 
 import pandas as pd
 import xarray as xr
@@ -50,12 +50,30 @@ def run_study(
     """
     if isinstance(study, str | PathLike):
         study = read_study(study)
-    study = Study.of(study)
+    return run_runs(Study.of(study), directory, executor, n_workers=n_workers, progress=progress)
+
+
+class Runs(Protocol):
+    """Table of runs, and its settings: a `Study`, or worlds."""
+
+    def runs(self) -> list[Run]:
+        """List the runs."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """Settings as JSON can hold them."""
+        ...
+
+
+def run_runs(
+    study: Runs, directory: FilePath, executor: Any, *, n_workers: int | None, progress: bool
+) -> xr.Dataset:
+    """Run the runs of a table that have not ended yet; see `run_study`."""
     require_executor(executor)
     store, runs = Store(directory), study.runs()
     pending = [run for run in runs if not store.has(run.key)]
     _rehearse(pending)
-    store.write_study(study, runs)
+    store.write_study(study.settings(), runs)
     total, done = len(runs), len(runs) - len(pending)
     failed: list[tuple[Run, str]] = []
     with tqdm(total=total, initial=done, desc="runs", disable=not progress) as bar:
@@ -74,7 +92,7 @@ def run_study(
         )
         if len(failed) == total:
             raise TrustboError(message)
-        warnings.warn(message, stacklevel=2)
+        warnings.warn(message, stacklevel=3)
     return load_study(directory)
 
 

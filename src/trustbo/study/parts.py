@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 
@@ -129,17 +129,25 @@ class Coupled(Model):
 MODELS = (Pooled, Hierarchical, Coupled)
 
 
+class Place(Protocol):
+    """Terrain of a run, as far as a simulator needs to know it."""
+
+    def workspace(self) -> Workspace:
+        """Workspace of the paths."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Simulating(Part):
     """Simulator that runs the paths."""
 
-    def simulator(self, workspace: Workspace) -> simulation.Simulator:
+    def simulator(self, place: Place) -> simulation.Simulator:
         """Make the simulator."""
         raise NotImplementedError
 
-    def truth(self, workspace: Workspace) -> simulation.Truth | None:
+    def truth(self, place: Place) -> simulation.Truth | None:
         """Find its truth; None where nobody asked for it."""
-        return simulation.Truth.of(self.simulator(workspace))
+        return simulation.Truth.of(self.simulator(place))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,15 +164,15 @@ class Kinematic(Simulating):
     bounding: str = "successive"
     known_truth: bool = False
 
-    def simulator(self, workspace: Workspace) -> simulation.Simulator:
+    def simulator(self, place: Place) -> simulation.Simulator:
         """Make the simulator."""
         own = asdict(self)
         del own["known_truth"]
-        return simulation.KinematicSimulator(workspace, **own)
+        return simulation.KinematicSimulator(place.workspace(), **own)
 
-    def truth(self, workspace: Workspace) -> simulation.Truth | None:
+    def truth(self, place: Place) -> simulation.Truth | None:
         """Find its truth; None where nobody asked for it."""
-        return super().truth(workspace) if self.known_truth else None
+        return super().truth(place) if self.known_truth else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,13 +191,13 @@ class FromModel(Simulating):
     observation: str = "gaussian"
     n_ticks: int | None = None
 
-    def simulator(self, workspace: Workspace) -> simulation.Simulator:
+    def simulator(self, place: Place) -> simulation.Simulator:
         """Make the simulator."""
         own = asdict(self)
         n_ticks = own.pop("n_ticks")
         model = models.PooledTrust(observation=own.pop("observation"))
         truth = models.TrustParams(**own | {"beta": np.array(self.beta, dtype=float)})
-        return simulation.ModelSimulator(workspace, truth, model, n_ticks=n_ticks)
+        return simulation.ModelSimulator(place.workspace(), truth, model, n_ticks=n_ticks)
 
 
 SIMULATORS = (Kinematic, FromModel)

@@ -21,9 +21,11 @@ from trustbo.campaign.loop import missions
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
+from trustbo.planning import POLICIES
 from trustbo.simulation import Truth
 from trustbo.study import workers
-from trustbo.study.parts import Model, Simulating
+from trustbo.study.contenders import identity_of, resolved
+from trustbo.study.parts import Simulating
 from trustbo.study.terrains import Terrain
 
 
@@ -36,7 +38,7 @@ class Run:
         terrain: Terrain, with start and goal.
         simulator: Simulator that runs the paths.
         model: Trust model.
-        policy: Name of the policy.
+        policy: Name of the policy, a policy, or the `"module:name"` of one.
         objective: Name of the objective.
         sampler: Name of the sampler.
         seed: Seed of the campaign.
@@ -47,8 +49,8 @@ class Run:
     labels: dict[str, Any]
     terrain: Terrain
     simulator: Simulating
-    model: Model
-    policy: str
+    model: Any
+    policy: Any
     objective: str
     sampler: str
     seed: int
@@ -61,6 +63,7 @@ class Run:
         own = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "labels"}
         for name in ("terrain", "simulator", "model"):
             own[name] = own[name].identity()
+        own["policy"] = identity_of(self.policy)
         return own | {"trustbo": version("trustbo")}
 
     @property
@@ -76,29 +79,31 @@ class Run:
         """
         options = dict(self.options)
         stop = options.pop("stop", None)
-        workspace = self.terrain.workspace()
+        workspace, policy = self.terrain.workspace(), resolved("policy", self.policy, POLICIES)
+        learn = getattr(policy, "learn", None)  # of one that learns by itself
         campaign = Campaign(
             workspace,
             *self.terrain.ends,
             model=self.model.model(),
-            policy=self.policy,
+            policy=self.policy if self.policy in POLICIES else policy,
             objective=self.objective,
             sampler=self.sampler,
             seed=self.seed,
-            callbacks=callbacks,
+            callbacks=callbacks if learn is None else (learn, *callbacks),
             **options,
         )
         rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
-        simulator = self.simulator.simulator(workspace)
+        simulator = self.simulator.simulator(self.terrain)
         return campaign, missions(campaign, simulator, n_iterations=self.n_iterations, stop=rule)
 
     def truth(self) -> Truth | None:
         """Truth of the simulator, where it is known."""
-        return self.simulator.truth(self.terrain.workspace())
+        return self.simulator.truth(self.terrain)
 
     def recommend(self, campaign: Campaign) -> tuple[Cell, ...]:
-        """Path that is recommended now."""
-        return campaign.recommend().path
+        """Path that is recommended now, by the model or, where the policy has its own, by that."""
+        own = getattr(campaign.policy, "recommend", None)
+        return campaign.recommend().path if own is None else own(campaign)
 
     def __str__(self) -> str:
         return ", ".join(f"{name}={value}" for name, value in self.labels.items())

@@ -7,7 +7,6 @@ from typing import Any
 
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_folder, write_text
-from trustbo.study.configuration import Study
 from trustbo.study.run import Run
 
 
@@ -18,10 +17,10 @@ class Store:
         """Use a folder, which need not exist yet; TrustboError if its name belongs to a file."""
         self.folder = require_folder(directory)
 
-    def write_study(self, study: Study, runs: list[Run]) -> None:
+    def write_study(self, settings: dict[str, Any], runs: list[Run]) -> None:
         """Write `study.json`: the settings, and the table of runs by key."""
         table = {run.key: run.labels for run in runs}
-        self._write("study.json", {"study": study.settings(), "runs": table})
+        self._write("study.json", {"study": settings, "runs": table})
 
     def table(self) -> dict[str, dict[str, Any]]:
         """Read the labels of each run, by key; TrustboError if the folder holds no study."""

@@ -1,0 +1,54 @@
+"""The open benchmark: the tables of docs/worlds.md, in Markdown.
+
+    python benchmarks/worlds.py --data ../shared/data --out out/worlds
+
+All worlds x 4 courses x contenders, 15 missions each; called again, it goes on where it stopped.
+`--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
+"""
+
+import argparse
+
+import numpy as np
+
+from trustbo.study import run_worlds, worlds_table
+from trustbo.study.benchmark import as_text
+
+RIGHT, WRONG = ("right", "bare", "slopes"), ("aged", "canopy")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data")
+    parser.add_argument("--out", default="out/worlds")
+    parser.add_argument("--objective", default="lost_contact")
+    parser.add_argument("--max-bounds", default="shortest+4")
+    parser.add_argument("--policy", nargs="*", default=["greedy", "optimistic", "thompson"])
+    parser.add_argument("--model", nargs="*", default=["pooled"])
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--targets", action="store_true")
+    parser.add_argument("--quick", action="store_true")
+    given = parser.parse_args()
+    objective, max_bounds = given.objective, given.max_bounds
+    if given.targets:
+        objective, max_bounds = "mean", "shortest+2"
+    results = run_worlds(
+        given.out, data=given.data, policies=given.policy, models=given.model, seeds=given.seeds,
+        objective=objective, max_bounds=max_bounds, quick=given.quick, executor="loky",
+    )  # fmt: skip
+    kinds = results["kind"].values
+    for title, chosen in (
+        ("all worlds", np.ones(len(kinds), bool)),
+        ("the assumed sight mode is right", np.isin(kinds, RIGHT)),
+        ("an old DSM, or a wrong canopy", np.isin(kinds, WRONG)),
+        ("wall", kinds == "wall"),
+    ):
+        if chosen.any():
+            n = len(np.unique(results["world"].values[chosen]))
+            print(f"\n{title} ({n} worlds), {objective}, {max_bounds}\n")
+            print(as_text(worlds_table(results.isel(run=chosen))))
+    print("\nby kind and contender\n")
+    print(as_text(worlds_table(results, ["kind", "contender"])))
+
+
+if __name__ == "__main__":
+    main()

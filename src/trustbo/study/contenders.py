@@ -1,0 +1,182 @@
+"""Contenders of the benchmark: a model and a policy, or a baseline; the user's own among them."""
+
+import hashlib
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_choice
+from trustbo.models import TrustModel
+from trustbo.models.params import Params
+from trustbo.models.record import model_to_record
+from trustbo.planning import POLICIES, Plan, Planner
+from trustbo.planning.path_sampling import path_sampler
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.policies import random, seed_of
+from trustbo.study.parts import MODELS, Part, Pooled, parts_of
+
+BASELINES = ("random", "shortest", "paper", "botorch")
+"""Baselines: a random path, a random one of the shortest, the paper's method, and BoTorch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnModel(Part):
+    """Trust model of the user's own: itself, or the `"module:name"` of it or of what makes it."""
+
+    kind = "own"
+    given: Any
+
+    def model(self) -> TrustModel:
+        """Give the model."""
+        found = resolved("model", self.given)
+        made = found() if callable(found) and not isinstance(found, TrustModel) else found
+        if not isinstance(made, TrustModel):
+            raise TrustboError(f"model {self.given!r} must be a TrustModel; got {made!r}.")
+        return made
+
+    def identity(self) -> dict[str, Any]:
+        """Settings that the numbers depend on."""
+        return {"kind": self.kind, "model": model_to_record(self.model())}
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One row of the table.
+
+    Attributes:
+        name: Name of the row.
+        model: Trust model.
+        policy: Name of a policy, or a policy.
+        objective: Objective of the policy.
+        options: Options of the campaign.
+        bounds: False for awareness of cells alone, as in the paper.
+    """
+
+    name: str
+    model: Any
+    policy: Any
+    objective: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    bounds: bool = True
+
+
+class Unlearned:
+    """Policy that recommends what it would do next, whatever a model has learned."""
+
+    def __init__(self, name: str, choose: Callable[[Array, Params, Planner], Plan]) -> None:
+        """Wrap a policy."""
+        self.__name__, self._choose = name, choose
+
+    def __call__(self, key: Array, posterior: Params, planner: Planner) -> Plan:
+        """Choose a path."""
+        return self._choose(key, posterior, planner)
+
+    def recommend(self, campaign: Campaign) -> tuple[Cell, ...]:
+        """Path of the next mission."""
+        return campaign.ask().path
+
+
+def random_shortest(key: Array, posterior: Params, planner: Planner) -> Plan:
+    """Path drawn uniformly from those with the fewest bounds."""
+    ends = planner.start, planner.goal
+    paths = AdmissiblePaths(planner.workspace, *ends, planner.connectivity, "shortest", True)
+    path = path_sampler(paths).draw(np.random.default_rng(seed_of(key)))
+    return planner.evaluate(path, posterior.mean())
+
+
+def contenders_of(
+    models: Any, policies: Any, baselines: Sequence[str], objective: str, max_bounds: int | str
+) -> list[Contender]:
+    """Every model with every policy, and baselines; TrustboError: an unknown name."""
+    options = {"max_bounds": max_bounds}
+    parts = _models_of(models)
+    named = {_name(policy): policy for policy in _listed(policies)}
+    for policy in named.values():
+        if not callable(resolved("policy", policy, POLICIES)):
+            raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
+    entrants = [
+        Contender(name if len(parts) == 1 else f"{model} {name}", part, policy, objective, options)
+        for model, part in parts.items()
+        for name, policy in named.items()
+    ]
+    for name in baselines:
+        require_choice("baseline", name, BASELINES)
+    pooled, paper = Pooled(), {"initial": "prior_draw", "max_bounds": "shortest+2"}
+    known = {
+        "random": Contender("random path", pooled, "baseline:random", objective, options),
+        "shortest": Contender("shortest path", pooled, "baseline:shortest", objective, options),
+        "paper": Contender("paper", pooled, "greedy", "terminal", paper, bounds=False),
+        "botorch": Contender("BoTorch", pooled, "baseline:botorch", objective, options),
+    }
+    return entrants + [known[name] for name in baselines]
+
+
+def resolved(what: str, given: Any, known: Mapping[str, Any] | None = None) -> Any:
+    """Object itself, one of some that are known by name, or that of a `"module:name"`.
+
+    TrustboError: there is no such module or name.
+    """
+    if not isinstance(given, str) or (known is not None and given in known):
+        return known[given] if known is not None and isinstance(given, str) else given
+    module, colon, name = given.partition(":")
+    if module == "baseline":
+        return _baseline(name)
+    if not colon:
+        require_choice(f'{what} (or give "module:name")', given, known or ())
+    if os.getcwd() not in sys.path:  # where a program runs, there are the user's modules
+        sys.path.append(os.getcwd())
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise TrustboError(f"{what} {given!r} cannot be imported: {error}.") from None
+
+
+def identity_of(given: Any) -> Any:
+    """Name of an object, with a hash of the code of a function, as JSON can hold it."""
+    if given is None or isinstance(given, str):
+        return given
+    kind = given if hasattr(given, "__qualname__") else type(given)
+    code = getattr(getattr(given, "__code__", None), "co_code", b"")
+    return f"{kind.__module__}:{kind.__qualname__} {hashlib.sha256(code).hexdigest()[:12]}"
+
+
+def _baseline(name: str) -> Any:
+    """New policy of a baseline."""
+    if name == "botorch":
+        from trustbo.study.outsider import PathBandit
+
+        return PathBandit()
+    return Unlearned(
+        *{"random": ("random", random), "shortest": ("shortest", random_shortest)}[name]
+    )
+
+
+def _models_of(models: Any) -> dict[str, Any]:
+    """Parts of models by name."""
+    kinds, parts = {kind.kind for kind in MODELS}, {}
+    for given in _listed(models):
+        if isinstance(given, str) and ":" not in given:
+            parts |= parts_of("model", (require_choice("model", given, kinds),), MODELS)
+        else:
+            part = OwnModel(given=given)
+            part.model()
+            parts[_name(given)] = part
+    return parts
+
+
+def _listed(given: Any) -> list[Any]:
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
+def _name(given: Any) -> str:
+    if isinstance(given, str):
+        return given.rpartition(":")[2]
+    return getattr(given, "__name__", type(given).__name__)

@@ -1,0 +1,183 @@
+"""A world: a true terrain, sight and team, what is assumed of them, and courses through it."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy import ndimage
+
+from trustbo import terrain
+from trustbo.data import Cell, Robot, Team
+from trustbo.errors import TrustboError, require_choice
+from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.workspace import Workspace
+from trustbo.workspace.sight import Sight
+
+REAL = ("wellington", "tahoe", "bcts", "topography")
+"""Real terrains by the names of their folders, each with a dem.tif and a dsm.tif."""
+COURSES = ("sw-ne", "nw-se", "n-s", "w-e")
+"""Courses through a world: two diagonals, from north to south and from west to east."""
+_STRIP = 250
+"""Rows of a real terrain that are used, those with most data: all but bcts have not many more."""
+
+Simulate = Callable[..., Simulator]
+"""Function `simulator(workspace, *, terrain, sight, team)` of a true world, the user's own."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A terrain with a true sight and team, and what is assumed of it.
+
+    Attributes:
+        name: Name of the world.
+        kind: `"right"`, the assumed is the true; `"wall"` or `"bare"`, so too, in another sight
+            mode; `"aged"`, an old DSM is assumed; `"canopy"`, a wrong model of the canopy is
+            assumed; `"slopes"`, robots that stand little slope.
+        ground: `"synthetic-N"`, the synthetic terrain of seed N, or a name in `REAL`.
+        sight: True model of sight.
+        assumed: Assumed model of sight; None for the true one.
+        max_slope: Slope limit of all robots, degrees; None for the default.
+        data: Folder of the real terrains.
+        shape: Planning grid.
+        side: Side of a synthetic terrain, m; its relief is 6 % of it.
+    """
+
+    name: str
+    kind: str
+    ground: str
+    sight: Sight = field(default_factory=Sight)
+    assumed: Sight | None = None
+    max_slope: float | None = None
+    data: str | None = None
+    shape: tuple[int, int] = (10, 10)
+    side: float = 500.0
+
+    @property
+    def is_made(self) -> bool:
+        """Whether the terrain is synthetic, and needs no files."""
+        return self.ground.startswith("synthetic")
+
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides its numbers; real terrains by their contents."""
+        own = asdict(self)
+        del own["data"]
+        return own if self.is_made else own | {"files": [_digest(f) for f in self.files()]}
+
+    def files(self) -> list[str]:
+        """Files of a real terrain.
+
+        TrustboError: they are absent, with where to put them.
+        """
+        names = [f"{self.ground}/{name}.tif" for name in ("dem", "dsm")]
+        if self.data is None:
+            raise TrustboError(
+                f"world {self.name!r} needs {' and '.join(names)}: name the folder that holds "
+                f"{self.ground}/ by data=, or leave the world out."
+            )
+        found = [Path(self.data).absolute() / name for name in names]
+        absent = [str(file) for file in found if not file.is_file()]
+        if absent:
+            raise TrustboError(
+                f"world {self.name!r} lacks {' and '.join(absent)}: put a DEM and a DSM there, or "
+                "name another folder by data=."
+            )
+        return [str(file) for file in found]
+
+    def true_terrain(self) -> xr.Dataset:
+        """DEM and DSM as they are."""
+        if self.is_made:
+            return _made(int(self.ground.partition("-")[2]), self.side)
+        return _read(*self.files())
+
+    def team(self) -> Team:
+        """Lead and robots."""
+        if self.max_slope is None:
+            return Team()
+        robot = Robot(max_slope=float(np.deg2rad(self.max_slope)))
+        return Team(robots=(robot,) * 3, lead=robot)
+
+    def workspace(self, *, bounds: bool = True) -> Workspace:
+        """Workspace on what is assumed; `bounds` as for `Workspace.from_terrain`."""
+        return _workspace(self, bounds)
+
+    def simulator(self, workspace: Workspace, simulate: Simulate | None = None) -> Simulator:
+        """Simulator of the true world, with posts and ways of a workspace on the assumed one."""
+        true = {"terrain": self.true_terrain(), "sight": self.sight, "team": self.team()}
+        return (KinematicSimulator if simulate is None else simulate)(workspace, **true)
+
+    def truth(self, simulate: Simulate | None = None, *, progress: bool = False) -> Truth:
+        """Truth of the simulator, from disk if it is known."""
+        return Truth.of(self.simulator(self.workspace(), simulate), progress=progress)
+
+    def ends(self, course: str) -> tuple[Cell, Cell]:
+        """Start and goal of a course: the nearest cells from which most others can be reached."""
+        rows, cols = (n - 1 for n in self.shape)
+        start, goal = {
+            "sw-ne": ((rows, 0), (0, cols)),
+            "nw-se": ((0, 0), (rows, cols)),
+            "n-s": ((0, cols // 2), (rows, cols - cols // 2)),
+            "w-e": ((rows - rows // 2, 0), (rows // 2, cols)),
+        }[require_choice("course", course, COURSES)]
+        regions: Any = ndimage.label(self.workspace().passable.values, np.ones((3, 3)))
+        labels = regions[0]
+        largest = np.argmax(np.bincount(labels.ravel())[1:]) + 1
+        free = np.argwhere(labels == largest)
+        near = [free[np.argmin(((free - cell) ** 2).sum(1))] for cell in (start, goal)]
+        (a, b), (c, d) = near
+        return (int(a), int(b)), (int(c), int(d))
+
+
+def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
+    """Terrain as an old survey has it: canopy lower, with clearings, ground off by some 0.3 m.
+
+    The canopy has 0.7 times its height, and none on 15 % of the area, in patches of some 10 m that
+    have grown over since; errors of the ground have sd 0.3 m, and are alike within some 10 m.
+    """
+    rng, step = np.random.default_rng(seed), abs(float(now["x"][1] - now["x"][0]))
+    dem, dsm = now["dem"].values, now["dsm"].values
+
+    def noise() -> np.ndarray:
+        smooth = ndimage.gaussian_filter(rng.standard_normal(dem.shape), 10.0 / step)
+        return smooth / smooth.std()
+
+    clearings = noise()
+    clearings = clearings > np.quantile(clearings, 0.85)
+    ground = dem + 0.3 * noise()
+    canopy = np.where(clearings, 0.0, 0.7 * (dsm - dem))
+    old = now["dem"].copy(data=ground), now["dsm"].copy(data=ground + canopy)
+    return terrain.assemble_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
+
+
+@lru_cache(maxsize=4)
+def _workspace(world: World, bounds: bool) -> Workspace:
+    ground = world.true_terrain()
+    assumed = aged(ground) if world.kind == "aged" else ground
+    sight = world.sight if world.assumed is None else world.assumed
+    return Workspace.from_terrain(assumed, world.shape, world.team(), sight=sight, bounds=bounds)
+
+
+@lru_cache(maxsize=2)
+def _made(seed: int, side: float) -> xr.Dataset:
+    return terrain.synthetic_terrain((side, side), seed=seed, relief=0.06 * side)
+
+
+@lru_cache(maxsize=2)
+def _read(dem: str, dsm: str) -> xr.Dataset:
+    whole = terrain.read_terrain(dem, dsm)
+    step = abs(float(whole["y"][1] - whole["y"][0]))
+    n_rows = round(_STRIP / step)
+    if whole.sizes["y"] <= 2 * n_rows:
+        return whole
+    known = np.isfinite(whole["dem"].values).sum(1)
+    first = int(np.convolve(known, np.ones(n_rows), "valid").argmax())
+    return whole.isel(y=slice(first, first + n_rows))
+
+
+@lru_cache(maxsize=64)
+def _digest(path: str) -> str:
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()

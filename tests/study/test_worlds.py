@@ -1,0 +1,202 @@
+"""Worlds: what is true and what is assumed, the comparison on them, and what is refused."""
+
+import dataclasses
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import trustbo as tb
+from trustbo.cli import app
+from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.study import World, run_worlds, worlds, worlds_table
+from trustbo.study.contenders import contenders_of
+from trustbo.study.world import COURSES, REAL, aged
+from trustbo.workspace.sight import Sight
+
+TINY = World("tiny", "aged", "synthetic-0", shape=(3, 3), side=60.0)
+ROWS = ("corner", "random path", "shortest path", "paper")
+
+
+def corner(key, posterior, planner):
+    """Policy of a user: along two sides."""
+    (row, col), (up, right) = planner.start, planner.goal
+    path = [
+        *((r, col) for r in range(row, up - 1, -1)),
+        *((up, c) for c in range(col + 1, right + 1)),
+    ]
+    return planner.evaluate(path, posterior.mean())
+
+
+def blind(workspace, **true):
+    """Simulator of a user: looks detect half as often."""
+    team = true["team"]
+    robots = tuple(dataclasses.replace(robot, detection=0.5) for robot in team.robots)
+    lead = dataclasses.replace(team.lead, detection=0.5)
+    return KinematicSimulator(workspace, **true | {"team": tb.Team(robots=robots, lead=lead)})
+
+
+@pytest.fixture
+def tiny(monkeypatch, tmp_path_factory):
+    """A benchmark of one small world, and the cache of its truth."""
+    cache = tmp_path_factory.getbasetemp() / "cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setattr("trustbo.study.benchmark.worlds", lambda data=None: {"tiny": TINY})
+
+
+def run(folder, **changes):
+    options = {"policies": corner, "courses": ["sw-ne"], "n_iterations": 2, "progress": False}
+    options["baselines"] = "random", "shortest", "paper"
+    return run_worlds(folder, **options | changes)
+
+
+def test_there_are_enough_worlds_of_every_kind():
+    known = worlds()
+    assert len(known) == 29 >= 20
+    assert len(COURSES) == 4
+    kinds = {world.kind for world in known.values()}
+    assert kinds == {"right", "wall", "bare", "aged", "canopy", "slopes"}
+    assert {world.ground for world in known.values()} == {
+        *REAL, "synthetic-0", "synthetic-1", "synthetic-2",
+    }  # fmt: skip
+    assert all(name == world.name for name, world in known.items())
+
+
+def test_an_old_survey_has_lower_canopy_clearings_and_errors_of_the_ground():
+    now = tb.terrain.synthetic_terrain((80.0, 80.0), seed=0)
+    old = aged(now)
+    error = (old["dem"] - now["dem"]).values
+    assert error.std() == pytest.approx(0.3, rel=0.05)
+    assert np.abs(np.diff(error, axis=0)).max() < 0.15  # smooth
+    canopy, before = ((t["dsm"] - t["dem"]).values for t in (now, old))
+    wooded = canopy > 0.1
+    cleared = wooded & (before < 1e-9)
+    assert 0.02 < cleared.sum() / wooded.sum() < 0.4
+    np.testing.assert_allclose(
+        before[wooded & ~cleared], 0.7 * canopy[wooded & ~cleared], atol=1e-9
+    )
+    assert old.rio.crs == now.rio.crs
+
+
+def test_the_true_world_differs_from_the_assumed_one_as_it_says():
+    world = World(
+        "w", "canopy", "synthetic-0", Sight("wall"), Sight(), 18.0, shape=(3, 3), side=60.0
+    )
+    workspace = world.workspace()
+    simulator = world.simulator(workspace)
+    assert (workspace.sights[0].mode, simulator.sight.mode) == ("transmittance", "wall")
+    assert np.rad2deg(workspace.team.max_slope) == pytest.approx(18.0)
+    assert simulator.team == workspace.team
+    np.testing.assert_array_equal(TINY.true_terrain()["dem"], simulator.terrain["dem"])
+    assert not np.allclose(TINY.workspace().terrain["dem"], TINY.true_terrain()["dem"])
+    for course in COURSES:
+        start, goal = world.ends(course)
+        assert max(abs(start[0] - goal[0]), abs(start[1] - goal[1])) == 2
+
+
+def test_contenders_run_on_worlds_and_their_recommendations_are_judged(tiny, tmp_path):
+    results = run(tmp_path)
+    assert results["contender"].values.tolist() == list(ROWS)
+    assert set(results["status"].values.ravel()) <= {"ok", "stuck"}
+    truth = Truth.of(TINY.simulator(TINY.workspace()))
+    best = truth.value(truth.best((2, 0), (0, 2))).lost
+    np.testing.assert_allclose(results["oracle"], best)
+    side = ((2, 0), (1, 0), (0, 0), (0, 1), (0, 2))
+    own = results.sel(run=results["contender"] == "corner")
+    np.testing.assert_allclose(own["regret_followed"], truth.regret(side))
+    # The baselines recommend what they do next; the paper's, what it has learned.
+    for name in ROWS[1:3]:
+        row = results.sel(run=results["contender"] == name)
+        assert row["recommended"].values[0, 0].tolist() == row["path"].values[0, 1].tolist()
+    short = results.sel(run=results["contender"] == "shortest path")["path"].values
+    assert (short[0, :, 3:] == -1).all()
+    table = worlds_table(results)
+    assert table.index.tolist() == list(ROWS)
+    assert (table["arrive", "value"] <= 1.0).all()
+    assert (table["regret after 0", "low"] <= table["regret after 0", "high"]).all()
+    kept = results.sel(run=results["contender"] == "paper")
+    assert table.loc["paper", ("regret after 1", "value")] == kept["regret"].values[0, 0]
+    assert table.loc["paper", ("lost after 0", "value")] == kept["lost_before"].values[0] - best
+    by_kind = worlds_table(results, ["kind", "contender"])
+    assert ("aged", "paper") in by_kind.index
+    before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()}
+    run(tmp_path)
+    assert {f.name: f.stat().st_mtime_ns for f in (tmp_path / "runs").iterdir()} == before
+
+
+def test_a_user_s_policy_model_and_simulator_enter_by_one_argument(tiny, tmp_path):
+    changes = {"baselines": (), "n_iterations": 1}
+    own = run(
+        tmp_path / "own", models=tb.models.PooledTrust(), simulator=blind,
+        policies=["greedy", corner], **changes,
+    )  # fmt: skip
+    assert own["contender"].values.tolist() == ["greedy", "corner"]
+    plain = run(tmp_path / "plain", **changes)
+    assert float(own["oracle"][1]) > float(plain["oracle"][0]) + 0.5  # half is lost
+    assert len({*own["key"].values.tolist(), *plain["key"].values.tolist()}) == 3
+
+
+def test_a_policy_may_be_named(tmp_path, monkeypatch):
+    (tmp_path / "my_policies.py").write_text("def best(key, posterior, planner): ...")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", list(sys.path))
+    (one,) = contenders_of("pooled", "my_policies:best", (), "mean", 9)
+    assert (one.name, one.policy) == ("best", "my_policies:best")
+
+
+def test_the_command_prints_the_table(tiny, tmp_path):
+    words = ["--out", tmp_path / "out", "--policy", "greedy", "--baseline", "shortest"]
+    words += ["--iterations", 1, "--executor", "serial", "--objective", "mean"]
+    done = CliRunner().invoke(app, ["worlds", *map(str, words)])
+    assert done.exit_code == 0, done.output
+    assert "| contender | regret after 0 (%) | regret after 1 (%) |" in done.output
+    assert "| shortest path | " in done.output
+    table = pd.read_csv(tmp_path / "out" / "worlds.csv", header=[0, 1], index_col=0, skiprows=[2])
+    assert table.index.tolist() == ["greedy", "shortest path"]
+
+
+def test_absent_files_are_named_with_where_to_put_them(tmp_path):
+    with pytest.raises(tb.TrustboError, match=r"'tahoe' needs tahoe/dem\.tif and tahoe/dsm\.tif"):
+        run_worlds(tmp_path, only=["tahoe"])
+    with pytest.raises(
+        tb.TrustboError, match=r"lacks .*/wellington/dem\.tif and .*: put a DEM and"
+    ):
+        run_worlds(tmp_path, data=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"only": ["atlantis"]}, "unknown world 'atlantis'; choose one of"),
+        ({"courses": ["up"]}, "unknown course 'up'; choose one of sw-ne"),
+        ({"policies": "gredy"}, "unknown policy .* 'gredy'; choose one of greedy"),
+        ({"policies": "nowhere:policy"}, "policy 'nowhere:policy' cannot be imported: No module"),
+        ({"policies": 3}, "policy must be a name or a callable; got 3"),
+        ({"models": "pool"}, "unknown model 'pool'; choose one of"),
+        ({"models": "math:pi"}, "model 'math:pi' must be a TrustModel"),
+        ({"baselines": ["best"]}, "unknown baseline 'best'; choose one of random"),
+        (
+            {"simulator": "math:tau"},
+            "simulator 'math:tau' must be a function that makes",
+        ),
+    ],
+)
+def test_impossible_comparisons_are_refused(tiny, tmp_path, changes, message):
+    with pytest.raises(tb.TrustboError, match=message):
+        run(tmp_path, **changes)
+
+
+def test_the_outsider_learns_and_recommends(tiny, tmp_path):
+    pytest.importorskip("botorch")
+    results = run(tmp_path, policies="greedy", baselines=["botorch"], n_iterations=3)
+    row = results.sel(run=results["contender"] == "BoTorch")
+    assert np.isfinite(row["regret"]).all()
+
+
+def test_without_botorch_its_baseline_is_left_out(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr("trustbo.study.benchmark.find_spec", lambda name: None)
+    with pytest.warns(UserWarning, match="the baseline botorch is left out: BoTorch is not inst"):
+        results = run(tmp_path, baselines=["botorch"], n_iterations=1)
+    assert results["contender"].values.tolist() == ["corner"]
