@@ -35,7 +35,7 @@ _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
 class Geometry(NamedTuple):
-    """Where the robots of some bounds stand and drive; positions are x, y in CRS metres."""
+    """Posts and ways of the robots in some bounds; positions are x, y in CRS metres."""
 
     ways: list[np.ndarray]  # of the lead, (point, 2) each
     posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
