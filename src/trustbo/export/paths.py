@@ -42,8 +42,8 @@ def path_frame(
     ways   Lines: `bound` (from 1), `robot` ("lead" first, which drives first), `length_m`.
     ====== ==================================================================================
 
-    `x` and `y` of points are metres in the CRS of the grid, `geometry` is in `crs`. Posts and ways
-    are those of successive bounding; a robot without a way in a bound has no line.
+    `x` and `y` of points are metres in the CRS of the grid, `geometry` is in `crs`. A robot without
+    a way in a bound has no line.
 
     Args:
         plan: Plan, or result whose recommended path is meant.
