@@ -8,11 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from trustbo.data import Team
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.parallel import in_order
 from trustbo.terrain import stencil
 from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
-from trustbo.terrain.dataset import is_lazy, warn_if_clipped
+from trustbo.terrain.dataset import is_lazy, pixel_size, warn_if_clipped
+from trustbo.terrain.features import openness
 from trustbo.terrain.pixel_feature import FEATURES, PixelFeature, feature_named
 from trustbo.terrain.strips import Strip, sample_strips, strips
 from trustbo.workspace.grid import CellMeans, CellQuantiles, Grid, Sums
@@ -263,3 +265,28 @@ def _require_aggregate(aggregate: str | float) -> float | None:
     elif not isinstance(aggregate, bool) and 0.0 <= aggregate <= 1.0:
         return float(aggregate)
     raise TrustboError(f'aggregate must be "mean" or a quantile in [0, 1]; got {aggregate!r}.')
+
+
+def within_reach(
+    features: dict[str, FeatureSpec], terrain: xr.Dataset, grid: Grid, team: Team
+) -> dict[str, FeatureSpec]:
+    """Definitions with openness over the lidar's range, limited by a cell and by the terrain."""
+    height, width = pixel_size(terrain)
+    rows, cols = terrain["dem"].shape
+    reach = min(
+        max(robot.lidar_range for robot in team.robots),
+        float(np.hypot(grid.cell_height, grid.cell_width)),
+        0.5 * min(rows * height, cols * width),
+    )
+    eye, target = team.robots[0].sensor_height, team.lead.target_height
+    ours = PixelFeature(
+        partial(openness, reach=reach, eye=eye, target=target), 1, reach, by_rows=True
+    )
+
+    def fitting(part: PixelFeature) -> PixelFeature:
+        return ours._replace(sign=part.sign) if part.compute is openness else part
+
+    return {
+        name: fitting(f) if isinstance(f, PixelFeature) else {n: fitting(p) for n, p in f.items()}
+        for name, f in features.items()
+    }

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import batched
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -22,6 +23,13 @@ LINE_OF_SIGHT = "line_of_sight"
 TRAVERSABLE = "traversability"
 """Name of the feature that is averaged along the way, instead of over the cell entered."""
 _BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
+
+
+class BoundMaps(NamedTuple):
+    """Awareness of bounds and of cells, each with the line of sight under each sight last."""
+
+    bounds: np.ndarray  # (robot, move, row, col, feature), NaN where there is none
+    cells: np.ndarray  # (robot, row, col, feature)
 
 
 def sight_features(n_sights: int) -> tuple[str, ...]:
@@ -73,8 +81,8 @@ def of_bounds(
     passable: np.ndarray,
     features: Sequence[str],
     traversability: np.ndarray | None,
-) -> np.ndarray:
-    """Compute awareness of bounds, (robot, move, row, col, feature); NaN where there is none.
+) -> BoundMaps:
+    """Compute awareness of bounds, and of cells: their own, and the mean of the bounds into them.
 
     Of the maps of `cells` (robot, row, col, feature) under the names `features`, followed by the
     line of sight under each of `sights`; `traversability` is the map of pixels (row, col), if there
@@ -109,7 +117,11 @@ def of_bounds(
             m = list(features).index(TRAVERSABLE)
             known = np.where(np.isfinite(easy.T), easy.T, maps[:, *own.T, m])
             maps[:, *own.T, m] = known
-    return np.clip(maps, 0.0, 1.0)
+    maps = np.clip(maps, 0.0, 1.0)
+    into = np.maximum(exists.sum(0), 1)[..., None]
+    seen = np.nansum(maps[..., n_features:], axis=1) / into
+    own = np.concatenate([cells, np.where(passable[..., None], seen, np.nan)], axis=-1)
+    return BoundMaps(maps, own)
 
 
 def _cells(index: np.ndarray) -> list[Cell]:

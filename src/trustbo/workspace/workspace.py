@@ -14,17 +14,16 @@ from trustbo.data import Cell, Mission, Team, default_features
 from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.terrain.composite import CompositeIndex
-from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
+from trustbo.terrain.dataset import is_lazy, require_terrain
 from trustbo.terrain.features import (
     PAPER_VISIBILITY,
     TRAVERSABILITY,
     VISIBILITY,
     exposure,
-    openness,
     require_observers,
 )
 from trustbo.terrain.pixel_feature import PixelFeature
-from trustbo.workspace.awareness import FeatureSpec, cell_maps, feature_specs
+from trustbo.workspace.awareness import cell_maps, feature_specs, within_reach
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
     is_line_of_sight,
@@ -34,7 +33,7 @@ from trustbo.workspace.bound_awareness import (
 )
 from trustbo.workspace.cells import of_cells
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds, moves_along
+from trustbo.workspace.moves import MOVE_NAMES, along, moves_along
 from trustbo.workspace.posts import FORMATION_RADIUS, Posts, require_formation
 from trustbo.workspace.sight import Sight, sights_of
 from trustbo.workspace.surface import Surface, surface_of
@@ -140,7 +139,7 @@ class Workspace:
             "traversability": TRAVERSABILITY,
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
         }
-        chosen = _within_reach(feature_specs(asked), terrain, grid, team)
+        chosen = within_reach(feature_specs(asked), terrain, grid, team)
         if observers is not None:
             place = require_observers(terrain, observers)
             chosen["exposure"] = PixelFeature(
@@ -240,15 +239,15 @@ class Workspace:
     def _with_line_of_sight(self) -> Self:
         ways, pixels = self.ground, self.pixels
         assert ways is not None and pixels is not None  # noqa: S101, PT018  # `require_sight`
-        passable, names = self.passable.values, (*self.features, *sight_features(len(self.sights)))
         easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
-        bounds = of_bounds(ways, self.sights, self.awareness.values, passable, self.features, easy)
-        n_cell = len(self.features)
-        into = np.maximum(existing_bounds(passable).sum(0), 1)[..., None]
-        seen = np.nansum(bounds[..., n_cell:], axis=1) / into
-        cells = np.concatenate([self.awareness, np.where(passable[..., None], seen, np.nan)], -1)
-        like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=list(names))
-        return dataclasses.replace(self, awareness=like.copy(data=cells)).with_bounds(bounds)
+        found = of_bounds(
+            ways, self.sights, self.awareness.values, self.passable.values, self.features, easy
+        )
+        names = [*self.features, *sight_features(len(self.sights))]
+        like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
+        return dataclasses.replace(self, awareness=like.copy(data=found.cells)).with_bounds(
+            found.bounds
+        )
 
     @cached_property
     def ground(self) -> Ways | None:
@@ -400,31 +399,6 @@ class Workspace:
         free = np.argwhere(self.passable.values)
         nearest = free[np.argmin(((free - (row, col)) ** 2).sum(1))]
         return int(nearest[0]), int(nearest[1])
-
-
-def _within_reach(
-    features: dict[str, FeatureSpec], terrain: xr.Dataset, grid: Grid, team: Team
-) -> dict[str, FeatureSpec]:
-    """Definitions with openness over the lidar's range, limited by a cell and by the terrain."""
-    height, width = pixel_size(terrain)
-    rows, cols = terrain["dem"].shape
-    reach = min(
-        max(robot.lidar_range for robot in team.robots),
-        float(np.hypot(grid.cell_height, grid.cell_width)),
-        0.5 * min(rows * height, cols * width),
-    )
-    eye, target = team.robots[0].sensor_height, team.lead.target_height
-    ours = PixelFeature(
-        partial(openness, reach=reach, eye=eye, target=target), 1, reach, by_rows=True
-    )
-
-    def fitting(part: PixelFeature) -> PixelFeature:
-        return ours._replace(sign=part.sign) if part.compute is openness else part
-
-    return {
-        name: fitting(f) if isinstance(f, PixelFeature) else {n: fitting(p) for n, p in f.items()}
-        for name, f in features.items()
-    }
 
 
 def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:
