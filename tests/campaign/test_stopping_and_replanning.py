@@ -185,9 +185,9 @@ def test_true_regret_goes_into_the_history(workspace):
     result = iterate(workspace, n_iterations=2, simulator=simulator, truth=truth)
     regret = result.history["regret"].values
     paths = [mission.path for mission in result.missions]
-    best = truth.value(truth.best(*ENDS, max_bounds="shortest+2"))
+    best = truth.value(truth.best(*ENDS, max_bounds="shortest+4"))
     for path, value in zip(paths, regret, strict=True):
-        n_best = len(truth.best(*ENDS, max_bounds="shortest+2")) - 1
+        n_best = len(truth.best(*ENDS, max_bounds="shortest+4")) - 1
         lacking = truth.value(path).lost - best.lost
         assert value == pytest.approx(100.0 * lacking / (n_best - best.lost), abs=1e-9)
     assert (regret >= -1e-9).all()
