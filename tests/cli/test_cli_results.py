@@ -34,7 +34,7 @@ def test_export_writes_what_is_asked_for(invoke, finished, tmp_path):
     formats = ("--format", "gpx", "--format", "csv", "--format", "gpx")
     done = invoke("export", folder, *formats, "--out", tmp_path)
     assert done.exit_code == 0, done.output
-    names = ["path.gpx", "bounds.csv", "path.csv"]
+    names = ["path.gpx", "bounds.csv", "path.csv", "path_posts.csv", "path_ways.csv"]
     assert done.output.splitlines() == [str(tmp_path / name) for name in names]
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(names)
 

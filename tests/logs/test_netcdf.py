@@ -23,7 +23,8 @@ def driven():
         tb.simulation.KinematicSimulator(workspace, record_states=keep) for keep in (True, False)
     ]
     missions = [s.run([(2, 0), (1, 1)], seed=0) for s in simulators]
-    log = Mission.from_arrays([(2, 0), (1, 1)], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))
+    z, names = np.full((1, 2, 3), 0.5), workspace.features
+    log = Mission.from_arrays([(2, 0), (1, 1)], z, np.full((1, 2), 0.5), features=names)
     return [*missions, log]
 
 

@@ -10,6 +10,7 @@ import xarray as xr
 from trustbo.data import Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import FilePath, defer_interrupt, read_checked, remove_checked, write_checked
+from trustbo.stacking import require_same_team
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
@@ -98,7 +99,8 @@ def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
 
 
 def _table(missions: Sequence[Mission]) -> xr.Dataset:
-    """Arrays of missions, padded with NaN."""
+    """Arrays of missions, padded with NaN; ShapeError if robots or features differ."""
+    require_same_team(missions)
     n_steps = max(len(mission.path) for mission in missions)
     shape = (len(missions), n_steps - 1)
     robots, features = missions[0].robots, missions[0].features
