@@ -14,6 +14,8 @@ from trustbo.report.numbers import counted, joined, number
 
 MOST_MAPS = 11
 """Number of missions with a map; of longer campaigns the first, the last, and some between."""
+MOST_BOUNDS = 3
+"""Number of bounds with a map of posts and ways: the first, the last, and some between."""
 MOST_PARAMETERS = 30
 
 
@@ -50,13 +52,19 @@ def trust_maps(result: Result) -> Picture:
 
 def orders(result: Result) -> Picture:
     """Draw what robots are to do along the recommended path."""
-    names = joined(result.workspace.team.names)
-    return picture(
-        lambda n_columns: plots.plan_map(result.plan, n_columns=n_columns),
-        f"A map of the path and one of each of its {counted(len(result.path) - 1, 'bound')}: stops "
-        f"and way of the lead, posts of {names}, their sight lines and ways.",
+    n, names = len(result.path) - 1, joined(result.workspace.team.names)
+    shown = np.unique(np.linspace(1, n, min(n, MOST_BOUNDS)).round().astype(int)).tolist()
+    caption = (
         "In each bound, the lead drives between its stops (stars) while the others watch it from "
-        "their posts; then they close up on the dashed ways to their next posts (hollow).",
+        "their posts; then they close up on the dashed ways to their next posts (hollow)."
+    )
+    if len(shown) < n:
+        caption += f" {len(shown)} of the {n} bounds are shown."
+    return picture(
+        lambda n_columns: plots.plan_map(result.plan, bounds=shown, n_columns=n_columns),
+        f"A map of the path, and {counted(len(shown), 'map')} of single bounds: stops and way of "
+        f"the lead, posts of {names}, their sight lines and ways.",
+        caption,
         phone_columns=2,
         shrink=True,
     )
