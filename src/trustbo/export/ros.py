@@ -139,14 +139,13 @@ def write_ros_bag(
 
     All messages are latched (transient local), for RViz, Foxglove and drivers:
 
-    ======================== ===================== ===========================================
-    /trustbo/cost            nav_msgs/OccupancyGrid cost map
-    /trustbo/path            nav_msgs/Path          centres of the cells, each towards the next
-    /trustbo/<robot>/way     nav_msgs/Path          ways of all bounds, also of the `lead`
-    /trustbo/<robot>/posts   geometry_msgs/PoseArray where it stands while the lead runs each
-                                                    bound, towards the lead's next stop
-    /trustbo/lead/waypoints  geometry_msgs/PoseArray stops of the lead, each towards the next
-    ======================== ===================== ===========================================
+    ======================= ======================= ==========================================
+    /trustbo/cost           nav_msgs/OccupancyGrid  cost map
+    /trustbo/path           nav_msgs/Path           centres of the cells, each towards the next
+    /trustbo/<robot>/way    nav_msgs/Path           ways of all bounds, also of the `lead`
+    /trustbo/<robot>/posts  geometry_msgs/PoseArray where it stands while the lead runs each bound
+    /trustbo/lead/waypoints geometry_msgs/PoseArray stops of the lead, each towards the next
+    ======================= ======================= ==========================================
 
     Ways, posts and waypoints need a terrain in memory; the way of a robot ends where it has none.
 
