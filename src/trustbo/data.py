@@ -22,6 +22,8 @@ Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact"
 STATUSES: tuple[str, ...] = get_args(Status)
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
+LINE_OF_SIGHT = "line_of_sight"
+"""Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
 
 
 @dataclass(frozen=True)
@@ -369,6 +371,11 @@ class Mission:
         array = np.stack([getattr(bound, name) for bound in self.bounds])
         array.flags.writeable = False
         return array
+
+
+def is_line_of_sight(feature: str) -> bool:
+    """Whether a feature is a predicted contact rate."""
+    return feature.startswith(LINE_OF_SIGHT)
 
 
 def default_features(n_features: int) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from jax import Array
 from numpyro.distributions import Distribution, constraints
 
 from trustbo import zheng2023
+from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.floored import Floored
@@ -124,7 +125,7 @@ class Priors:
         most rates drawn from the prior lie in [0, 1]. Counts, whose trust is a logit, have five
         times these, for rates around one half. With no such feature, `default`.
         """
-        is_sight = np.array([name.startswith("line_of_sight") for name in features])
+        is_sight = np.array([is_line_of_sight(name) for name in features])
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
         if not is_sight.any():
             return default

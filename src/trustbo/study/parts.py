@@ -1,5 +1,6 @@
 """Parts of a study as plain settings: their base, trust models and simulators."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Protocol, Self
@@ -138,12 +139,12 @@ class Place(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulating(Part):
+class Simulating(Part, ABC):
     """Simulator that runs the paths."""
 
+    @abstractmethod
     def simulator(self, place: Place) -> simulation.Simulator:
         """Make the simulator."""
-        raise NotImplementedError
 
     def truth(self, place: Place) -> simulation.Truth | None:
         """Find its truth; None where nobody asked for it."""

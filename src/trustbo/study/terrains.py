@@ -1,6 +1,7 @@
 """Terrains of studies, as plain settings."""
 
 import hashlib
+from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +22,7 @@ EACH_RUN = "run"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Terrain(Part):
+class Terrain(Part, ABC):
     """Planning grid of a run, with start and goal; by default from bottom left to top right."""
 
     shape: tuple[int, int] = (10, 10)
@@ -51,9 +52,9 @@ class Terrain(Part):
         """Workspace, which is made once per process, for a few terrains."""
         return _workspace(self)
 
+    @abstractmethod
     def make(self) -> Workspace:
         """Make the workspace anew."""
-        raise NotImplementedError
 
     def judged_by(self, planner: Planner) -> dict[str, Any]:
         """Paths that regret is held against, see `path_class`."""

@@ -39,8 +39,8 @@ class WorldCourse(Terrain):
             "judged": self.judged,
         }
 
-    def workspace(self) -> Workspace:
-        """Workspace, which is made once per process, for a few worlds."""
+    def make(self) -> Workspace:
+        """Take the world's workspace, which all its courses share."""
         return self.world.workspace(bounds=self.bounds)
 
     def judged_by(self, planner: Planner) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell
+from trustbo.data import LINE_OF_SIGHT, Cell, is_line_of_sight
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.parallel import in_order
 from trustbo.terrain.composite import MAX_PIXELS
@@ -18,8 +18,6 @@ from trustbo.workspace.moves import MOVES, existing_bounds
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.ways import Ways
 
-LINE_OF_SIGHT = "line_of_sight"
-"""Name of the feature; `line_of_sight_1`, `_2`, ... where several sights are assumed."""
 TRAVERSABLE = "traversability"
 """Name of the feature that is averaged along the way, instead of over the cell entered."""
 _BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
@@ -67,11 +65,6 @@ def require_sight(
                 "sight mode 'wall' needs canopy, and the DSM is nowhere above the DEM; give a DSM, "
                 "or sight='bare'."
             )
-
-
-def is_line_of_sight(feature: str) -> bool:
-    """Whether a feature is a predicted contact rate."""
-    return feature.startswith(LINE_OF_SIGHT)
 
 
 def of_bounds(

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, Mission, Team, default_features
+from trustbo.data import Cell, Mission, Team, default_features, is_line_of_sight
 from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.terrain.composite import CompositeIndex
@@ -26,7 +26,6 @@ from trustbo.terrain.pixel_feature import PixelFeature
 from trustbo.workspace.awareness import cell_maps, feature_specs, within_reach
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
-    is_line_of_sight,
     of_bounds,
     require_sight,
     sight_features,
