@@ -143,7 +143,7 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
     monkeypatch.setattr(run, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
-        fit(missions)
+        fit(missions, sampler="nuts")
     assert tried == [NutsSettings(), NutsSettings(600, 2000, 4, 0.98, collapse=True)]
     assert error.value.posterior.attrs["retries"] == 1
     assert fit(missions, check=False).attrs["retries"] == 0
@@ -190,7 +190,7 @@ def test_the_caller_s_jax_configuration_is_untouched(posterior):
 
 
 def test_bad_input_is_refused_before_sampling(missions):
-    with pytest.raises(TrustboError, match="unknown sampler 'gibbs'; choose one of nuts, exact"):
+    with pytest.raises(TrustboError, match="unknown sampler 'gibbs'; choose one of auto, exact, nuts"):
         fit(missions, sampler="gibbs")
     with pytest.raises(ShapeError, match="no missions"):
         fit([])

@@ -311,7 +311,11 @@ class Campaign:
             return
         try:
             tree = self._learning.learn(
-                [entries[j].mission for j in numbers], len(waiting), self.log.last_tree, seed
+                [entries[j].mission for j in numbers],
+                len(waiting),
+                self.log.last_tree,
+                seed,
+                self.workspace,
             )
         except CannotLearnError as error:
             for j in waiting:

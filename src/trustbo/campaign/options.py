@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Callback = Callable[[Campaign, Mission], None]
 
-POLICY, OBJECTIVE, SAMPLER = "greedy", "lost_contact", "nuts"
+POLICY, OBJECTIVE, SAMPLER = "greedy", "lost_contact", "auto"
 """Defaults of keywords that are no options; commands and studies have the same."""
 PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
 _OWN = ("awareness", "callbacks")

@@ -11,6 +11,7 @@ from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
 from trustbo.models.loo import loo
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
+from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
@@ -25,6 +26,7 @@ __all__ = [
     "CoupledTrust",
     "ExactPosterior",
     "HierarchicalTrust",
+    "PlaceEffect",
     "PooledTrust",
     "Priors",
     "RobotParams",

@@ -14,6 +14,8 @@ from trustbo.models.likelihood import kalman_numpy, latent
 from trustbo.models.likelihood.contact_rate import mission_log_likelihood
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.params import Params, assemble_params, params_of
+from trustbo.models.place import bounds_of
+from trustbo.models.place_maps import prior_maps
 from trustbo.models.posterior_tree import missions_of, to_datatree
 from trustbo.stacking import MissionBatch, stack_missions
 
@@ -22,12 +24,13 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior")
+_KEPT = ("posterior", "sample_stats", "prior", "places")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     """Posterior without the groups that grow with the number of missions; see `complete`."""
-    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in _KEPT})
+    kept = [name for name in _KEPT if name in posterior.children]
+    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
     alone.attrs = posterior.attrs
     return alone
 
@@ -117,15 +120,17 @@ def _groups(
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
     every = params_of(posterior).flat()
+    bounds = bounds_of(missions, batch.contact_rate.shape[:2]) if every.places else None
+    every = every.on(bounds)
     index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
-    few = type(every)(*(values[index] for values in every))
+    few = every.map(lambda values, _: values[index])
     seed = posterior.attrs["seed"]
     if law.by_numpy:
         n_bounds = np.array([len(mission.bounds) for mission in missions])
         found = _trust_by_numpy(law, every, few, batch, n_bounds, seed)
     else:
         found = _trust_compiled(law, every, few, latents, kept, batch, seed)
-    prior = _prior_of(posterior)
+    prior = _prior_of(posterior).on(bounds)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -151,7 +156,11 @@ def _likelihood_name(posterior: xr.DataTree) -> str:
 
 def _prior_of(posterior: xr.DataTree) -> Params:
     sites = {str(n): a.values[0] for n, a in posterior["prior"].data_vars.items()}
-    return assemble_params(sites, {n: posterior.attrs[n] for n in ("x0_mean", "x0_sd")}).flat()
+    x0 = {n: posterior.attrs[n] for n in ("x0_mean", "x0_sd")}
+    params = assemble_params(sites, x0).flat()
+    if "places" not in posterior.children:
+        return params
+    return params._replace(**prior_maps(posterior["places"].to_dataset(), sites))  # pyright: ignore
 
 
 def _trust_by_numpy(

@@ -104,7 +104,10 @@ def draw_sites(
     if model.priors_are_independent:
         rng, priors = np.random.default_rng(seed), model.priors
         sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
-        drawn = {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
+        own = {name: size for name, size in sizes.items() if name not in model.place_dims}
+        drawn = {name: draw(getattr(priors, name), size, rng) for name, size in own.items()}
+        if model.place is not None:
+            drawn |= model.place.draw(n_draws, rng)
         return priors.of_stationary(drawn)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)

@@ -9,14 +9,14 @@ from jax import random
 from scipy import stats
 from tqdm import tqdm
 
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, write_text
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.prior_predictive import prior_draws
 from trustbo.models.samplers.nuts import NutsSettings
-from trustbo.models.samplers.run import SAMPLERS, draw_posterior, require_sampler
+from trustbo.models.samplers.run import draw_posterior, resolve_sampler
 from trustbo.stacking import MissionBatch
 
 _CHAINS = 4
@@ -65,7 +65,7 @@ def sbc(
             the checkpoint is of other arguments.
     """
     model = PooledTrust() if model is None else model
-    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
+    sampler, _ = resolve_sampler(model, sampler)
     require_whole("n_datasets", n_datasets, 1)
     kept = require_whole("n_ranked", n_ranked, _CHAINS) // _CHAINS
     settings = NutsSettings(n_draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)

@@ -153,17 +153,17 @@ class PlanningProblem:
         moves = move_indices(self.paths.connectivity)
         if cells is None or cells.ndim == 4 or not params.leading:
             cells = cells if params.leading else self.mean_cells
-            return trust_dynamics(params, self._of_bounds(cells, moves), team, x0)
+            return trust_dynamics(params, self._of_bounds(cells, moves), team, x0, moves)
         which = (np.arange(params.leading[0]) if draws is None else draws) % len(cells)
         if self.workspace.of_bounds is None:
-            return trust_dynamics(params, _any_move(cells[which]), team, x0)
+            return trust_dynamics(params, _any_move(cells[which]), team, x0, moves)
         # Awareness of all robots, moves and features is large: only drift is kept for all draws.
-        whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0)
+        whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0, moves)
         n = max(1, _ENTRIES // (len(moves) * cells[0].size))
         for part in (slice(i, i + n) for i in range(0, len(which), n)):
             z = self._of_bounds(cells[which[part]], moves)
             some: Params = params.draw(part)  # pyright: ignore[reportArgumentType]
-            whole.drift[part] = trust_dynamics(some, z, team).drift
+            whole.drift[part] = trust_dynamics(some, z, team, moves=moves).drift
         return whole
 
 

@@ -69,15 +69,15 @@ def evaluate(
     flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
-    z = problem.awareness_along(cells, params)
-    draws = roll_trust(params, z, x0)
+    z, along = problem.awareness_along(cells, params), params.along(cells)
+    draws = roll_trust(along, z, x0)
     draws = draws.reshape(-1, *draws.shape[-2:])
     trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
     team = trust.mean(1) if problem.team == "mean" else trust.min(1)
     cost = objective.length_weight * length
     if objective.name in ("stationary", "lost_contact"):
-        along = trust_dynamics(params, as_map(z), problem.team, x0)
-        value = _value(objective.capped(along) if cap else along, objective, cost).mean()
+        dynamics = trust_dynamics(along, as_map(z), problem.team, x0)
+        value = _value(objective.capped(dynamics) if cap else dynamics, objective, cost).mean()
     else:
         value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
     return Plan(

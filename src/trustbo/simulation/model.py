@@ -12,7 +12,7 @@ from trustbo.models import PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, along
+from trustbo.workspace.moves import MOVES, along, moves_along
 
 _BUCKET = 8  # bounds: missions of about the same length share compiled code
 
@@ -74,7 +74,9 @@ class ModelSimulator:
         padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
         with own_settings():  # else the caller's flags decide what is drawn
             key = jax.random.key(seed)
-        sample = self.model.simulate(key, self.params, padded[None], self.n_ticks)
+        bounds = np.full((1, len(padded), 3), -1)
+        bounds[0, :n_bounds] = np.column_stack([moves_along(cells), np.asarray(cells)[1:]])
+        sample = self.model.simulate(key, self.params.on(bounds), padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
         features, robots = self.workspace.features, self.workspace.team.names
@@ -82,7 +84,8 @@ class ModelSimulator:
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""
-        truth = {name: np.asarray(value).tolist() for name, value in self.params._asdict().items()}
+        fields = self.params._asdict().items()
+        truth = {n: np.asarray(value).tolist() for n, value in fields if value is not None}
         return {
             "simulator": type(self).__name__,
             "simulator_model": self.model.describe(),
