@@ -1,6 +1,7 @@
 """Draws of parameters, and of contact rates, from the priors alone."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import jax
 import numpy as np
@@ -17,6 +18,8 @@ from trustbo.models.params import Params, assemble_params
 from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
+
+_BATCH = 500  # draws computed at once
 
 
 def prior_predictive(
@@ -106,10 +109,12 @@ def draw_sites(
         sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
         drawn = {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
         return priors.of_stationary(drawn)
+    # Whole batches: any number of draws meets one compiled program.
+    rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
-        drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)
-        return {name: np.asarray(drawn[name]) for name in model.dims}
+        drawn = [_parameter_draws(model, shape, keys[row]) for row in rows]
+    return {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in model.dims}
 
 
 @jax.jit
@@ -122,9 +127,20 @@ def prior_draws(
         params = model.sample_params(*awareness.shape[2:])
         model.sample_rates(params, awareness, n_ticks=n_ticks)
 
+    return _traced(program, (*model.dims, "contact_rate"), keys)
+
+
+@partial(jax.jit, static_argnames="shape")
+def _parameter_draws(model: TrustModel, shape: tuple[int, int], keys: Array) -> dict[str, Array]:
+    """The same parameters without the rates, whose part of the program takes long to compile."""
+    return _traced(partial(model.sample_params, *shape), tuple(model.dims), keys)
+
+
+def _traced(program: Callable[[], object], names: Sequence[str], keys: Array) -> dict[str, Array]:
+    """Values of a program's sites by name, one set per key."""
+
     def one(key: Array) -> dict[str, Array]:
         trace = handlers.trace(handlers.seed(program, key)).get_trace()
-        names = (*model.dims, "contact_rate")
         return {name: trace[name]["value"] for name in names}
 
     return jax.vmap(one)(keys)
