@@ -140,6 +140,12 @@ class TrustModel(ABC):
             return self
         return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
 
+    def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
+        """Shape of each parameter that a posterior has."""
+        length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
+        length["feature"] = n_features
+        return {name: tuple(length[axis] for axis in axes) for name, axes in self.dims.items()}
+
     def options(self) -> dict[str, str]:
         """Options by name, without the priors."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "priors"}

@@ -32,8 +32,8 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     return alone
 
 
-class _Law(NamedTuple):
-    """Law of contact rates given parameters, as a posterior's attributes tell it."""
+class Law(NamedTuple):
+    """Law of contact rates given parameters."""
 
     family: Family
     lag: float
@@ -42,6 +42,7 @@ class _Law(NamedTuple):
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
+        """Law of a posterior."""
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
@@ -79,7 +80,7 @@ def complete(
     """
     if "latent" in posterior.children:
         return posterior
-    law = _Law.of(posterior)
+    law = Law.of(posterior)
     if missions is None:
         if "constant_data" not in posterior.children:
             raise TrustboError(
@@ -106,7 +107,7 @@ def complete(
 
 def _groups(
     posterior: xr.DataTree,
-    law: _Law,
+    law: Law,
     missions: Sequence[Mission],
     n_trajectories: int,
     latents: latent.Latents,
@@ -140,7 +141,7 @@ def _groups(
             "draw": kept,
         },
         "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
-        "prior_predictive": {"contact_rate": _predict(law, prior, batch, seed + 3)[None]},
+        "prior_predictive": {"contact_rate": predict(law, prior, batch, seed + 3)[None]},
     }, of
 
 
@@ -155,7 +156,7 @@ def _prior_of(posterior: xr.DataTree) -> Params:
 
 
 def _trust_by_numpy(
-    law: _Law,
+    law: Law,
     every: Params,
     few: Params,
     batch: MissionBatch,
@@ -175,7 +176,7 @@ def _trust_by_numpy(
 
 
 def _trust_compiled(
-    law: _Law,
+    law: Law,
     every: Params,
     few: Params,
     latents: latent.Latents,
@@ -202,8 +203,8 @@ def _trust_compiled(
         return {name: np.asarray(array) for name, array in found.items()}
 
 
-def _predict(law: _Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
-    """Contact rates of replicated missions, (draw, mission, bound, robot)."""
+def predict(law: Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
+    """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
     if law.by_numpy:
         rng = np.random.default_rng(seed)
         return kalman_numpy.simulate(params, law.lag, batch.awareness, rng)

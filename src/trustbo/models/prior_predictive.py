@@ -15,6 +15,7 @@ from trustbo.errors import ShapeError, require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
+from trustbo.models.posterior_groups import Law, predict
 from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
@@ -61,9 +62,10 @@ def prior_predictive(
     model = model.for_features(names).at_resolution(
         weigh_ticks(MissionBatch(z, np.zeros(z.shape[:3]), ticks))
     )
-    with own_settings():
-        keys = jax.random.split(jax.random.key(seed), n_draws)
-        drawn = {k: np.asarray(v)[None] for k, v in prior_draws(model, z, ticks, keys).items()}
+    drawn = draw_sites(model, z.shape[2:], n_draws, seed)
+    law = Law(model.family, model.lag, model.family.integrates_out and model.robots_are_apart)
+    params, batch = assemble_params(drawn, model.x0).flat(), MissionBatch(z, z[..., 0], ticks)
+    drawn["contact_rate"] = predict(law, params, batch, seed + 1)
     dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
     robots = [f"r{i + 1}" for i in range(z.shape[2])]
     coords = {
@@ -75,7 +77,7 @@ def prior_predictive(
     }
 
     def group(names: Iterable[str]) -> xr.Dataset:
-        variables = {n: (("chain", "draw", *dims[n]), drawn[n]) for n in names}
+        variables = {n: (("chain", "draw", *dims[n]), drawn[n][None]) for n in names}
         used = {d for axes, _ in variables.values() for d in axes} & set(coords)
         index = {"chain": [0], "draw": np.arange(n_draws)}
         return xr.Dataset(variables, {d: coords[d] for d in coords if d in used} | index)
@@ -106,8 +108,10 @@ def draw_sites(
     """Draws of the parameters from the prior for (robots, features), by name."""
     if model.priors_are_independent:
         rng, priors = np.random.default_rng(seed), model.priors
-        sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
-        drawn = {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
+        drawn = {
+            name: draw(getattr(priors, name), (n_draws, *size), rng)
+            for name, size in model.sizes(*shape).items()
+        }
         return priors.of_stationary(drawn)
     # Whole batches: any number of draws meets one compiled program.
     rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
