@@ -208,6 +208,7 @@ def test_what_the_program_cannot_resume_goes_on_in_python(simulator, result):
     assert end.text == "It is under way, or was interrupted: Campaign.load(folder) goes on."
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_names_cannot_break_the_page_and_a_result_needs_no_terrain(hostile, tmp_path):
     text = write(hostile, tmp_path, title="<script>alert(1)</script>")
     page = Page(text)

@@ -19,7 +19,7 @@ from trustbo.models import (
     sample_prior,
 )
 from trustbo.models.model import require_model
-from trustbo.models.params import Params
+from trustbo.models.params import Params, assemble_params
 from trustbo.models.samplers.run import resolve_sampler
 from trustbo.workspace import Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
@@ -56,7 +56,7 @@ class Learning:
                 f'got "{self.update}" and "{self.model.observation}".'
             )
         if self.update == "moment_matched":
-            if not self.model.priors_are_independent:
+            if self.model.robot_sets != "all":
                 raise TrustboError(
                     f'update="moment_matched" is for PooledTrust; got {type(self.model).__name__}.'
                 )
@@ -129,11 +129,11 @@ class Learning:
         """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
         model, n_features = self.model.for_features(features), len(features)
         if initial == "prior_mean" and model.priors_are_independent:
-            priors = model.priors
-            x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
-            mean = TrustParams(**priors.mean(n_features), **x0)
-        else:
-            # The mean of parameters that robots share has no closed form.
-            n_draws = 1 if initial == "prior_draw" else 1000
-            mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
+            values = model.priors.mean(n_features)
+            sizes = model.sizes(n_robots, n_features)
+            means = {name: np.broadcast_to(values[name], (1, *sizes[name])) for name in sizes}
+            return assemble_params(means, model.x0).flat()
+        # The mean of parameters that robots are drawn around has no closed form.
+        n_draws = 1 if initial == "prior_draw" else 1000
+        mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
         return mean.flat()

@@ -113,6 +113,11 @@ class CoupledTrust(TrustModel):
         return self.inter_robot == "none"
 
     @property
+    def priors_are_independent(self) -> bool:
+        """Whether nothing couples the robots."""
+        return self.robots_are_apart
+
+    @property
     def robot_sets(self) -> str | None:
         """Each robot has its own, if nothing couples them."""
         return "each" if self.robots_are_apart else None

@@ -151,6 +151,13 @@ class TrustModel(ABC):
             return self
         return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
 
+    def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
+        """Shape of each parameter that a posterior has, those of places apart."""
+        length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
+        length["feature"] = n_features
+        own = {name: axes for name, axes in self.dims.items() if name not in self.place_dims}
+        return {name: tuple(length[axis] for axis in axes) for name, axes in own.items()}
+
     def options(self) -> dict[str, str]:
         """Options by name, without the priors and the effects of places."""
         others = ("priors", "place")

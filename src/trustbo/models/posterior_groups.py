@@ -35,8 +35,8 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     return alone
 
 
-class _Law(NamedTuple):
-    """Law of contact rates given parameters, as a posterior's attributes tell it."""
+class Law(NamedTuple):
+    """Law of contact rates given parameters."""
 
     family: Family
     lag: float
@@ -45,6 +45,7 @@ class _Law(NamedTuple):
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
+        """Law of a posterior."""
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
@@ -82,7 +83,7 @@ def complete(
     """
     if "latent" in posterior.children:
         return posterior
-    law = _Law.of(posterior)
+    law = Law.of(posterior)
     if missions is None:
         if "constant_data" not in posterior.children:
             raise TrustboError(
@@ -109,7 +110,7 @@ def complete(
 
 def _groups(
     posterior: xr.DataTree,
-    law: _Law,
+    law: Law,
     missions: Sequence[Mission],
     n_trajectories: int,
     latents: latent.Latents,
@@ -145,7 +146,7 @@ def _groups(
             "draw": kept,
         },
         "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
-        "prior_predictive": {"contact_rate": _predict(law, prior, batch, seed + 3)[None]},
+        "prior_predictive": {"contact_rate": predict(law, prior, batch, seed + 3)[None]},
     }, of
 
 
@@ -164,7 +165,7 @@ def _prior_of(posterior: xr.DataTree) -> Params:
 
 
 def _trust_by_numpy(
-    law: _Law,
+    law: Law,
     every: Params,
     few: Params,
     batch: MissionBatch,
@@ -184,7 +185,7 @@ def _trust_by_numpy(
 
 
 def _trust_compiled(
-    law: _Law,
+    law: Law,
     every: Params,
     few: Params,
     latents: latent.Latents,
@@ -211,8 +212,8 @@ def _trust_compiled(
         return {name: np.asarray(array) for name, array in found.items()}
 
 
-def _predict(law: _Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
-    """Contact rates of replicated missions, (draw, mission, bound, robot)."""
+def predict(law: Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
+    """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
     if law.by_numpy:
         rng = np.random.default_rng(seed)
         return kalman_numpy.simulate(params, law.lag, batch.awareness, rng)

@@ -4,8 +4,9 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
-import arviz as az
+import arviz_base
 import numpy as np
+from arviz_stats import sampling_diagnostics
 from jax import Array, random
 
 from trustbo.errors import TrustboError, require_choice
@@ -275,7 +276,7 @@ def _is_complete(contact_rate: np.ndarray) -> bool:
 
 def _complaints(draws: Draws) -> list[str]:
     """Limits that the draws exceed, parameter by parameter; empty if none."""
-    sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
+    sites = arviz_base.from_dict({"posterior": draws.params})["posterior"].to_dataset()
     found = []
     for name, (worst, fewest) in convergence(sites).items():
         if not worst <= MAX_RHAT:  # NaN is a complaint too
@@ -293,8 +294,8 @@ def _mode_complaints(raw: NutsDraws) -> list[str]:
     found, around = [], visits(raw.modes, np.asarray(raw.theta))
     if len(around) == 1:
         return found
-    shares = az.from_dict({"posterior": {str(i): each * 1.0 for i, each in around.items()}})
-    error = az.mcse(shares["posterior"].to_dataset())
+    shares = arviz_base.from_dict({"posterior": {str(i): each * 1.0 for i, each in around.items()}})
+    error = sampling_diagnostics.mcse(shares["posterior"].to_dataset())
     for i, each in around.items():
         mass, share = float(raw.modes.share[i]), each.mean()
         mode = f"the mode where {_telling(raw, i)}"
