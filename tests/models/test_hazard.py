@@ -10,7 +10,7 @@ import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.models.exposures import Exposures
-from trustbo.models.hazard_sampler import Law, _Density, impute, sample
+from trustbo.models.hazard_sampler import _Density, impute, sample
 
 
 def workspace(n=3):

@@ -17,8 +17,8 @@ from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
-from trustbo.models.samplers.convergence import diagnostics
 from trustbo.models.risk import BoundRisk
+from trustbo.models.samplers.convergence import diagnostics
 from trustbo.models.sbc import sbc
 from trustbo.models.updating import ExactPosterior, moment_matched, sample_statistics
 

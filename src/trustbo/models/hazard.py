@@ -12,6 +12,7 @@ what happened there: the less strength s, the more. DESIGN 5.12; docs/failures.m
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike

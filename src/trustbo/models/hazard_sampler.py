@@ -3,9 +3,9 @@
 Target: z, the hyperparameters in units of their normal priors, and the bound k_j at which each
 mission lost somewhere unknown failed, with the chances of all bounds integrated out:
 
-    p(z, k | data) ~ N(z; 0, I) prod_e B(s m_e + f_e, s (1 - m_e) + n_e - f_e) / B(s m_e, s (1 - m_e)),
+    p(z, k | data) ~ N(z; 0, I) prod_e B(a_e + f_e, b_e + n_e - f_e) / B(a_e, b_e),
 
-n and f counting, for given k, exposures and failures of each bound e. Points z come from Student-t
+a_e = s m_e, b_e = s (1 - m_e), n and f counting, for given k, exposures and failures of bound e. Points z come from Student-t
 densities around the modes; given z, places are imputed one mission after the other, each from its
 predictive distribution given those before (sequential imputation; Kong, Liu and Wong 1994), times a
 look ahead to later missions that share its bounds. The weight is the density of z and of the known
@@ -20,7 +20,7 @@ depends on it.
 from typing import Any, NamedTuple
 
 import numpy as np
-from arviz_stats.base import array_stats
+from arviz_stats.base.array import array_stats
 from scipy import special, stats
 
 from trustbo.models.exposures import Exposures

@@ -124,7 +124,7 @@ class BoundRisk:
         a = strength * special.expit(logit) + FLOOR + failed
         b = strength * special.expit(-logit) + FLOOR + n - failed
         for j, (path, weight) in enumerate(zip(self.lost, self.lost_weights, strict=True)):
-            met = np.ravel_multi_index(tuple(path.T), self.exists.shape)
+            met = np.asarray(np.ravel_multi_index(tuple(path.T), self.exists.shape))
             add_lost(_places_in(bounds, met), weight, self.place[draws, j] - 1, a, b)
         return a, b
 

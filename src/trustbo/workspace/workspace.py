@@ -284,8 +284,8 @@ class Workspace:
     def difficulty(self) -> xr.DataArray:
         """Difficulty of bounds, (move, row, col, measure); NaN where there is none.
 
-        Measures are `difficulty.MEASURES`: 0 where the way is easy, about 1 at the team's limit. None
-        of them, an axis of length 0, without a terrain in memory.
+        Measures are `difficulty.MEASURES`, 0 where the way is easy, about 1 at the team's limit; an
+        axis of length 0 without a terrain in memory.
         """
         exists, names = self.passable_bounds, ()
         values = np.empty((*exists.shape, 0))
