@@ -34,10 +34,11 @@ class Hazard:
     """Priors of the chance that a bound ends the mission; normal ones are (mean, sd).
 
     Attributes:
-        intercept: Of the logit of the mean chance at medium difficulty.
-        coefficient: Of each measure of difficulty, from easy (0) to the robots' limit (1).
-        log_strength: Of the log of the strength s: the failures and successes that the mean is
-            worth. Small where bounds fail always or never.
+        intercept: Prior of the logit of the mean chance at medium difficulty.
+        coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
+            limit (1).
+        log_strength: Prior of the log of the strength s: the failures and successes that the mean
+            is worth, few where bounds fail always or never.
         cause: Concentration of the Dirichlet over the causes of failure, for each.
 
     Raises:

@@ -5,13 +5,13 @@ mission lost somewhere unknown failed, with the chances of all bounds integrated
 
     p(z, k | data) ~ N(z; 0, I) prod_e B(a_e + f_e, b_e + n_e - f_e) / B(a_e, b_e),
 
-a_e = s m_e, b_e = s (1 - m_e), n and f counting, for given k, exposures and failures of bound e. Points z come from Student-t
-densities around the modes; given z, places are imputed one mission after the other, each from its
-predictive distribution given those before (sequential imputation; Kong, Liu and Wong 1994), times a
-look ahead to later missions that share its bounds. The weight is the density of z and of the known
-outcomes, times the predictive probabilities of the places over those they were drawn with, over the
-density of the proposal: unbiased for any number of lost missions, paths that share bounds included,
-so that the weighted (z, k) are of the joint posterior.
+a_e = s m_e, b_e = s (1 - m_e), n and f counting, for given k, exposures and failures of bound e.
+Points z come from Student-t densities around the modes; given z, places are imputed one mission
+after the other, each from its predictive distribution given those before (sequential imputation;
+Kong, Liu and Wong 1994), times a look ahead to later missions that share its bounds. The weight is
+the density of z and of the known outcomes, times the predictive probabilities of the places over
+those they were drawn with, over the density of the proposal: unbiased for any number of lost
+missions, paths that share bounds included, so that the weighted (z, k) are of the joint posterior.
 
 The modes are those of a density in which lost missions are independent given z; only the proposal
 depends on it.

@@ -22,12 +22,13 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior")
+_KEPT = ("posterior", "sample_stats", "prior", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     """Posterior without the groups that grow with the number of missions; see `complete`."""
-    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in _KEPT})
+    kept = [name for name in _KEPT if name in posterior.children]
+    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
     alone.attrs = posterior.attrs
     return alone
 

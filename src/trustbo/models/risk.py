@@ -23,7 +23,7 @@ class BoundRisk:
     are NaN where there is no bound.
 
     Attributes:
-        coefficients: Of the logit of the prior mean, intercept first, (draw, 1 + measure).
+        coefficients: Weights in the logit of the prior mean, intercept first, (draw, 1 + measure).
         strength: Strength of the Betas, (draw,).
         difficulty: Difficulty less its reference, (move, row, col, measure).
         exists: Whether there is a bound, (move, row, col).
