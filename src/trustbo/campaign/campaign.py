@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
+from trustbo.campaign.failures import Failure, learn_hazard, to_avoid
 from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import (
     LEARNED,
@@ -31,7 +32,15 @@ from trustbo.campaign.told import never_to_be_learned, require_extra, require_mi
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath
-from trustbo.models import TrustModel, diagnostics, params_of
+from trustbo.models import (
+    CAUSES,
+    BoundRisk,
+    Hazard,
+    TrustModel,
+    diagnostics,
+    fit_hazard,
+    params_of,
+)
 from trustbo.models.params import Params
 from trustbo.models.posterior_groups import parameters_alone
 from trustbo.models.record import model_from_record, model_to_record
@@ -42,7 +51,7 @@ from trustbo.stacking import fill_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along
 
-_STREAMS = ("policy", "fit", "mission", "prior", "awareness")
+_STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
 _N_MAPS = 500
 """Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
 _N_KEPT = 200
@@ -65,6 +74,7 @@ class Campaign:
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
             first mission, one from the prior.
         awareness: Belief about the awareness; None where the map is trusted.
+        prior_hazard: Priors of the chance that a bound fails; see `hazard` and `risk`.
     """
 
     def __init__(
@@ -111,6 +121,9 @@ class Campaign:
         self.awareness = self.options.belief(workspace)
         self._plan: Plan | None = None
         self._believed: Planner | None = None
+        self.prior_hazard = Hazard()
+        self._hazard: xr.Dataset | None = None
+        self._risk: BoundRisk | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
         n_robots, seed_of_prior = len(workspace.team.robots), self.seed_of("prior")
@@ -171,7 +184,31 @@ class Campaign:
             return None
         if self._whole is None or self._whole[0] is not last:
             self._whole = last, whole_posterior(last(), self.missions)
-        return self._whole[1]
+        whole = self._whole[1]
+        whole["hazard"] = xr.DataTree(self.hazard)
+        return whole
+
+    @property
+    def hazard(self) -> xr.Dataset:
+        """Group `hazard` of the posterior, see `models.fit_hazard`; of the prior at first."""
+        if self._hazard is None:
+            log, last = self.log, self.log.last_tree
+            self._hazard = learn_hazard(
+                log.entries, log.failures, self.workspace, self.prior_hazard,
+                self.options.forgetting, self.seed_of("hazard"),
+            )  # fmt: skip
+            if self._hazard is None and last is not None and "hazard" in last.children:
+                self._hazard = last["hazard"].to_dataset()
+            if self._hazard is None:
+                self._hazard = fit_hazard([], self.workspace, self.prior_hazard)
+        return self._hazard
+
+    @property
+    def risk(self) -> BoundRisk:
+        """Chances of the bounds to fail, of all missions so far."""
+        if self._risk is None:
+            self._risk = BoundRisk.of(self.hazard, self.workspace)
+        return self._risk
 
     # --- ask and tell ---
 
@@ -293,6 +330,7 @@ class Campaign:
         entries.append(Entry(filled, mission, plan, trust_map, row, self.log.last, extra))
         if reason := never_to_be_learned(filled):
             entries[-1].become(SET_ASIDE, reason)
+            self._forget_risk()
             warnings.warn(f"mission {len(entries)} is set aside: {reason}", stacklevel=3)
         else:
             self._learn(seed)
@@ -304,6 +342,7 @@ class Campaign:
 
     def _learn(self, seed: int) -> None:
         """Fit the posterior of all missions that are not set aside; if it is refused, go on."""
+        self._forget_risk()
         entries, waiting = self.log.entries, self.log.numbers(TOLD)
         numbers, last = self.log.numbers(TOLD, LEARNED), self.log.last
         if not numbers:
@@ -329,6 +368,7 @@ class Campaign:
             return
         alone = self.options.update == "moment_matched"  # the prior stands for those before
         tree.attrs["missions"] = waiting if alone else numbers
+        tree["hazard"] = xr.DataTree(self.hazard)
         if "latent" not in tree.children:
             tree = parameters_alone(tree)
         if last is not None:
@@ -340,26 +380,44 @@ class Campaign:
         self.belief = params_of(tree)
 
     def fail(
-        self, reason: str, mission: Mission | None = None, *, other_path: bool = False
+        self,
+        reason: str,
+        mission: Mission | None = None,
+        *,
+        where: Cell | None = None,
+        other_path: bool = False,
     ) -> xr.DataTree | None:
-        """Give up the mission that was asked for.
+        """Give up the mission that was asked for; the next plan knows.
 
         Args:
-            reason: Reason, for the record.
+            reason: Reason, for the record. One of `models.CAUSES`, such as "stuck", says that a
+                bound of the plan failed, and is learned from as a hazard.
             mission: Bounds that were run, to learn from; None if there are none.
+            where: Cell that it failed to enter, where it did not report but that is known.
             other_path: Whether it is known to have followed another path, as for `tell`.
 
         Returns:
             Posterior of the parameters, if there was something to learn.
 
         Raises:
-            TrustboError: The mission is one that `tell` refuses.
+            TrustboError: The mission is one that `tell` refuses; or a `where` that the plan does
+                not enter, beside a mission, or for another reason.
         """
-        posterior = None if mission is None else self.tell(mission, other_path=other_path)
-        self.log.failures.append((len(self.missions), str(reason)))
-        self._plan = None
+        if mission is not None and where is not None:
+            raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
+        posterior, path = None, ()
+        if mission is not None:
+            posterior = self.tell(mission, other_path=other_path)
+        elif where is not None or reason in CAUSES:
+            path = self.ask().path
+        self.log.failures.append(Failure.of(len(self.missions), reason, path, where))
+        self._plan = self._believed = None
         self._write_state()
+        self._forget_risk()
         return posterior
+
+    def _forget_risk(self) -> None:
+        self._hazard = self._risk = None
 
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, whatever the policy would try next."""
@@ -553,13 +611,21 @@ class Campaign:
         return replace(plan, bands=bands)
 
     def planner_now(self) -> Planner:
-        """Planner with the awareness that is believed in now."""
-        if self.awareness is None:
-            return self.planner
+        """Planner with the awareness that is believed in now, away from bounds that stopped robots.
+
+        A bound that did so twice is not entered again unless there is no other way, or its chance
+        to fail fell below 0.2.
+        """
         if self._believed is None:
-            n_maps = min(_N_MAPS, self.belief.leading[0])
-            maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
-            self._believed = self.planner.with_awareness(maps, self.awareness.mean())
+            planner = self.planner
+            if self.awareness is not None:
+                n_maps = min(_N_MAPS, self.belief.leading[0])
+                maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
+                planner = planner.with_awareness(maps, self.awareness.mean())
+            if self.log.entries or self.log.failures:
+                avoided = to_avoid(self.risk)
+                planner = planner.avoiding(avoided, self.risk.mean) if avoided.any() else planner
+            self._believed = planner
         return self._believed
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
@@ -579,6 +645,6 @@ class Campaign:
     def seed_of(self, stream: str) -> int:
         """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
         entropy = [self.seed, _STREAMS.index(stream), len(self.log.entries)]
-        if n_failures := sum(n == len(self.log.entries) for n, _ in self.log.failures):
+        if n_failures := sum(f.after == len(self.log.entries) for f in self.log.failures):
             entropy.append(n_failures)  # another try may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])

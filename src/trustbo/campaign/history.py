@@ -11,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from trustbo.campaign.damage import naming_what_is_left
+from trustbo.campaign.failures import Failure
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError
 from trustbo.files import checksum
@@ -146,13 +147,13 @@ class History:
 
     Attributes:
         entries: One for each mission told.
-        failures: Missions given up: number of missions before each, and the reason.
+        failures: Missions given up.
         notes: More for `Result.settings`, by the loop.
         stop_reason: Reason of the end.
     """
 
     entries: list[Entry] = field(default_factory=list)
-    failures: list[tuple[int, str]] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
     notes: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
 
@@ -253,5 +254,5 @@ class History:
                 kept.missions, measured[:n], plans, maps, rows, kept.posteriors.kept, extras[:n]
             )  # fmt: skip
             entries = [Entry(*values) for values in zip(*columns, strict=True)]
-        failures = [(after, reason) for after, reason in state["failures"]]
+        failures = [Failure.restore(record) for record in state["failures"]]
         return cls(entries, failures, state["notes"], state["stop_reason"])

@@ -4,8 +4,10 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
 from trustbo.models.coupled import CoupledTrust
+from trustbo.models.exposures import CAUSES, LostMission
 from trustbo.models.filter import TrustFilter, TrustState
 from trustbo.models.fit import fit
+from trustbo.models.hazard import Hazard, fit_hazard
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
 from trustbo.models.loo import loo
@@ -16,16 +18,21 @@ from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
+from trustbo.models.risk import BoundRisk
 from trustbo.models.samplers.convergence import diagnostics
 from trustbo.models.sbc import sbc
 from trustbo.models.updating import ExactPosterior, moment_matched, sample_statistics
 
 __all__ = [
+    "CAUSES",
+    "BoundRisk",
     "ContactRate",
     "CoupledParams",
     "CoupledTrust",
     "ExactPosterior",
+    "Hazard",
     "HierarchicalTrust",
+    "LostMission",
     "PlaceEffect",
     "PooledTrust",
     "Priors",
@@ -38,6 +45,7 @@ __all__ = [
     "complete",
     "diagnostics",
     "fit",
+    "fit_hazard",
     "loo",
     "moment_matched",
     "params_of",

@@ -24,7 +24,7 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior", "places")
+_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:

@@ -7,30 +7,35 @@ from numba import njit
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, require_connectivity
+from trustbo.workspace.moves import MOVES, move_indices, require_connectivity
 
 
 class NoPathError(TrustboError, nx.NetworkXNoPath):
     """The goal cannot be reached from the start."""
 
 
-def cell_graph(workspace: Workspace, connectivity: int = 8) -> nx.DiGraph:
+def cell_graph(
+    workspace: Workspace, connectivity: int = 8, bounds: np.ndarray | None = None
+) -> nx.DiGraph:
     """Build the graph with passable cells `(row, col)` as nodes and possible bounds as edges.
 
-    A DiGraph with node attributes `x`, `y` (CRS metres) and edge attribute `length` (m).
+    Bounds (move, row, col) of a connectivity's moves are by default all that the robots have a way
+    for. A DiGraph with node attributes `x`, `y` (CRS metres) and edge attribute `length` (m).
     TrustboError: a connectivity other than 4, or 8 to allow diagonal bounds too.
     """
     moves = MOVES[require_connectivity(connectivity)]
     grid, passable = workspace.grid, workspace.passable.values
+    if bounds is None:
+        bounds = workspace.passable_bounds.values[move_indices(connectivity)]
     graph = nx.DiGraph()
     for row, col in np.argwhere(passable).tolist():
         x, y = grid.center((row, col))
         graph.add_node((row, col), x=x, y=y)
     lengths = move_lengths(workspace, connectivity).tolist()
     for row, col in list(graph):
-        for (down, right), length in zip(moves, lengths, strict=True):
+        for m, ((down, right), length) in enumerate(zip(moves, lengths, strict=True)):
             other = (row + down, col + right)
-            if other in graph:
+            if other in graph and bounds[m, *other]:
                 graph.add_edge((row, col), other, length=length)
     return graph
 
@@ -41,45 +46,47 @@ def move_lengths(workspace: Workspace, connectivity: int) -> np.ndarray:
     return np.hypot(*(np.array(MOVES[connectivity]) * size).T)
 
 
-def fewest_bounds(passable: np.ndarray, cell: Cell, connectivity: int) -> np.ndarray:
-    """Fewest bounds between a cell and every other, shape (row, col); -1 where there is no way."""
-    rows, cols = passable.shape
+def fewest_bounds(
+    bounds: np.ndarray, cell: Cell, connectivity: int, *, back: bool = False
+) -> np.ndarray:
+    """Fewest bounds from a cell to every other, shape (row, col); -1 where there is no way.
+
+    Of bounds (move, row, col) of a connectivity's moves. With `back`, from every other to the cell.
+    """
     # A closed margin saves the test whether a move leaves the grid.
-    known = np.full((rows + 2, cols + 2), -1, np.int32)
-    known[1:-1, 1:-1][~passable] = _CLOSED
-    known[[0, -1]] = known[:, [0, -1]] = _CLOSED
-    steps = np.array(MOVES[connectivity]) @ (cols + 2, 1)
-    _breadth_first(known.ravel(), (cell[0] + 1) * (cols + 2) + cell[1] + 1, steps)
-    return np.maximum(known[1:-1, 1:-1], -1)
-
-
-_CLOSED = -2
+    closed = np.pad(bounds, ((0, 0), (1, 1), (1, 1)))
+    rows, cols = closed.shape[1:]
+    known = np.full(rows * cols, -1, np.int32)
+    steps = np.array(MOVES[connectivity]) @ (cols, 1)
+    start = (cell[0] + 1) * cols + cell[1] + 1
+    _breadth_first(known, closed.reshape(len(bounds), -1), start, steps, back)
+    return known.reshape(rows, cols)[1:-1, 1:-1]
 
 
 @njit(cache=True, nogil=True)
-def _breadth_first(known, start, steps):
+def _breadth_first(known, bounds, start, steps, back):
     queue = np.empty(len(known), np.int32)
     queue[0], known[start] = start, 0
     first, last = 0, 1
     while first < last:
         c = queue[first]
         first += 1
-        for step in steps:
-            if known[c + step] == -1:
-                known[c + step] = known[c] + 1
-                queue[last] = c + step
+        for m in range(len(steps)):
+            other = c - steps[m] if back else c + steps[m]
+            if bounds[m, c if back else other] and known[other] == -1:
+                known[other] = known[c] + 1
+                queue[last] = other
                 last += 1
 
 
 def require_way(
-    passable: np.ndarray, to_goal: np.ndarray, start: Cell, goal: Cell, connectivity: int
+    bounds: np.ndarray, to_goal: np.ndarray, start: Cell, goal: Cell, connectivity: int
 ) -> None:
     """Refuse ends that are not connected: NoPathError, which counts the cells in reach."""
     if to_goal[start] < 0:
-        n_reached = int((fewest_bounds(passable, start, connectivity) >= 0).sum())
+        n_reached = int((fewest_bounds(bounds, start, connectivity) >= 0).sum())
         n_goal = int((to_goal >= 0).sum())
         raise NoPathError(
-            f"no path from {start} to {goal}: {n_reached} of {int(passable.sum())} passable cells "
-            f"can be reached from the start, and the goal from {n_goal}. Choose ends in one part, "
-            "or a team with a larger max_slope."
+            f"no path from {start} to {goal}: {n_reached} cells can be reached from the start, and "
+            f"the goal from {n_goal}. Choose ends in one part, or a team with a larger max_slope."
         )

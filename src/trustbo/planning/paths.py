@@ -20,7 +20,13 @@ from trustbo.planning.graph import (
     require_way,
 )
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, require_connectivity
+from trustbo.workspace.moves import (
+    MOVES,
+    existing_bounds,
+    move_indices,
+    moves_along,
+    require_connectivity,
+)
 
 DEFAULT_EXTRA = 8
 """Bounds beyond the fewest possible that `success` and `bottleneck` may take by default."""
@@ -36,7 +42,8 @@ class AdmissiblePaths:
     A path ends on entering the goal, and has `shortest` to `longest` bounds; `max_bounds` is the
     limit as `Planner` takes it. With `u_turns`, where it is a number, a bound may lead back to the
     cell that the last one left; with `revisit` a path may enter a cell twice. `steps` are the moves
-    to neighbouring cells, shape (move, 2), `lengths` theirs in metres, shape (move,).
+    to neighbouring cells, shape (move, 2), `lengths` theirs in metres, shape (move,), and `bounds`
+    those that a path may take, (move, row, col): the workspace's, less the `avoided`.
     """
 
     def __init__(
@@ -47,8 +54,12 @@ class AdmissiblePaths:
         connectivity: int,
         max_bounds: int | str | None,
         revisit: bool,
+        avoided: np.ndarray | None = None,
     ) -> None:
-        """Prepare the tables; see `Planner`. `max_bounds` None: shortest + `DEFAULT_EXTRA`."""
+        """Prepare the tables; see `Planner`, and `avoiding` for bounds (8 moves, row, col).
+
+        `max_bounds` None: shortest + `DEFAULT_EXTRA`.
+        """
         self.workspace, self.connectivity = workspace, require_connectivity(connectivity)
         self.start = workspace.require_cell("start", start)
         self.goal = workspace.require_cell("goal", goal)
@@ -57,8 +68,11 @@ class AdmissiblePaths:
         self.passable = workspace.passable.values
         self.steps = np.array(MOVES[connectivity])
         self.lengths = move_lengths(workspace, connectivity)
-        self.bounds_to_goal = fewest_bounds(self.passable, self.goal, connectivity)
-        require_way(self.passable, self.bounds_to_goal, self.start, self.goal, connectivity)
+        open_, self.avoided = workspace.passable_bounds.values, avoided
+        open_ = open_ if avoided is None else open_ & ~avoided
+        self.bounds = open_[move_indices(connectivity)]
+        self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, connectivity, back=True)
+        require_way(self.bounds, self.bounds_to_goal, self.start, self.goal, connectivity)
         self.shortest = int(self.bounds_to_goal[self.start])
         self.longest = self._most_bounds(max_bounds)
         self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest
@@ -68,7 +82,7 @@ class AdmissiblePaths:
     @cached_property
     def graph(self) -> nx.DiGraph:
         """Graph of passable cells (see `cell_graph`)."""
-        return cell_graph(self.workspace, self.connectivity)
+        return cell_graph(self.workspace, self.connectivity, self.bounds)
 
     @cached_property
     def to_goal(self) -> dict[Cell, int]:
@@ -78,18 +92,36 @@ class AdmissiblePaths:
     @cached_property
     def bounds_from_start(self) -> np.ndarray:
         """Fewest bounds from the start, shape (row, col); -1 where there is no way."""
-        return fewest_bounds(self.passable, self.start, self.connectivity)
+        return fewest_bounds(self.bounds, self.start, self.connectivity)
 
     @cached_property
     def layers(self) -> Layers:
         """Layered DAG: the grid unrolled over the bounds that are left."""
-        return build_layers(
+        layers = build_layers(
             self.bounds_to_goal,
             self.bounds_from_start,
             self.steps,
             self.longest,
             u_turns=self.u_turns,
         )
+        if self.all_alike:
+            return layers
+        kept = self.bounds.reshape(len(self.steps), -1)[layers.move, layers.cell[layers.head]]
+        first = np.concatenate([[0], np.cumsum(kept)])[layers.first]
+        return layers._replace(first=first, head=layers.head[kept], move=layers.move[kept])
+
+    @cached_property
+    def all_alike(self) -> bool:
+        """Whether a path may take every bound between passable cells."""
+        exists = existing_bounds(self.passable)[move_indices(self.connectivity)]
+        return bool((self.bounds == exists).all())
+
+    def masked(self, values: np.ndarray) -> np.ndarray:
+        """Values of bounds (..., move, row, col), NaN for those that no path may take.
+
+        They are unchanged, and may be of one move, where a path may take every bound.
+        """
+        return values if self.all_alike else np.where(self.bounds, values, np.nan)
 
     @cached_property
     def neighbours(self) -> np.ndarray:
@@ -99,8 +131,42 @@ class AdmissiblePaths:
         i, j = row + self.steps[:, 0], col + self.steps[:, 1]
         inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
         other = np.where(inside, i * cols + j, 0)
-        both = self.passable.ravel()[other] & self.passable.ravel()[:, None]
-        return np.where(inside & both, other, -1)
+        open_ = self.bounds.reshape(len(self.steps), -1)[np.arange(len(self.steps)), other]
+        return np.where(inside & open_, other, -1)
+
+    def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
+        """Restrict to paths that take none of some bounds, if there are any.
+
+        Otherwise those of the least risk are taken back one by one, until there is a path.
+
+        Args:
+            bounds: Bounds to avoid, (move, row, col) of the eight `MOVES`.
+            risk: Chance to fail of each bound, (move, row, col).
+        """
+        avoided = bounds & self.workspace.passable_bounds.values
+        if self.avoided is not None:
+            avoided |= self.avoided
+        order = np.argwhere(avoided)
+        order = order[np.argsort(risk[avoided], kind="stable")]
+        for least in (None, *order.tolist()):
+            if least is not None:
+                avoided[*least] = False
+            try:
+                return self._with(self.start, self.goal, self.max_bounds, avoided.copy())
+            except TrustboError:  # the goal is out of reach, or of the bounds that are allowed
+                continue
+        return self
+
+    def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
+        """Return the paths to another cell, of so many bounds more than the fewest."""
+        ends = self.workspace, self.start, cell, self.connectivity
+        return AdmissiblePaths(*ends, f"shortest+{extra}", True, self.avoided)
+
+    def _with(
+        self, start: Cell, goal: Cell, max_bounds: int | str, avoided: np.ndarray | None
+    ) -> "AdmissiblePaths":
+        ends = self.workspace, start, goal, self.connectivity
+        return AdmissiblePaths(*ends, max_bounds, self.revisit, avoided)
 
     def onward(self, done: Sequence[Cell]) -> "AdmissiblePaths":
         """Restrict to the rest of a mission that entered the cells `done` so far, start first.
@@ -123,9 +189,7 @@ class AdmissiblePaths:
         max_bounds = left
         if not self.u_turns:
             max_bounds = f"shortest+{left - fewest}"
-        return AdmissiblePaths(
-            self.workspace, here, self.goal, self.connectivity, max_bounds, revisit=self.revisit
-        )
+        return self._with(here, self.goal, max_bounds, self.avoided)
 
     def flat(self, cell: Cell) -> int:
         """Index of a cell in row-major order."""
@@ -157,6 +221,8 @@ class AdmissiblePaths:
         far = np.abs(step).sum(1) if self.connectivity == 4 else np.abs(step).max(1)
         there = np.where(inside[:, None], where[1:], 0)
         broken = (far != 1) | ~inside | ~self.passable[*there.T]
+        if not broken.any():
+            broken = ~self.workspace.passable_bounds.values[moves_along(where), *there.T]
         if broken.any():
             k = int(np.argmax(broken))
             raise TrustboError(

@@ -140,6 +140,10 @@ class Planner:
         """Return a path as a tuple of cells; refuse a broken one, or one between other ends."""
         return self.paths.require_path(path)
 
+    def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> Self:
+        """Return the planner of paths without some bounds; see `AdmissiblePaths.avoiding`."""
+        return self._with(replace(self.problem, paths=self.paths.avoiding(bounds, risk)))
+
     def with_awareness(self, awareness: ArrayLike, mean: ArrayLike | None = None) -> Self:
         """Return the planner with other awareness of cells; see `PlanningProblem`."""
         return self._with(self.problem.with_awareness(awareness, mean))

@@ -69,7 +69,8 @@ def _largest_trust(admissible: AdmissiblePaths, dynamics: Dynamics) -> np.ndarra
     fewest = admissible.bounds_from_start
     if dynamics.is_scalar:
         beta0, x0 = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
-        return best_trust(dynamics.drift[:, 0], beta0, x0, fewest, admissible.steps, extra)
+        drift = admissible.masked(dynamics.drift[:, 0])
+        return best_trust(drift, beta0, x0, fewest, admissible.steps, extra)
     values = np.full((len(dynamics.start), *fewest.shape), np.nan)
     for row, col in np.argwhere(fewest >= 0).tolist():
         values[:, row, col] = _trust_at(admissible, dynamics, (row, col), extra)
@@ -82,14 +83,7 @@ def _trust_at(
     """Largest trust at one cell, by planning a path to it: vector trust has no scalar recursion."""
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
-    there = AdmissiblePaths(
-        admissible.workspace,
-        admissible.start,
-        cell,
-        admissible.connectivity,
-        f"shortest+{extra}",
-        True,
-    )
+    there = admissible.to(cell, extra)
     paths = plan_compiled(there, dynamics, Objective("terminal")).paths
     return np.array(
         [team_trust(dynamics.take(d).along(there.cells(path)))[-1] for d, path in enumerate(paths)]

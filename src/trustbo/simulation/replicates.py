@@ -13,7 +13,7 @@ from trustbo.simulation.bounding import State
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import takes
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.moves import MOVES
 
 END = len(MOVES[8])
 """Index of "no next move": the bound enters the goal."""
@@ -45,8 +45,8 @@ class Replicates(Protocol):
 
 
 def edges_of(workspace: Workspace) -> list[Edge]:
-    """All bounds of a workspace."""
-    exists = existing_bounds(workspace.passable.values)
+    """All bounds of a workspace that its robots have a way for."""
+    exists = workspace.passable_bounds.values
     edges = []
     for move, row, col in np.argwhere(exists).tolist():
         down, right = MOVES[8][move]

@@ -13,6 +13,7 @@ from trustbo.data import Cell, Team
 from trustbo.errors import TerrainError, TrustboError, require_positive
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
+from trustbo.workspace.regions import are_linked, largest_region, linked_to
 from trustbo.workspace.sight import Sight, detection_probability, optics
 from trustbo.workspace.surface import Surface
 
@@ -47,7 +48,7 @@ class Posts:
         self.grid, self.team, self.surface = grid, team, surface
         self._sight, self._radius = sight, radius
         self._traversability = _smoothed(traversability, surface.pixel)
-        self._standable = _largest_region(surface.passable)
+        self._standable = largest_region(surface.passable)
         self._waypoints: dict[Cell, np.ndarray] = {}
         self._known: dict[Cell, dict[Cell | None, np.ndarray]] = {}
         # Row and column of the cell that each row and column of pixels belongs to, ascending.
@@ -65,6 +66,15 @@ class Posts:
             max(0, int(left * per_col)),
             min(cols, int(np.ceil(right * per_col))),
         )
+
+    def are_linked(self, a: Cell, c: Cell) -> bool:
+        """Whether the robots have a way from cell to cell: their posts are in one region.
+
+        T2's posts in a cell are linked to its waypoint within half a cell around, so that one test,
+        of the waypoints, holds for all robots and whatever cell comes next.
+        """
+        ends = [self.surface.pixel_at(*self.waypoint(cell).tolist()) for cell in (a, c)]
+        return are_linked(self.surface.passable, self.window(a, c), ends[0], ends[1])
 
     def waypoint(self, cell: Cell) -> np.ndarray:
         """Stop of the lead in a cell, shape (2,): a traversable pixel near the centre."""
@@ -101,7 +111,7 @@ class Posts:
     def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> dict[Cell | None, np.ndarray]:
         """Posts of T2 by the next cell: of equal sight the closer one, none on top of another."""
         here, robots = self.waypoint(cell), self.team.robots
-        position = self._position(*self._pixels_of(cell))
+        position = self._position(*self._linked(cell))
         distance = np.linalg.norm(position - here, axis=1)
         near = np.flatnonzero((distance <= self._radius) & (distance >= SPACING))
         if len(near) < len(robots):  # few passable pixels, or large ones
@@ -160,6 +170,19 @@ class Posts:
                 break
         return row + top, col + left
 
+    def _linked(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of those pixels of a cell that are linked to its waypoint.
+
+        Linked within half a cell around, which the window of every bound contains.
+        """
+        row, col = self._pixels_of(cell)
+        start, window = (
+            self.surface.pixel_at(*self.waypoint(cell).tolist()),
+            self.window(cell, cell),
+        )
+        linked = linked_to(self.surface.passable, window, start)[row - window[0], col - window[2]]
+        return (row[linked], col[linked]) if linked.any() else (row, col)
+
     def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
         y, x = self.surface.axes
         return np.stack([x[col], y[row]], axis=-1)
@@ -169,17 +192,3 @@ def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0
     size = [max(1, round(width / step)) for step in pixel]
     window: dict[str, Any] = {"size": size, "mode": "nearest"}
     return ndimage.uniform_filter(np.nan_to_num(values), **window)
-
-
-def _largest_region(passable: np.ndarray) -> np.ndarray:
-    """Largest connected set of passable pixels; no route leaves it.
-
-    Pixels are connected by edges: routes do not pass where two touch at a corner only.
-    """
-    regions: Any = ndimage.label(passable)
-    labels, n_regions = regions
-    if n_regions == 0:
-        return passable
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return labels == np.argmax(sizes)

@@ -31,8 +31,9 @@ from trustbo.workspace.bound_awareness import (
     sight_features,
 )
 from trustbo.workspace.cells import of_cells
+from trustbo.workspace.difficulty import MEASURES, bound_difficulty
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import MOVE_NAMES, along, moves_along
+from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds, moves_along
 from trustbo.workspace.posts import FORMATION_RADIUS, Posts, require_formation
 from trustbo.workspace.sight import Sight, sights_of
 from trustbo.workspace.surface import Surface, surface_of
@@ -259,6 +260,43 @@ class Workspace:
         if self.terrain is None or self.pixels is None:
             return None
         return surface_of(self.terrain, self.pixels["passable"].values.astype(bool))
+
+    @cached_property
+    def passable_bounds(self) -> xr.DataArray:
+        """Bounds between passable cells that the robots have a way for, (move, row, col), bool.
+
+        The bound enters the cell (row, col) by the move, one of the eight of `MOVES`. Ways are
+        those of the map of pixels, within two cells and half a cell around; without a terrain in
+        memory there is one between any two neighbours.
+        """
+        exists = existing_bounds(self.passable.values)
+        if (ground := self.ground) is not None:
+            n_moves = len(exists)
+            for m, (down, right) in enumerate(MOVES[8][: n_moves // 2]):
+                for row, col in np.argwhere(exists[m]).tolist():
+                    left = row - down, col - right
+                    linked = ground.posts.are_linked(left, (row, col))
+                    exists[m, row, col] = exists[n_moves - 1 - m, *left] = linked
+        like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
+        return like.copy(data=exists).rename("passable_bounds")
+
+    @cached_property
+    def difficulty(self) -> xr.DataArray:
+        """Difficulty of bounds, (move, row, col, measure); NaN where there is none.
+
+        Measures are `difficulty.MEASURES`, 0 where the way is easy, about 1 at the team's limit; an
+        axis of length 0 without a terrain in memory.
+        """
+        exists, names = self.passable_bounds, ()
+        values = np.empty((*exists.shape, 0))
+        if (ground := self.ground) is not None:
+            assert self.pixels is not None  # noqa: S101  # there are ways
+            names, shape = MEASURES, ground.posts.surface.ground.shape
+            known = self.pixels.get(TRAVERSABLE)
+            easy = np.full(shape, np.nan) if known is None else known.values
+            values = bound_difficulty(ground, easy, exists.values, self.team.max_slope)
+        coords = {**exists.coords, "measure": list(names)}
+        return xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
 
     def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
         """Posts and ways over another surface of the same terrain, such as one with closed areas.

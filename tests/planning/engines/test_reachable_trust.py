@@ -7,7 +7,7 @@ import pytest
 
 from trustbo.planning.engines.reachable_trust import best_trust
 from trustbo.planning.graph import fewest_bounds
-from trustbo.workspace.moves import MOVES
+from trustbo.workspace.moves import MOVES, existing_bounds, move_indices
 
 
 def walks(shape, passable, start, moves, most):
@@ -38,7 +38,9 @@ def test_it_is_the_best_of_all_paths(seed, connectivity, slack):
         rng.normal(size=3),
     )
     beta0 = np.array([0.7, -0.9, 1.1])
-    fewest = fewest_bounds(passable, start, connectivity)
+    fewest = fewest_bounds(
+        existing_bounds(passable)[move_indices(connectivity)], start, connectivity
+    )
     moves = MOVES[connectivity]
     expected = np.full((3, *shape), np.nan)
     for walk in walks(shape, passable, start, moves, int(fewest.max()) + slack):
@@ -60,7 +62,7 @@ def test_many_draws_are_as_each_by_itself():
     rng, shape = np.random.default_rng(5), (6, 7)
     passable = rng.uniform(size=shape) < 0.8
     passable[5, 0] = True
-    fewest, steps = fewest_bounds(passable, (5, 0), 8), np.array(MOVES[8])
+    fewest, steps = fewest_bounds(existing_bounds(passable), (5, 0), 8), np.array(MOVES[8])
     drift, beta0, x0 = (
         rng.normal(size=(150, 1, *shape)),
         rng.uniform(-1, 1, 150),

@@ -42,7 +42,7 @@ def plan_compiled(
         return _labelled(admissible, dynamics, objective, length_cost)
     if objective.name == "stationary":
         _, paths = best_stationary(
-            lambda part: dynamics.take(part).steady_state(),
+            lambda part: admissible.masked(dynamics.take(part).steady_state()),
             len(dynamics.start),
             admissible.passable,
             length_cost,

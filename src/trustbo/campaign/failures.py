@@ -1,0 +1,103 @@
+"""Failures of a campaign: missions given up, the hazard of bounds, and bounds to keep away from."""
+
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+
+from trustbo.campaign.told import never_to_be_learned
+from trustbo.data import Cell
+from trustbo.errors import PosteriorError, TrustboError, require_pair
+from trustbo.models import CAUSES, BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.workspace import Workspace
+
+if TYPE_CHECKING:
+    from trustbo.campaign.history import Entry
+
+STOPPED = 2
+"""Failures of a bound from which on it is not entered again without need."""
+RECOVERED = 0.2
+"""Mean chance to fail below which such a bound may be entered again all the same."""
+
+
+class Failure(NamedTuple):
+    """A mission that was given up without a report to learn from."""
+
+    after: int
+    """Number of missions told before."""
+    reason: str
+    path: tuple[Cell, ...] = ()
+    """Path that was asked for, start first; empty where its failure says nothing of the bounds."""
+    where: Cell | None = None
+    """Cell that it failed to enter, where that is known."""
+
+    @classmethod
+    def of(cls, after: int, reason: str, path: Sequence[Cell], where: Cell | None = None) -> Self:
+        """Failure on the way along a path; reasons other than `CAUSES` say nothing of its bounds.
+
+        TrustboError: a `where` that the path does not enter, or for another reason.
+        """
+        reason = str(reason)
+        if where is None:
+            return cls(after, reason, tuple(path) if reason in CAUSES else ())
+        cell = require_pair("where", where)
+        if reason not in CAUSES:
+            raise TrustboError(
+                f"where = {cell} is for the reasons {', '.join(CAUSES)}, from which bounds are "
+                f"learned; got {reason!r}."
+            )
+        if cell not in path[1:]:
+            raise TrustboError(f"where must be a cell that the plan enters, {path}; got {cell}.")
+        return cls(after, reason, tuple(path), cell)
+
+    @classmethod
+    def restore(cls, record: Sequence[Any]) -> Self:
+        """Failure of a record, one of version 0.1 without a path."""
+        after, reason, *rest = record
+        path, where = rest or ((), None)
+        cells = tuple((row, col) for row, col in path)
+        return cls(after, reason, cells, None if where is None else (where[0], where[1]))
+
+
+def learn_hazard(
+    entries: "Sequence[Entry]",
+    failures: Sequence[Failure],
+    workspace: Workspace,
+    hazard: Hazard,
+    forgetting: float,
+    seed: int,
+) -> xr.Dataset | None:
+    """Fit the hazard of bounds to all missions that were not set aside by hand.
+
+    A mission set aside because it measured no contact rate tells all the same where it failed.
+    None, with a warning, where the posterior is refused.
+    """
+    told = [
+        (j, entry.measured)
+        for j, entry in enumerate(entries)
+        if entry.state != "set aside" or never_to_be_learned(entry.mission)
+    ]
+    lost = [failure for failure in failures if failure.path]
+    ages = [len(entries) - 1 - j for j, _ in told], [len(entries) - f.after for f in lost]
+    weights = [forgetting ** np.array(age, dtype=float) for age in ages]
+    try:
+        return fit_hazard(
+            [mission for _, mission in told],
+            workspace,
+            hazard,
+            lost=[LostMission(f.path, f.reason, f.where) for f in lost],
+            weights=weights[0],
+            lost_weights=weights[1],
+            seed=seed,
+        )
+    except PosteriorError as error:
+        warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=4)
+        return None
+
+
+def to_avoid(risk: BoundRisk) -> np.ndarray:
+    """Bounds that stopped robots twice, and whose posterior has not recovered, (move, row, col)."""
+    with np.errstate(invalid="ignore"):
+        return (risk.stopped >= STOPPED - 1e-9) & ~(risk.mean < RECOVERED)

@@ -1,0 +1,194 @@
+"""Hazard of bounds: the chance that a bound ends the mission, learned from missions.
+
+Bound e, from one cell to the next, fails with chance p_e ~ Beta(s m_e, s (1 - m_e)). Its prior mean
+is a logistic of how difficult the way is in terms of the robots' own slope limit,
+
+    logit m_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2),
+
+so that a bound that was never tried is judged by others like it, and one that was tried mostly by
+what happened there: the less strength s, the more. DESIGN 5.12; docs/failures.md.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from trustbo.data import Mission
+from trustbo.errors import PosteriorError, TrustboError, require_positive, require_whole
+from trustbo.models.exposures import CAUSES, Exposures, LostMission
+from trustbo.models.hazard_sampler import LIMIT, Law, Points, sample
+from trustbo.models.risk import BoundRisk
+from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVE_NAMES
+
+REFERENCE = 0.5
+"""Difficulty at which the intercept is the logit of the prior mean."""
+
+
+@dataclass(frozen=True)
+class Hazard:
+    """Priors of the chance that a bound ends the mission; normal ones are (mean, sd).
+
+    Attributes:
+        intercept: Prior of the logit of the mean chance at medium difficulty.
+        coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
+            limit (1).
+        log_strength: Prior of the log of the strength s: the failures and successes that the mean
+            is worth, few where bounds fail always or never.
+        cause: Concentration of the Dirichlet over the causes of failure, for each.
+
+    Raises:
+        TrustboError: An sd or a concentration that is not positive.
+    """
+
+    intercept: tuple[float, float] = (-5.0, 1.5)
+    coefficient: tuple[float, float] = (1.0, 1.0)
+    log_strength: tuple[float, float] = (0.0, 1.0)
+    cause: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name in ("intercept", "coefficient", "log_strength"):
+            mean, sd = getattr(self, name)
+            value = float(mean), require_positive(f"sd of {name}", sd)
+            object.__setattr__(self, name, value)
+        require_positive("cause", self.cause)
+
+    def law(self, difficulty: np.ndarray) -> Law:
+        """Law of bounds of these difficulties, (bound, measure)."""
+        priors = [self.intercept, *[self.coefficient] * difficulty.shape[1], self.log_strength]
+        center, scale = np.array(priors).T
+        return Law(center, scale, difficulty - REFERENCE)
+
+    def prior(self, workspace: Workspace, *, seed: int = 0, n_draws: int = 1000) -> BoundRisk:
+        """Risk of the bounds of a workspace before any mission."""
+        return BoundRisk.of(fit_hazard([], workspace, self, seed=seed, n_draws=n_draws), workspace)
+
+
+def fit_hazard(
+    missions: Sequence[Mission],
+    workspace: Workspace,
+    hazard: Hazard | None = None,
+    *,
+    lost: Sequence[LostMission] = (),
+    weights: ArrayLike | None = None,
+    lost_weights: ArrayLike | None = None,
+    seed: int = 0,
+    n_draws: int = 1000,
+    check: bool = True,
+) -> xr.Dataset:
+    """Learn the chance to fail of every bound, by importance sampling in NumPy.
+
+    Bounds completed are exposures survived, the last bound of a mission that failed is one that
+    failed; an aborted bound counts for nothing. Where a lost mission failed is imputed with the
+    hyperparameters: draws are of the joint posterior.
+
+    Args:
+        missions: Missions as measured, none needed.
+        workspace: Workspace of their paths, whose terrain gives the difficulty of bounds; without
+            one, the mean has an intercept only.
+        hazard: Priors; by default `Hazard()`.
+        lost: Missions that failed and did not report.
+        weights: Weight of each mission, shape (mission,); 1 by default.
+        lost_weights: Weight of each lost mission, shape (lost,); 1 by default.
+        seed: Seed; the same seed gives the same posterior.
+        n_draws: Number of draws.
+        check: Refuse a posterior with k-hat > 0.7; `False` returns it unchecked.
+
+    Returns:
+        The group `hazard` of a posterior: `intercept` (draw), `coefficient` (draw, measure),
+        `strength` (draw), and `place` (draw, lost), the bound from 1 at which each mission lost
+        somewhere unknown failed; `p_fail` and `p_fail_sd` (move, row, col), posterior mean and sd
+        of the chance to fail, NaN where there is no bound; `exposures` and `failures` (move, row,
+        col), counts of the known ones; `failures_by_cause` (cause). `BoundRisk.of` draws from it.
+
+    Raises:
+        TrustboError: A mission's path jumps or leaves the grid, or an unknown cause.
+        PosteriorError: k-hat is beyond its limit.
+    """
+    started, hazard = time.perf_counter(), Hazard() if hazard is None else hazard
+    n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
+    exposures = Exposures.of(missions, lost, weights, lost_weights)
+    difficulty = workspace.difficulty.values
+    _require_on_grid(exposures, difficulty.shape[1:3])
+    measures = difficulty[*exposures.bounds.T]
+    # A bound that the map says does not exist was driven all the same: as hard as can be.
+    points = sample(hazard.law(np.nan_to_num(measures, nan=1.0)), exposures, seed)
+    group = _dataset(hazard, exposures, points, workspace, n_draws, seed)
+    risk = BoundRisk.of(group, workspace)
+    dims = ("move", "row", "col")
+    group = group.assign(p_fail=(dims, risk.mean), p_fail_sd=(dims, risk.sd))
+    group.attrs["seconds"] = time.perf_counter() - started
+    if check and not points.k_hat <= LIMIT:
+        raise PosteriorError(
+            f"hazard refused: k-hat = {points.k_hat:.2f} > {LIMIT:g}.",
+            group,
+            "Give firmer priors, Hazard(...), or pass check=False to have it as it is.",
+        )
+    return group
+
+
+def _require_on_grid(exposures: Exposures, shape: tuple[int, ...]) -> None:
+    cells = exposures.bounds[:, 1:]
+    if (off := ((cells < 0) | (cells >= shape)).any(1)).any():
+        cell = tuple(cells[np.argmax(off)].tolist())
+        raise TrustboError(f"a mission enters {cell}, outside the grid of {shape} rows and cols.")
+
+
+def _dataset(
+    hazard: Hazard,
+    exposures: Exposures,
+    points: Points,
+    workspace: Workspace,
+    n_draws: int,
+    seed: int,
+) -> xr.Dataset:
+    """The group without the maps of chances."""
+    rng = np.random.default_rng([seed, 2])
+    # Systematic resampling: equally weighted draws, in random order.
+    grid = (rng.random() + np.arange(n_draws)) / n_draws
+    chosen = rng.permutation(np.searchsorted(np.cumsum(points.weights)[:-1], grid))
+    law = hazard.law(np.empty((0, points.z.shape[1] - 2)))
+    values = law.center + law.scale * points.z[chosen]
+    shape = workspace.difficulty.shape[:3]
+    n, failed = np.zeros(shape), np.zeros(shape)
+    n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
+    longest = max((len(path) for path in exposures.lost), default=0)
+    lost = np.full((len(exposures.lost), longest, 3), -1)
+    for j, path in enumerate(exposures.lost):
+        lost[j, : len(path)] = exposures.bounds[path]
+    maps = ("move", "row", "col")
+    return xr.Dataset(
+        {
+            "intercept": ("draw", values[:, 0]),
+            "coefficient": (("draw", "measure"), values[:, 1:-1]),
+            "strength": ("draw", np.exp(values[:, -1])),
+            "place": (("draw", "lost"), points.places[chosen] + 1),
+            "lost_bound": (("lost", "bound", "axis"), lost),
+            "lost_weight": ("lost", exposures.lost_weights),
+            "exposures": (maps, n),
+            "failures": (maps, failed),
+            "failures_by_cause": ("cause", exposures.causes),
+        },
+        {
+            "draw": np.arange(n_draws),
+            "measure": list(workspace.difficulty["measure"].values),
+            "cause": list(CAUSES),
+            "axis": list(maps),
+            "move": list(MOVE_NAMES),
+        },
+        {
+            "k_hat": points.k_hat if np.isfinite(points.k_hat) else float(np.sign(points.k_hat)),
+            "kish": float(1.0 / (points.weights**2).sum()),
+            "seed": seed,
+            "reference": REFERENCE,
+            "cause_concentration": hazard.cause,
+            **{f"prior_{n}": list(getattr(hazard, n)) for n in _NORMALS},
+        },
+    )
+
+
+_NORMALS = ("intercept", "coefficient", "log_strength")

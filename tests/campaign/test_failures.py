@@ -1,0 +1,157 @@
+"""Failures in the loop: learned beside trust, kept, resumed, and bounds that are avoided."""
+
+import itertools
+
+import numpy as np
+import pytest
+from simulators import ModelSimulator
+
+import trustbo as tb
+from trustbo.errors import PosteriorError
+from trustbo.models import BoundRisk, LostMission, fit_hazard
+from trustbo.workspace.moves import moves_along
+
+ENDS = ((3, 0), (0, 3))
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+
+
+class Trap:
+    """Missions that end in one bound, whenever they come to it."""
+
+    def __init__(self, workspace, bound):
+        self.inner, self.bound = ModelSimulator(workspace), bound
+
+    def run(self, path, *, seed):
+        bounds = list(itertools.pairwise(path))
+        fail_at = bounds.index(self.bound) + 1 if self.bound in bounds else None
+        self.inner.fail_at = fail_at
+        return self.inner.run(path, seed=seed)
+
+    def describe(self):
+        return {"simulator": "Trap"}
+
+
+def begin(workspace, **options):
+    return tb.Campaign(workspace, *ENDS, sampler="exact", seed=1, **options)
+
+
+def at(bound):
+    return int(moves_along(bound)[0]), *bound[1]
+
+
+def test_the_hazard_is_that_of_all_missions_and_in_the_posterior(workspace):
+    campaign = begin(workspace)
+    first = campaign.ask().path
+    bound = first[1:3]
+    simulator = Trap(workspace, bound)
+    before = campaign.risk.mean[at(bound)]
+    posterior = campaign.tell(simulator.run(first, seed=0))
+    assert posterior["hazard"]["failures"].values[at(bound)] == 1
+    assert campaign.risk.mean[at(bound)] > 2.0 * before
+    alone = fit_hazard(campaign.missions, workspace, seed=campaign.seed_of("hazard"))
+    assert alone.drop_attrs().identical(campaign.hazard.drop_attrs())
+    assert campaign.posterior["hazard"].to_dataset().identical(campaign.hazard)
+    assert "latent" in campaign.posterior.children
+
+
+def test_a_bound_that_stopped_robots_twice_is_not_entered_again(workspace):
+    campaign = begin(workspace)
+    bound = tuple(campaign.ask().path[1:3])
+    simulator = Trap(workspace, bound)
+    paths = []
+    for seed in range(5):
+        paths.append(campaign.ask().path)
+        campaign.tell(simulator.run(paths[-1], seed=seed), again=True)
+    met = [bound in itertools.pairwise(path) for path in paths]
+    assert sum(met) == 2
+    assert bound not in itertools.pairwise(campaign.recommend().path)
+
+
+def test_it_is_entered_where_there_is_no_other_way():
+    corridor = tb.Workspace.from_awareness(np.full((1, 1, 3, 1), 0.6))
+    campaign = tb.Campaign(corridor, (0, 0), (0, 2), sampler="exact")
+    for _ in range(3):
+        campaign.ask()
+        campaign.fail("stuck", where=(0, 2))
+    assert campaign.risk.mean[4, 0, 2] > 0.5
+    assert campaign.ask().path == ((0, 0), (0, 1), (0, 2))
+
+
+def test_a_mission_that_did_not_report_is_learned_from(workspace):
+    campaign = begin(workspace)
+    path = campaign.ask().path
+    campaign.fail("tipped")
+    expected = fit_hazard(
+        [], workspace, lost=[LostMission(path, "tipped")], seed=campaign.seed_of("hazard")
+    )
+    assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
+    mean = campaign.risk.mean[moves_along(path), *np.array(path)[1:].T]
+    assert (mean > BoundRisk.of(fit_hazard([], workspace), workspace).mean[at(path[:2])]).all()
+    campaign.ask()
+    campaign.fail("rain")
+    assert campaign.hazard["failures_by_cause"].values.tolist() == [0, 1, 0, 0, 0]
+
+
+def test_where_is_checked(workspace):
+    campaign = begin(workspace)
+    path = campaign.ask().path
+    with pytest.raises(tb.TrustboError, match=r"where must be a cell that the plan enters"):
+        campaign.fail("stuck", where=path[0])
+    with pytest.raises(tb.TrustboError, match="is for the reasons stuck, tipped"):
+        campaign.fail("rain", where=path[1])
+    with pytest.raises(tb.TrustboError, match="the mission tells where it failed"):
+        campaign.fail("stuck", ModelSimulator(workspace).run(path, seed=0), where=path[1])
+    assert campaign.log.failures == []
+
+
+def test_a_campaign_resumes_with_the_same_hazard(workspace, tmp_path):
+    campaign = begin(workspace, directory=tmp_path)
+    bound = tuple(campaign.ask().path[1:3])
+    simulator = Trap(workspace, bound)
+    for seed in range(2):
+        campaign.tell(simulator.run(campaign.ask().path, seed=seed), again=True)
+    campaign.ask()
+    campaign.fail("stuck")
+    campaign.fail("lost_contact", where=campaign.ask().path[1])
+    campaign.close()
+    with tb.Campaign.load(tmp_path) as again:
+        assert again.log.failures == campaign.log.failures
+        assert again.hazard.drop_attrs().identical(campaign.hazard.drop_attrs())
+        np.testing.assert_array_equal(again.risk.draw(5), campaign.risk.draw(5))
+        assert again.ask().path == campaign.ask().path
+        kept = again.posteriors[1]["hazard"].to_dataset()
+        assert kept.identical(campaign.posteriors[1]["hazard"].to_dataset())
+
+
+def test_a_refused_hazard_leaves_the_one_before(workspace, monkeypatch):
+    campaign = begin(workspace)
+    campaign.tell(ModelSimulator(workspace, fail_at=1).run(campaign.ask().path, seed=0))
+    before = campaign.hazard
+
+    def refuse(*args, **kwargs):
+        raise PosteriorError("hazard refused: k-hat = 0.90 > 0.7.")
+
+    monkeypatch.setattr("trustbo.campaign.failures.fit_hazard", refuse)
+    with pytest.warns(UserWarning, match="goes on with the hazard before"):
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=1))
+    assert campaign.hazard.identical(before)
+
+
+def test_a_mission_set_aside_by_hand_is_forgotten(workspace):
+    campaign = begin(workspace)
+    for seed in range(2):
+        campaign.tell(ModelSimulator(workspace, fail_at=1).run(campaign.ask().path, seed=seed))
+    campaign.set_aside("a person pushed the robot")
+    assert campaign.hazard["failures"].values.sum() == 1
+
+
+def test_older_failures_weigh_less_under_forgetting(workspace):
+    campaign = begin(workspace, forgetting=0.5)
+    for seed, fail_at in enumerate((1, None, None)):
+        simulator = ModelSimulator(workspace, fail_at=fail_at)
+        campaign.tell(simulator.run(campaign.ask().path, seed=seed))
+    assert campaign.hazard["failures"].values.sum() == 0.25

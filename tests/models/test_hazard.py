@@ -1,0 +1,228 @@
+"""Hazard: likelihood, places of lost missions, calibration, and what is counted."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import special, stats
+
+import trustbo as tb
+from trustbo.errors import PosteriorError, TrustboError
+from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.models.exposures import Exposures
+from trustbo.models.hazard_sampler import _Density, impute, sample
+
+
+def workspace(n=3):
+    return tb.Workspace.from_awareness(np.full((1, n, n, 1), 0.5))
+
+
+def mission(path, status="ok", n_bounds=None):
+    n = len(path) - 1 if n_bounds is None else n_bounds
+    return tb.Mission.from_arrays(
+        path, np.full((n, 1, 1), 0.5), np.full((n, 1), 0.5), status=status
+    )
+
+
+ROW = ((0, 0), (0, 1), (0, 2))
+
+
+def exposures(n, failed, lost=(), weights=None):
+    """Exposures of made-up bounds."""
+    n = np.array(n, dtype=float)
+    bounds = np.column_stack([np.zeros(len(n), int), np.arange(len(n)), np.zeros(len(n), int)])
+    weight = np.ones(len(lost)) if weights is None else np.array(weights)
+    paths = tuple(np.array(path) for path in lost)
+    return Exposures(bounds, n, np.array(failed, dtype=float), paths, weight, np.zeros(5))
+
+
+def law(difficulty):
+    return Hazard().law(np.asarray(difficulty, dtype=float))
+
+
+def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
+    rng = np.random.default_rng(0)
+    n = np.array([1, 2, 3, 12, 5, 0, 30])
+    failed = np.array([0, 1, 3, 0, 2, 0, 11])
+    of = law(rng.uniform(size=(7, 2)))
+    z = rng.standard_normal((20, 4))
+    alpha, beta = of(z)
+    binomial = stats.betabinom.logpmf(failed, n, alpha, beta) - np.log(special.comb(n, failed))
+    expected = binomial.sum(1) + stats.norm.logpdf(z).sum(1)
+    np.testing.assert_allclose(_Density(of, exposures(n, failed)).known(z), expected, rtol=1e-9)
+
+
+def test_fractional_weights_have_the_ratio_of_beta_functions():
+    of, z = law(np.empty((2, 0))), np.array([[0.3, -0.8]])
+    n, failed = np.array([2.5, 0.81]), np.array([0.5, 0.81])
+    alpha, beta = of(z)
+    ratio = special.betaln(alpha + failed, beta + n - failed) - special.betaln(alpha, beta)
+    expected = ratio.sum(1) + stats.norm.logpdf(z).sum(1)
+    np.testing.assert_allclose(_Density(of, exposures(n, failed)).known(z), expected, rtol=1e-9)
+
+
+def test_imputing_places_integrates_lost_missions_out_as_quadrature_does():
+    """Two lost missions that share bounds: E prod_j (1 - prod_e (1 - p_e)) by tensor quadrature."""
+    n, failed = [2, 1, 0], [0, 1, 0]
+    data = exposures(n, failed, lost=[[0, 1, 2], [2, 0]])
+    of, z = law(np.empty((3, 0))), np.array([[0.7, 0.4]])
+    alpha, beta = of(z)
+    axes = []
+    for e in range(3):
+        a, b = alpha[0, e] + failed[e], beta[0, e] + n[e] - failed[e]
+        # Gauss-Jacobi nodes of the Beta, exact for the polynomial in question.
+        x, w = special.roots_jacobi(12, b - 1.0, a - 1.0)
+        axes.append((0.5 * (x + 1.0), w / w.sum()))
+    expected = 0.0
+    nodes = itertools.product(*(list(zip(*axis, strict=True)) for axis in axes))
+    for (p0, w0), (p1, w1), (p2, w2) in nodes:
+        both = (1.0 - (1.0 - p0) * (1.0 - p1) * (1.0 - p2)) * (1.0 - (1.0 - p2) * (1.0 - p0))
+        expected += w0 * w1 * w2 * both
+    n_points = 200_000
+    _, log_fail = impute(of, data, np.repeat(z, n_points, axis=0), np.random.default_rng(1))
+    found = np.exp(log_fail)
+    # 5 standard errors of the mean over independent imputations.
+    np.testing.assert_allclose(found.mean(), expected, atol=5.0 * found.std() / np.sqrt(n_points))
+
+
+def test_a_lost_mission_that_enters_a_bound_twice_survived_it_once():
+    """1 - E (1 - p)^2 for a path of one bound twice."""
+    data, of, z = exposures([0], [0], lost=[[0, 0]]), law(np.empty((1, 0))), np.zeros((1, 2))
+    (a,), (b,) = (part[0] for part in of(z))
+    expected = 1.0 - b * (b + 1.0) / ((a + b) * (a + b + 1.0))
+    log_fail = impute(of, data, z, np.random.default_rng(0))[1]
+    np.testing.assert_allclose(np.exp(log_fail), expected, rtol=1e-10)
+
+
+def test_posterior_means_equal_those_of_a_grid():
+    """One bound that failed in 3 of 8: intercept and strength on a grid."""
+    data, of = exposures([8], [3]), law(np.empty((1, 0)))
+    points = sample(of, data, seed=0)
+    axis = np.linspace(-7.0, 7.0, 401)
+    z = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    alpha, beta = (part[:, 0] for part in of(z))
+    log_p = stats.betabinom.logpmf(3, 8, alpha, beta) + stats.norm.logpdf(z).sum(1)
+    weight = special.softmax(log_p)
+    chance = weight @ ((alpha + 3.0) / (alpha + beta + 8.0))
+    alpha, beta = (part[:, 0] for part in of(points.z))
+    # 4096 quasi-random points of an effective sample of about half as many.
+    np.testing.assert_allclose(points.weights @ points.z, weight @ z, atol=0.02)
+    np.testing.assert_allclose(
+        points.weights @ ((alpha + 3.0) / (alpha + beta + 8.0)), chance, atol=2e-3
+    )
+    assert points.k_hat < 0.5
+
+
+def test_the_hazard_is_calibrated():
+    """SBC: ranks of hyperparameters and of chances are uniform over 200 data sets."""
+    prior, n_sets, n_bounds, n_ranks = Hazard(), 200, 25, 20
+    rng = np.random.default_rng(1)
+    ranks = []
+    for seed in range(n_sets):
+        x = rng.uniform(size=(n_bounds, 2)) * 1.5
+        of = prior.law(x)
+        z = rng.standard_normal((1, 4))
+        p = rng.beta(*(part[0] for part in of(z)))
+        n, failed, lost = np.zeros(n_bounds), np.zeros(n_bounds), []
+        for j in range(12):
+            path = rng.choice(n_bounds, 6, replace=False)
+            fails = rng.random(6) < p[path]
+            k = int(np.argmax(fails)) if fails.any() else 6
+            if fails.any() and j % 3 == 0:
+                lost.append(path)
+                continue
+            n[path[: k + 1]] += 1
+            failed[path[k : k + 1]] += fails.any()
+        data = exposures(n, failed, lost)
+        points = sample(of, data, seed)
+        assert points.k_hat < 0.7
+        chosen = rng.choice(len(points.z), n_ranks - 1, p=points.weights)
+        a, b = of(points.z[chosen])
+        a, b = a + failed, b + n - failed
+        for j, path in enumerate(lost):
+            for k, e in enumerate(path):
+                a[:, e] += points.places[chosen, j] == k
+                b[:, e] += points.places[chosen, j] > k
+        chance = rng.beta(a, b)
+        truth = np.array([*z[0], p[0], p[1], (1.0 - p).prod()])
+        drawn = np.column_stack([points.z[chosen], chance[:, :2], (1.0 - chance).prod(1)])
+        # Chances underflow to 0 in truth and draws alike: such ties are broken at random.
+        ties = rng.integers((drawn == truth).sum(0) + 1)
+        ranks.append((drawn < truth).sum(0) + ties)
+    names = ["intercept", "w1", "w2", "log s", "p0", "p1", "arrive"]
+    for name, of_one in zip(names, np.array(ranks).T, strict=True):
+        counts = np.bincount(of_one, minlength=n_ranks).reshape(10, 2).sum(1)
+        assert stats.chisquare(counts).pvalue > 1e-3, (name, counts)
+
+
+def test_missions_count_as_exposures_up_to_where_they_end():
+    path = ((0, 0), (0, 1), (0, 2), (1, 2))
+    counted = Exposures.of(
+        [mission(path), mission(path, "stuck", 2), mission(path, "aborted", 2)],
+        [LostMission(path, "tipped", (0, 1)), LostMission(path, "timeout")],
+    )
+    east, south = 4, 6
+    assert counted.bounds.tolist() == [[east, 0, 1], [east, 0, 2], [south, 1, 2]]
+    assert counted.n.tolist() == [4, 2, 1]
+    assert counted.failed.tolist() == [1, 1, 0]
+    assert counted.lost[0].tolist() == [0, 1, 2]
+    assert counted.causes.tolist() == [1, 1, 1, 0, 0]
+
+
+def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():
+    ws = workspace()
+    before = Hazard().prior(ws)
+    group = fit_hazard([mission(ROW, "stuck", 2)] * 3, ws)
+    risk = BoundRisk.of(group, ws)
+    first, second = (4, 0, 1), (4, 0, 2)
+    assert risk.mean[first] < before.mean[first] < 0.1
+    assert risk.mean[second] > 0.6
+    assert risk.stopped[second] == 3
+    assert max(risk.causes, key=risk.causes.__getitem__) == "stuck"
+    assert sum(risk.causes.values()) == pytest.approx(1.0)
+    assert np.isnan(risk.mean[4, 0, 0])  # no cell west of the grid
+    np.testing.assert_array_equal(group["p_fail"].values, risk.mean)
+
+
+def test_draws_of_chances_have_the_moments_of_the_map():
+    ws = workspace()
+    lost = [LostMission(ROW, "stuck"), LostMission(((0, 0), (0, 1), (1, 1)), "stuck")]
+    risk = BoundRisk.of(fit_hazard([mission(ROW), mission(ROW, "stuck", 2)], ws, lost=lost), ws)
+    draws = risk.draw(20_000, seed=1)
+    exists = ws.passable_bounds.values
+    assert (np.isfinite(draws) == exists).all()
+    # 5 standard errors, of 1000 distinct hyperparameters.
+    error = 5.0 * risk.sd[exists] / np.sqrt(1000)
+    assert (np.abs(draws.mean(0) - risk.mean)[exists] < error).all()
+    np.testing.assert_allclose(draws.std(0)[exists], risk.sd[exists], rtol=0.15)
+
+
+def test_the_same_seed_gives_the_same_hazard():
+    ws, told = workspace(), [mission(ROW, "stuck", 1)]
+    lost = [LostMission(ROW, "stuck")]
+    one, other = (fit_hazard(told, ws, lost=lost, seed=3) for _ in range(2))
+    assert one.drop_attrs().identical(other.drop_attrs())
+    assert not one["p_fail"].equals(fit_hazard(told, ws, lost=lost, seed=4)["p_fail"])
+
+
+def test_a_bad_proposal_is_refused(monkeypatch):
+    def unlucky(*args):
+        points = sample(*args)
+        return points._replace(k_hat=0.93)
+
+    monkeypatch.setattr("trustbo.models.hazard.sample", unlucky)
+    with pytest.raises(PosteriorError, match=r"k-hat = 0.93 > 0.7"):
+        fit_hazard([], workspace())
+    assert fit_hazard([], workspace(), check=False).attrs["k_hat"] == 0.93
+
+
+def test_wrong_input_is_named():
+    ws = workspace()
+    with pytest.raises(TrustboError, match=r"never enters where = \(2, 2\)"):
+        fit_hazard([], ws, lost=[LostMission(ROW, "stuck", (2, 2))])
+    with pytest.raises(TrustboError, match="unknown cause 'tired'"):
+        fit_hazard([], ws, lost=[LostMission(ROW, "tired")])
+    with pytest.raises(TrustboError, match=r"a mission enters \(0, 2\), outside"):
+        fit_hazard([mission(ROW)], workspace(2))
+    with pytest.raises(TrustboError, match="sd of intercept must be positive"):
+        Hazard(intercept=(0.0, 0.0))

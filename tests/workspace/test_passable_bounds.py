@@ -1,0 +1,94 @@
+"""Passable bounds: the labelling of regions against the search of routes, and who goes by it."""
+
+import networkx as nx
+import numpy as np
+
+import trustbo as tb
+from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.regions import are_linked, linked_to
+
+
+def walled(gap=None, side=60, shape=(3, 3)):
+    """Workspace of flat ground behind a wall in the middle of column 1, with a gap in some rows."""
+    dem = np.zeros((side, side))
+    wall = np.ones(side, bool)
+    if gap is not None:
+        wall[gap] = False
+    dem[wall, side // 2] = 30.0
+    terrain = tb.terrain.synthetic_terrain((side, side), resolution=1.0, seed=0)
+    terrain["dem"].values[:] = dem
+    terrain["dsm"].values[:] = dem
+    return tb.Workspace.from_terrain(terrain, shape, sight="bare")
+
+
+def test_linked_pixels_are_those_of_networkx():
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        passable = rng.random((12, 14)) < 0.6
+        top, left = rng.integers(0, 4, 2)
+        window = (int(top), int(top) + 8, int(left), int(left) + 9)
+        graph = nx.grid_2d_graph(12, 14)
+        closed = [
+            (i, j) for i, j in graph if not passable[i, j]
+            or not (window[0] <= i < window[1] and window[2] <= j < window[3])
+        ]  # fmt: skip
+        graph.remove_nodes_from(closed)
+        a, b = ((int(top + i), int(left + j)) for i, j in rng.integers(0, 8, (2, 2)))
+        expected = a in graph and b in graph and nx.has_path(graph, a, b)
+        assert are_linked(passable, window, a, b) == expected
+        if a in graph:
+            mask = linked_to(passable, window, a)
+            cells = {(int(i) + top, int(j) + left) for i, j in np.argwhere(mask)}
+            assert cells == nx.node_connected_component(graph, a)
+
+
+def test_a_bound_is_passable_if_and_only_if_all_its_ways_exist():
+    workspace = walled(slice(6, 9))
+    passable = workspace.passable_bounds.values
+    exists = existing_bounds(workspace.passable.values)
+    assert (passable <= exists).all()
+    assert 0 < passable.sum() < exists.sum()
+    ground = workspace.ground
+    for m, row, col in np.argwhere(exists).tolist():
+        a = row - MOVES[8][m][0], col - MOVES[8][m][1]
+        ahead = [c for c in np.ndindex(3, 3) if max(abs(c[0] - row), abs(c[1] - col)) == 1]
+        ways = [ground.lead(a, (row, col))]
+        for c in (None, *ahead):
+            ways += ground.closing(a, (row, col), c)
+        assert {way is not None for way in ways} == {bool(passable[m, row, col])}
+
+
+def test_a_bound_and_its_reverse_are_alike():
+    workspace = walled(slice(6, 9))
+    passable, hard = workspace.passable_bounds.values, workspace.difficulty.values
+    for m, row, col in np.argwhere(passable).tolist():
+        left = row - MOVES[8][m][0], col - MOVES[8][m][1]
+        assert passable[7 - m, *left]
+        np.testing.assert_array_equal(hard[m, row, col], hard[7 - m, *left])
+
+
+def test_without_a_terrain_every_bound_between_passable_cells_is_passable():
+    passable = np.array([[True, True], [False, True]])
+    workspace = tb.Workspace.from_awareness(np.full((1, 2, 2, 1), 0.5), passable)
+    np.testing.assert_array_equal(workspace.passable_bounds.values, existing_bounds(passable))
+    assert workspace.difficulty.shape == (8, 2, 2, 0)
+
+
+def test_difficulty_grows_with_slope_and_narrowness():
+    """A plane of tan 0.3, under limits of tan 1 and tan 0.4: steepness and step are the ratios."""
+    flat, rows = np.zeros((60, 60)), np.arange(60.0)
+    found = []
+    for limit in (1.0, 0.4):
+        terrain = tb.terrain.synthetic_terrain((60.0, 60.0), resolution=1.0, seed=0)
+        for name in ("dem", "dsm"):
+            terrain[name].values[:] = flat + 0.3 * rows[:, None]
+        robot = tb.Robot(max_slope=float(np.arctan(limit)))
+        team = tb.Team(robots=(robot,) * 2, lead=robot)
+        workspace = tb.Workspace.from_terrain(terrain, (3, 3), team, sight="bare")
+        found.append(workspace.difficulty.sel(move="e").values[1, 1])
+    for (_, steep, step, narrow), limit in zip(found, (1.0, 0.4), strict=True):
+        np.testing.assert_allclose([steep, step], 0.3 / limit, rtol=1e-10)
+        assert narrow < 0.2
+    open_ways = walled(slice(20, 40)).difficulty.values[..., 3]
+    through_gap = walled(slice(27, 33)).difficulty.values[..., 3]
+    assert np.nanmax(through_gap) > np.nanmax(open_ways)
