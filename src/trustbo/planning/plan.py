@@ -30,7 +30,8 @@ class Plan:
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
         value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
             the bounds' worth of contact expected to be lost, with trust capped at 1.
-        success: Product over the bounds of sigma(team's trust): the probability that all succeed.
+        success_index: Product over the bounds of sigma(team's trust). It compares paths, and is no
+            probability of anything; see `p_arrive`.
         objective: Name of the objective.
         exact: True if no admissible path is better.
         bound: Upper bound on the value of any admissible path; `value` where exact, NaN for a given
@@ -47,7 +48,7 @@ class Plan:
     trust: np.ndarray
     bands: np.ndarray
     value: float
-    success: float
+    success_index: float
     objective: str
     exact: bool
     bound: float
@@ -92,6 +93,8 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     """Convert the record of `plan_to_record` to a plan of a workspace."""
     values: dict[str, Any] = {**record, "workspace": workspace}
+    if "success" in values:  # its name in version 0.1
+        values["success_index"] = values.pop("success")
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
     values["path"] = tuple((row, col) for row, col in record["path"])

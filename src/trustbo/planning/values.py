@@ -87,7 +87,7 @@ def evaluate(
         trust=trust,
         bands=_bands(draws),
         value=float(value),
-        success=float(np.exp(-softplus(-team).sum())),
+        success_index=float(np.exp(-softplus(-team).sum())),
         objective=objective.name,
         exact=False,
         bound=np.nan,
