@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Cell
+from trustbo.planning.risk import PathRisk
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -40,6 +41,7 @@ class Plan:
         engine: Engine that found the path, "networkx" or "numba"; or "given".
         seconds: Time of the search, s.
         workspace: Workspace of the path.
+        risk: Chance of each bound to end the mission, None without a hazard.
     """
 
     path: tuple[Cell, ...]
@@ -56,6 +58,22 @@ class Plan:
     engine: str
     seconds: float
     workspace: Workspace
+    risk: PathRisk | None = None
+
+    @property
+    def p_fail(self) -> np.ndarray | None:
+        """Chance of each bound to end the mission, given that it is begun, shape (bound,)."""
+        return None if self.risk is None else self.risk.p_fail
+
+    @property
+    def p_arrive(self) -> float | None:
+        """Chance that the mission reaches the goal, at the posterior mean of the risk."""
+        return None if self.risk is None else self.risk.p_arrive
+
+    @property
+    def p_arrive_band(self) -> tuple[float, float] | None:
+        """Ends of the 90 % band of `p_arrive` over draws of the risk; None without draws."""
+        return None if self.risk is None else self.risk.band
 
     @cached_property
     def waypoints(self) -> np.ndarray | None:

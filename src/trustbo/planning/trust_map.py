@@ -90,7 +90,9 @@ def _trust_at(
         f"shortest+{extra}",
         True,
     )
-    paths = plan_compiled(there, dynamics, Objective("terminal")).paths
+    found = plan_compiled(there, dynamics, Objective("terminal"))
+    assert found is not None  # as there is no risk  # noqa: S101
+    paths = found.paths
     return np.array(
         [team_trust(dynamics.take(d).along(there.cells(path)))[-1] for d, path in enumerate(paths)]
     )
