@@ -294,6 +294,7 @@ def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):
         )
         assert (campaign.settings["policy"], campaign.seed) == ("thompson", 3)
         assert [mission.path for mission in campaign.missions] == [tuple(result.path)]
+        assert campaign.plans[0].success_index == 0.6837119175124123  # `success` in its file
         assert (campaign.ask().path[0], campaign.ask().path[-1]) == ((2, 0), (0, 2))
 
 

@@ -80,14 +80,15 @@ def evaluate(
         value = _value(objective.capped(dynamics) if cap else dynamics, objective, cost).mean()
     else:
         value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
+    risk = None if problem.risk is None else problem.risk.along(cells)
     return Plan(
         path=path,
         positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
         length=length,
         trust=trust,
         bands=_bands(draws),
-        value=float(value),
-        success=float(np.exp(-softplus(-team).sum())),
+        value=float(value) - problem.cost_of_failure(cells),
+        success_index=float(np.exp(-softplus(-team).sum())),
         objective=objective.name,
         exact=False,
         bound=np.nan,
@@ -95,6 +96,7 @@ def evaluate(
         engine="given",
         seconds=0.0,
         workspace=problem.workspace,
+        risk=risk,
     )
 
 

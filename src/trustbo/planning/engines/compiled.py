@@ -8,12 +8,15 @@ from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.buckets import best_stationary
+from trustbo.planning.engines.compiled_risk import LayeredSearch, plan_layered, require_complete
+from trustbo.planning.engines.constrained import Best
 from trustbo.planning.engines.contact_loss import LAWS, TINY_SD, least_loss
 from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
 from trustbo.planning.engines.labels import TERMINAL, LabelSearch, mode_of, search
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.risk import RiskTable
 
 _TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
 _MAX_LABELS = 300_000  # per search
@@ -31,9 +34,17 @@ class BestPaths(NamedTuple):
 
 
 def plan_compiled(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
-) -> BestPaths:
-    """Find the best path of every draw; `dynamics` with a leading axis (draw,)."""
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    risk: RiskTable | None = None,
+) -> BestPaths | None:
+    """Find the best path of every draw; `dynamics` with a leading axis (draw,).
+
+    None if no path is feasible under a risk.
+    """
+    if risk is not None:
+        return _within_risk(admissible, dynamics, objective, risk)
     length_cost = objective.length_weight * admissible.lengths
     if objective.name == "lost_contact" and objective.has_labels and dynamics.is_scalar:
         if admissible.revisit:
@@ -57,16 +68,43 @@ def plan_compiled(
     return BestPaths(paths, np.zeros(len(paths)))
 
 
+def _within_risk(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, risk: RiskTable
+) -> BestPaths | None:
+    free = admissible.revisit or objective.name not in ("success", "bottleneck")
+    scalar = dynamics.is_scalar if objective.has_labels else len(dynamics.views) == 1
+    if objective.name == "stationary" or not (scalar and free):
+        raise TrustboError(
+            f"the compiled engine has no plans within a risk for {objective.name!r} of vector "
+            "trust or without revisits; use engine='networkx'."
+        )
+    return _found(plan_layered(admissible, dynamics, objective, risk), admissible)
+
+
+def _found(found: list[Best], admissible: AdmissiblePaths) -> BestPaths | None:
+    """Paths and gaps of all draws, None if no path is feasible, which no draw changes."""
+    require_complete(found, admissible.longest)
+    if not all(len(best.path) for best in found):
+        return None
+    paths = np.full((len(found), max(len(best.path) for best in found)), -1, np.int64)
+    for row, best in zip(paths, found, strict=True):
+        row[: len(best.path)] = best.path
+    return BestPaths(paths, np.array([best.cost - best.bound for best in found]))
+
+
 def expected_path(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
-) -> np.ndarray:
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    risk: RiskTable | None = None,
+) -> np.ndarray | None:
     """Find the path with the best *expectation* of terminal or mean trust, or of lost contact.
 
     These are linear in u with weights that do not depend on the path, so the expectation of weight
     times u, per bound and bounds left, replaces them: exact, with no assumption on the posterior.
 
     Returns:
-        Flat indices of cells, filled with -1.
+        Flat indices of cells, filled with -1; None if no path is feasible under a risk.
     """
     weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
     u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
@@ -75,6 +113,11 @@ def expected_path(
     pick = np.eye(admissible.longest + 1)[None]
     averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
     length_cost = objective.length_weight * admissible.lengths
+    if risk is not None:
+        by_left = gain.reshape(len(gain), -1)
+        search = LayeredSearch(admissible, risk, length_cost)
+        best = _found([search.sums(by_left, averaged.constant[0], averaged.scale)], admissible)
+        return None if best is None else best.paths[0]
     return _best_of_lengths(admissible, gain[None], averaged, length_cost)[0]
 
 
