@@ -176,7 +176,7 @@ def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
     censored = PooledTrust(observation="censored")
     with pytest.raises(TrustboError, match=r'forgetting = 0.9 needs update "refit" and Gaussian'):
         Campaign(workspace, *ENDS, model=censored, forgetting=0.9)
-    with pytest.raises(TrustboError, match='its observations are not Gaussian'):
+    with pytest.raises(TrustboError, match="its observations are not Gaussian"):
         Campaign(workspace, *ENDS, model=censored, sampler="exact")
     with pytest.raises(TrustboError, match="unknown update 'online'"):
         Campaign(workspace, *ENDS, update="online")

@@ -190,7 +190,9 @@ def test_the_caller_s_jax_configuration_is_untouched(posterior):
 
 
 def test_bad_input_is_refused_before_sampling(missions):
-    with pytest.raises(TrustboError, match="unknown sampler 'gibbs'; choose one of auto, exact, nuts"):
+    with pytest.raises(
+        TrustboError, match="unknown sampler 'gibbs'; choose one of auto, exact, nuts"
+    ):
         fit(missions, sampler="gibbs")
     with pytest.raises(ShapeError, match="no missions"):
         fit([])

@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
-from trustbo.campaign.failures import Failure, learn_hazard, to_avoid
+from trustbo.campaign.failures import Failure, learn_hazard, to_avoid, under_risk
 from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import (
     LEARNED,
@@ -625,7 +625,7 @@ class Campaign:
             if self.log.entries or self.log.failures:
                 avoided = to_avoid(self.risk)
                 planner = planner.avoiding(avoided, self.risk.mean) if avoided.any() else planner
-            self._believed = planner
+            self._believed = under_risk(planner, self.risk)
         return self._believed
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:

@@ -87,5 +87,8 @@ def _trust_at(
     assert found is not None  # as there is no risk  # noqa: S101
     paths = found.paths
     return np.array(
-        [team_trust(dynamics.take(d).along(there.cells(path)))[-1] for d, path in enumerate(paths)]
+        [
+            team_trust(dynamics.take(d).along(admissible.cells(path)))[-1]
+            for d, path in enumerate(paths)
+        ]
     )
