@@ -8,15 +8,22 @@ from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.buckets import best_stationary
-from trustbo.planning.engines.compiled_risk import LayeredSearch, plan_layered, require_complete
+from trustbo.planning.engines.compiled_risk import (
+    LayeredSearch,
+    plan_layered,
+    plan_stationary,
+    require_complete,
+)
 from trustbo.planning.engines.constrained import Best
+from trustbo.planning.engines.constrained_stationary import least_to_goal
 from trustbo.planning.engines.contact_loss import LAWS, TINY_SD, least_loss
 from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
-from trustbo.planning.engines.labels import TERMINAL, LabelSearch, mode_of, search
+from trustbo.planning.engines.labels import TERMINAL, LabelRisk, LabelSearch, mode_of, search
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import RiskTable
+from trustbo.planning.values import entry_cost
 
 _TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
 _MAX_LABELS = 300_000  # per search
@@ -71,13 +78,13 @@ def plan_compiled(
 def _within_risk(
     admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, risk: RiskTable
 ) -> BestPaths | None:
-    free = admissible.revisit or objective.name not in ("success", "bottleneck")
+    length_cost = objective.length_weight * admissible.lengths
+    if objective.name == "stationary":
+        cost = entry_cost(admissible.passable, dynamics)
+        return _found(plan_stationary(admissible, cost, length_cost, risk), admissible)
     scalar = dynamics.is_scalar if objective.has_labels else len(dynamics.views) == 1
-    if objective.name == "stationary" or not (scalar and free):
-        raise TrustboError(
-            f"the compiled engine has no plans within a risk for {objective.name!r} of vector "
-            "trust or without revisits; use engine='networkx'."
-        )
+    if not scalar or (objective.has_labels and not admissible.revisit):
+        return _labelled(admissible, dynamics, objective, length_cost, risk)
     return _found(plan_layered(admissible, dynamics, objective, risk), admissible)
 
 
@@ -155,24 +162,45 @@ def _least_loss(
 
 
 def _labelled(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
-) -> BestPaths:
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    length_cost: np.ndarray,
+    risk: RiskTable | None = None,
+) -> BestPaths | None:
     n_draws = len(dynamics.start)
     found: list[tuple[np.ndarray, float]] = [(np.empty(0), np.nan)] * n_draws
 
     def work(first: int, last: int) -> None:
         for d in range(first, last):
-            found[d] = _label_one(admissible, dynamics.take(d), objective, length_cost)
+            found[d] = _label_one(admissible, dynamics.take(d), objective, length_cost, label_risk)
 
+    label_risk = _label_risk(admissible, risk)
     work(0, n_draws) if n_draws == 1 else over_rows(work, n_draws)
+    if not all(len(path) for path, _ in found):
+        return None
     paths = np.full((n_draws, max(len(path) for path, _ in found)), -1, np.int64)
     for d, (path, _) in enumerate(found):
         paths[d, : len(path)] = path
     return BestPaths(paths, np.array([gap for _, gap in found]))
 
 
+def _label_risk(admissible: AdmissiblePaths, risk: RiskTable | None) -> LabelRisk:
+    """Risks of bounds for the label search; none without a risk."""
+    n_cells = admissible.passable.size
+    if risk is None:
+        return LabelRisk(np.empty((0, 0)), np.empty(0), 0, 0.0, np.empty((n_cells, 0)))
+    of_bounds = np.ascontiguousarray(risk.of_bounds.reshape(len(risk.limits), -1).T)
+    safest = least_to_goal(admissible.neighbours, of_bounds, admissible.flat(admissible.goal))
+    return LabelRisk(of_bounds, risk.limits, risk.needed, risk.failure_cost, safest)
+
+
 def _label_one(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    length_cost: np.ndarray,
+    risk: LabelRisk,
 ) -> tuple[np.ndarray, float]:
     """Find the best path of one draw and its optimality gap."""
     lengths = [admissible.longest]
@@ -181,12 +209,18 @@ def _label_one(
     best, best_score, best_bound = np.empty(0, np.int64), -np.inf, -np.inf
     for n_bounds in lengths:
         scale = n_bounds if objective.name == "mean" else 1
-        problem = _label_search(admissible, dynamics, objective, n_bounds, scale * length_cost)
+        problem = _label_search(
+            admissible, dynamics, objective, n_bounds, scale * length_cost, risk
+        )
         path, cost, bound = _search_within_limit(problem)
         each = n_bounds if objective.name == "lost_contact" and not objective.has_labels else 0
         if len(path) and -cost / scale - each > best_score:
             best, best_score = path, -cost / scale - each
         best_bound = max(best_bound, -bound / scale - each)
+    if not len(best):
+        if best_bound > -np.inf:
+            raise _too_many_labels(admissible.longest)
+        return best, 0.0
     return best, best_bound - best_score
 
 
@@ -196,6 +230,7 @@ def _label_search(
     objective: Objective,
     n_bounds: int,
     length_cost: np.ndarray,
+    risk: LabelRisk,
 ) -> LabelSearch:
     goal = admissible.flat(admissible.goal)
     at_goal = objective.name == "terminal"
@@ -216,6 +251,7 @@ def _label_search(
         admissible.u_turns,
         admissible.revisit or not objective.has_labels,
         max(float(dynamics.noise_sd), TINY_SD),
+        risk,
     )
 
 

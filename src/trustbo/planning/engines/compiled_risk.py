@@ -18,6 +18,8 @@ from trustbo.planning.engines.constrained import (
     best_within,
     safest_to_go,
 )
+from trustbo.planning.engines.constrained_stationary import Network, least_to_goal
+from trustbo.planning.engines.constrained_stationary import best_within as best_free_within
 from trustbo.planning.engines.contact_loss import LAWS, TINY_SD
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
 from trustbo.planning.engines.reference import best_stationary
@@ -26,6 +28,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import RiskTable
 
 _MAX_LABELS = 300_000  # per search
+_MAX_ENTRIES = 20_000_000  # of the risks of labels
 
 
 class LayeredSearch:
@@ -95,7 +98,7 @@ class LayeredSearch:
             Bounds(toll, drift, start_cost, *trust, law),
             self.risk,
             best.cost,
-            _MAX_LABELS,
+            most_labels(self.risk.limits),
         )
         bound = min(found.bound, best.bound)
         return Best(found.path if len(found.path) else best.path, min(found.cost, best.cost), bound)
@@ -144,6 +147,32 @@ def safest_path(
     rows, cols = np.array(path[1:]).T
     moves = [admissible.steps.tolist().index([c[0] - a[0], c[1] - a[1]]) for a, c in pairwise(path)]
     return path, float(of_bounds[moves, rows * admissible.passable.shape[1] + cols].sum())
+
+
+def plan_stationary(
+    admissible: AdmissiblePaths, cost: np.ndarray, length_cost: np.ndarray, risk: RiskTable
+) -> list[Best]:
+    """Find the feasible path of least cost under every draw.
+
+    Costs are those of bounds, (draw, move, row, col).
+    """
+    of_bounds = np.ascontiguousarray(risk.of_bounds.reshape(len(risk.limits), -1).T)
+    goal = admissible.flat(admissible.goal)
+    n_moves, n_cells = len(length_cost), admissible.passable.size
+    by_bound = np.broadcast_to(cost.reshape(len(cost), -1, n_cells), (len(cost), n_moves, n_cells))
+    tolls = (by_bound + length_cost[:, None]).reshape(len(cost), -1)
+    shared = of_bounds, *risk.priced(of_bounds), risk.limits, risk.needed
+    safest = least_to_goal(admissible.neighbours, of_bounds, goal)
+    ends = admissible.neighbours, admissible.flat(admissible.start), goal
+    return [
+        best_free_within(Network(*ends, toll, *shared, safest), most_labels(risk.limits))
+        for toll in tolls
+    ]
+
+
+def most_labels(limits: np.ndarray) -> int:
+    """Limit on the labels of a search."""
+    return min(_MAX_LABELS, _MAX_ENTRIES // len(limits))
 
 
 def law_of(objective: Objective) -> int:

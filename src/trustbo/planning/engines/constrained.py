@@ -24,6 +24,9 @@ A label is dropped if another one at its node costs no more, has no less trust a
 risk that it could still keep within its limit. Where U-turns are forbidden, the other must have
 come by the same move, or there must be two of these that came by different moves.
 
+With `LEAST` a path is sought whose every loss is below an aim: the cost so far does not matter then
+to what dominates, and the aim halves the interval between the bound and the best path known.
+
 Exact because the labels that are left include the best path, unless it is the one known. Beyond
 `max_labels` the best path known is returned, with the Lagrangian bound.
 """
@@ -40,8 +43,10 @@ from trustbo.planning.engines.layers import Layers
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 SOFTPLUS, LEAST, NONE = range(2, 5)
 """Losses beside those of `contact_loss`: -log sigma(x); the largest -x; and none."""
-_PRICES = 12
+PRICES = 12
 """Number of prices of risk that are tried."""
+_AIMS = 100
+"""Number of costs that `LEAST` aims at."""
 
 
 class Bounds(NamedTuple):
@@ -114,7 +119,7 @@ def safest_to_go(layers: Layers, of_bounds: np.ndarray, bound: np.ndarray) -> np
 def best_within(
     layers: Layers, bounds: Bounds, risk: EdgeRisk, best: float, max_labels: int
 ) -> Best:
-    """Find the feasible path of least cost, if it is below `best`."""
+    """Find the feasible path of least cost; no path if none costs less than `best`."""
     none = np.empty(0, np.int64)
     if not _any_start(layers, bounds, risk):
         return Best(none, np.inf, np.inf)
@@ -122,12 +127,20 @@ def best_within(
     known, cheap, priced, offset, root = _lagrangian(layers, bounds, risk, ahead, best)
     if root >= known.cost:
         return known
-    path, cost, complete = _search(
-        layers, bounds, risk, ahead, cheap, priced, offset, known.cost, max_labels
-    )
-    if len(path) == 0:
-        path, cost = known.path, known.cost
-    return Best(path, cost, cost if complete else root)
+    aim, complete = known.cost, True
+    for _ in range(_AIMS if bounds.law == LEAST else 1):
+        path, cost, complete = _search(
+            layers, bounds, risk, ahead, cheap, priced, offset, aim, max_labels
+        )
+        if len(path) > 0:
+            known = Best(path, cost, root)
+            aim = 0.5 * (root + cost)
+        elif not complete or aim == known.cost:
+            break
+        else:
+            root, aim = aim, known.cost
+    proven = complete and (bounds.law != LEAST or aim == known.cost or root >= known.cost)
+    return Best(known.path, known.cost, known.cost if proven else root)
 
 
 @_compiled
@@ -321,7 +334,7 @@ def _lagrangian(layers, bounds, risk, ahead, best):
     priced, offset, root = cheap, 0.0, least + _failure(risk, low)
     # Local improvement where the price of the first risk is the slope of the failure cost.
     tangent = F * math.exp(-low)
-    for _ in range(_PRICES if F > 0.0 else 0):
+    for _ in range(PRICES if F > 0.0 else 0):
         to_go = _pass_back(layers, law, ahead, _prices(bounds, risk, 0.0, tangent))
         _, start = _root(layers, bounds, to_go)
         known, _, first, _, _ = _tried(layers, bounds, risk, ahead, to_go, start, known, path)
@@ -372,7 +385,7 @@ def _dual(layers, bounds, risk, ahead, known, mu, base, priced, offset, root, pa
     """
     limit, price = risk.priced_limit, 0.0
     within_cost, within_used, beyond_cost, beyond_used = np.inf, np.inf, -np.inf, np.inf
-    for _ in range(_PRICES if limit < np.inf else 1):
+    for _ in range(PRICES if limit < np.inf else 1):
         to_go = _pass_back(layers, bounds.law, ahead, _prices(bounds, risk, price, mu))
         least, start = _root(layers, bounds, to_go)
         added = base - price * limit if price > 0.0 else base
@@ -391,15 +404,30 @@ def _dual(layers, bounds, risk, ahead, known, mu, base, priced, offset, root, pa
             if cost + mu * first == beyond_cost and used == beyond_used and within_used < np.inf:
                 break
             beyond_cost, beyond_used = cost + mu * first, used
-        if within_used < beyond_used < np.inf:
-            price = (within_cost - beyond_cost) / (beyond_used - within_used)
-        elif price == 0.0:
-            price = 1.0 / max(used - limit, 1e-3) if used < np.inf else 1.0
-        else:
-            price *= 4.0
+        price = next_price(price, used - limit, within_cost, within_used, beyond_cost, beyond_used)
         if not price > 0.0:
             break
     return known, priced, offset, root
+
+
+@_compiled
+def next_price(
+    price: float,
+    excess: float,
+    within_cost: float,
+    within_used: float,
+    beyond_cost: float,
+    beyond_used: float,
+) -> float:
+    """Price at which the last paths within and beyond a limit are worth the same.
+
+    Higher than `price` where there is no path within; `excess` is what the last one has too much.
+    """
+    if within_used < beyond_used < np.inf:
+        return (within_cost - beyond_cost) / (beyond_used - within_used)
+    if price > 0.0:
+        return 4.0 * price
+    return 1.0 / max(excess, 1e-3) if excess < np.inf else 1.0
 
 
 class _Labels(NamedTuple):
@@ -507,6 +535,8 @@ def _covers(risk, labels, a, b, node, law):
     """2 if label a is better than b, 1 if it is equal, in all that matters; else 0."""
     cost_a, x_a, _ = labels.state[a]
     cost_b, x_b, _ = labels.state[b]
+    if law == LEAST:
+        cost_a = cost_b
     if cost_a > cost_b or (law != NONE and x_a < x_b):
         return 0
     equal = cost_a == cost_b and (law == NONE or x_a == x_b)
