@@ -89,8 +89,8 @@ class Planner:
                 mean (in units of trust) and stationary (in units of log probability).
             engine: `"networkx"`, the reference; `"numba"`, compiled; or `"auto"`: networkx for
                 single plans on up to 50 x 50 cells; for success, bottleneck, `team="min"` and
-                lost_contact of other than Gaussian rates up to 10 x 10. All find paths of the same
-                value.
+                lost_contact of other than Gaussian rates up to 10 x 10; never within a risk. All
+                find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
             observation: Family of the contact rates, and
             response: quantity that they measure, both as of the trust model: for lost_contact,

@@ -31,13 +31,18 @@ class Engine(NamedTuple):
     name: str = "auto"
     backend: str | None = None
 
-    def choose(self, n_cells: int, n_draws: int, *, labels: bool = False) -> str:
+    def choose(
+        self, n_cells: int, n_draws: int, *, labels: bool = False, risk: bool = False
+    ) -> str:
         """Resolve the name; `auto` goes by the number of cells and draws, and the kind of search.
 
-        The reference engine has no heuristic for labels: 41 s for `success` on 30 x 30 cells.
+        The reference engine has no heuristic for labels: 41 s for `success` on 30 x 30 cells, and
+        1 s within a risk on 10 x 10.
         """
         if require_choice("engine", self.name, ENGINES) != "auto":
             return self.name
+        if risk:
+            return "numba"
         most = LARGEST_FOR_LABELS if labels else LARGEST_FOR_NETWORKX
         return "networkx" if n_draws == 1 and n_cells <= most else "numba"
 
@@ -58,7 +63,8 @@ def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> F
     paths, objective = problem.paths, problem.objective
     require_valid(dynamics, objective)
     dynamics = objective.capped(dynamics)
-    name = engine.choose(paths.passable.size, 1, labels=_has_labels(problem))
+    labels, risk = _has_labels(problem), problem.risk_table is not None
+    name = engine.choose(paths.passable.size, 1, labels=labels, risk=risk)
 
     def best(risk: RiskTable | None) -> FoundPath | None:
         if name == "networkx":
