@@ -75,12 +75,11 @@ def shorter(words, page):
     return ["--iterations", "2", *(["--sampler", "exact"] if page != "README.md" else [])]
 
 
+@pytest.mark.usefixtures("blank_figures")  # a run on real terrain, in cli/, draws them
 @pytest.mark.parametrize("page", PAGES)
 def test_the_commands_of_a_page_run_from_top_to_bottom(
-    page, terrain, campaign, tmp_path, monkeypatch, request
+    page, terrain, campaign, tmp_path, monkeypatch
 ):
-    if page != "README.md":  # whose figures are drawn
-        request.getfixturevalue("blank_figures")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "loky", None)  # studies run here, not in processes of loky
     for name in ("dem", "dsm"):
