@@ -19,7 +19,7 @@ from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.place import Visited
 
 _BUCKET = 32
-_JITTER = 1e-6  # of tau_s^2, where bounds have no effect of their own
+_JITTER = 1e-10  # of tau_s^2, where bounds have no effect of their own
 
 
 class PlaceIndex(NamedTuple):
