@@ -16,6 +16,7 @@ from trustbo.models.params import CoupledParams, RobotParams, TrustParams, param
 from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
+from trustbo.models.prior_from import prior_from
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
 from trustbo.models.risk import BoundRisk
@@ -49,6 +50,7 @@ __all__ = [
     "loo",
     "moment_matched",
     "params_of",
+    "prior_from",
     "prior_predictive",
     "sample_prior",
     "sample_statistics",
