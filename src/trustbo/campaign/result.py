@@ -35,6 +35,7 @@ _BELIEVED = "believed.nc"
 _NEW = ("max_failure", "failure_cost")
 """Options of planning that results of version 0.1 lack."""
 
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """Result of a campaign.
