@@ -13,15 +13,21 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
-@pytest.fixture
-def blank_figures(monkeypatch):
+@pytest.fixture(scope="session")
+def leave_figures_blank():
     """Save figures without what they show: to draw all those of a report takes seconds."""
     save = Figure.savefig
 
     def save_blank(figure, file, **options):
         save(Figure(figure.get_size_inches()), file, **options)
 
-    monkeypatch.setattr(Figure, "savefig", save_blank)
+    return lambda monkeypatch: monkeypatch.setattr(Figure, "savefig", save_blank)
+
+
+@pytest.fixture
+def blank_figures(monkeypatch, leave_figures_blank):
+    """The same for one test."""
+    leave_figures_blank(monkeypatch)
 
 
 @pytest.fixture

@@ -56,8 +56,10 @@ def page_of(namespace):
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name_of)
-def test_the_examples_of_a_page_run_and_print_what_it_says(page, tmp_path, monkeypatch):
+def test_the_examples_of_a_page_run_and_print_what_it_says(page, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
+    if page == page_of("report"):  # whose figures its own tests draw
+        request.getfixturevalue("blank_figures")
     text, namespace = page.read_text(), {}
     with plt.rc_context():
         for block in BLOCK.finditer(text):

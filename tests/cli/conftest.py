@@ -36,9 +36,11 @@ def flags(rasters):
 
 
 @pytest.fixture(scope="session")
-def finished(invoke, flags, tmp_path_factory):
-    """The folder of a run of two missions, and what it printed."""
+def finished(invoke, flags, tmp_path_factory, leave_figures_blank):
+    """The folder of a run of two missions, and what it printed; its figures are blank."""
     out = tmp_path_factory.mktemp("runs") / "mine"
-    done = invoke("run", *flags, "--iterations", 2, "--seed", 1, "--out", out)
+    with pytest.MonkeyPatch.context() as patch:
+        leave_figures_blank(patch)
+        done = invoke("run", *flags, "--iterations", 2, "--seed", 1, "--out", out)
     assert done.exit_code == 0, done.output
     return out, done

@@ -20,6 +20,7 @@ from trustbo.workspace import SIGHT_MODES
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_report_writes_one_page(invoke, finished, tmp_path):
     folder, _ = finished
     page = tmp_path / "mine.html"

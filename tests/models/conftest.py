@@ -30,4 +30,4 @@ def missions():
 
 @pytest.fixture(scope="session")
 def posterior(missions):
-    return fit(missions, seed=1)
+    return fit(missions, sampler="nuts", seed=1)

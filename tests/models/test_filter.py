@@ -12,7 +12,7 @@ from trustbo.models import TrustFilter, TrustParams
 def mixture(n_draws=4, seed=0):
     rng = np.random.default_rng(seed)
     draws = [random_params(rng) for _ in range(n_draws)]
-    return draws, TrustParams(*(np.stack(v) for v in zip(*draws, strict=True)))
+    return draws, TrustParams(*(np.stack(v) for v in zip(*(d[:7] for d in draws), strict=True)))
 
 
 def test_after_each_bound_trust_is_its_exact_posterior():
@@ -24,13 +24,13 @@ def test_after_each_bound_trust_is_its_exact_posterior():
     for k in range(1, 7):
         state = live.update(z[k - 1], y[k - 1])
         log_weight = [
-            sum(dense_log_likelihood(*p, z[:k, i], y[:k, i]) for i in range(3)) for p in draws
+            sum(dense_log_likelihood(*p[:7], z[:k, i], y[:k, i]) for i in range(3)) for p in draws
         ]
         weight = np.exp(log_weight - np.max(log_weight))
         weight /= weight.sum()
         np.testing.assert_allclose(live.weights, weight, rtol=1e-8)
         for i in range(3):
-            moments = [dense_posterior_of_trust(*p, z[:k, i], y[:k, i]) for p in draws]
+            moments = [dense_posterior_of_trust(*p[:7], z[:k, i], y[:k, i]) for p in draws]
             means = np.array([m[-1] for m, _ in moments])
             variances = np.array([v[-1, -1] for _, v in moments])
             mean = weight @ means

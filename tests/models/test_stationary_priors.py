@@ -72,7 +72,7 @@ def test_most_rates_of_the_prior_are_rates_and_follow_the_line_of_sight(observat
     z = rng.uniform(0.4, 0.9, (40, 9, 1, 3))
     z[..., 2] = rng.beta(6.0, 1.5, (40, 1, 1))  # a line of sight that stays as it is
     model = PooledTrust(observation=observation).for_features(FEATURES)
-    drawn = prior_predictive(model, z, n_ticks=60, features=FEATURES, n_draws=300)
+    drawn = prior_predictive(model, z, n_ticks=60, features=FEATURES, n_draws=1200)
     rates = drawn["prior_predictive"]["contact_rate"].values[0][..., -1, 0]  # (draw, mission)
     assert ((rates >= 0.0) & (rates <= 1.0)).mean() > 0.5
     slopes = [np.polyfit(z[:, -1, 0, 2], of_draw, 1)[0] for of_draw in rates]

@@ -74,7 +74,7 @@ def test_what_nuts_sums_up_is_the_likelihood(response):
     assert sums.mask.shape == (4, 8)
     p = TrustParams(0.55, np.array([0.2, 0.3]), 0.07, 0.06, 0.08, 0.5, 0.5)
     with jax.enable_x64(True):
-        params = TrustParams(*(jnp.asarray(value, dtype=float) for value in p))
+        params = p.map(lambda value, _: jnp.asarray(value, dtype=float))
         found = float(log_likelihood(params, jax.tree.map(jnp.asarray, sums), model.lag))
     np.testing.assert_allclose(found, model.log_likelihood(p, missions).sum(), rtol=1e-10)
 
@@ -172,7 +172,7 @@ def test_what_does_not_add_up_is_named():
     statistics = model.update(None, missions)
     with pytest.raises(TrustboError, match=r"forgetting must be in \(0, 1\]; got 0"):
         model.update(statistics, missions, forgetting=0)
-    with pytest.raises(TrustboError, match=r"needs Gaussian observations.*got HierarchicalTrust"):
+    with pytest.raises(TrustboError, match=r"HierarchicalTrust.*share some parameters only"):
         HierarchicalTrust().update(None, missions)
     other = PooledTrust(Priors(x0_mean=0.2))
     with pytest.raises(TrustboError, match="different x0_mean or response do not add up"):

@@ -103,7 +103,7 @@ def test_bands_are_quantiles_of_rolled_trust(workspace, draws):
     alone = planner.plan(draws.mean())
     np.testing.assert_allclose(alone.bands, np.repeat(alone.trust[None], 4, 0))
     team = plan.trust.mean(1)
-    np.testing.assert_allclose(plan.success, np.prod(1.0 / (1.0 + np.exp(-team))))
+    np.testing.assert_allclose(plan.success_index, np.prod(1.0 / (1.0 + np.exp(-team))))
     x, y = workspace.grid.center(plan.path[1])
     assert plan.positions[1].tolist() == [x, y]
     steps = np.diff(plan.positions, axis=0)

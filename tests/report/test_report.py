@@ -157,7 +157,7 @@ def test_the_summary_says_what_is_recommended_and_how_sure_that_is(page, result)
     assert facts["Recommended"].text.endswith(" → ".join(f"{r},{c}" for r, c in result.path) + ".")
     assert facts["Value"].text.startswith(number(result.value))
     assert facts["Value"].good
-    assert number(result.plan.success) in facts["Success"].text
+    assert number(result.plan.success_index) in facts["Success"].text
     assert facts["Posteriors"].good
     assert "k-hat" in facts["Posteriors"].text
 
@@ -208,6 +208,7 @@ def test_what_the_program_cannot_resume_goes_on_in_python(simulator, result):
     assert end.text == "It is under way, or was interrupted: Campaign.load(folder) goes on."
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_names_cannot_break_the_page_and_a_result_needs_no_terrain(hostile, tmp_path):
     text = write(hostile, tmp_path, title="<script>alert(1)</script>")
     page = Page(text)

@@ -418,8 +418,8 @@ def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
     simulator = MujocoSimulator(workspace, sight="transmittance")
     result = tb.iterate(
         workspace,
-        (4, 3),
-        (2, 6),
+        (3, 4),
+        (2, 3),
         n_iterations=3,
         sampler="exact",
         simulator=simulator,

@@ -15,7 +15,10 @@ def cast(ground, surface, start, end, mode=rays.TRANSMITTANCE, k=0.1, base=0.3, 
 
 
 def bilinear(values, r, c):
-    i, j = min(int(r), values.shape[0] - 2), min(int(c), values.shape[1] - 2)
+    i, j = (
+        np.minimum(np.asarray(at).astype(int), n - 2)
+        for at, n in zip((r, c), values.shape, strict=True)
+    )
     fr, fc = r - i, c - j
     top = values[i, j] * (1 - fc) + values[i, j + 1] * fc
     bottom = values[i + 1, j] * (1 - fc) + values[i + 1, j + 1] * fc
@@ -25,15 +28,13 @@ def bilinear(values, r, c):
 def finely_sampled(ground, surface, start, end, k, base, n=20_000):
     """Transmittance by walking the ray in small steps over bilinear surfaces."""
     start, end = np.array(start), np.array(end)
-    length = np.linalg.norm(end - start)
-    inside = 0
-    for t in (np.arange(n) + 0.5) / n:
-        r, c, z = start + t * (end - start)
-        g, s = bilinear(ground, r, c), bilinear(surface, r, c)
-        if z < g:
-            return 0.0
-        inside += g + base * (s - g) < z < s
-    return math.exp(-k * inside / n * length)
+    length, t = np.linalg.norm(end - start), (np.arange(n) + 0.5) / n
+    r, c, z = (start + t[:, None] * (end - start)).T
+    g, s = bilinear(ground, r, c), bilinear(surface, r, c)
+    if (z < g).any():
+        return 0.0
+    inside = (g + base * (s - g) < z) & (z < s)
+    return math.exp(-k * inside.mean() * length)
 
 
 def rough(seed, shape=(24, 24)):

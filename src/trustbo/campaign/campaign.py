@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
-from trustbo.campaign.failures import Failure, learn_hazard, to_avoid
+from trustbo.campaign.failures import Failure, learn_hazard, to_avoid, under_risk
 from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import (
     LEARNED,
@@ -97,7 +97,7 @@ class Campaign:
             workspace: Workspace of the paths.
             start: First cell of every path.
             goal: Last cell of every path.
-            model: Trust model; by default `PooledTrust()`.
+            model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
             policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
             objective: Objective of the paths; see `Planner`.
             sampler: Sampler of the posterior; see `trustbo.models.fit`.
@@ -350,7 +350,11 @@ class Campaign:
             return
         try:
             tree = self._learning.learn(
-                [entries[j].mission for j in numbers], len(waiting), self.log.last_tree, seed
+                [entries[j].mission for j in numbers],
+                len(waiting),
+                self.log.last_tree,
+                seed,
+                self.workspace,
             )
         except CannotLearnError as error:
             for j in waiting:
@@ -621,7 +625,7 @@ class Campaign:
             if self.log.entries or self.log.failures:
                 avoided = to_avoid(self.risk)
                 planner = planner.avoiding(avoided, self.risk.mean) if avoided.any() else planner
-            self._believed = planner
+            self._believed = under_risk(planner, self.risk)
         return self._believed
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:

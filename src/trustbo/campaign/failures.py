@@ -11,11 +11,13 @@ from trustbo.campaign.told import never_to_be_learned
 from trustbo.data import Cell
 from trustbo.errors import PosteriorError, TrustboError, require_pair
 from trustbo.models import CAUSES, BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
     from trustbo.campaign.history import Entry
 
+_N_DRAWS = 200
 STOPPED = 2
 """Failures of a bound from which on it is not entered again without need."""
 RECOVERED = 0.2
@@ -95,6 +97,11 @@ def learn_hazard(
     except PosteriorError as error:
         warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=4)
         return None
+
+
+def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
+    """Planner that knows the chances of bounds to fail."""
+    return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes)
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:

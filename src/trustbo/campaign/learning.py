@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, TrustboError, require_choice
+from trustbo.errors import PosteriorError, TrustboError
 from trustbo.models import (
     TrustModel,
     TrustParams,
@@ -19,8 +19,9 @@ from trustbo.models import (
     sample_prior,
 )
 from trustbo.models.model import require_model
-from trustbo.models.params import Params
-from trustbo.models.samplers.run import SAMPLERS, require_sampler
+from trustbo.models.params import Params, assemble_params
+from trustbo.models.samplers.run import resolve_sampler
+from trustbo.workspace import Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
 
 _N_DRAWS = 1000
@@ -46,7 +47,7 @@ class Learning:
 
     def __post_init__(self) -> None:
         require_model(self.model)
-        require_sampler(self.model, require_choice("sampler", self.sampler, SAMPLERS))
+        resolve_sampler(self.model, self.sampler)
         if self.forgetting < 1.0 and (
             self.update != "refit" or not self.model.family.integrates_out
         ):
@@ -55,14 +56,19 @@ class Learning:
                 f'got "{self.update}" and "{self.model.observation}".'
             )
         if self.update == "moment_matched":
-            if not self.model.priors_are_independent:
+            if self.model.robot_sets != "all":
                 raise TrustboError(
                     f'update="moment_matched" is for PooledTrust; got {type(self.model).__name__}.'
                 )
             warnings.warn(MOMENT_MATCHED_WARNING, stacklevel=5)
 
     def learn(
-        self, missions: list[Mission], new: int, last: xr.DataTree | None, seed: int
+        self,
+        missions: list[Mission],
+        new: int,
+        last: xr.DataTree | None,
+        seed: int,
+        workspace: Workspace | None = None,
     ) -> xr.DataTree:
         """Fit the posterior of missions; one that is refused is tried again in other ways.
 
@@ -71,6 +77,7 @@ class Learning:
             new: Number of the last of them that `last` does not know.
             last: Posterior of the others.
             seed: Seed of the sampler.
+            workspace: Workspace of the missions, where places have effects.
 
         Returns:
             Posterior of the parameters, see `models.complete`.
@@ -90,8 +97,8 @@ class Learning:
         for sampler, n_draws, shift in self._attempts():
             try:
                 return fit(
-                    missions, model, sampler, weights=weights, seed=seed + shift, n_draws=n_draws,
-                    whole=False,
+                    missions, model, sampler, workspace=workspace, earlier=last, weights=weights,
+                    seed=seed + shift, n_draws=n_draws, whole=False,
                 )  # fmt: skip
             except PosteriorError as error:
                 reason = error.reason
@@ -105,10 +112,13 @@ class Learning:
 
     def _attempts(self) -> list[tuple[str, int, int]]:
         """Sampler, draws of a chain, and what is added to the seed, for each attempt."""
-        attempts = [(self.sampler, _N_DRAWS, 0), (self.sampler, 2 * _N_DRAWS, 1)]
-        other = "nuts" if self.sampler == "exact" else "exact"
+        sampler, _ = resolve_sampler(self.model, self.sampler)
+        # Draws of the exact sampler are nearly independent, and effects of places make them large.
+        n = _N_DRAWS // 4 if sampler == "exact" and self.model.place else _N_DRAWS
+        attempts = [(self.sampler, n, 0), (self.sampler, 2 * n, 1)]
+        other = "nuts" if sampler == "exact" else "exact"
         try:
-            require_sampler(self.model, other)
+            resolve_sampler(self.model, other)
         except TrustboError:
             return attempts
         return [*attempts, (other, 2 * _N_DRAWS, 2)]
@@ -119,11 +129,11 @@ class Learning:
         """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
         model, n_features = self.model.for_features(features), len(features)
         if initial == "prior_mean" and model.priors_are_independent:
-            priors = model.priors
-            x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
-            mean = TrustParams(**priors.mean(n_features), **x0)
-        else:
-            # The mean of parameters that robots share has no closed form.
-            n_draws = 1 if initial == "prior_draw" else 1000
-            mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
-        return type(mean)(*(np.asarray(value, dtype=float)[None] for value in mean))
+            values = model.priors.mean(n_features)
+            sizes = model.sizes(n_robots, n_features)
+            means = {name: np.broadcast_to(values[name], (1, *sizes[name])) for name in sizes}
+            return assemble_params(means, model.x0).flat()
+        # The mean of parameters that robots are drawn around has no closed form.
+        n_draws = 1 if initial == "prior_draw" else 1000
+        mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
+        return mean.flat()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Callback = Callable[[Campaign, Mission], None]
 
-POLICY, OBJECTIVE, SAMPLER = "greedy", "lost_contact", "nuts"
+POLICY, OBJECTIVE, SAMPLER = "optimistic", "lost_contact", "auto"
 """Defaults of keywords that are no options; commands and studies have the same."""
 PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
 _OWN = ("awareness", "callbacks")
@@ -45,6 +45,10 @@ class CampaignOptions:
             `Planner`, also for the default.
         team: Trust of the team, the mean or the min of its robots'.
         length_weight: Cost of a metre of the path, in units of the objective. See `Planner`.
+        max_failure: Largest chance that a mission fails; by default no limit. Where no path
+            keeps within it, the safest is taken.
+        failure_cost: Cost of a failure for lost_contact, in bounds. By default all bounds of the
+            shortest path, see `Planner`.
         initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,
             as in the paper).
         update: Missions that a posterior is fitted to: refit (all so far) or, for comparison with
@@ -68,6 +72,8 @@ class CampaignOptions:
     max_bounds: int | str | None = field(default=None, metadata=_of(PLANNING))
     team: str = field(default="mean", metadata=_of(PLANNING, "mean", "min"))
     length_weight: float = field(default=0.0, metadata=_of(PLANNING))
+    max_failure: float | None = field(default=None, metadata=_of(PLANNING))
+    failure_cost: float | None = field(default=None, metadata=_of(PLANNING))
     initial: str = field(default="prior_mean", metadata=_of(LEARNING, "prior_mean", "prior_draw"))
     update: str = field(default="refit", metadata=_of(LEARNING, "refit", "moment_matched"))
     forgetting: float = field(default=1.0, metadata=_of(LEARNING))
@@ -139,16 +145,17 @@ class CampaignOptions:
 
         chosen: dict[str, Any] = {name: getattr(self, name) for name in options_of(PLANNING)}
         law = {"observation": observation, "response": response}
+        chosen["infeasible"] = "safest"
         return Planner(workspace, start, goal, objective, **law, **chosen)
 
     def learning(self, model: "TrustModel | None", sampler: str) -> "Learning":
-        """Learning of a model, by default `PooledTrust()`."""
+        """Learning of a model, by default `PooledTrust` with effects of places."""
         from trustbo.campaign.learning import Learning
-        from trustbo.models import PooledTrust
+        from trustbo.models import PlaceEffect, PooledTrust
 
-        return Learning(
-            PooledTrust() if model is None else model, sampler, self.update, self.forgetting
-        )
+        if model is None:  # moments that are matched are those of the paper's parameters
+            model = PooledTrust(place=PlaceEffect() if self.update == "refit" else None)
+        return Learning(model, sampler, self.update, self.forgetting)
 
     def belief(self, workspace: "Workspace") -> "AwarenessBelief | None":
         """Belief about the awareness; None where the map is trusted."""

@@ -72,7 +72,7 @@ def run_replanning(
         if live is not None and k + 1 < len(path):
             planner = campaign.planner_now().onward(path[: k + 1])
             awareness = _known(campaign, path[k - 1], bound)
-            live.update(awareness, bound.contact_rate)
+            live.update(awareness, bound.contact_rate, (path[k - 1], bound.cell))
             path = [*path[:k], *better_rest(planner, live, path[k:], threshold)]
         k += 1
     getattr(simulator, "close", lambda: None)()
@@ -110,7 +110,7 @@ def better_rest(
 def weighted_mean(params: Params, weights: np.ndarray) -> Params:
     """Weighted mean of draws; `weights` (draw,) sum to 1."""
     flat = params.flat()
-    return type(flat)(*(np.tensordot(weights, value, 1) for value in flat))  # pyright: ignore[reportReturnType]
+    return flat.map(lambda value, _: np.tensordot(weights, value, 1))
 
 
 def _run_bound(simulator: Any, k: int, cell: Cell, ahead: Cell | None) -> Bound:

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.damage import naming_what_is_left, read_json
+from trustbo.campaign.failures import under_risk
 from trustbo.campaign.history import Kept, Posterior, Posteriors, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
 from trustbo.data import Cell, Mission
@@ -23,12 +24,16 @@ from trustbo.files import (
     write_text,
 )
 from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
-from trustbo.models import params_of
+from trustbo.models import BoundRisk, params_of
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
 
 _BELIEVED = "believed.nc"
+
+
+_NEW = ("max_failure", "failure_cost")
+"""Options of planning that results of version 0.1 lack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +100,8 @@ class Result:
     @cached_property
     def planner(self) -> Planner:
         """Planner as the campaign's, with the awareness believed in at the end."""
-        names = options_of(PLANNING)
+        # Version 0.1 knew of no failures.
+        names = [n for n in options_of(PLANNING) if n in self.settings or n not in _NEW]
         missing = [n for n in ("start", "goal", "objective", *names) if n not in self.settings]
         if missing:
             raise TrustboError(
@@ -109,6 +115,9 @@ class Result:
         ]
         objective = self.settings["objective"]
         planner = options.planner(self.workspace, start, goal, objective, *law)
+        if "hazard" in self.posterior.children:
+            hazard = self.posterior["hazard"].to_dataset()
+            planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
         if self.believed is None:
             return planner
         return planner.with_awareness(self.believed["draws"].values, self.believed["mean"].values)

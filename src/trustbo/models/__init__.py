@@ -13,8 +13,10 @@ from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
 from trustbo.models.loo import loo
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
+from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
+from trustbo.models.prior_from import prior_from
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
 from trustbo.models.risk import BoundRisk
@@ -32,6 +34,7 @@ __all__ = [
     "Hazard",
     "HierarchicalTrust",
     "LostMission",
+    "PlaceEffect",
     "PooledTrust",
     "Priors",
     "RobotParams",
@@ -47,6 +50,7 @@ __all__ = [
     "loo",
     "moment_matched",
     "params_of",
+    "prior_from",
     "prior_predictive",
     "sample_prior",
     "sample_statistics",

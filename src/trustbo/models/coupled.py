@@ -8,7 +8,7 @@ import numpyro
 from jax import Array
 from numpyro.distributions import Distribution, LKJCholesky
 
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import CoupledParams, Params, RobotParams, ordered_params
 
@@ -32,6 +32,11 @@ class CoupledTrust(TrustModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("inter_robot", self.inter_robot, INTER_ROBOT)
+        if self.place is not None and self.inter_robot != "none":
+            raise TrustboError(
+                f'effects of places need inter_robot="none"; got {self.inter_robot!r}. Give '
+                "place=None."
+            )
 
     def sample_params(self, n_robots: int, n_features: int) -> Params:
         """Sample statements; see the class for the coupling of the robots."""
@@ -96,12 +101,21 @@ class CoupledTrust(TrustModel):
         if self.inter_robot == "full":
             return {name: CoupledParams.AXES[name] for name in CoupledParams._fields[:5]}
         gamma = {"gamma": ("follower",)} if self.inter_robot == "ordered" else {}
-        return {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]} | gamma
+        return (
+            {name: RobotParams.AXES[name] for name in RobotParams._fields[:5]}
+            | gamma
+            | self.place_dims
+        )
 
     @property
     def robots_are_apart(self) -> bool:
         """Whether `inter_robot` is `"none"`."""
         return self.inter_robot == "none"
+
+    @property
+    def priors_are_independent(self) -> bool:
+        """Whether nothing couples the robots."""
+        return self.robots_are_apart
 
     @property
     def robot_sets(self) -> str | None:

@@ -1,15 +1,18 @@
 """Trust in real time, bound by bound of a running mission."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
+from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
+from trustbo.workspace.moves import moves_along
 
 
 class TrustState(NamedTuple):
@@ -72,7 +75,7 @@ class TrustFilter:
         flat = posterior.flat()
         n = len(flat.b)
         kept = np.linspace(0, n - 1, min(n, max_draws)).astype(int)
-        self.params = type(flat)(*(each[kept] for each in flat))
+        self.params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
         self._n_robots = n_robots
         lag = float(require_choice("response", response, RESPONSES) == "change")
         self._core = self.params.live(lag, n_robots)
@@ -91,37 +94,47 @@ class TrustFilter:
         """Trust after the bounds so far, shapes (robot,)."""
         return self._average(self._mean, self._var)
 
-    def update(self, awareness: ArrayLike, contact_rate: ArrayLike) -> TrustState:
+    def update(
+        self,
+        awareness: ArrayLike,
+        contact_rate: ArrayLike,
+        bound: tuple[Cell, Cell] | None = None,
+    ) -> TrustState:
         """Take in one bound.
 
         Args:
             awareness: Shape (robot, feature).
             contact_rate: Shape (robot,); NaN where not measured.
+            bound: Cell left and cell entered; needed where places have effects.
 
         Returns:
             Trust after it, shapes (robot,).
 
         Raises:
             ShapeError: Another number of robots or features.
-            TrustboError: Awareness that is NaN, or a rate outside [0, 1].
+            TrustboError: Awareness that is NaN, a rate outside [0, 1], or a bound that is missing
+                or none.
         """
         z, y = self._checked(awareness, 2), np.asarray(contact_rate, dtype=float)
+        effect = self._effects(bound, 1)[0]
         if y.shape != (self._n_robots,):
             raise ShapeError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
         if ((y < 0.0) | (y > 1.0)).any():
             raise TrustboError(f"contact_rate must be in [0, 1]; got {y}.")
-        self._mean, self._var, increment = self._core.update(self._mean, self._var, z, y)
+        self._mean, self._var, increment = self._core.update(self._mean, self._var, z, y, effect)
         self._log_weight += increment
         weights = np.exp(self._log_weight - self._log_weight.max())
         self.weights = weights / weights.sum()
         self.n_bounds += 1
         return self.state
 
-    def predict(self, awareness: ArrayLike) -> TrustState:
+    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustState:
         """Trust along the bounds to come, none of them measured yet.
 
         Args:
             awareness: Shape (bound, robot, feature).
+            path: The cell where the team is and the cells to be entered; needed where places have
+                effects.
 
         Returns:
             Shapes (bound, robot).
@@ -131,10 +144,23 @@ class TrustFilter:
             TrustboError: Awareness that is NaN.
         """
         mean, var, ahead = self._mean, self._var, []
-        for z in self._checked(awareness, 3):
-            mean, var = self._core.predict(mean, var, z)
+        zs = self._checked(awareness, 3)
+        for z, effect in zip(zs, self._effects(path, len(zs)), strict=True):
+            mean, var = self._core.predict(mean, var, z, effect)
             ahead.append(self._average(mean, var))
         return TrustState(*(np.stack(column) for column in zip(*ahead, strict=True)))
+
+    def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[np.ndarray | float]:
+        """Effect of each bound's place (draw, robot or 1); 0 where there are none."""
+        if not self.params.places:
+            return [0.0] * n_bounds
+        if path is None or len(path) != n_bounds + 1:
+            raise TrustboError(
+                f"places have effects: say which {n_bounds + 1} cells the bounds lead over, the "
+                f"cell left first; got {path!r}."
+            )
+        bounds = np.column_stack([moves_along(path), np.asarray(path)[1:]])
+        return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
 
     def _average(self, mean: np.ndarray, var: np.ndarray) -> TrustState:
         """Mean and sd of the mixture over draws."""

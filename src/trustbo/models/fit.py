@@ -1,5 +1,6 @@
 """From missions to a posterior: sampling, checking it, and laying it out for ArviZ."""
 
+import json
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -9,16 +10,20 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_choice
+from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.models.model import TrustModel, require_model
+from trustbo.models.place import Visited, bounds_of, visited
+from trustbo.models.place_maps import place_group
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
 from trustbo.models.posterior_tree import to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.samplers.nuts import NutsSettings
-from trustbo.models.samplers.run import SAMPLERS, draw_posterior, require_sampler
+from trustbo.models.samplers.run import draw_posterior, resolve_sampler
+from trustbo.models.samplers.student import Student
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
+from trustbo.workspace import Workspace
 
 _N_PRIOR = 500
 
@@ -26,8 +31,10 @@ _N_PRIOR = 500
 def fit(
     missions: Sequence[Mission],
     model: TrustModel | None = None,
-    sampler: str = "nuts",
+    sampler: str = "auto",
     *,
+    workspace: Workspace | None = None,
+    earlier: xr.DataTree | None = None,
     weights: ArrayLike | None = None,
     seed: int = 0,
     n_warmup: int = 300,
@@ -42,11 +49,16 @@ def fit(
     Args:
         missions: All missions to learn from; contact rates that are NaN were not measured.
         model: Trust model; by default `PooledTrust()`.
-        sampler: `"nuts"`. Or `"exact"`: near-independent draws by importance sampling, without
-            compiling, for Gaussian observations of robots that share their parameters or have
-            nothing in common; it falls back on NUTS, with a warning, where its weights are too
-            uneven. Or `"joint"`: NUTS on parameters and latent trust together, which `"nuts"` is
-            too where trust does not integrate out.
+        sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
+            attributes say which, and why. `"exact"`: near-independent draws by importance sampling,
+            without compiling, for Gaussian observations of robots that share their parameters or
+            have nothing in common; it falls back on NUTS, with a warning, where its weights are too
+            uneven. `"nuts"`. Or `"joint"`: NUTS on parameters and latent trust together, which
+            `"nuts"` is too where trust does not integrate out.
+        workspace: Workspace of the missions. A model with effects of places then knows them over
+            the whole grid, else up to the last row and column that was visited.
+        earlier: Posterior of earlier missions, to begin the exact sampler of effects of places
+            from; the posterior is the same but for Monte Carlo error.
         weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
             observations.
         seed: Seed; the same seed gives the same posterior.
@@ -78,16 +90,19 @@ def fit(
     """
     model = PooledTrust() if model is None else model
     require_model(model)
-    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
     batch = stack_missions(missions)
     model = model.for_features(missions[0].features)
+    chosen, reason = resolve_sampler(model, sampler)
+    places = _places(model, missions, batch, workspace)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)
     floored = model.at_resolution(ticks)
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
-    draws, complaints = draw_posterior(floored, sampler, settings, seed, batch, weight, check=check)
+    draws, complaints = draw_posterior(
+        floored, chosen, settings, seed, batch, weight, places, _proposal(earlier), check=check
+    )
     prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
     groups = {
         "posterior": {name: draws.params[name] for name in model.dims},
@@ -95,11 +110,16 @@ def fit(
         "prior": {name: values[None] for name, values in prior.items()},
     }
     posterior = to_datatree(groups, missions, model.dims)
+    if places is not None:
+        group = place_group(draws.places, places, seed)
+        posterior["places"] = xr.DataTree(group)
     posterior.attrs |= {
         "model": type(model).__name__,
         "inter_robot": "none",
         **model.options(),
+        "place": "none" if model.place is None else json.dumps(model.place.to_record()),
         "sampler": draws.sampler,
+        "sampler_reason": reason if draws.sampler == chosen else "weights were too uneven",
         "seed": seed,
         **draws.summary,
         "x0_mean": float(model.priors.x0_mean),
@@ -124,6 +144,29 @@ def fit(
             "Give more missions or firmer priors, or pass check=False to have it as it is.",
         )
     return posterior
+
+
+def _places(
+    model: TrustModel,
+    missions: Sequence[Mission],
+    batch: MissionBatch,
+    workspace: Workspace | None,
+) -> Visited | None:
+    """Places of missions, where they have effects."""
+    if model.place is None:
+        return None
+    shape = None if workspace is None else workspace.passable.shape
+    bounds = bounds_of(missions, batch.contact_rate.shape[:2])
+    return visited(bounds, model.place, batch.contact_rate.shape[2], shape)  # pyright: ignore
+
+
+def _proposal(earlier: xr.DataTree | None) -> Student | None:
+    """Proposal that an earlier posterior was drawn by."""
+    if earlier is None or "proposal_center" not in earlier.attrs:
+        return None
+    center = np.atleast_1d(earlier.attrs["proposal_center"]).astype(float)
+    scale = np.reshape(earlier.attrs["proposal_scale"], (len(center), len(center)))
+    return Student(center, scale.astype(float))
 
 
 def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:

@@ -114,4 +114,5 @@ class HierarchicalTrust(TrustModel):
             "tau_beta0": (),
             "tau_beta": ("feature",),
             "tau_b": (),
+            **self.place_dims,
         }

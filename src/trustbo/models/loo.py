@@ -3,9 +3,9 @@
 import warnings
 from typing import cast
 
-import arviz as az
 import numpy as np
 import xarray as xr
+from arviz_stats.loo import loo as unweighted
 from arviz_stats.utils import ELPDData, ELPDDataLOO
 
 from trustbo.errors import TrustboError
@@ -45,7 +45,7 @@ def loo(posterior: xr.DataTree) -> ELPDData:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the second call says it again
         powers = each.isel(mission=counted) * xr.DataArray(weight[counted], dims="mission")
-        found = cast(ELPDDataLOO, az.loo(_tree(posterior, powers), pointwise=True))
+        found = cast(ELPDDataLOO, unweighted(_tree(posterior, powers), pointwise=True))
     # The posterior is already without a mission of weight 0: equal weights.
     log_weights = xr.full_like(each, -np.log(each.sizes["chain"] * each.sizes["draw"]))
     log_weights = log_weights.transpose(*found.log_weights.dims)
@@ -53,7 +53,7 @@ def loo(posterior: xr.DataTree) -> ELPDData:
     pareto_k = xr.zeros_like(each.isel(chain=0, draw=0, drop=True))
     pareto_k[counted] = found.pareto_k.values
     tree = _tree(posterior, each)
-    result = az.loo(tree, pointwise=True, log_weights=log_weights, pareto_k=pareto_k)
+    result = unweighted(tree, pointwise=True, log_weights=log_weights, pareto_k=pareto_k)
     return cast(ELPDData, result)
 
 

@@ -25,6 +25,7 @@ from trustbo.models.likelihood.contact_rate import (
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
 from trustbo.models.params import Params, check_params
+from trustbo.models.place import PlaceEffect, bounds_of
 from trustbo.models.priors import Priors
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution
 from trustbo.stacking import MissionBatch, stack_missions
@@ -46,14 +47,17 @@ class TrustModel(ABC):
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
             trust being a logit.
         response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
+        place: Effects of places beyond what awareness says of them; None is the paper's model.
 
     Raises:
-        TrustboError: A name is unknown, or the family does not allow `"change"`.
+        TrustboError: A name is unknown, the family does not allow `"change"`, or robots that
+            influence each other are to have effects of places.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
     observation: str = "gaussian"
     response: str = "level"
+    place: PlaceEffect | None = None
 
     def __post_init__(self) -> None:
         require_choice("observation", self.observation, FAMILIES)
@@ -67,6 +71,8 @@ class TrustModel(ABC):
             object.__setattr__(self, "priors", Priors.default(self.observation))
         elif not isinstance(self.priors, Priors):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
+        if not isinstance(self.place, PlaceEffect | None):
+            raise TrustboError(f"place must be a PlaceEffect or None; got {self.place!r}.")
 
     # --- defined by each model ---
 
@@ -91,6 +97,11 @@ class TrustModel(ABC):
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of each parameter that a posterior has."""
+
+    @property
+    def place_dims(self) -> dict[str, tuple[str, ...]]:
+        """Axes of the hyperparameters of places, where these have effects."""
+        return {} if self.place is None else {name: () for name in self.place.names}
 
     @property
     def robot_sets(self) -> str | None:
@@ -140,9 +151,17 @@ class TrustModel(ABC):
             return self
         return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
 
+    def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
+        """Shape of each parameter that a posterior has, those of places apart."""
+        length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
+        length["feature"] = n_features
+        own = {name: axes for name, axes in self.dims.items() if name not in self.place_dims}
+        return {name: tuple(length[axis] for axis in axes) for name, axes in own.items()}
+
     def options(self) -> dict[str, str]:
-        """Options by name, without the priors."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "priors"}
+        """Options by name, without the priors and the effects of places."""
+        others = ("priors", "place")
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
     # --- shared by all models ---
 
@@ -219,11 +238,12 @@ class TrustModel(ABC):
         batch = stack_missions(missions)
         check_params(params, batch.awareness.shape[2], batch.awareness.shape[3])
         require_ticks(self.family, batch)
-        leading = params.leading
+        leading, flat = params.leading, params.flat()
+        if params.places:
+            flat = flat.on(bounds_of(missions, batch.contact_rate.shape[:2]))
         with own_settings():
             key = jax.random.key(seed)
-            data = (batch.awareness, batch.contact_rate, batch.n_ticks)
-            values = mission_log_likelihood(self.family, self.lag, params.flat(), *data, key)
+            values = mission_log_likelihood(self.family, self.lag, flat, *batch, key)
         return np.asarray(values)[:, : len(missions)].reshape(*leading, len(missions))
 
     def simulate(
@@ -237,7 +257,8 @@ class TrustModel(ABC):
 
         Args:
             key: Random key.
-            params: Parameters without leading axes.
+            params: Parameters without leading axes; where places have effects, those of the
+                missions' bounds, `params.on(bounds)`.
             awareness: Shape (mission, bound, robot, feature).
             n_ticks: Ticks of each bound, of shape (mission, bound, robot) or broadcast to it; the
                 beta-binomial family needs them.
@@ -256,7 +277,7 @@ class TrustModel(ABC):
         check_params(params, z.shape[2], z.shape[3])
         ticks = broadcast_ticks(self.family, n_ticks, z.shape[:3])
         with own_settings():
-            params64 = type(params)(*(jnp.asarray(p, dtype=float) for p in params))
+            params64 = params.map(lambda value, _: jnp.asarray(value, dtype=float))
             drawn = simulate_missions(self.family, self.lag, params64, z, ticks * 1.0, key)
         return TrustSample(*(np.swapaxes(np.asarray(a), 0, 1) for a in drawn))
 
@@ -273,7 +294,7 @@ class TrustModel(ABC):
         ShapeError: the number of robots or features changed. TrustboError: the model has no such
         statistics, or the weight is outside (0, 1].
         """
-        self.require_exact()
+        self.require_statistics()
         require_forgetting(forgetting)
         new = self.gather(stack_missions(missions))
         if statistics is None:
@@ -295,22 +316,34 @@ class TrustModel(ABC):
         apart = [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
         return tuple(sufficient_statistics(one, *args) for one in apart)
 
-    def require_exact(self) -> None:
+    def require_statistics(self) -> None:
         """Refuse a model that has no sufficient statistics.
 
         Raises:
-            TrustboError: Observations are not Gaussian, or robots share some parameters only, or
-                influence each other.
+            TrustboError: Observations are not Gaussian; robots share some parameters only, or
+                influence each other; or places have effects, which no sum over missions knows.
         """
-        if self.robot_sets is None or not self.family.integrates_out:
-            raise TrustboError(
-                'sampler "exact" needs Gaussian observations, and PooledTrust or '
-                f'CoupledTrust(inter_robot="none"); got {self.describe()}. Use sampler="nuts".'
+        reason = self.why_not_exact or (self.place and "places have effects")
+        if reason:
+            raise TrustboError(f"{self.describe()} has no sufficient statistics: {reason}.")
+
+    @property
+    def why_not_exact(self) -> str | None:
+        """Reason why the exact sampler cannot treat the model; None if it can."""
+        if not self.family.integrates_out:
+            return "its observations are not Gaussian"
+        if self.robot_sets is None:
+            return "its robots share some parameters only, or influence each other"
+        if self.place is not None and (self.robot_sets == "each" or self.lag):
+            return "it has effects of places, and " + (
+                "rates measure changes" if self.lag else "robots with nothing else in common"
             )
+        return None
 
     def describe(self) -> str:
         """The model's name and options."""
         listed = ", ".join(f'{name}="{value}"' for name, value in self.options().items())
+        listed += "" if self.place is None else f", place={self.place}"
         return f"{type(self).__name__}({listed})"
 
 

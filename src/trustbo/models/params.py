@@ -1,6 +1,6 @@
 """Parameters of the trust models as tuples of arrays, with leading axes such as (draw,)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
@@ -8,13 +8,22 @@ import numpy as np
 import xarray as xr
 from jax import Array
 
+from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models.likelihood.live import ApartFilter, CoupledFilter
 from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.likelihood.vector import VectorSSM
+from trustbo.models.place_maps import place_maps_of
+from trustbo.workspace.moves import moves_along
 
 Numbers = Any
 """A float, a NumPy array, or a JAX array or tracer."""
+
+
+_PLACES: Mapping[str, tuple[str, ...]] = {
+    "place": ("effect", "row", "col"),
+    "place_bound": ("effect", "move", "row", "col"),
+}
 
 
 class _Draws:
@@ -55,11 +64,61 @@ class _Draws:
             for name, axes in self.AXES.items()
             if "robot" in axes
         }
+        for name, value in self.places.items():
+            own = slice(robot, robot + 1) if value.shape[-len(self.AXES[name])] > 1 else slice(None)
+            picked[name] = np.moveaxis(np.moveaxis(value, -len(self.AXES[name]), 0)[own], 0,
+                                       -len(self.AXES[name]))  # fmt: skip
         return self._replace(**picked)  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def places(self) -> dict[str, np.ndarray]:
+        """Effects of places there are, place and place_bound, by name."""
+        found = {name: getattr(self, name, None) for name in _PLACES}
+        return {name: np.asarray(value) for name, value in found.items() if value is not None}
+
+    def of_places(self, bounds: np.ndarray) -> np.ndarray:
+        """Effect of each bound, its cell's and its own; shape (..., bound, effect).
+
+        Args:
+            bounds: Move, row and column of each bound (bound, 3), moves as in `MOVES[8]`; the
+                effect is 0 where the move is negative.
+        """
+        moves, rows, cols = np.asarray(bounds).T
+        total: Any = 0.0
+        if "place" in self.places:
+            total = total + self.places["place"][..., rows, cols]
+        if "place_bound" in self.places:
+            total = total + self.places["place_bound"][..., moves, rows, cols]
+        return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
+
+    def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
+        """Parameters of the bounds of a path, as of one mission in `on`."""
+        if not self.places:
+            return self
+        bounds = np.column_stack([moves_along(path), np.asarray(path)[1:]])
+        return self.on(bounds[None])
+
+    def on(self, bounds: np.ndarray | None) -> Self:
+        """Parameters of given missions: the effects of their bounds' places are in the intercept.
+
+        Args:
+            bounds: Move, row and column of each bound, (mission, bound, 3).
+
+        Returns:
+            Parameters without places, b (..., mission, bound, robot), the last axis of length 1
+            where all robots share it; the same parameters where there are no places.
+        """
+        if not self.places or bounds is None:
+            return self
+        effect = self.of_places(bounds.reshape(-1, 3))
+        effect = effect.reshape(*effect.shape[:-2], *bounds.shape[:2], effect.shape[-1])
+        b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
+        b = b[..., None, None, None] if self.n_robots is None else b[..., None, None, :]
+        return self._replace(b=b + effect, place=None, place_bound=None)  # pyright: ignore
 
     def draw(self, index: int) -> Self:
         """One draw out of many, with its leading axis dropped."""
-        return self._map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
+        return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
 
     def mean(self) -> Self:
         """Mean over all leading axes."""
@@ -69,7 +128,7 @@ class _Draws:
             mean = np.asarray(value, dtype=float).reshape(-1, *core).mean(0)
             return mean if n else float(mean)
 
-        return self._map(average)
+        return self.map(average)
 
     def flat(self) -> Self:
         """Every field with exactly one leading axis (draw,), float64."""
@@ -80,15 +139,20 @@ class _Draws:
             full = np.broadcast_to(np.asarray(value, dtype=float), leading + core)
             return full.reshape(int(np.prod(leading)), *core)
 
-        return self._map(expand)
+        return self.map(expand)
 
     def _size(self, name: str, axis: str) -> int | None:
         axes = self.AXES.get(name, ())
         return np.shape(getattr(self, name))[axes.index(axis) - len(axes)] if axis in axes else None
 
-    def _map(self, function: Any) -> Self:
+    def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
+        """The same with a function of each field and the number of its own axes in its place."""
         core = {name: len(self.AXES.get(name, ())) for name in self._fields}
-        values = {name: function(getattr(self, name), n) for name, n in core.items()}
+        values = {
+            name: function(value, n)
+            for name, n in core.items()
+            if (value := getattr(self, name)) is not None
+        }
         return self._replace(**values)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -107,17 +171,24 @@ class _Trust(NamedTuple):
     """Mean of trust before the first bound, shape () or (...,)."""
     x0_sd: Numbers = 0.5
     """Its standard deviation, shape () or (...,)."""
+    place: Numbers | None = None
+    """Effect of each cell entered, shape (..., effect, row, col); None: there is none. The axis
+    effect is of robots, or of length 1 where all share them."""
+    place_bound: Numbers | None = None
+    """Effect of each bound, shape (..., effect, move, row, col), moves as in `workspace.MOVES[8]`;
+    None: there is none."""
 
 
 class TrustParams(_Draws, _Trust):
     """Parameters of the pooled model, equations (3)-(4); leading axes (...,) such as (draw,).
 
-    Fields: beta0 (...,), beta (..., feature), b (...,), delta_w (...,), delta_v (...,), and
-    x0_mean and x0_sd, () or (...,).
+    Fields: beta0 (...,), beta (..., feature), b (...,), delta_w (...,), delta_v (...,),
+    x0_mean and x0_sd, () or (...,), and effects of places, place (..., effect, row, col) and
+    place_bound (..., effect, move, row, col), or None.
     """
 
     __slots__ = ()
-    AXES: ClassVar = {"beta": ("feature",)}
+    AXES: ClassVar = {"beta": ("feature",), **_PLACES}
 
     def ssm(self, awareness: Array, lag: float = 0.0) -> ScalarSSM:
         """The state space of missions with awareness (mission, bound, robot, feature)."""
@@ -133,8 +204,8 @@ class TrustParams(_Draws, _Trust):
 class RobotParams(_Draws, _Trust):
     """Parameters of robots with coefficients of their own, that do not influence each other.
 
-    Fields: beta0 (..., robot), beta (..., robot, feature), b, delta_w and delta_v (..., robot), and
-    x0_mean and x0_sd, () or (...,).
+    Fields: beta0 (..., robot), beta (..., robot, feature), b, delta_w and delta_v (..., robot),
+    x0_mean, x0_sd, place and place_bound as in `TrustParams`.
     """
 
     __slots__ = ()
@@ -144,11 +215,12 @@ class RobotParams(_Draws, _Trust):
         "b": ("robot",),
         "delta_w": ("robot",),
         "delta_v": ("robot",),
+        **_PLACES,
     }
 
     def ssm(self, awareness: Array, lag: float = 0.0) -> ScalarSSM:
         """The state space of missions with awareness (mission, bound, robot, feature)."""
-        drift = jnp.einsum("jkim,im->kji", awareness, self.beta) + jnp.reshape(self.b, (1, 1, -1))
+        drift = jnp.swapaxes(jnp.einsum("jkim,im->jki", awareness, self.beta) + self.b, 0, 1)
         p = self
         return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
 
@@ -242,7 +314,11 @@ def params_of(posterior: xr.DataTree) -> Params:
         str(n): np.ascontiguousarray(draws[n].transpose("sample", ...).values)
         for n in draws.data_vars
     }
-    return assemble_params(sites, {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")})
+    x0 = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
+    params = assemble_params(sites, x0)
+    if "places" not in posterior.children:
+        return params
+    return params._replace(**place_maps_of(posterior["places"].to_dataset(), sites))  # pyright: ignore
 
 
 def assemble_params(sites: Mapping[str, np.ndarray], x0: Mapping[str, float]) -> Params:
@@ -276,14 +352,17 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
             f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} "
             "features."
         )
+    for field, value in params.places.items():
+        if (n := value.shape[-len(_PLACES[field])]) not in (1, n_robots or n):
+            raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
     if "robot" not in sizes:
         return
     if n_robots is not None and sizes["robot"] != n_robots:
         raise ShapeError(
             f"params.{name} is of {sizes['robot']} robots, but the missions have {n_robots}."
         )
-    for field, field_axes in params.AXES.items():
-        value = np.asarray(getattr(params, field))
+    for field in params.AXES.keys() - _PLACES.keys():
+        field_axes, value = params.AXES[field], np.asarray(getattr(params, field))
         expected = tuple(sizes[axis.strip("_")] for axis in field_axes)
         if value.shape[value.ndim - len(expected) :] != expected or value.ndim < len(expected):
             raise ShapeError(

@@ -14,6 +14,8 @@ from trustbo.models.likelihood import kalman_numpy, latent
 from trustbo.models.likelihood.contact_rate import mission_log_likelihood
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.params import Params, assemble_params, params_of
+from trustbo.models.place import bounds_of
+from trustbo.models.place_maps import prior_maps
 from trustbo.models.posterior_tree import missions_of, to_datatree
 from trustbo.stacking import MissionBatch, stack_missions
 
@@ -22,7 +24,7 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior", "hazard")
+_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
@@ -33,8 +35,8 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     return alone
 
 
-class _Law(NamedTuple):
-    """Law of contact rates given parameters, as a posterior's attributes tell it."""
+class Law(NamedTuple):
+    """Law of contact rates given parameters."""
 
     family: Family
     lag: float
@@ -43,6 +45,7 @@ class _Law(NamedTuple):
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
+        """Law of a posterior."""
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
@@ -80,7 +83,7 @@ def complete(
     """
     if "latent" in posterior.children:
         return posterior
-    law = _Law.of(posterior)
+    law = Law.of(posterior)
     if missions is None:
         if "constant_data" not in posterior.children:
             raise TrustboError(
@@ -107,7 +110,7 @@ def complete(
 
 def _groups(
     posterior: xr.DataTree,
-    law: _Law,
+    law: Law,
     missions: Sequence[Mission],
     n_trajectories: int,
     latents: latent.Latents,
@@ -118,15 +121,17 @@ def _groups(
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
     every = params_of(posterior).flat()
+    bounds = bounds_of(missions, batch.contact_rate.shape[:2]) if every.places else None
+    every = every.on(bounds)
     index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
-    few = type(every)(*(values[index] for values in every))
+    few = every.map(lambda values, _: values[index])
     seed = posterior.attrs["seed"]
     if law.by_numpy:
         n_bounds = np.array([len(mission.bounds) for mission in missions])
         found = _trust_by_numpy(law, every, few, batch, n_bounds, seed)
     else:
         found = _trust_compiled(law, every, few, latents, kept, batch, seed)
-    prior = _prior_of(posterior)
+    prior = _prior_of(posterior).on(bounds)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -141,7 +146,7 @@ def _groups(
             "draw": kept,
         },
         "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
-        "prior_predictive": {"contact_rate": _predict(law, prior, batch, seed + 3)[None]},
+        "prior_predictive": {"contact_rate": predict(law, prior, batch, seed + 3)[None]},
     }, of
 
 
@@ -152,11 +157,15 @@ def _likelihood_name(posterior: xr.DataTree) -> str:
 
 def _prior_of(posterior: xr.DataTree) -> Params:
     sites = {str(n): a.values[0] for n, a in posterior["prior"].data_vars.items()}
-    return assemble_params(sites, {n: posterior.attrs[n] for n in ("x0_mean", "x0_sd")}).flat()
+    x0 = {n: posterior.attrs[n] for n in ("x0_mean", "x0_sd")}
+    params = assemble_params(sites, x0).flat()
+    if "places" not in posterior.children:
+        return params
+    return params._replace(**prior_maps(posterior["places"].to_dataset(), sites))  # pyright: ignore
 
 
 def _trust_by_numpy(
-    law: _Law,
+    law: Law,
     every: Params,
     few: Params,
     batch: MissionBatch,
@@ -176,7 +185,7 @@ def _trust_by_numpy(
 
 
 def _trust_compiled(
-    law: _Law,
+    law: Law,
     every: Params,
     few: Params,
     latents: latent.Latents,
@@ -203,8 +212,8 @@ def _trust_compiled(
         return {name: np.asarray(array) for name, array in found.items()}
 
 
-def _predict(law: _Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
-    """Contact rates of replicated missions, (draw, mission, bound, robot)."""
+def predict(law: Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
+    """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
     if law.by_numpy:
         rng = np.random.default_rng(seed)
         return kalman_numpy.simulate(params, law.lag, batch.awareness, rng)

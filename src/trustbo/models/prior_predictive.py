@@ -1,6 +1,7 @@
 """Draws of parameters, and of contact rates, from the priors alone."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import jax
 import numpy as np
@@ -10,13 +11,16 @@ from numpy.typing import ArrayLike
 from numpyro import handlers
 
 from trustbo.data import default_features
-from trustbo.errors import ShapeError, require_whole
+from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params
+from trustbo.models.posterior_groups import Law, predict
 from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
+
+_BATCH = 500  # draws computed at once
 
 
 def prior_predictive(
@@ -45,11 +49,16 @@ def prior_predictive(
 
     Raises:
         ShapeError: Awareness has other axes.
-        TrustboError: The family needs n_ticks.
+        TrustboError: The family needs n_ticks; or places have effects, which depend on paths.
     """
     z = np.asarray(awareness, dtype=float)
     if z.ndim != 4:
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
+    if model.place is not None:
+        raise TrustboError(
+            "effects of places need the paths of missions: fit them, and take the posterior's "
+            "group prior_predictive; or give a model with place=None."
+        )
     ticks = broadcast_ticks(model.family, n_ticks, z.shape[:3])
     require_whole("n_draws", n_draws, 1)
     names = tuple(features) or default_features(z.shape[3])
@@ -58,9 +67,10 @@ def prior_predictive(
     model = model.for_features(names).at_resolution(
         weigh_ticks(MissionBatch(z, np.zeros(z.shape[:3]), ticks))
     )
-    with own_settings():
-        keys = jax.random.split(jax.random.key(seed), n_draws)
-        drawn = {k: np.asarray(v)[None] for k, v in prior_draws(model, z, ticks, keys).items()}
+    drawn = draw_sites(model, z.shape[2:], n_draws, seed)
+    law = Law(model.family, model.lag, model.family.integrates_out and model.robots_are_apart)
+    params, batch = assemble_params(drawn, model.x0).flat(), MissionBatch(z, z[..., 0], ticks)
+    drawn["contact_rate"] = predict(law, params, batch, seed + 1)
     dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
     robots = [f"r{i + 1}" for i in range(z.shape[2])]
     coords = {
@@ -72,7 +82,7 @@ def prior_predictive(
     }
 
     def group(names: Iterable[str]) -> xr.Dataset:
-        variables = {n: (("chain", "draw", *dims[n]), drawn[n]) for n in names}
+        variables = {n: (("chain", "draw", *dims[n]), drawn[n][None]) for n in names}
         used = {d for axes, _ in variables.values() for d in axes} & set(coords)
         index = {"chain": [0], "draw": np.arange(n_draws)}
         return xr.Dataset(variables, {d: coords[d] for d in coords if d in used} | index)
@@ -103,13 +113,25 @@ def draw_sites(
     """Draws of the parameters from the prior for (robots, features), by name."""
     if model.priors_are_independent:
         rng, priors = np.random.default_rng(seed), model.priors
-        sizes = {name: (n_draws, *shape[2 - len(axes) :]) for name, axes in model.dims.items()}
-        drawn = {name: draw(getattr(priors, name), size, rng) for name, size in sizes.items()}
-        return priors.of_stationary(drawn)
+        drawn = {
+            name: draw(getattr(priors, name), (n_draws, *size), rng)
+            for name, size in model.sizes(*shape).items()
+        }
+        return priors.of_stationary(drawn) | _place_draws(model, n_draws, seed)
+    # Whole batches: any number of draws meets one compiled program.
+    rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
-        drawn = prior_draws(model, np.zeros((1, 1, *shape)), np.ones((1, 1, shape[0])), keys)
-        return {name: np.asarray(drawn[name]) for name in model.dims}
+        drawn = [_parameter_draws(model, shape, keys[row]) for row in rows]
+    found = {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in drawn[0]}
+    return found | _place_draws(model, n_draws, seed)
+
+
+def _place_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:
+    """Draws of the hyperparameters of places, where these have effects."""
+    if model.place is None:
+        return {}
+    return model.place.draw(n_draws, np.random.default_rng([seed, 1]))
 
 
 @jax.jit
@@ -122,9 +144,20 @@ def prior_draws(
         params = model.sample_params(*awareness.shape[2:])
         model.sample_rates(params, awareness, n_ticks=n_ticks)
 
+    return _traced(program, (*model.sizes(*awareness.shape[2:]), "contact_rate"), keys)
+
+
+@partial(jax.jit, static_argnames="shape")
+def _parameter_draws(model: TrustModel, shape: tuple[int, int], keys: Array) -> dict[str, Array]:
+    """The same parameters without the rates, whose part of the program takes long to compile."""
+    return _traced(partial(model.sample_params, *shape), tuple(model.sizes(*shape)), keys)
+
+
+def _traced(program: Callable[[], object], names: Sequence[str], keys: Array) -> dict[str, Array]:
+    """Values of a program's sites by name, one set per key."""
+
     def one(key: Array) -> dict[str, Array]:
         trace = handlers.trace(handlers.seed(program, key)).get_trace()
-        names = (*model.dims, "contact_rate")
         return {name: trace[name]["value"] for name in names}
 
     return jax.vmap(one)(keys)

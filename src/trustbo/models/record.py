@@ -7,6 +7,7 @@ from trustbo.errors import TrustboError
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
+from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 
@@ -15,7 +16,12 @@ _MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, C
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
     """Class, options, and priors as text; whether they go by the names of the features."""
-    own = {"class": type(model).__name__, **model.options(), "priors": model.priors.describe()}
+    own = {
+        "class": type(model).__name__,
+        **model.options(),
+        "place": None if model.place is None else model.place.to_record(),
+        "priors": model.priors.describe(),
+    }
     by_feature = model.priors is Priors.default(model.observation)
     return own | ({"by_feature": True} if by_feature else {})
 
@@ -25,19 +31,21 @@ def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -
 
     TrustboError: it has to be given and was not, or another was given.
     """
+    record = {"place": None, **record}  # version 0.1 had none
     if given is not None:
         if model_to_record(given) != record:
             raise TrustboError(
                 f"the campaign's model is {record}; the one given is {model_to_record(given)}."
             )
         return given
-    ours = ("class", "priors", "by_feature")
+    ours = ("class", "priors", "place", "by_feature")
     options = {name: value for name, value in record.items() if name not in ours}
     kind = _MODELS.get(record["class"])
+    place = None if record["place"] is None else PlaceEffect(**record["place"])
     if kind is not None:
         fixed = replace(Priors.default(record["observation"]))
         for priors in (None, fixed, Priors.zheng2023()):
-            model = kind(priors=priors, **options)  # pyright: ignore[reportArgumentType]
+            model = kind(priors=priors, place=place, **options)  # pyright: ignore
             if model_to_record(model) == record:
                 return model
     raise TrustboError(

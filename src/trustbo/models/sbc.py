@@ -9,14 +9,15 @@ from jax import random
 from scipy import stats
 from tqdm import tqdm
 
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, write_text
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.prior_predictive import prior_draws
 from trustbo.models.samplers.nuts import NutsSettings
-from trustbo.models.samplers.run import SAMPLERS, draw_posterior, require_sampler
+from trustbo.models.samplers.run import draw_posterior, resolve_sampler
+from trustbo.models.sbc_places import Walks
 from trustbo.stacking import MissionBatch
 
 _CHAINS = 4
@@ -39,7 +40,9 @@ def sbc(
     """Rank each true parameter among posterior draws, over data sets simulated from the prior.
 
     If prior, likelihood and sampler fit together, ranks are uniform. Awareness is uniform in
-    [0, 1]; contact rates are the model's, for Gaussian observations not cut to [0, 1].
+    [0, 1]; contact rates are the model's, for Gaussian observations not cut to [0, 1]. Where places
+    have effects, missions walk at random over a grid of 4 x 4 cells, and the effects of the first
+    two bounds, of the mission's first cell and of the last cell of the grid are ranked too.
 
     Args:
         model: Trust model; by default `PooledTrust()`.
@@ -65,7 +68,7 @@ def sbc(
             the checkpoint is of other arguments.
     """
     model = PooledTrust() if model is None else model
-    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
+    sampler, _ = resolve_sampler(model, sampler)
     require_whole("n_datasets", n_datasets, 1)
     kept = require_whole("n_ranked", n_ranked, _CHAINS) // _CHAINS
     settings = NutsSettings(n_draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)
@@ -75,20 +78,30 @@ def sbc(
     asked = f"{model.describe()}, {model.priors.describe()}, {sampler}, {shape}, {n_ticks}, "
     asked += f"{settings}, {n_ranked}, {seed}"
     ranks = _read(checkpoint, asked)
+    walks = None if model.place is None else Walks.random(shape[:2], seed)
     model = model.at_resolution({float(n_ticks): 1.0})
     for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
         if j < len(ranks):
             continue
-        with own_settings():
-            keys = random.fold_in(random.key(seed), j)[None]
-            drawn = prior_draws(model, awareness, ticks, keys)
-            simulated = {name: np.asarray(values)[0] for name, values in drawn.items()}
+        if walks is not None:
+            simulated = walks.simulate(model, awareness, ticks, seed + j)
+        else:
+            with own_settings():
+                keys = random.fold_in(random.key(seed), j)[None]
+                drawn = prior_draws(model, awareness, ticks, keys)
+                simulated = {name: np.asarray(values)[0] for name, values in drawn.items()}
         batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
-        draws, _ = draw_posterior(model, sampler, settings, seed + j, batch, check=False)
+        places = None if walks is None else walks.places(model)
+        draws, _ = draw_posterior(
+            model, sampler, settings, seed + j, batch, places=places, check=False
+        )
+        found = draws.params
+        if walks is not None:
+            found = found | walks.effects(model, draws, seed + j)
         rank = {}
-        for name in model.dims:
-            below = (draws.params[name][:, thinned] < simulated[name]).sum((0, 1))
-            free = np.ptp(draws.params[name], axis=(0, 1)) > 0.0
+        for name in found:
+            below = (found[name][:, thinned] < simulated[name]).sum((0, 1))
+            free = np.ptp(found[name], axis=(0, 1)) > 0.0
             for index in map(tuple, np.argwhere(free)):
                 rank[_label(name, index)] = int(below[index])
         ranks.append(rank)

@@ -43,7 +43,7 @@ def sample_statistics(
     Raises:
         TrustboError: The model has no such statistics, or its priors are not conjugate.
     """
-    model.require_exact()
+    model.require_statistics()
     require_whole("n_draws", n_draws, 1)
     model = model.at_resolution(add_ticks([s.ticks for s in statistics]))
     each = [sample_exact(s, model.priors, n_draws, seed + i) for i, s in enumerate(statistics)]

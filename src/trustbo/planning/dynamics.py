@@ -72,13 +72,19 @@ class Dynamics(NamedTuple):
 
 
 def trust_dynamics(
-    params: Params, awareness: ArrayLike, team: str = "mean", x0: ArrayLike | None = None
+    params: Params,
+    awareness: ArrayLike,
+    team: str = "mean",
+    x0: ArrayLike | None = None,
+    moves: np.ndarray | None = None,
 ) -> Dynamics:
     """Build the recursion of expected trust under parameters with leading axes (...,).
 
     Awareness has shape (robot, move, row, col, feature), or (draw, robot, move, row, col, feature)
-    with one map for each draw; its moves are those of the drift. `x0`, expected trust before the
-    first bound, () or (robot,), with leading axes or not, is by default `params.x0_mean`.
+    with one map for each draw. Its moves are those of the drift, or `moves`, their indices in
+    `MOVES[8]` (by default all), where awareness is that of cells and places have effects. `x0`,
+    expected trust before the first bound, () or (robot,), with leading axes or not, is by default
+    `params.x0_mean`.
     ShapeError: other numbers of robots or features.
     """
     z = np.asarray(awareness, dtype=float)
@@ -93,10 +99,11 @@ def trust_dynamics(
     sd = np.broadcast_to(sd.mean(-1) if params.n_robots else sd, leading)
     if isinstance(params, RobotParams | CoupledParams) or team == "min":
         views = np.eye(n_robots) if team == "min" else np.full((1, n_robots), 1.0 / n_robots)
-        return Dynamics(transition(params, n_robots), drift(params, z), start, views, sd)
+        return Dynamics(transition(params, n_robots), drift(params, z, moves), start, views, sd)
     beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
     # The mean over robots obeys the same equation.
-    u = drift(params, z.mean(-5, keepdims=True) if n_robots > 1 else z)
+    z = z.mean(-5, keepdims=True) if n_robots > 1 else z
+    u = drift(params, z, moves).mean(-4, keepdims=True)  # robots may differ in effects of places
     start = start.mean(-1, keepdims=True)
     return Dynamics(np.broadcast_to(beta0, (*leading, 1, 1)), u, start, np.eye(1), sd)
 
@@ -118,14 +125,16 @@ def transition(params: Params, n_robots: int) -> np.ndarray:
     return np.broadcast_to(beta0, (*params.leading, n_robots))[..., None] * np.eye(n_robots)
 
 
-def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
+def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None) -> np.ndarray:
     """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
 
     Awareness (robot, move, row, col, feature), or with a leading axis (draw,) like the parameters'.
-    ShapeError: other numbers of robots, features or draws than the parameters'.
+    Effects of places are added, those of bounds for the given `moves`, by default all; or those of
+    the bounds of a path, see `Params.along`. ShapeError: other numbers of robots, features, cells
+    or draws than the parameters'.
     """
     z = np.asarray(awareness, dtype=float)
-    check_params(params, z.shape[-5], z.shape[-1])
+    check_params(params, None if params.places else z.shape[-5], z.shape[-1])
     if z.ndim == 6 and params.leading != z.shape[:1]:
         raise ShapeError(
             f"{z.shape[0]} maps of awareness need as many draws of the parameters; got "
@@ -143,8 +152,25 @@ def drift(params: Params, awareness: ArrayLike) -> np.ndarray:
             if z.ndim == 5
             else np.einsum("nm,nidrcm->nidrc", beta, z)
         )
-        b = b[..., None]
+        b = b[..., None] if b.ndim == len(params.leading) else b
+    if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot): of the bounds of a path
+        return u + np.swapaxes(b[..., 0, :, :], -1, -2)[..., None, None, :]
     u += b[..., None, None, None]  # in place: over many draws and cells this is large
+    return _with_places(u, params, moves)
+
+
+def _with_places(u: np.ndarray, params: Params, moves: np.ndarray | None) -> np.ndarray:
+    """Drift (..., robot, move, row, col) with the effects of places added."""
+    for name, effect in params.places.items():
+        if effect.shape[-2:] != u.shape[-2:]:
+            raise ShapeError(
+                f"params.{name} is of {effect.shape[-2:]} cells, the workspace has {u.shape[-2:]}."
+            )
+        if name == "place":
+            effect = effect[..., None, :, :]
+        elif moves is not None:
+            effect = effect[..., moves, :, :]
+        u = u + effect
     return u
 
 
@@ -152,7 +178,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
     """Expected trust along a path, equations (1) and (3) without their noise.
 
     Args:
-        params: Parameters of any model, with leading axes (...,) such as (draw,).
+        params: Parameters of any model, with leading axes (...,) such as (draw,). Where places have
+            effects, those of the path, `params.along(path)`.
         awareness: Shape (bound, robot, feature), or (draw, bound, robot, feature) with one for each
             draw of the parameters.
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default

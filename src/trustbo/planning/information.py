@@ -32,7 +32,7 @@ def information_gain(
     gains = []
     for path in paths:
         z = np.swapaxes(along(awareness, path), -3, -2)
-        levels = _levels(params, roll_trust(params, z), lag)
+        levels = _levels(params, roll_trust(params.along(path), z), lag)
         rates, _, _ = family.rate_moments(levels, _noise_sd(params))
         flat = rates.reshape(len(rates), -1)
         L = np.linalg.cholesky(rate_noise(mean, levels.mean(0), family, lag))

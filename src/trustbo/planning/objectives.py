@@ -83,11 +83,13 @@ OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = {
 """Value of a path, to be maximised; the length cost is the path's metres times `length_weight`.
 
 lost_contact: minus the contact that is expected to be lost on the way, in bounds (9 bounds with an
-expected rate of .9 lose .9), less the length cost. terminal: sigma(x^K - length cost), one minus
-the paper's cost (6) without length cost. mean: mean trust over the bounds, less the length cost.
-success: product of sigma(x^k), the probability that every bound succeeds. bottleneck: least trust
-on the path. stationary: the product of sigma of each bound's steady-state trust, independent of
-history, times exp(-length cost).
+expected rate of .9 lose .9), less the length cost; where the planner has a risk, less
+`failure_cost` times the chance to fail. terminal: sigma(x^K - length cost), one minus the paper's
+cost (6) without length cost. mean: mean trust over the bounds, less the length cost. success:
+product of sigma(x^k), an index that compares paths: every bound counts, and a worse one more; the
+probability to arrive is another, `Plan.p_arrive`. bottleneck: least trust on the path. stationary:
+the product of sigma of each bound's steady-state trust, independent of history, times exp(-length
+cost).
 """
 ADDITIVE = ("lost_contact", "terminal", "mean", "stationary")
 """Objectives that admit a length weight."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Cell
+from trustbo.planning.risk import PathRisk
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -30,7 +31,8 @@ class Plan:
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
         value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
             the bounds' worth of contact expected to be lost, with trust capped at 1.
-        success: Product over the bounds of sigma(team's trust): the probability that all succeed.
+        success_index: Product over the bounds of sigma(team's trust). It compares paths, and is no
+            probability of anything; see `p_arrive`.
         objective: Name of the objective.
         exact: True if no admissible path is better.
         bound: Upper bound on the value of any admissible path; `value` where exact, NaN for a given
@@ -39,6 +41,7 @@ class Plan:
         engine: Engine that found the path, "networkx" or "numba"; or "given".
         seconds: Time of the search, s.
         workspace: Workspace of the path.
+        risk: Chance of each bound to end the mission, None without a hazard.
     """
 
     path: tuple[Cell, ...]
@@ -47,7 +50,7 @@ class Plan:
     trust: np.ndarray
     bands: np.ndarray
     value: float
-    success: float
+    success_index: float
     objective: str
     exact: bool
     bound: float
@@ -55,6 +58,22 @@ class Plan:
     engine: str
     seconds: float
     workspace: Workspace
+    risk: PathRisk | None = None
+
+    @property
+    def p_fail(self) -> np.ndarray | None:
+        """Chance of each bound to end the mission, given that it is begun, shape (bound,)."""
+        return None if self.risk is None else self.risk.p_fail
+
+    @property
+    def p_arrive(self) -> float | None:
+        """Chance that the mission reaches the goal, at the posterior mean of the risk."""
+        return None if self.risk is None else self.risk.p_arrive
+
+    @property
+    def p_arrive_band(self) -> tuple[float, float] | None:
+        """Ends of the 90 % band of `p_arrive` over draws of the risk; None without draws."""
+        return None if self.risk is None else self.risk.p_arrive_band
 
     @cached_property
     def waypoints(self) -> np.ndarray | None:
@@ -86,13 +105,18 @@ class Plan:
 def plan_to_record(plan: Plan) -> dict[str, Any]:
     """Convert a plan, without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
+    values["risk"] = None if plan.risk is None else plan.risk.to_record()
     return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}
 
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     """Convert the record of `plan_to_record` to a plan of a workspace."""
     values: dict[str, Any] = {**record, "workspace": workspace}
+    if "success" in values:  # its name in version 0.1
+        values["success_index"] = values.pop("success")
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
+    if record.get("risk"):  # unknown to version 0.1
+        values["risk"] = PathRisk.from_record(record["risk"])
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

@@ -1,7 +1,7 @@
 """The planner of a user: one workspace, one start and goal, one objective."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Self
@@ -23,6 +23,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.posterior import DrawnPaths, choose_draws
 from trustbo.planning.problem import PlanningProblem, draws_of
+from trustbo.planning.risk import FailureRule, Risk
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.planning.values import evaluate
 from trustbo.workspace import Workspace
@@ -62,6 +63,10 @@ class Planner:
         backend: str | None = None,
         observation: str = "gaussian",
         response: str = "level",
+        max_failure: float | None = None,
+        confidence: float | None = None,
+        failure_cost: float | None = None,
+        infeasible: str = "refuse",
     ) -> None:
         """Prepare to plan.
 
@@ -84,12 +89,21 @@ class Planner:
                 mean (in units of trust) and stationary (in units of log probability).
             engine: `"networkx"`, the reference; `"numba"`, compiled; or `"auto"`: networkx for
                 single plans on up to 50 x 50 cells; for success, bottleneck, `team="min"` and
-                lost_contact of other than Gaussian rates up to 10 x 10. All find paths of the same
-                value.
+                lost_contact of other than Gaussian rates up to 10 x 10; never within a risk. All
+                find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
             observation: Family of the contact rates, and
             response: quantity that they measure, both as of the trust model: for lost_contact,
                 and for the policy `information`.
+            max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
+                by default no limit.
+            confidence: Least share of the draws of the risk under which a path must respect
+                `max_failure`; by default it must at their posterior mean.
+            failure_cost: Cost of a failure for lost_contact, in bounds: its value is less by this
+                times the chance to fail. By default the fewest bounds from start to goal, so that
+                a mission that fails counts as one that lost all contact.
+            infeasible: Where no path respects `max_failure`, `"refuse"`: InfeasibleError; or
+                `"safest"`: plan the best of the safest paths.
 
         Raises:
             TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
@@ -106,7 +120,8 @@ class Planner:
             max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
         paths = AdmissiblePaths(workspace, start, goal, connectivity, max_bounds, revisit)
         chosen = Objective(objective, length_weight, self.family, self.lag)
-        self._hold(PlanningProblem(paths, chosen, team))
+        rule = FailureRule(max_failure, confidence, failure_cost, infeasible)
+        self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
     def _hold(self, problem: PlanningProblem) -> None:
         paths = problem.paths
@@ -148,6 +163,33 @@ class Planner:
         """Return the planner with other awareness of cells; see `PlanningProblem`."""
         return self._with(self.problem.with_awareness(awareness, mean))
 
+    def with_risk(
+        self,
+        p_fail: ArrayLike | None,
+        draws: ArrayLike | None = None,
+        causes: Mapping[str, ArrayLike] | None = None,
+    ) -> Self:
+        """Return the planner with the chance of each bound to end the mission.
+
+        Plans then have `p_arrive`, respect `max_failure`, and pay `failure_cost` in lost_contact.
+
+        Args:
+            p_fail: Posterior mean, shape (move, row, col) with the moves of `workspace.moves.MOVES`
+                for connectivity 8; NaN where there is no bound. None: no risk.
+            draws: Draws from its posterior, shape (draw, move, row, col), for bands of `p_arrive`
+                and for `confidence`.
+            causes: Share of each cause of failure, numbers or arrays (move, row, col).
+
+        Raises:
+            ShapeError: Other shapes.
+            TrustboError: A chance outside [0, 1].
+        """
+        if p_fail is None:
+            return self._with(self.problem.with_risk(None))
+        drawn = None if draws is None else np.asarray(draws, dtype=float)
+        risk = Risk(np.asarray(p_fail, dtype=float), drawn, dict(causes or {}))
+        return self._with(self.problem.with_risk(risk))
+
     def of_draw(self, index: int) -> Self:
         """Return the planner with the awareness map of one draw, where awareness is uncertain."""
         return self._with(self.problem.of_draw(index))
@@ -172,6 +214,7 @@ class Planner:
         Raises:
             ShapeError: Parameters with leading axes, or of other robots or features.
             TrustboError: beta0 is outside the range the objective is exact for.
+            InfeasibleError: No path respects `max_failure`.
         """
         started = time.perf_counter()
         if params.leading:

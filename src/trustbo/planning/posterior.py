@@ -91,7 +91,8 @@ class DrawnPaths:
         return (count / len(self.paths)).reshape(passable.shape)
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
-        return path_value(dynamics, self.problem.objective, self.problem.paths, path)
+        value = path_value(dynamics, self.problem.objective, self.problem.paths, path)
+        return value - self.problem.cost_of_failure(path)
 
     @cached_property
     def _unique(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

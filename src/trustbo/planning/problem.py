@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -14,8 +15,9 @@ from trustbo.models.params import Params, params_of
 from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
 from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
 from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.risk import NO_RULE, FailureRule, Risk, RiskTable, risk_table
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along, move_indices
+from trustbo.workspace.moves import MOVES, along, move_indices
 
 _ALL = slice(None)
 _ENTRIES = 1 << 22  # of awareness of bounds at a time
@@ -28,7 +30,8 @@ class PlanningProblem:
     Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. Where the awareness
     is not the workspace's, `cells` has that of cells, (robot, row, col, feature), with a leading
     axis (draw,) where it is uncertain, and `mean_cells` the mean over these. What cells differ in
-    from the workspace's is added to the awareness of all bounds into them.
+    from the workspace's is added to the awareness of all bounds into them. `rule` says how much
+    failure is accepted, and `risk` how probable it is.
 
     TrustboError: unknown team or objective; a length weight that is negative, or for success or
     bottleneck.
@@ -39,9 +42,12 @@ class PlanningProblem:
     team: str
     cells: np.ndarray | None = None
     mean_cells: np.ndarray | None = None
+    rule: FailureRule = NO_RULE
+    risk: Risk | None = None
 
     def __post_init__(self) -> None:
         name, length_weight, family, lag = self.objective
+        self.rule.checked(name)
         require_choice("objective", name, OBJECTIVES)
         require_choice("team", self.team, TEAMS)
         if not 0.0 <= length_weight < np.inf:
@@ -121,14 +127,54 @@ class PlanningProblem:
         mean = z.reshape(-1, *expected).mean(0) if mean is None else np.asarray(mean)
         return replace(self, cells=z, mean_cells=mean)
 
+    def with_risk(self, risk: Risk | None) -> Self:
+        """Return the problem with a risk; ShapeError if it is not of the workspace's cells."""
+        expected = (len(MOVES[8]), *self.paths.passable.shape)
+        if risk is not None and risk.p_fail.shape != expected:
+            raise ShapeError(f"p_fail must have shape {expected}; got {risk.p_fail.shape}.")
+        return replace(self, risk=risk)
+
+    @cached_property
+    def risk_table(self) -> RiskTable | None:
+        """Risks of the bounds and their limits, None where plans do not depend on them.
+
+        TrustboError: there is a limit and no risk, or what `risk_table` raises.
+        """
+        if self.risk is None:
+            if self.rule.max_failure is not None:
+                raise TrustboError(
+                    f"max_failure = {self.rule.max_failure:g} needs the chance of each bound to "
+                    "fail; use planner.with_risk(p_fail)."
+                )
+            return None
+        return risk_table(self.risk, self.rule, self.failure_cost, self.paths)
+
+    @property
+    def failure_cost(self) -> float:
+        """Cost of a failure, in bounds; 0 for other objectives than lost_contact."""
+        if self.objective.name != "lost_contact":
+            return 0.0
+        cost = self.rule.failure_cost
+        return float(self.paths.shortest) if cost is None else cost
+
+    def cost_of_failure(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """`failure_cost` times the chance that a path fails, 0 without a risk."""
+        if self.risk is None or self.failure_cost == 0.0:
+            return 0.0
+        return self.failure_cost * (1.0 - self.risk.survival(path))
+
     def onward(self, done: Sequence[Cell]) -> Self:
         """Return the problem of the rest of a mission that entered the cells `done`, start first.
 
-        Bounds already made count towards the limit. The value of a plan is that of the rest alone:
-        for `mean`, the mean over the bounds still to come. Raises what `AdmissiblePaths.onward`
-        raises.
+        Bounds already made count towards the limit on their number, and their risk towards
+        `max_failure`. The value of a plan is that of the rest alone: for `mean`, the mean over the
+        bounds still to come. Raises what `AdmissiblePaths.onward` raises.
         """
-        return replace(self, paths=self.paths.onward(done))
+        rule, most = self.rule, self.rule.max_failure
+        if self.risk is not None and most is not None and len(done) > 1:
+            survived = self.risk.survival(done)
+            rule = rule._replace(max_failure=max(0.0, 1.0 - (1.0 - most) / max(survived, 1e-300)))
+        return replace(self, paths=self.paths.onward(done), rule=rule)
 
     def of_draw(self, index: int) -> Self:
         """Return the problem with the awareness map of one draw, where awareness is uncertain."""
@@ -153,17 +199,17 @@ class PlanningProblem:
         moves = move_indices(self.paths.connectivity)
         if cells is None or cells.ndim == 4 or not params.leading:
             cells = cells if params.leading else self.mean_cells
-            return trust_dynamics(params, self._of_bounds(cells, moves), team, x0)
+            return trust_dynamics(params, self._of_bounds(cells, moves), team, x0, moves)
         which = (np.arange(params.leading[0]) if draws is None else draws) % len(cells)
         if self.workspace.of_bounds is None:
-            return trust_dynamics(params, _any_move(cells[which]), team, x0)
+            return trust_dynamics(params, _any_move(cells[which]), team, x0, moves)
         # Awareness of all robots, moves and features is large: only drift is kept for all draws.
-        whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0)
+        whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0, moves)
         n = max(1, _ENTRIES // (len(moves) * cells[0].size))
         for part in (slice(i, i + n) for i in range(0, len(which), n)):
             z = self._of_bounds(cells[which[part]], moves)
             some: Params = params.draw(part)  # pyright: ignore[reportArgumentType]
-            whole.drift[part] = trust_dynamics(some, z, team).drift
+            whole.drift[part] = trust_dynamics(some, z, team, moves=moves).drift
         return whole
 
 

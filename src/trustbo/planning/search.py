@@ -1,5 +1,6 @@
 """Search for the best path: validity of the objective, choice of the engine, optimality gap."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,9 +10,11 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.compiled import expected_path, plan_compiled
+from trustbo.planning.engines.compiled_risk import safest_path
 from trustbo.planning.engines.reference import plan_networkx
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
+from trustbo.planning.risk import FailureRule, InfeasibleError, Risk, RiskTable
 
 ENGINES = ("auto", "networkx", "numba")
 LARGEST_FOR_NETWORKX = 2500
@@ -28,13 +31,18 @@ class Engine(NamedTuple):
     name: str = "auto"
     backend: str | None = None
 
-    def choose(self, n_cells: int, n_draws: int, *, labels: bool = False) -> str:
+    def choose(
+        self, n_cells: int, n_draws: int, *, labels: bool = False, risk: bool = False
+    ) -> str:
         """Resolve the name; `auto` goes by the number of cells and draws, and the kind of search.
 
-        The reference engine has no heuristic for labels: 41 s for `success` on 30 x 30 cells.
+        The reference engine has no heuristic for labels: 41 s for `success` on 30 x 30 cells, and
+        1 s within a risk on 10 x 10.
         """
         if require_choice("engine", self.name, ENGINES) != "auto":
             return self.name
+        if risk:
+            return "numba"
         most = LARGEST_FOR_LABELS if labels else LARGEST_FOR_NETWORKX
         return "networkx" if n_draws == 1 and n_cells <= most else "numba"
 
@@ -48,15 +56,60 @@ class FoundPath(NamedTuple):
 
 
 def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> FoundPath:
-    """Find the best path under one draw, `dynamics` without leading axes."""
+    """Find the best path under one draw, `dynamics` without leading axes.
+
+    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
+    """
     paths, objective = problem.paths, problem.objective
     require_valid(dynamics, objective)
     dynamics = objective.capped(dynamics)
-    name = engine.choose(paths.passable.size, 1, labels=_has_labels(problem))
-    if name == "networkx":
-        return FoundPath(plan_networkx(paths, dynamics, objective, engine.backend), 0.0, name)
-    best = plan_compiled(paths, dynamics.flat(), objective)
-    return FoundPath(paths.cells(best.paths[0]), float(best.gap[0]), name)
+    labels, risk = _has_labels(problem), problem.risk_table is not None
+    name = engine.choose(paths.passable.size, 1, labels=labels, risk=risk)
+
+    def best(risk: RiskTable | None) -> FoundPath | None:
+        if name == "networkx":
+            path = plan_networkx(paths, dynamics, objective, engine.backend, risk)
+            return None if path is None else FoundPath(path, 0.0, name)
+        found = plan_compiled(paths, dynamics.flat(), objective, risk)
+        if found is None:
+            return None
+        return FoundPath(paths.cells(found.paths[0]), float(found.gap[0]), name)
+
+    return _feasible(problem, best)
+
+
+def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T | None]) -> T:
+    """What is best under the planner's risk, or under that of the safest path.
+
+    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
+    """
+    risk = problem.risk_table
+    if (found := best(risk)) is not None:
+        return found
+    assert risk is not None and problem.risk is not None  # noqa: S101, PT018
+    path, limit = safest_path(problem.paths, problem.objective.name, risk.of_bounds[0])
+    if problem.rule.infeasible == "refuse":
+        raise _infeasible(problem.rule, problem.risk, path)
+    # The best of those that are as safe, as rounding tells them apart.
+    limits = np.array([limit + 1e-12 * max(1.0, limit)])
+    found = best(RiskTable(risk.of_bounds[:1], limits, 1, risk.failure_cost))
+    assert found is not None  # noqa: S101
+    return found
+
+
+def _infeasible(rule: FailureRule, risk: Risk, path: tuple[Cell, ...]) -> InfeasibleError:
+    p_fail, most = 1.0 - risk.survival(path), rule.max_failure or 0.0
+    sure, held = "", ""
+    if rule.confidence is not None:
+        sure = f" with confidence {rule.confidence:g}"
+        held = f", which holds the limit under {risk.share_within(path, most):.3g} of the draws"
+    return InfeasibleError(
+        f"no admissible path from {path[0]} to {path[-1]} fails with a chance of at most "
+        f"max_failure = {most:g}{sure}; the least is {p_fail:.4g}, on the path {path}{held}. Raise "
+        "max_failure, admit more paths by max_bounds, or plan the safest, infeasible='safest'.",
+        path,
+        p_fail,
+    )
 
 
 def _has_labels(problem: PlanningProblem) -> bool:
@@ -67,15 +120,24 @@ def _has_labels(problem: PlanningProblem) -> bool:
 def find_paths(
     problem: PlanningProblem, dynamics: Dynamics, engine: Engine
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the best path under every draw: flat indices (draw, length), padded by -1; and gaps."""
+    """Find the best path under every draw: flat indices (draw, length), padded by -1; and gaps.
+
+    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
+    """
     paths, objective, n_draws = problem.paths, problem.objective, len(dynamics.start)
     require_valid(dynamics, objective)
     dynamics = objective.capped(dynamics)
     if engine.choose(paths.passable.size, n_draws, labels=_has_labels(problem)) == "numba":
-        return plan_compiled(paths, dynamics, objective)
-    found = [
-        plan_networkx(paths, dynamics.take(d), objective, engine.backend) for d in range(n_draws)
-    ]
+        return _feasible(problem, lambda risk: plan_compiled(paths, dynamics, objective, risk))
+
+    def best(risk: RiskTable | None) -> list[tuple[Cell, ...]] | None:
+        found = [
+            plan_networkx(paths, dynamics.take(d), objective, engine.backend, risk)
+            for d in range(n_draws)
+        ]
+        return None if None in found else found  # pyright: ignore[reportReturnType]
+
+    found = _feasible(problem, best)
     padded = np.full((n_draws, max(map(len, found))), -1)
     for flat, path in zip(padded, found, strict=True):
         flat[: len(path)] = [paths.flat(cell) for cell in path]
@@ -85,6 +147,7 @@ def find_paths(
 def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, ...]:
     """Find the path with the best expectation over draws of the objective, trust not capped.
 
+    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     TrustboError: another objective than terminal, mean or, where rates are linear in trust,
     lost_contact; or `team="min"`.
     """
@@ -96,7 +159,8 @@ def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, .
             "linear in trust, 'lost_contact' of a team's mean trust; got "
             f"{objective.name!r} of {objective.family.name!r} rates with team={problem.team!r}."
         )
-    return paths.cells(expected_path(paths, dynamics, objective))
+    found = _feasible(problem, lambda risk: expected_path(paths, dynamics, objective, risk))
+    return paths.cells(found)
 
 
 def require_valid(dynamics: Dynamics, objective: Objective) -> None:

@@ -83,8 +83,12 @@ def _trust_at(
     """Largest trust at one cell, by planning a path to it: vector trust has no scalar recursion."""
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
-    there = admissible.to(cell, extra)
-    paths = plan_compiled(there, dynamics, Objective("terminal")).paths
+    found = plan_compiled(admissible.to(cell, extra), dynamics, Objective("terminal"))
+    assert found is not None  # as there is no risk  # noqa: S101
+    paths = found.paths
     return np.array(
-        [team_trust(dynamics.take(d).along(there.cells(path)))[-1] for d, path in enumerate(paths)]
+        [
+            team_trust(dynamics.take(d).along(admissible.cells(path)))[-1]
+            for d, path in enumerate(paths)
+        ]
     )

@@ -69,25 +69,26 @@ def evaluate(
     flat, grid = np.fromiter(itertools.chain.from_iterable(path), int), problem.workspace.grid
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
-    z = problem.awareness_along(cells, params)
-    draws = roll_trust(params, z, x0)
+    z, along = problem.awareness_along(cells, params), params.along(cells)
+    draws = roll_trust(along, z, x0)
     draws = draws.reshape(-1, *draws.shape[-2:])
     trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
     team = trust.mean(1) if problem.team == "mean" else trust.min(1)
     cost = objective.length_weight * length
     if objective.name in ("stationary", "lost_contact"):
-        along = trust_dynamics(params, as_map(z), problem.team, x0)
-        value = _value(objective.capped(along) if cap else along, objective, cost).mean()
+        dynamics = trust_dynamics(along, as_map(z), problem.team, x0)
+        value = _value(objective.capped(dynamics) if cap else dynamics, objective, cost).mean()
     else:
         value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
+    risk = None if problem.risk is None else problem.risk.along(cells)
     return Plan(
         path=path,
         positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
         length=length,
         trust=trust,
         bands=_bands(draws),
-        value=float(value),
-        success=float(np.exp(-softplus(-team).sum())),
+        value=float(value) - problem.cost_of_failure(cells),
+        success_index=float(np.exp(-softplus(-team).sum())),
         objective=objective.name,
         exact=False,
         bound=np.nan,
@@ -95,6 +96,7 @@ def evaluate(
         engine="given",
         seconds=0.0,
         workspace=problem.workspace,
+        risk=risk,
     )
 
 

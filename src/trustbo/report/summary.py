@@ -14,9 +14,10 @@ _MEANS = {
     "terminal": "the chance \N{GREEK SMALL LETTER SIGMA}(trust) at the goal, 1 minus the paper's "
     "cost (6)",
     "mean": "the mean of expected trust over the bounds",
-    "success": "the probability that every bound succeeds",
+    "success": "the product of \N{GREEK SMALL LETTER SIGMA}(trust) over the bounds",
     "bottleneck": "the least expected trust on the way",
-    "stationary": "the probability that every bound succeeds, trust taken as settled in each cell",
+    "stationary": "the product of \N{GREEK SMALL LETTER SIGMA}(trust) over the bounds, trust taken "
+    "as settled in each cell",
 }
 
 
@@ -81,8 +82,8 @@ def _exactness(plan: Plan) -> str:
 def _success(plan: Plan) -> str:
     n, sigma = len(plan.path) - 1, "\N{GREEK SMALL LETTER SIGMA}"
     return (
-        f"All {counted(n, 'bound')} of it succeed with probability {number(plan.success)}, the "
-        f"product of {sigma}(trust) over them. That compares paths rather than predicts: as "
+        f"Its success index is {number(plan.success_index)}, the product of {sigma}(trust) over "
+        f"its {counted(n, 'bound')}. That compares paths rather than predicts: as "
         f"{sigma}(1) is 0.73, even {counted(n, 'bound')} of full contact come to "
         f"{number(expit(1.0) ** n)}."
     )

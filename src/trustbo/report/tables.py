@@ -1,8 +1,8 @@
 """Tables of a page."""
 
-import arviz as az
 import numpy as np
 import xarray as xr
+from arviz_stats import sampling_diagnostics
 
 from trustbo.campaign.result import Result
 from trustbo.files import to_json
@@ -40,8 +40,8 @@ def parameter_table(result: Result) -> Table:
     diagnosed = posterior.attrs["sampler"] != "exact"
     sites = posterior["posterior"].to_dataset()
     with np.errstate(invalid="ignore"):
-        rhat = az.rhat(sites) if diagnosed else None
-        ess = az.ess(sites, method="bulk") if diagnosed else None
+        rhat = sampling_diagnostics.rhat(sites) if diagnosed else None
+        ess = sampling_diagnostics.ess(sites, method="bulk") if diagnosed else None
     rows = []
     for label, name, where, draws in labelled_draws(sites):
         sd = float(draws.std())

@@ -85,7 +85,9 @@ class ModelSimulator:
         padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
         with own_settings():  # else the caller's flags decide what is drawn
             key = jax.random.key(seed)
-        sample = self.model.simulate(key, self.params, padded[None], self.n_ticks)
+        bounds = np.full((1, len(padded), 3), -1)
+        bounds[0, :n_bounds] = np.column_stack([moves_along(cells), np.asarray(cells)[1:]])
+        sample = self.model.simulate(key, self.params.on(bounds), padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
         n, status = self._end(cells, seed)
@@ -107,7 +109,8 @@ class ModelSimulator:
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""
-        truth = {name: np.asarray(value).tolist() for name, value in self.params._asdict().items()}
+        fields = self.params._asdict().items()
+        truth = {n: np.asarray(value).tolist() for n, value in fields if value is not None}
         about: dict[str, object] = {
             "simulator": type(self).__name__,
             "simulator_model": self.model.describe(),

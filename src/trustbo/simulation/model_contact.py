@@ -60,7 +60,8 @@ class ModelContact:
 
     def contact(self, path: Sequence[Cell]) -> np.ndarray:
         """Expected contact rates of the bounds of a path, shape (bound, robot)."""
-        trust = roll_trust(self._params, np.swapaxes(along(self._awareness, path), 0, 1))
+        z = np.swapaxes(along(self._awareness, path), 0, 1)
+        trust = roll_trust(self._params.along(path), z)
         return self._rate(trust, self._spread(len(trust)))
 
     def failure(self, path: Sequence[Cell]) -> np.ndarray:

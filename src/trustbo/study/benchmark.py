@@ -13,7 +13,7 @@ import xarray as xr
 from trustbo.campaign.options import OBJECTIVE, SAMPLER
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import FilePath
-from trustbo.models.samplers.run import require_sampler
+from trustbo.models.samplers.run import resolve_sampler
 from trustbo.study.conduct import run_runs
 from trustbo.study.contenders import BASELINES, Contender, contenders_of
 from trustbo.study.run import Run
@@ -129,7 +129,7 @@ def _run(
     n_iterations: int,
 ) -> Run:
     try:
-        require_sampler(entrant.model.model(), sampler)
+        resolve_sampler(entrant.model.model(), sampler)
     except TrustboError:
         sampler = SAMPLER
     labels = {

@@ -1,7 +1,7 @@
 """Parts of a study as plain settings: their base, trust models and simulators."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar, Protocol, Self
 
@@ -92,7 +92,7 @@ class Model(Part):
     observation: str = "gaussian"
     response: str = "level"
     priors: str = "default"
-    make: ClassVar[type[models.TrustModel]]
+    make: ClassVar[Callable[..., models.TrustModel]]
 
     def __post_init__(self) -> None:
         require_choice("priors", self.priors, ("default", "zheng2023"))
@@ -113,6 +113,21 @@ class Pooled(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Places(Model):
+    """Settings of `models.PooledTrust` with effects of places."""
+
+    kind = "places"
+    cells: bool = True
+    bounds: bool = True
+
+    @staticmethod
+    def make(priors: models.Priors | None, **options: Any) -> models.TrustModel:
+        """Make the model."""
+        place = models.PlaceEffect(cells=options.pop("cells"), bounds=options.pop("bounds"))
+        return models.PooledTrust(priors, place=place, **options)  # pyright: ignore
+
+
+@dataclass(frozen=True, kw_only=True)
 class Hierarchical(Model):
     """Settings of `models.HierarchicalTrust`."""
 
@@ -127,7 +142,7 @@ class Coupled(Model):
     inter_robot: str = "full"
 
 
-MODELS = (Pooled, Hierarchical, Coupled)
+MODELS = (Pooled, Places, Hierarchical, Coupled)
 
 
 class Place(Protocol):

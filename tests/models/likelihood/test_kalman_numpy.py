@@ -19,7 +19,7 @@ def test_process_noise_that_underflows_is_no_process_noise():
     found = []
     for delta_w in (1e-8, 1e-200):  # the square of the latter is 0
         params = TrustParams(0.6, np.array([0.3, 0.2]), 0.1, delta_w, 0.1)
-        params = TrustParams(*(np.asarray(v, dtype=float)[None] for v in params))
+        params = params.flat()
         summary = trajectories.summarize(params, 0.0, batch)
         draw = trajectories.sample(params, 0.0, batch, np.random.default_rng(1))
         assert np.isfinite(draw).all()
@@ -45,16 +45,16 @@ def with_losses():
 def test_trust_is_that_of_dense_conditioning_where_no_rate_was_measured(with_losses):
     n = 4000
     params = TrustParams(0.6, np.array([0.3, 0.2]), 0.1, 0.05, 0.08, 0.4, 0.3)
-    draws = TrustParams(*(np.repeat(np.asarray(v, dtype=float)[None], n, 0) for v in params))
+    draws = params.map(lambda v, _: np.repeat(np.asarray(v, dtype=float)[None], n, 0))
     batch = stack_missions(with_losses, pad=False)
     n_bounds = np.array([len(m.bounds) for m in with_losses])
-    few = TrustParams(*(v[:2] for v in draws))
+    few = draws.map(lambda v, _: v[:2])
     summary = trajectories.summarize(few, 0.0, batch, n_bounds)
     drawn = trajectories.sample(draws, 0.0, batch, np.random.default_rng(0), n_bounds)
     for j, mission in enumerate(with_losses):
         for i in range(3):
             z, y = mission.awareness[:, i], mission.contact_rate[:, i]
-            mean, covariance = dense_posterior_of_trust(*params, z, y)
+            mean, covariance = dense_posterior_of_trust(*params[:7], z, y)
             K, sd = len(mean), np.sqrt(np.diag(covariance))
             np.testing.assert_allclose(summary.mean[j, :K, i], mean, rtol=1e-9)
             np.testing.assert_allclose(summary.sd[j, :K, i], sd, rtol=1e-6)
@@ -73,7 +73,7 @@ def test_a_posterior_knows_trust_where_no_rate_was_measured(with_losses, sampler
     for j, i in ((0, 0), (1, 1), (2, 2)):
         mission = with_losses[j]
         z, y = mission.awareness[:, i], mission.contact_rate[:, i]
-        each = [dense_posterior_of_trust(*p, z, y) for p in picked]
+        each = [dense_posterior_of_trust(*p[:7], z, y) for p in picked]
         means = np.array([m for m, _ in each])
         variance = np.mean([np.diag(c) for _, c in each], axis=0) + means.var(0)
         here = {"mission": j, "robot": f"r{i + 1}", "bound": slice(1, len(y))}

@@ -41,7 +41,7 @@ def test_log_likelihood_equals_the_dense_joint_normal(seed):
     params, missions = random_params(rng), random_missions(rng, missing=0.3 * (seed % 2))
     expected = [
         sum(
-            dense_log_likelihood(*params, mission.awareness[:, i], mission.contact_rate[:, i])
+            dense_log_likelihood(*params[:7], mission.awareness[:, i], mission.contact_rate[:, i])
             for i in range(3)
         )
         for mission in missions
@@ -54,7 +54,7 @@ def test_log_likelihood_is_vectorised_over_draws_of_parameters():
     rng = np.random.default_rng(0)
     missions = random_missions(rng)
     draws = [random_params(rng) for _ in range(4)]
-    stacked = TrustParams(*(np.stack(values) for values in zip(*draws, strict=True)))
+    stacked = TrustParams(*(np.stack(v) for v in zip(*(d[:7] for d in draws), strict=True)))
     together = PooledTrust().log_likelihood(stacked, missions)
     alone = [PooledTrust().log_likelihood(draw, missions) for draw in draws]
     assert together.shape == (4, 3)
@@ -105,7 +105,7 @@ def test_the_smoother_and_backward_sampling_have_the_exact_moments(seed):
         draws = np.asarray(draws)[:, :, 0]
     for i in range(3):
         mean, cov = dense_posterior_of_trust(
-            *params, mission.awareness[:, i], mission.contact_rate[:, i]
+            *params[:7], mission.awareness[:, i], mission.contact_rate[:, i]
         )
         np.testing.assert_allclose(smoothed.mean[:, 0, i], mean, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(smoothed.var[:, 0, i], np.diag(cov), rtol=1e-7, atol=1e-12)
@@ -130,7 +130,7 @@ def test_simulated_rates_have_the_joint_normal_s_moments():
     cov = np.cov(rates.T)
     mean = rates.mean(0)
     log_density = -0.5 * (np.linalg.slogdet(cov)[1] + 4 * np.log(2 * np.pi))
-    expected = dense_log_likelihood(*params, z[0, :, 0], mean)
+    expected = dense_log_likelihood(*params[:7], z[0, :, 0], mean)
     # slogdet of a 4 x 4 sample covariance has sd sqrt(2 * 4 / n), halved here: 5 of these.
     assert abs(log_density - expected) < 5 * 0.5 * np.sqrt(8 / n_draws)
 

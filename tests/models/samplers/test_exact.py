@@ -36,7 +36,7 @@ def test_the_quadratic_form_is_the_dense_joint_normal(seed):
         found = -0.5 * (q.alpha[i] - 2 * c @ q.h[i] + c @ q.P[i] @ c + q.log_det[i])
         found -= 0.5 * statistics.n_measured * np.log(2 * np.pi)
         expected = sum(
-            dense_log_likelihood(*p, m.awareness[:, r], m.contact_rate[:, r])
+            dense_log_likelihood(*p[:7], m.awareness[:, r], m.contact_rate[:, r])
             for m in missions
             for r in range(3)
         )

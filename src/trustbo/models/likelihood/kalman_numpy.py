@@ -101,7 +101,7 @@ def simulate(
         x = p.x0_mean + p.x0_sd * rng.standard_normal((len(group.mission), n))
         for k in range(len(group.y)):
             before = x
-            x = p.beta0 * x + group.z[k] @ p.beta + p.b + p.delta_w * w[k]
+            x = p.beta0 * x + p.drift(group.z[k], k) + p.delta_w * w[k]
             y = x - lag * before + p.delta_v * v[k]
             rates[:, group.mission, k, group.robot] = y.T
     return rates
@@ -112,11 +112,15 @@ class _Draws(NamedTuple):
 
     beta0: np.ndarray
     beta: np.ndarray  # (feature, draw)
-    b: np.ndarray
+    b: np.ndarray  # (draw,), or (bound, sequence, draw)
     delta_w: np.ndarray
     delta_v: np.ndarray
     x0_mean: np.ndarray
     x0_sd: np.ndarray
+
+    def drift(self, z: np.ndarray, k: int) -> np.ndarray:
+        """Increment of trust by bound k at awareness z (sequence, feature), (sequence, draw)."""
+        return z @ self.beta + (self.b if self.b.ndim == 1 else self.b[k])
 
 
 class _Group(NamedTuple):
@@ -142,8 +146,11 @@ def _groups(
 ) -> Iterator[_Group]:
     n_missions, longest, n_robots = batch.contact_rate.shape
     n_bounds = np.full(n_missions, longest) if n_bounds is None else n_bounds
+    b, n_draws = np.asarray(params.b), len(params.b)
+    of_bounds = b.ndim == 4  # (draw, mission, bound, robot), see `Params.on`
     for members in params.alike(n_robots):
-        draws = _draws_last(params.of_robot(members[0]))
+        of = params._replace(b=np.zeros((n_draws, n_robots))) if of_bounds else params
+        draws = _draws_last(of.of_robot(members[0]))
         mission, robot = (a.ravel() for a in np.meshgrid(range(n_missions), members, indexing="ij"))
         y = batch.contact_rate[mission, :, robot].T
         seen = ~np.isnan(y)
@@ -153,6 +160,9 @@ def _groups(
         for n, measured in np.unique(kinds, axis=1).T:
             rows = np.flatnonzero((kinds == [[n], [measured]]).all(0))
             here = seen[:n, rows, None]
+            if of_bounds:
+                own = np.minimum(robot[rows], b.shape[3] - 1)
+                draws = draws._replace(b=b[:, mission[rows], :n, own].transpose(2, 0, 1).copy())
             yield _Group(
                 draws,
                 mission[rows],
@@ -170,17 +180,17 @@ def _draws_last(params: Params) -> _Draws:
         value = np.broadcast_to(np.asarray(value, dtype=float), (n, *np.shape(value)[1:]))
         return np.ascontiguousarray(value.T)
 
-    return _Draws(*(column(value) for value in params))
+    return _Draws(*(column(getattr(params, name)) for name in _Draws._fields))
 
 
 def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
     h, Q, R = p.beta0 - lag, p.delta_w**2, p.delta_v**2
-    m = np.broadcast_to(p.x0_mean, (len(group.mission), p.b.shape[0]))
-    P = np.broadcast_to(p.x0_sd**2, (group.seen.shape[1], p.b.shape[0]))
+    m = np.broadcast_to(p.x0_mean, (len(group.mission), len(p.beta0)))
+    P = np.broadcast_to(p.x0_sd**2, (group.seen.shape[1], len(p.beta0)))
     means, variances, drifts = [], [], []
     log_likelihood = np.zeros(m.shape)
-    for y, z, seen in zip(group.y, group.z, group.seen, strict=True):
-        drift = z @ p.beta + p.b
+    for k, (y, z, seen) in enumerate(zip(group.y, group.z, group.seen, strict=True)):
+        drift = p.drift(z, k)
         S, C = innovation(p.beta0, h, Q, R, P)
         gain = np.where(seen, C / S, 0.0)
         e = y[:, None] - h * m - drift

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from trustbo.models.params import CoupledParams, RobotParams, TrustParams
 
 Moments = tuple[np.ndarray, np.ndarray]
+Effect = np.ndarray | float
+"""Effect of a place, shape (draw, robot or 1)."""
 
 
 class ApartFilter:
@@ -30,17 +32,22 @@ class ApartFilter:
         mean, sd = (np.broadcast_to(p[:, None], shape) for p in self._x0)
         return mean.copy(), sd**2
 
-    def predict(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray) -> Moments:
-        """Mean and variance after a bound with awareness z (robot, feature), nothing measured."""
+    def predict(
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, effect: Effect = 0.0
+    ) -> Moments:
+        """Mean and variance after a bound with awareness z (robot, feature), nothing measured.
+
+        `effect` is that of its place.
+        """
         ahead = kalman.update(self._beta0, self._Q, var, 0.0, 0.0)
-        return self._beta0 * mean + self._drift(z), ahead
+        return self._beta0 * mean + self._drift(z) + effect, ahead
 
     def update(
-        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray, effect: Effect = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The same given rates y (robot,), and their log density but for a constant, (draw,)."""
         seen = ~np.isnan(y)
-        drift = self._drift(z)
+        drift = self._drift(z) + effect
         S, C = kalman.innovation(self._beta0, self._h, self._Q, self._R, var)
         e = np.where(seen, y - self._h * mean - drift, 0.0)
         gain = np.where(seen, C / S, 0.0)
@@ -75,19 +82,21 @@ class CoupledFilter:
         mean = np.repeat(self._p.x0_mean[:, None], self._n_robots, axis=1)
         return mean, self._p.x0_sd[:, None, None] ** 2 * np.eye(self._n_robots)
 
-    def predict(self, mean: np.ndarray, var: np.ndarray, z: np.ndarray) -> Moments:
+    def predict(
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, effect: Effect = 0.0
+    ) -> Moments:
         """See `ApartFilter.predict`."""
         n = self._n_robots
         F, F_T = self._F[:, :n], self._F_T[:, :, :n]
-        moved = (F @ mean[..., None])[..., 0] + self._drift(z)
+        moved = (F @ mean[..., None])[..., 0] + self._drift(z) + effect
         return moved, F @ var @ F_T + self._p.Delta_w
 
     def update(
-        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray, effect: Effect = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `ApartFilter.update`."""
         n = self._n_robots
-        drift = self._drift(z)
+        drift = self._drift(z) + effect
         joint = (self._F @ mean[..., None])[..., 0]
         joint[:, :n] += drift
         joint[:, n:] += drift

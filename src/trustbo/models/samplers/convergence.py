@@ -1,8 +1,8 @@
 """Convergence diagnostics of a posterior, and the limits beyond which it is refused."""
 
-import arviz as az
 import numpy as np
 import xarray as xr
+from arviz_stats import sampling_diagnostics
 
 MAX_RHAT, MIN_ESS = 1.01, 400.0
 """Largest rank-normalised R-hat, and least bulk effective sample size, of NUTS."""
@@ -31,7 +31,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 def convergence(sites: xr.Dataset) -> dict[str, tuple[float, float]]:
     """The worst R-hat and the least bulk ESS of each parameter."""
     with np.errstate(invalid="ignore"):
-        rhat, ess = az.rhat(sites), az.ess(sites, method="bulk")
+        rhat, ess = sampling_diagnostics.rhat(sites), sampling_diagnostics.ess(sites, method="bulk")
     found = {}
     for name, draws in sites.data_vars.items():
         # A value that never moves is a constant of the model, such as an absent correlation.

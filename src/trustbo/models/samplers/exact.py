@@ -151,9 +151,10 @@ def sample_exact(
     Raises:
         TrustboError: A prior is of another kind; NUTS takes any.
     """
-    _require_conjugate(priors)
+    if reason := why_not_conjugate(priors):
+        raise TrustboError(f'sampler "exact": {reason}. Use sampler="nuts", which takes any.')
     # Matrices are small: a second BLAS thread costs more than it brings.
-    with _blas().limit(limits=1, user_api="blas"):
+    with blas().limit(limits=1, user_api="blas"):
         target = _target(statistics, priors)
         first = _matched(target, _modes(target), seed)
         points = last = _weigh(target, first, seed)
@@ -164,7 +165,7 @@ def sample_exact(
             points = min(points, last, key=lambda each: each.khat)
     rng = np.random.default_rng(seed)
     weights = np.exp(points.log_w)
-    chosen = rng.permutation(_systematic(weights, n_draws, rng))
+    chosen = rng.permutation(systematic(weights, n_draws, rng))
     beta0, delta_w, delta_v, _ = target.constrain(points.z[chosen])
     mean, factor = points.mean[:, chosen], points.factor[..., chosen]
     coefficients = mean + _backward(factor, rng.standard_normal(mean.shape))
@@ -181,7 +182,7 @@ def sample_exact(
 
 
 @cache
-def _blas() -> ThreadpoolController:
+def blas() -> ThreadpoolController:
     """Loaded BLAS libraries: the search for them takes a fifth as long as the sampling."""
     return ThreadpoolController()
 
@@ -287,7 +288,7 @@ def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
     whole = np.linalg.cholesky(covariance)
     white = np.linalg.solve(whole, z.T).T
     order = np.argsort(z[:, 2])
-    drawn = order[_systematic(weights[order], _N_AROUND, np.random.default_rng(seed))]
+    drawn = order[systematic(weights[order], _N_AROUND, np.random.default_rng(seed))]
     scales = []
     for center in white[drawn]:
         near = weights * np.exp(-0.5 * ((white - center) ** 2).sum(1))
@@ -300,7 +301,7 @@ def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
     return Mixture(*(np.concatenate(both) for both in zip(local, kept, strict=True)))
 
 
-def _systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+def systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
     """Indices of n equally weighted draws, by systematic resampling."""
     points = (rng.random() + np.arange(n)) / n
     return np.searchsorted(np.cumsum(weights)[:-1] / weights.sum(), points)
@@ -335,7 +336,8 @@ def _backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     return x
 
 
-def _require_conjugate(priors: Priors) -> None:
+def why_not_conjugate(priors: Priors) -> str | None:
+    """Reason why the sampler cannot treat these priors; None if it can."""
     for name, allowed, kind in (
         ("beta", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),
         ("b", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),
@@ -346,10 +348,8 @@ def _require_conjugate(priors: Priors) -> None:
         prior = getattr(priors, name)
         prior = prior.base if isinstance(prior, Floored) else prior
         if not allowed(prior):
-            raise TrustboError(
-                f'sampler "exact" needs the prior of {name} to be {kind}; got {prior!r}. Use '
-                'sampler="nuts", which takes any.'
-            )
+            return f"it needs the prior of {name} to be {kind}; got {prior!r}"
+    return None
 
 
 _LINES = (constraints.unit_interval, constraints.real)

@@ -96,13 +96,18 @@ def run_nuts(
             return target.potential(z | {"theta": theta_of(z["theta"])})
 
         key_start, key_innovations, key_run = random.split(key, 3)
+        key_effects = random.fold_in(key, 3)
         # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
         z = {"theta": 1.5 * random.normal(key_start, mode.shape, mode.dtype)}
         if joint:
             z["innovations"] = random.normal(key_innovations, shape, mode.dtype)
         z, stats = _run_chain(settings, potential, z, mass, adapt, key_run)
         theta = jax.vmap(theta_of)(z["theta"])
-        return jax.vmap(target.constrain)(theta), stats, z.get("innovations"), theta
+        params = jax.vmap(target.constrain)(theta)
+        if data.places is not None and not joint:
+            keys = random.split(key_effects, settings.n_draws)
+            params["place_unit"] = lax.map(lambda of: target.draw_effects(*of), (theta, keys))
+        return params, stats, z.get("innovations"), theta
 
     # One chain after the other: vectorised chains would all wait for the longest trajectory.
     keys = random.split(key, settings.n_chains)

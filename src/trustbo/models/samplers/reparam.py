@@ -38,6 +38,7 @@ from trustbo.models.samplers.laplace import newton
 from trustbo.models.samplers.partial_centring import RobotFit, centre, fit_robots
 from trustbo.models.samplers.target import NutsData, Sites, Target, innovations_shape
 
+_OF_PLACES = {"tau_s", "length_scale", "tau_e", "place_white"}
 _AUTOREGRESSIONS = {"beta0", "mean_beta0", "B0_diagonal"}
 
 
@@ -59,6 +60,8 @@ class Reparametrisation(NamedTuple):
     no mass: each location parameter takes a power of the noise away. That is added, as in REML.
     """
     linearisation: Array | None
+    draw_effects: Callable[[Array, Array], Array]
+    """Effects of places given such a vector, one draw by a key, where these integrate out."""
 
 
 def reparametrise(
@@ -94,11 +97,17 @@ def reparametrise(
         if space.collapsed:
             return energy
         total = target.unravel(theta)["delta_w"]  # t, the log of all noise
-        n_locations = len(theta) - 2 * total.size
+        of_places = sum(v.size for name, v in target.unravel(theta).items() if name in _OF_PLACES)
+        n_locations = len(theta) - 2 * total.size - of_places
         return energy - n_locations * total.mean()
 
     starts, longest = _starts(model, target, space.means.scatter)
-    return Reparametrisation(starts, longest, constrain, potential, profile, target.linearisation)
+
+    def draw_effects(theta: Array, key: Array) -> Array:
+        return target.draw_effects(target.values(space.to_sites(theta, robots)[0]), key)
+
+    known = constrain, potential, profile, target.linearisation, draw_effects
+    return Reparametrisation(starts, longest, *known)
 
 
 def _starts(model: TrustModel, target: Target, scatter: Array) -> tuple[Array, Array]:

@@ -1,25 +1,33 @@
 """Draws from a model's posterior by the chosen sampler, and the checks of their diagnostics."""
 
 import warnings
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, cast
 
-import arviz as az
+import arviz_base
 import numpy as np
+from arviz_stats import sampling_diagnostics
 from jax import Array, random
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.gram_jax import spectrum
 from trustbo.models.likelihood.latent import Latents
+from trustbo.models.likelihood.place_marginal import PlaceIndex
+from trustbo.models.likelihood.place_rows import gather_rows
 from trustbo.models.model import TrustModel
+from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
-from trustbo.models.samplers.exact import ExactDraws, sample_exact
+from trustbo.models.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
+from trustbo.models.samplers.exact_places import sample_places, split_units
 from trustbo.models.samplers.modes import visits
 from trustbo.models.samplers.nuts import NutsDraws, NutsSettings, run_nuts
+from trustbo.models.samplers.place_target import PlaceTarget
+from trustbo.models.samplers.student import Student
 from trustbo.models.samplers.target import NutsData
 from trustbo.stacking import MissionBatch
 
-SAMPLERS = ("nuts", "exact", "joint")
+SAMPLERS = ("auto", "exact", "nuts", "joint")
 _VISITED = 0.1  # of the draws that a mode's mass promises; Laplace's masses are rough
 _MAX_SHARE_ERROR = 0.015  # Monte Carlo error of a mode's share of the draws
 
@@ -29,10 +37,12 @@ class Draws(NamedTuple):
 
     params: dict[str, np.ndarray]
     stats: dict[str, np.ndarray]
-    summary: dict[str, float]
+    summary: dict[str, Any]
     sampler: str
     latents: Latents = Latents()
     """Innovations of latent trust, with the same leading axes, if it was sampled."""
+    places: Mapping[str, np.ndarray] = {}
+    """Effects of visited places, see `place_maps.place_group`."""
 
 
 def draw_posterior(
@@ -42,6 +52,8 @@ def draw_posterior(
     seed: int,
     batch: MissionBatch,
     weight: np.ndarray | None = None,
+    places: Visited | None = None,
+    start: Student | None = None,
     *,
     check: bool,
 ) -> tuple[Draws, list[str]]:
@@ -54,18 +66,33 @@ def draw_posterior(
         seed: Seed; the same seed gives the same draws.
         batch: Missions, padded.
         weight: Weight of each mission, shape (mission,); 1 by default.
+        places: Visited places, where these have effects.
+        start: What the exact sampler begins with, from an earlier posterior with places.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
     """
-    if sampler == "exact" and (exact := _sample_exact(model, settings, seed, batch, weight)):
-        return exact, []
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
-    data = nuts_data(model, batch, weight)
+    if sampler == "exact":
+        exact = (
+            _sample_exact(model, settings, seed, batch, weight)
+            if places is None
+            else _sample_places(model, settings, seed, batch, weight, places, start)
+        )
+        if exact is not None:
+            return exact, []
+    data = nuts_data(model, batch, weight, places)
     with own_settings():
-        return _sample_nuts(model, settings, random.key(seed), data, check=check)
+        draws, complaints = _sample_nuts(model, settings, random.key(seed), data, check=check)
+    if places is not None:
+        draws = _with_effects(model, draws, places, seed)
+    return draws, complaints
 
 
-def nuts_data(model: TrustModel, batch: MissionBatch, weight: np.ndarray) -> NutsData:
-    """Data for NUTS: sums alone for the pooled Gaussian model without gaps."""
+def nuts_data(
+    model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None = None
+) -> NutsData:
+    """Data for NUTS: sums alone for the pooled Gaussian model without gaps and places."""
+    if places is not None:
+        return NutsData(*batch, weight, places=PlaceIndex.of(places))
     if model.robot_sets == "all" and model.family.integrates_out:
         (statistics,) = model.gather(batch, weight)
         if not statistics.gaps:
@@ -91,13 +118,30 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
             some parameters only or influence each other; or it is `"joint"`, and trust integrates
             out.
     """
-    if sampler == "exact":
-        model.require_exact()
+    if sampler == "exact" and (reason := model.why_not_exact):
+        raise TrustboError(
+            f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
+        )
     if sampler == "joint" and model.family.integrates_out:
         raise TrustboError(
             'sampler "joint" is for observations that trust does not integrate out of; with '
             'Gaussian ones use "nuts" or "exact".'
         )
+
+
+def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
+    """The sampler to use, and why: for `"auto"` the exact one where it applies, else NUTS.
+
+    Raises:
+        TrustboError: See `require_sampler`.
+    """
+    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
+    if sampler != "auto":
+        return sampler, "asked for"
+    reason = model.why_not_exact or why_not_conjugate(model.priors)
+    if reason is None:
+        return "exact", "trust and coefficients integrate out"
+    return ("nuts" if model.family.integrates_out else "joint"), reason
 
 
 def _sample_exact(
@@ -114,12 +158,7 @@ def _sample_exact(
         for i, statistics in enumerate(model.gather(batch, weight))
     ]
     khat = max(exact.khat for exact in each)
-    if not all(exact.khat <= MAX_KHAT for exact in each):
-        warnings.warn(
-            f"the exact sampler's k-hat is {khat:.2f} (limit {MAX_KHAT}): its weights are "
-            "too uneven here, so NUTS is used instead.",
-            stacklevel=4,
-        )
+    if not _is_even(khat):
         return None
     summary = {
         "k_hat": khat,
@@ -128,6 +167,48 @@ def _sample_exact(
     }
     params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     return Draws(params, stats, summary, "exact")
+
+
+def _sample_places(
+    model: TrustModel,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray,
+    places: Visited,
+    start: Student | None,
+) -> Draws | None:
+    """The same for a model with effects of places."""
+    shape = (settings.n_chains, settings.n_draws)
+    rates = batch.awareness, batch.contact_rate
+    rows = gather_rows(*rates, places, weight, float(model.priors.x0_mean))
+    target = PlaceTarget(rows, places, model.priors, cast(PlaceEffect, model.place))
+    drawn, proposal = sample_places(target, shape[0] * shape[1], seed, start)
+    if not _is_even(drawn.khat):
+        return None
+    params = {name: of.reshape(*shape, *of.shape[1:]) for name, of in drawn.params.items()}
+    effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
+    stats = {"lp": drawn.lp.reshape(shape), "log_weight": drawn.log_weight.reshape(shape)}
+    summary = {
+        "k_hat": drawn.khat,
+        "kish": drawn.kish,
+        "log_evidence": drawn.log_evidence,
+        "proposal_center": proposal.center.tolist(),
+        "proposal_scale": proposal.scale.ravel().tolist(),
+    }
+    return Draws(params, stats, summary, "exact", places=effects)
+
+
+def _is_even(khat: float) -> bool:
+    """Whether importance weights can be used; warns where they cannot."""
+    if khat <= MAX_KHAT:
+        return True
+    warnings.warn(
+        f"the exact sampler's k-hat is {khat:.2f} (limit {MAX_KHAT}): its weights are too uneven "
+        "here, so NUTS is used instead.",
+        stacklevel=5,
+    )
+    return False
 
 
 def _join(each: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
@@ -154,8 +235,9 @@ def _sample_nuts(
     check: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws by NUTS, longer ones if the first are bad, and complaints about the last."""
+    collapse = data.places is None
     longer = NutsSettings(
-        2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98, collapse=True
+        2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98, collapse=collapse
     )
     complete = _is_complete(np.asarray(data.contact_rate))
     name = "nuts" if model.family.integrates_out else "joint"
@@ -173,6 +255,18 @@ def _sample_nuts(
     return attempt(longer, 1) if complaints else (draws, complaints)
 
 
+def _with_effects(model: TrustModel, draws: Draws, places: Visited, seed: int) -> Draws:
+    """Draws with the effects of visited places, of cells and bounds apart."""
+    params = dict(draws.params)
+    units = params.pop("place_unit")[..., : len(places.units)]
+    flat = units.reshape(-1, units.shape[-1])
+    hyper = {name: params[name].ravel() for name in model.place_dims}
+    rng = np.random.default_rng([seed, 3])
+    effects = split_units(flat, hyper, places, cast(PlaceEffect, model.place), rng)
+    shaped = {n: of.reshape(*units.shape[:2], -1) for n, of in effects.items()}
+    return draws._replace(params=params, places=shaped)
+
+
 def _is_complete(contact_rate: np.ndarray) -> bool:
     """Whether no rate is missing before the last of a mission, the same bound for all robots."""
     seen = ~np.isnan(contact_rate)
@@ -182,7 +276,7 @@ def _is_complete(contact_rate: np.ndarray) -> bool:
 
 def _complaints(draws: Draws) -> list[str]:
     """Limits that the draws exceed, parameter by parameter; empty if none."""
-    sites = az.from_dict({"posterior": draws.params})["posterior"].to_dataset()
+    sites = arviz_base.from_dict({"posterior": draws.params})["posterior"].to_dataset()
     found = []
     for name, (worst, fewest) in convergence(sites).items():
         if not worst <= MAX_RHAT:  # NaN is a complaint too
@@ -200,8 +294,8 @@ def _mode_complaints(raw: NutsDraws) -> list[str]:
     found, around = [], visits(raw.modes, np.asarray(raw.theta))
     if len(around) == 1:
         return found
-    shares = az.from_dict({"posterior": {str(i): each * 1.0 for i, each in around.items()}})
-    error = az.mcse(shares["posterior"].to_dataset())
+    shares = arviz_base.from_dict({"posterior": {str(i): each * 1.0 for i, each in around.items()}})
+    error = sampling_diagnostics.mcse(shares["posterior"].to_dataset())
     for i, each in around.items():
         mass, share = float(raw.modes.share[i]), each.mean()
         mode = f"the mode where {_telling(raw, i)}"

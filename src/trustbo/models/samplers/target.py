@@ -5,23 +5,26 @@ likelihood that knows the weight of each mission, whether missions are complete,
 the place of rates, and the linearisation point.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
 import numpyro
+import numpyro.distributions as dist
 from jax import Array, random
 from jax.flatten_util import ravel_pytree
 from numpyro import handlers
 from numpyro.distributions.transforms import biject_to
 from numpyro.infer.util import constrain_fn, potential_energy
 
-from trustbo.models.likelihood import gram_jax
+from trustbo.models.likelihood import gram_jax, place_marginal
 from trustbo.models.likelihood.contact_rate import ContactRate
 from trustbo.models.likelihood.families import Observed
 from trustbo.models.likelihood.gram_jax import Spectrum
-from trustbo.models.model import TrustModel, sample_innovations
+from trustbo.models.likelihood.place_marginal import PlaceHyper, PlaceIndex
+from trustbo.models.model import TrustModel, sample, sample_innovations
 from trustbo.models.params import Params
+from trustbo.models.place import PlaceEffect
 
 Sites = dict[str, Array]
 
@@ -37,6 +40,8 @@ class NutsData(NamedTuple):
     """Sums over pooled Gaussian missions without gaps, which take the rates' place."""
     means: tuple[Array | np.ndarray, ...] | None = None
     """Mean rate, mean awareness (feature,) and the rates' sd, which go with the sums."""
+    places: PlaceIndex | None = None
+    """Visited places, where these have effects."""
 
 
 class Target:
@@ -60,8 +65,7 @@ class Target:
         self.model, self.data, self.complete = model, data, complete
         self._sizes = data.awareness.shape[2:]
         self.linearisation: Array | None = None
-        seeded = handlers.seed(model.sample_params, random.key(0))
-        trace = handlers.trace(seeded).get_trace(*self._sizes)
+        trace = handlers.trace(handlers.seed(self._sample, random.key(0))).get_trace()
         sites = {name: site["fn"] for name, site in trace.items() if site["type"] == "sample"}
         self.inverse = {name: biject_to(prior.support) for name, prior in sites.items()}
         start = {name: _start(self.inverse[name], prior) for name, prior in sites.items()}
@@ -73,7 +77,7 @@ class Target:
 
     def params(self, values: Sites) -> Params:
         """Parameters assembled from sites on their supports."""
-        return handlers.substitute(self.model.sample_params, values)(*self._sizes)  # pyright: ignore
+        return handlers.substitute(self._sample, values)()[0]  # pyright: ignore
 
     def potential(self, site: Sites) -> Array:
         """Minus the log posterior density of sites, `innovations` among them if needed."""
@@ -81,9 +85,34 @@ class Target:
 
     def constrain(self, site: Sites) -> Sites:
         """The model's parameters, by name."""
-        args = (self.model.sample_params, self._sizes, {}, site)
-        values = constrain_fn(*args, return_deterministic=True)
-        return {name: values[name] for name in self.model.dims}
+        values = constrain_fn(self._sample, (), {}, site, return_deterministic=True)
+        own = ("place_unit",) if self._samples_effects else ()
+        return {name: values[name] for name in (*self.model.dims, *own)}
+
+    @property
+    def _samples_effects(self) -> bool:
+        """Whether effects of places are sampled with the parameters, and not integrated out."""
+        return self.data.places is not None and not self.model.family.integrates_out
+
+    def _sample(self) -> tuple[Params, PlaceHyper | None]:
+        """Sample statements; effects of places that are sampled are in the intercepts."""
+        params = self.model.sample_params(*self._sizes)
+        if self.data.places is None:
+            return params, None
+        hyper = sample_hyper(cast(PlaceEffect, self.model.place))
+        if self._samples_effects:
+            white = sample("place_white", dist.Normal(0.0, 1.0), (len(self.data.places.cell_of),))
+            effect = place_marginal.prior_factor(hyper, self.data.places) @ white
+            numpyro.deterministic("place_unit", effect)
+            params = params._replace(b=params.b + effect[self.data.places.unit])  # pyright: ignore
+        return params, hyper
+
+    def draw_effects(self, values: Sites, key: Array) -> Array:
+        """One exact draw of the effects of units, given parameters of Gaussian rates."""
+        params, hyper = handlers.substitute(self._sample, values)()  # pyright: ignore
+        ssm = params.ssm(self.data.awareness, self.model.lag)
+        known = self.data.contact_rate, self.data.weight, hyper, self.data.places
+        return place_marginal.draw_effects(ssm, *known, key)  # pyright: ignore
 
     def log_likelihood(
         self, params: Params, innovations: Array | None = None, *, complete: bool = False
@@ -101,7 +130,12 @@ class Target:
         self.linearisation = self.model.family.refine(ssm, observed).linearisation
 
     def _program(self) -> None:
-        params = self.model.sample_params(*self._sizes)
+        params, hyper = self._sample()
+        if hyper is not None and not self._samples_effects:
+            ssm = params.ssm(self.data.awareness, self.model.lag)  # pyright: ignore
+            known = self.data.contact_rate, self.data.weight, hyper, self.data.places
+            numpyro.factor("contact_rate", place_marginal.log_likelihood(ssm, *known))  # pyright: ignore
+            return
         if self.data.spectrum is not None:
             sums = gram_jax.log_likelihood(params, self.data.spectrum, self.model.lag)  # pyright: ignore
             numpyro.factor("contact_rate", sums)
@@ -127,6 +161,19 @@ class _WeightedRates(ContactRate):
         complete = self.target.complete
         each = self.target.log_likelihood(self.params, self.innovations, complete=complete)
         return each.sum(1) * self.target.data.weight
+
+
+def sample_hyper(place: PlaceEffect) -> PlaceHyper:
+    """Sample statements of the hyperparameters of places."""
+    zero, one = jnp.zeros(()), jnp.ones(())
+    tau_s, length_scale, tau_e = zero, one, zero
+    if place.cells:
+        tau_s = sample("tau_s", dist.HalfNormal(place.tau_s))
+        scale = jnp.log(place.length_scale), place.length_scale_sd
+        length_scale = sample("length_scale", dist.LogNormal(*scale))
+    if place.bounds:
+        tau_e = sample("tau_e", dist.HalfNormal(place.tau_e))
+    return PlaceHyper(tau_s, length_scale, tau_e)
 
 
 def innovations_shape(data: NutsData) -> tuple[int, int, int]:

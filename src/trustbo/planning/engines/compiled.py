@@ -8,12 +8,22 @@ from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.buckets import best_stationary
+from trustbo.planning.engines.compiled_risk import (
+    LayeredSearch,
+    plan_layered,
+    plan_stationary,
+    require_complete,
+)
+from trustbo.planning.engines.constrained import Best
+from trustbo.planning.engines.constrained_stationary import least_to_goal
 from trustbo.planning.engines.contact_loss import LAWS, TINY_SD, least_loss
 from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
-from trustbo.planning.engines.labels import TERMINAL, LabelSearch, mode_of, search
+from trustbo.planning.engines.labels import TERMINAL, LabelRisk, LabelSearch, mode_of, search
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.risk import RiskTable
+from trustbo.planning.values import entry_cost
 
 _TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
 _MAX_LABELS = 300_000  # per search
@@ -31,9 +41,17 @@ class BestPaths(NamedTuple):
 
 
 def plan_compiled(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
-) -> BestPaths:
-    """Find the best path of every draw; `dynamics` with a leading axis (draw,)."""
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    risk: RiskTable | None = None,
+) -> BestPaths | None:
+    """Find the best path of every draw; `dynamics` with a leading axis (draw,).
+
+    None if no path is feasible under a risk.
+    """
+    if risk is not None:
+        return _within_risk(admissible, dynamics, objective, risk)
     length_cost = objective.length_weight * admissible.lengths
     if objective.name == "lost_contact" and objective.has_labels and dynamics.is_scalar:
         if admissible.revisit:
@@ -57,16 +75,43 @@ def plan_compiled(
     return BestPaths(paths, np.zeros(len(paths)))
 
 
+def _within_risk(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, risk: RiskTable
+) -> BestPaths | None:
+    length_cost = objective.length_weight * admissible.lengths
+    if objective.name == "stationary":
+        cost = entry_cost(admissible.passable, dynamics)
+        return _found(plan_stationary(admissible, cost, length_cost, risk), admissible)
+    scalar = dynamics.is_scalar if objective.has_labels else len(dynamics.views) == 1
+    if not scalar or (objective.has_labels and not admissible.revisit):
+        return _labelled(admissible, dynamics, objective, length_cost, risk)
+    return _found(plan_layered(admissible, dynamics, objective, risk), admissible)
+
+
+def _found(found: list[Best], admissible: AdmissiblePaths) -> BestPaths | None:
+    """Paths and gaps of all draws, None if no path is feasible, which no draw changes."""
+    require_complete(found, admissible.longest)
+    if not all(len(best.path) for best in found):
+        return None
+    paths = np.full((len(found), max(len(best.path) for best in found)), -1, np.int64)
+    for row, best in zip(paths, found, strict=True):
+        row[: len(best.path)] = best.path
+    return BestPaths(paths, np.array([best.cost - best.bound for best in found]))
+
+
 def expected_path(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective
-) -> np.ndarray:
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    risk: RiskTable | None = None,
+) -> np.ndarray | None:
     """Find the path with the best *expectation* of terminal or mean trust, or of lost contact.
 
     These are linear in u with weights that do not depend on the path, so the expectation of weight
     times u, per bound and bounds left, replaces them: exact, with no assumption on the posterior.
 
     Returns:
-        Flat indices of cells, filled with -1.
+        Flat indices of cells, filled with -1; None if no path is feasible under a risk.
     """
     weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
     u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
@@ -75,6 +120,11 @@ def expected_path(
     pick = np.eye(admissible.longest + 1)[None]
     averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
     length_cost = objective.length_weight * admissible.lengths
+    if risk is not None:
+        by_left = gain.reshape(len(gain), -1)
+        search = LayeredSearch(admissible, risk, length_cost)
+        best = _found([search.sums(by_left, averaged.constant[0], averaged.scale)], admissible)
+        return None if best is None else best.paths[0]
     return _best_of_lengths(admissible, gain[None], averaged, length_cost)[0]
 
 
@@ -112,24 +162,45 @@ def _least_loss(
 
 
 def _labelled(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
-) -> BestPaths:
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    length_cost: np.ndarray,
+    risk: RiskTable | None = None,
+) -> BestPaths | None:
     n_draws = len(dynamics.start)
     found: list[tuple[np.ndarray, float]] = [(np.empty(0), np.nan)] * n_draws
 
     def work(first: int, last: int) -> None:
         for d in range(first, last):
-            found[d] = _label_one(admissible, dynamics.take(d), objective, length_cost)
+            found[d] = _label_one(admissible, dynamics.take(d), objective, length_cost, label_risk)
 
+    label_risk = _label_risk(admissible, risk)
     work(0, n_draws) if n_draws == 1 else over_rows(work, n_draws)
+    if not all(len(path) for path, _ in found):
+        return None
     paths = np.full((n_draws, max(len(path) for path, _ in found)), -1, np.int64)
     for d, (path, _) in enumerate(found):
         paths[d, : len(path)] = path
     return BestPaths(paths, np.array([gap for _, gap in found]))
 
 
+def _label_risk(admissible: AdmissiblePaths, risk: RiskTable | None) -> LabelRisk:
+    """Risks of bounds for the label search; none without a risk."""
+    n_cells = admissible.passable.size
+    if risk is None:
+        return LabelRisk(np.empty((0, 0)), np.empty(0), 0, 0.0, np.empty((n_cells, 0)))
+    of_bounds = np.ascontiguousarray(risk.of_bounds.reshape(len(risk.limits), -1).T)
+    safest = least_to_goal(admissible.neighbours, of_bounds, admissible.flat(admissible.goal))
+    return LabelRisk(of_bounds, risk.limits, risk.needed, risk.failure_cost, safest)
+
+
 def _label_one(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    length_cost: np.ndarray,
+    risk: LabelRisk,
 ) -> tuple[np.ndarray, float]:
     """Find the best path of one draw and its optimality gap."""
     lengths = [admissible.longest]
@@ -138,12 +209,18 @@ def _label_one(
     best, best_score, best_bound = np.empty(0, np.int64), -np.inf, -np.inf
     for n_bounds in lengths:
         scale = n_bounds if objective.name == "mean" else 1
-        problem = _label_search(admissible, dynamics, objective, n_bounds, scale * length_cost)
+        problem = _label_search(
+            admissible, dynamics, objective, n_bounds, scale * length_cost, risk
+        )
         path, cost, bound = _search_within_limit(problem)
         each = n_bounds if objective.name == "lost_contact" and not objective.has_labels else 0
         if len(path) and -cost / scale - each > best_score:
             best, best_score = path, -cost / scale - each
         best_bound = max(best_bound, -bound / scale - each)
+    if not len(best):
+        if best_bound > -np.inf:
+            raise _too_many_labels(admissible.longest)
+        return best, 0.0
     return best, best_bound - best_score
 
 
@@ -153,6 +230,7 @@ def _label_search(
     objective: Objective,
     n_bounds: int,
     length_cost: np.ndarray,
+    risk: LabelRisk,
 ) -> LabelSearch:
     goal = admissible.flat(admissible.goal)
     at_goal = objective.name == "terminal"
@@ -173,6 +251,7 @@ def _label_search(
         admissible.u_turns,
         admissible.revisit or not objective.has_labels,
         max(float(dynamics.noise_sd), TINY_SD),
+        risk,
     )
 
 

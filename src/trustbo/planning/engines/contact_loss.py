@@ -86,7 +86,7 @@ def expected_loss(law: int, x: float, sd: float) -> float:
 
 
 @_compiled
-def _least_slope(law, lo, hi, sd):
+def least_slope(law: int, lo: float, hi: float, sd: float) -> float:
     """Least fall of the expected loss with trust, between lo and hi."""
     middle = 0.0 if law == LOGISTIC else 0.5
     x = lo if middle - lo > hi - middle else hi
@@ -220,7 +220,7 @@ def _bounds(layers, u, beta0, hi, lo, length_cost, law, sd, W, t):
             W[node], t[node] = np.inf, 0.0
             continue
         W[node] = expected_loss(law, hi[node], sd) + V
-        t[node] = _least_slope(law, lo[node], hi[node], sd) + s
+        t[node] = least_slope(law, lo[node], hi[node], sd) + s
 
 
 @_compiled

@@ -14,8 +14,9 @@ rates are linear in trust; to these three length costs are added. None rises if 
 Invariant: a label leaves the queue in the order of a lower bound on the cost of its completions
 (`Heuristic`). It is expanded unless an expanded label of the same cell dominates it (see
 `dominance`): fewer or as many bounds, no higher cost, and at least as much trust at every bound
-still to come, whatever cells follow. Every completion of the dominated label is then a completion
-of the other, at no higher cost, so the first label that leaves the queue at the goal is optimal.
+still to come, whatever cells follow, and no more of any risk. Every completion of the dominated
+label is then a completion of the other, at no higher cost, so the first label that leaves the queue
+at the goal is optimal.
 
 With a tolerance, labels are dropped too that another dominates up to that amount (Warburton 1987).
 The least estimate among those dropped is kept: no path costs less than the smaller of it and the
@@ -46,6 +47,16 @@ def mode_of(objective: Objective) -> int:
     return _MODES[objective.name]
 
 
+class LabelRisk(NamedTuple):
+    """Risks -log(1 - p) of bounds, which a path adds up, and their limits; see `RiskTable`."""
+
+    of_bounds: np.ndarray  # (bound, resource), index move * cells + cell entered
+    limits: np.ndarray  # (resource,)
+    needed: int
+    failure_cost: float
+    safest: np.ndarray  # (cell, resource), least sums from a cell to the goal
+
+
 class LabelSearch(NamedTuple):
     """Data of one search, for one draw."""
 
@@ -65,6 +76,7 @@ class LabelSearch(NamedTuple):
     u_turns: bool
     revisit: bool
     noise_sd: float  # of a rate
+    risk: LabelRisk
 
 
 class SearchResult(NamedTuple):
@@ -94,7 +106,9 @@ def _search(problem, tolerance, max_labels):
     heads = np.full(n_cells * n_before * (most + 1 if fixed else 1), -1, np.int64)
     size = min(max_labels, 1024)
     labels, cost = np.empty((size, 5), np.int64), np.empty(size)  # cell, bounds, parent, move, next
-    state, tested = np.empty((size, len(problem.start_state))), np.empty((size, len(problem.tests)))
+    n_tests, n_risks = len(problem.tests), len(problem.risk.limits)
+    # Tests of trust, then minus the sums of risks.
+    tested, state = np.zeros((size, n_tests + n_risks)), np.empty((size, len(problem.start_state)))
     seen = np.zeros((size, 1 if revisit else n_cells // 64 + 1), np.uint64)
     labels[0] = (problem.start, 0, -1, -1, -1)
     cost[0], state[0] = -np.inf if mode == BOTTLENECK else 0.0, problem.start_state
@@ -107,25 +121,18 @@ def _search(problem, tolerance, max_labels):
             return _path_of(labels, label), estimate, min(estimate, least_dropped), True
         if not revisit:
             seen[label, cell // 64] |= np.uint64(1) << np.uint64(cell % 64)
-        tested[label] = problem.tests @ state[label]
+        tested[label, :n_tests] = problem.tests @ state[label]
         key = (cell * n_before + (0 if u_turns else by + 1)) + (
             n_bounds * n_cells * n_before if fixed else 0
         )
         verdict = _dominance(label, heads[key], labels, cost, tested, seen, tolerance, revisit)
-        if verdict == 2:
-            least_dropped = min(least_dropped, estimate)
         if verdict:
+            least_dropped = min(least_dropped, estimate) if verdict == 2 else least_dropped
             continue
         labels[label, 4], heads[key] = heads[key], label
         for m in range(n_moves):
             other = neighbours[cell, m]
-            if other < 0 or (not u_turns and by >= 0 and m == n_moves - 1 - by):
-                continue
-            if to_goal[other] < 0 or n_bounds + 1 + to_goal[other] > most:
-                continue
-            if fixed and (other == goal) != (n_bounds + 1 == most):
-                continue
-            if not revisit and seen[label, other // 64] >> np.uint64(other % 64) & np.uint64(1):
+            if not _is_open(problem, seen[label], m, by, n_bounds + 1, other):
                 continue
             if n == len(cost):
                 if n >= max_labels:
@@ -133,6 +140,10 @@ def _search(problem, tolerance, max_labels):
                 labels, cost = np.concatenate((labels, labels)), np.concatenate((cost, cost))
                 state, tested = np.concatenate((state, state)), np.concatenate((tested, tested))
                 seen = np.concatenate((seen, seen))
+            if n_risks > 0 and not _spend(
+                problem.risk, tested, n, label, m * n_cells + other, other
+            ):
+                continue
             x = problem.transition @ state[label] + problem.drift[:, m * by_move, other]
             total = _add_cost(
                 mode,
@@ -143,12 +154,42 @@ def _search(problem, tolerance, max_labels):
             )
             left = most - n_bounds - 1 if fixed else to_goal[other]
             reach = _estimate(mode, problem.heuristic, x, total, other, left, problem.noise_sd)
+            if n_risks > 0:
+                least = problem.risk.safest[other, 0] - tested[n, n_tests]
+                reach -= problem.risk.failure_cost * math.expm1(-least)
             if reach < np.inf:
                 labels[n] = (other, n_bounds + 1, label, m, -1)
                 cost[n], state[n], seen[n] = total, x, seen[label]
                 heapq.heappush(queue, (reach, np.int64(n)))
                 n += 1
     return np.empty(0, np.int64), np.inf, least_dropped, True
+
+
+@_compiled
+def _is_open(problem, seen, move, by, n_bounds, other):
+    """Whether a move, after the move `by`, may enter a cell as bound number `n_bounds`."""
+    if other < 0 or (
+        not problem.u_turns and by >= 0 and move == problem.neighbours.shape[1] - 1 - by
+    ):
+        return False
+    to_goal = problem.to_goal[other]
+    if to_goal < 0 or n_bounds + to_goal > problem.max_bounds:
+        return False
+    if problem.mode >= TERMINAL and (other == problem.goal) != (n_bounds == problem.max_bounds):
+        return False
+    return problem.revisit or not seen[other // 64] >> np.uint64(other % 64) & np.uint64(1)
+
+
+@_compiled
+def _spend(risk, tested, label, parent, bound, cell):
+    """Write down a label's risks after a bound; whether enough can stay within their limits."""
+    n_risks, within = len(risk.limits), 0
+    first = tested.shape[1] - n_risks
+    for k in range(n_risks):
+        spent = tested[parent, first + k] - risk.of_bounds[bound, k]
+        tested[label, first + k] = spent
+        within += risk.safest[cell, k] - spent <= risk.limits[k]
+    return within >= risk.needed
 
 
 @_compiled

@@ -17,8 +17,10 @@ from trustbo.errors import TrustboError
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.dominance import dominance_tests
 from trustbo.planning.engines.layers import additive_weights
+from trustbo.planning.engines.reference_risk import feasible_paths
 from trustbo.planning.objectives import Objective, softplus
 from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.risk import RiskTable
 from trustbo.planning.values import entry_cost, path_length, path_value, team_trust
 from trustbo.workspace.moves import MOVES
 
@@ -31,8 +33,17 @@ def plan_networkx(
     dynamics: Dynamics,
     objective: Objective,
     backend: str | None = None,
-) -> Path:
-    """Find the best path of one draw, `dynamics` without leading axes; `backend` is networkx's."""
+    risk: RiskTable | None = None,
+) -> Path | None:
+    """Find the best path of one draw, `dynamics` without leading axes; `backend` is networkx's.
+
+    None if there is no path that is feasible under a risk.
+    """
+    if risk is not None:
+        feasible = feasible_paths(admissible, dynamics, objective, risk)
+        cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
+        scores = [_score(dynamics, objective, admissible, path) for path in feasible]
+        return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
     if objective.name == "stationary":
         cost = entry_cost(admissible.passable, dynamics)
         return best_stationary(admissible, cost, objective.length_weight, backend)

@@ -1,0 +1,159 @@
+"""Effects of places on trust, and the index of the places that missions visited."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_positive
+from trustbo.workspace.moves import MOVES, moves_along
+
+N_MOVES = len(MOVES[8])
+MAX_VISITED = 4000
+"""Largest number of visited bounds: the effort grows with its cube."""
+
+
+@dataclass(frozen=True)
+class PlaceEffect:
+    """What contact is like at a place, beyond what awareness says of it.
+
+    The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
+    + e(a -> c). s is a Gaussian process over cells, of sd tau_s and covariance Matern 3/2 with a
+    length scale in cells; e(a -> c) ~ N(0, tau_e^2), independent for each directed bound.
+
+    Attributes:
+        cells: Whether there is s.
+        bounds: Whether there is e.
+        shared: Whether all robots share s and e; else each robot has its own, of the same tau_s,
+            tau_e and length scale.
+        tau_s: Scale of the half-normal prior of the sd of s.
+        tau_e: Scale of the half-normal prior of the sd of e.
+        length_scale: Median of the log-normal prior of the length scale, in cells.
+        length_scale_sd: Its standard deviation, of the logarithm.
+
+    Raises:
+        TrustboError: Neither cells nor bounds have an effect, or a number is not positive.
+    """
+
+    cells: bool = True
+    bounds: bool = True
+    shared: bool = True
+    tau_s: float = 0.2
+    tau_e: float = 0.2
+    length_scale: float = 2.0
+    length_scale_sd: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (self.cells or self.bounds):
+            raise TrustboError(
+                "PlaceEffect needs an effect of cells or of bounds; for neither, give place=None."
+            )
+        for name in ("tau_s", "tau_e", "length_scale", "length_scale_sd"):
+            require_positive(f"PlaceEffect.{name}", getattr(self, name))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the hyperparameters: tau_s and length_scale of s, tau_e of e."""
+        return ("tau_s", "length_scale") * self.cells + ("tau_e",) * self.bounds
+
+    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Draws of the hyperparameters from their prior, each (draw,), by name."""
+        scores = rng.standard_normal((3, n))
+        drawn = {
+            "tau_s": self.tau_s * np.abs(scores[0]),
+            "length_scale": self.length_scale * np.exp(self.length_scale_sd * scores[1]),
+            "tau_e": self.tau_e * np.abs(scores[2]),
+        }
+        return {name: drawn[name] for name in self.names}
+
+    def to_record(self) -> dict[str, Any]:
+        """Fields by name, for JSON."""
+        return asdict(self)
+
+
+class Visited(NamedTuple):
+    """Cells entered and directed bounds made by some missions.
+
+    A place is a robot, a cell, and for bounds the move into it; the robot is 0 where all share the
+    effects. A unit is a visited bound, or a visited cell where bounds have no effect.
+    """
+
+    shape: tuple[int, int]  # rows and columns of the grid
+    cells: np.ndarray  # (cell, 3): robot, row, col, in order
+    units: np.ndarray  # (unit, 4): robot, move, row, col, in order; move -1 where units are cells
+    cell_of: np.ndarray  # (unit,), index among the visited cells
+    unit: np.ndarray  # (mission, bound, robot), -1 in the padding
+
+    @property
+    def n_effects(self) -> int:
+        """Number of robots with effects of their own, 1 where all share them."""
+        return 1 if self.unit.shape[2] == 1 else int(self.unit.shape[2])
+
+
+def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
+    """Move, row and column of each mission's bounds, (mission, bound, 3), -1 in the padding.
+
+    `shape`, missions and bounds, is that with the padding, by default without. TrustboError: a path
+    jumps, so that it has no directed bounds.
+    """
+    if shape is None:
+        shape = len(missions), max(len(mission.bounds) for mission in missions)
+    found = np.full((*shape, 3), -1)
+    for j, mission in enumerate(missions):
+        path = mission.path[: len(mission.bounds) + 1]  # one that failed has not made the rest
+        try:
+            moves = moves_along(path)
+        except TrustboError as error:
+            raise TrustboError(
+                f"mission {j}: {error} A model with place effects needs whole paths; give "
+                "place=None, or split the mission there."
+            ) from None
+        found[j, : len(mission.bounds)] = np.column_stack([moves, path[1:]])
+    return found
+
+
+def visited(
+    bounds: np.ndarray,
+    place: PlaceEffect,
+    n_robots: int,
+    shape: tuple[int, int] | None = None,
+) -> Visited:
+    """Index the places of bounds (mission, bound, 3), see `bounds_of`.
+
+    Args:
+        bounds: Move, row and column, -1 in the padding.
+        place: Which effects there are.
+        n_robots: Number of robots.
+        shape: Rows and columns of the grid; by default the fewest that hold all cells.
+
+    Raises:
+        TrustboError: A cell lies outside the grid, or there are too many bounds for one dense
+            factor.
+    """
+    there = bounds[..., 0] >= 0
+    least = tuple((bounds[there].max(0)[1:] + 1).tolist()) if there.any() else (1, 1)
+    shape = least if shape is None else shape
+    if any(have > rows for have, rows in zip(least, shape, strict=True)):
+        j, k = np.argwhere(there & (bounds[..., 1:] >= shape).any(-1))[0]
+        raise TrustboError(
+            f"mission {j} enters the cell {tuple(bounds[j, k, 1:].tolist())}, outside the grid of "
+            f"{shape[0]} rows and {shape[1]} columns; give the workspace the missions were run on."
+        )
+    n_effects = 1 if place.shared else n_robots
+    robot = np.broadcast_to(np.arange(n_effects), (*there.shape, n_effects))
+    move = bounds[..., 0] if place.bounds else np.where(there, -1, -2)
+    four = np.stack(np.broadcast_arrays(robot, *(each[..., None] for each in (
+        move, bounds[..., 1], bounds[..., 2]))), axis=-1)  # fmt: skip
+    units, index = np.unique(four[there].reshape(-1, 4), axis=0, return_inverse=True)
+    if len(units) > MAX_VISITED:
+        raise TrustboError(
+            f"{len(units)} visited places are more than {MAX_VISITED}, the most that one dense "
+            "factor takes. Give coarser cells, PlaceEffect(bounds=False), shared=True, or "
+            "place=None."
+        )
+    cells, cell_of = np.unique(units[:, [0, 2, 3]], axis=0, return_inverse=True)
+    unit = np.full((*there.shape, n_effects), -1)
+    unit[there] = index.reshape(-1, n_effects)
+    return Visited(shape, cells, units, cell_of.ravel(), unit)

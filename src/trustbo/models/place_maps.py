@@ -1,0 +1,198 @@
+"""Effects of places over a whole grid: draws given those at visited places.
+
+s at the other cells by Matheron's rule: a draw of the prior over the whole grid, corrected by
+kriging at the visited cells. Prior draws are made by the fast Fourier transform of a circulant
+covariance (Dietrich and Newsam 1997), on a torus so large that the correlation is all but 0 half
+way round. e at the other bounds has its prior. Length scales are rounded to steps of 10 %, which
+changes the correlation of neighbouring cells by less than .01.
+
+What is drawn at random has mean 0 over the draws, so that the mean of the maps is the posterior
+mean of the effects, without Monte Carlo error where nothing was measured.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy import fft
+from scipy.linalg import cho_factor, cho_solve
+
+from trustbo.models.likelihood.place_prior import correlation, matern
+from trustbo.models.place import N_MOVES, Visited
+
+_STEP = 0.1  # of the logarithm of length scales
+_REACH = 5.0  # length scales at which the correlation is .002
+_JITTER = 1e-9
+_AXIS = {"place": "cell", "place_bound": "bound"}
+_OF_CELL, _OF_BOUND = ("effect", "row", "col"), ("effect", "move", "row", "col")
+
+
+class PlaceScales(NamedTuple):
+    """Hyperparameters of places, each (draw,); 0 for an effect there is not."""
+
+    tau_s: np.ndarray
+    length_scale: np.ndarray
+    tau_e: np.ndarray
+
+
+def draw_maps(
+    scales: PlaceScales,
+    places: Visited,
+    s: np.ndarray | None,
+    e: np.ndarray | None,
+    seed: int,
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Draw the effects of all cells and bounds given those of visited places.
+
+    Args:
+        scales: Hyperparameters of each draw.
+        places: Visited places, the grid's shape among them.
+        s: Effects of visited cells (draw, cell); None where cells have none.
+        e: Effects of visited bounds (draw, unit); None where bounds have none.
+        seed: Seed of all that is not known.
+
+    Returns:
+        place (draw, effect, row, col) and place_bound (draw, effect, move, row, col), None where
+        there is no such effect. The axis effect is of robots, of length 1 where all share them.
+    """
+    n, n_effects = len(scales.tau_s), places.n_effects
+    place = place_bound = None
+    if s is not None:
+        place = np.empty((n, n_effects, *places.shape))
+        for i in range(n_effects):
+            mine = places.cells[:, 0] == i
+            place[:, i] = _cells(scales, places.shape, places.cells[mine], s[:, mine], [seed, i])
+    if e is not None:
+        rng = np.random.default_rng([seed, n_effects])
+        place_bound = rng.standard_normal((n, n_effects, N_MOVES, *places.shape))
+        place_bound *= scales.tau_e[:, None, None, None, None]
+        _centre(place_bound)
+        place_bound[:, *places.units.T] = e
+    return place, place_bound
+
+
+def nowhere(shape: tuple[int, int], n_effects: int) -> Visited:
+    """No visited places, on a grid."""
+    nothing = np.zeros((0, 3), dtype=int), np.zeros((0, 4), dtype=int), np.zeros(0, dtype=int)
+    return Visited(shape, *nothing, np.zeros((0, 0, n_effects), dtype=int))
+
+
+def _cells(
+    scales: PlaceScales,
+    shape: tuple[int, int],
+    cells: np.ndarray,
+    known: np.ndarray,
+    seed: list[int],
+) -> np.ndarray:
+    """S over the grid, (draw, row, col), given some cells."""
+    grid = np.column_stack([np.zeros(shape[0] * shape[1]), *np.indices(shape).reshape(2, -1)])
+    own = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
+    flat = cells[:, 1] * shape[1] + cells[:, 2]
+    centre = np.zeros((len(known), len(grid)))
+    off = np.empty(centre.shape)
+    steps = np.round(np.log(scales.length_scale) / _STEP).astype(int)
+    for step in np.unique(steps):
+        rows, length_scale = steps == step, float(np.exp(_STEP * step))
+        rng = np.random.default_rng([*seed, step + 1000])
+        free = _prior(shape, length_scale, int(rows.sum()), rng) * scales.tau_s[rows, None]
+        if len(cells):
+            K = correlation(own, own, length_scale) + _JITTER * np.eye(len(own))
+            weights = cho_solve(cho_factor(K), correlation(own, grid, length_scale))
+            centre[rows] = known[rows] @ weights
+            free -= free[:, flat] @ weights
+        off[rows] = free
+    return (centre + _centre(off)).reshape(-1, *shape)
+
+
+def _prior(
+    shape: tuple[int, int], length_scale: float, n: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Draws of unit variance over the grid, (n, cell)."""
+    reach = int(_REACH * length_scale)
+    torus = [int(fft.next_fast_len(max(2 * m, m + reach), real=True) or 2 * m) for m in shape]
+    down, right = (np.minimum(np.arange(m), m - np.arange(m)) for m in torus)
+    kernel = matern(np.hypot(down[:, None], right[None]), length_scale)
+    spectrum = np.real(np.asarray(fft.rfft2(kernel), dtype=complex))
+    white = fft.rfft2(rng.standard_normal((n, *torus)))
+    field = fft.irfft2(np.sqrt(np.maximum(spectrum, 0.0)) * white, s=torus)
+    return np.asarray(field)[:, : shape[0], : shape[1]].reshape(n, -1)
+
+
+def _centre(draws: np.ndarray) -> np.ndarray:
+    """The same draws with mean 0 and the variance they had, in place; a single one as it is."""
+    n = len(draws)
+    if n > 1:
+        draws -= draws.mean(0)
+        draws *= np.sqrt(n / (n - 1.0))
+    return draws
+
+
+def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
+    """Lay out the draws at visited places as a group of a posterior.
+
+    Args:
+        draws: place (chain, draw, cell) and place_bound (chain, draw, unit), or one of these.
+        places: Visited places.
+        seed: Seed of the maps that `params_of` draws.
+    """
+    variables = {name: (("chain", "draw", _AXIS[name]), draws[name]) for name in draws}
+    n_chains, n_draws = next(iter(draws.values())).shape[:2]
+    coords = {
+        "chain": np.arange(n_chains),
+        "draw": np.arange(n_draws),
+        **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_OF_CELL)},
+        **{f"bound_{name}": ("bound", places.units[:, i]) for i, name in enumerate(_OF_BOUND)},
+    }
+    attrs = {"shape": list(places.shape), "n_effects": places.n_effects, "seed": seed}
+    return xr.Dataset(variables, coords, attrs)
+
+
+def visited_of(group: xr.Dataset) -> Visited:
+    """Visited places of such a group; of its `unit`, only the number of effects is kept."""
+    cells = np.column_stack([group[f"cell_{name}"].values for name in _OF_CELL])
+    units = np.column_stack([group[f"bound_{name}"].values for name in _OF_BOUND])
+    n_effects = int(group.attrs["n_effects"])
+    shape = tuple(int(n) for n in group.attrs["shape"])
+    nothing = np.zeros((0, 0, n_effects), dtype=int)
+    return Visited(shape, cells, units, np.zeros(0, dtype=int), nothing)  # pyright: ignore
+
+
+def place_maps_of(
+    group: xr.Dataset, sites: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray | None]:
+    """Effects over the whole grid for each draw of a posterior, see `draw_maps`.
+
+    Args:
+        group: Group `places` of a posterior.
+        sites: Its hyperparameters by name, (draw,), chains joined.
+    """
+    known = {
+        name: group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
+        for name, axis in _AXIS.items()
+        if name in group
+    }
+    maps = draw_maps(
+        scales_of(sites), visited_of(group), known.get("place"), known.get("place_bound"),
+        int(group.attrs["seed"]),
+    )  # fmt: skip
+    return dict(zip(_AXIS, maps, strict=True))
+
+
+def prior_maps(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray | None]:
+    """Effects drawn from their prior over the grid of a posterior's group `places`."""
+    places, scales = visited_of(group), scales_of(sites)
+    n = len(scales.tau_s)
+    no = {name: np.zeros((n, 0)) if name in group else None for name in _AXIS}
+    empty = nowhere(places.shape, places.n_effects)
+    maps = draw_maps(scales, empty, no["place"], no["place_bound"], int(group.attrs["seed"]) + 1)
+    return dict(zip(_AXIS, maps, strict=True))
+
+
+def scales_of(sites: Mapping[str, np.ndarray]) -> PlaceScales:
+    """Hyperparameters by name; 0 for those of an effect there is not."""
+    nothing = np.zeros(len(sites["beta0"]))
+    return PlaceScales(
+        sites.get("tau_s", nothing), sites.get("length_scale", nothing + 1.0),
+        sites.get("tau_e", nothing),
+    )  # fmt: skip

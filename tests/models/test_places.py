@@ -1,0 +1,345 @@
+"""Effects of places against dense joint normals, which share no code with them."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.linalg import block_diag
+
+import trustbo as tb
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams, fit, params_of
+from trustbo.models.likelihood import place_marginal
+from trustbo.models.likelihood.place_rows import gather_rows
+from trustbo.models.place import bounds_of, visited
+from trustbo.models.place_maps import PlaceScales, draw_maps, nowhere
+from trustbo.models.priors import Priors
+from trustbo.models.samplers.place_target import PlaceTarget
+from trustbo.models.samplers.student import Student, log_mixture
+
+SHAPE = (5, 5)
+PLACES = [
+    PlaceEffect(),
+    PlaceEffect(bounds=False),
+    PlaceEffect(cells=False),
+    PlaceEffect(shared=False),
+]
+
+
+def walk(rng, n_bounds):
+    """Random walk over neighbouring cells."""
+    cells = [tuple(rng.integers(SHAPE).tolist())]
+    while len(cells) <= n_bounds:
+        row, col = np.array(cells[-1]) + rng.integers(-1, 2, size=2)
+        if 0 <= row < SHAPE[0] and 0 <= col < SHAPE[1] and (row, col) != cells[-1]:
+            cells.append((int(row), int(col)))
+    return cells
+
+
+def random_missions(seed, n_missions=4, n_robots=3, gaps=True):
+    rng, missions = np.random.default_rng(seed), []
+    for _ in range(n_missions):
+        n = int(rng.integers(4, 9))
+        rates = rng.uniform(size=(n, n_robots))
+        if gaps:
+            rates[rng.uniform(size=rates.shape) < 0.2] = np.nan
+        z = rng.uniform(size=(n, n_robots, 2))
+        missions.append(Mission.from_arrays(walk(rng, n), z, rates))
+    return missions
+
+
+class Dense:
+    """Joint normal of all rates, by matrices over missions, robots and bounds."""
+
+    def __init__(self, missions, place, theta, priors):
+        beta0, w, v, tau_s, ell, tau_e = theta
+        T, V, mean, U, rows = [], [], [], [], []
+        for m in missions:
+            K = len(m.bounds)
+            lag = np.subtract.outer(np.arange(K), np.arange(K))
+            t = np.where(lag >= 0, beta0 ** np.maximum(lag, 0.0), 0.0)
+            start = beta0 ** np.arange(1, K + 1)
+            cov = priors.x0_sd**2 * np.outer(start, start) + w**2 * t @ t.T + v**2 * np.eye(K)
+            for i in range(m.contact_rate.shape[1]):
+                T.append(t)
+                V.append(cov)
+                mean.append(priors.x0_mean * start)
+                U.append(np.column_stack([m.awareness[:, i], np.ones(K)]))
+                rows += [(i, a, c) for a, c in zip(m.path[:-1], m.path[1:], strict=True)]
+        self.rows, self.T = rows, block_diag(*T)
+        y = np.concatenate([m.contact_rate[:, i] for m in missions for i in range(3)])
+        self.seen, self.U = ~np.isnan(y), np.concatenate(U)
+        own = np.array([i for i, _, _ in rows]) * (not place.shared)
+        cells, before = (np.array([r[k] for r in rows]) for k in (2, 1))
+        same = own[:, None] == own[None]
+        gap = np.linalg.norm(cells[:, None] - cells[None], axis=2) * np.sqrt(3.0) / ell
+        self.K_s = place.cells * tau_s**2 * (1.0 + gap) * np.exp(-gap) * same
+        met = (cells[:, None] == cells[None]).all(2) & (before[:, None] == before[None]).all(2)
+        self.K_e = place.bounds * tau_e**2 * (met & same)
+        rest = 1.0 - beta0 if priors.stationary else 1.0
+        n = self.U.shape[1] - 1
+        self.c_mean = rest * np.append(np.broadcast_to(priors.beta.loc, n), priors.b.loc)
+        sd = rest * np.append(np.broadcast_to(priors.beta.scale, n), priors.b.scale)
+        self.c_cov = np.diag(sd**2)
+        inside = self.U @ self.c_cov @ self.U.T + self.K_s + self.K_e
+        full = block_diag(*V) + self.T @ inside @ self.T.T
+        self.cov = full[np.ix_(self.seen, self.seen)]
+        self.off = (y - np.concatenate(mean) - self.T @ self.U @ self.c_mean)[self.seen]
+
+    def log_likelihood(self):
+        return stats.multivariate_normal(cov=self.cov).logpdf(self.off)
+
+    def posterior(self, prior_cross, prior_cov, prior_mean):
+        """Moments of what has this prior covariance with T'y's argument."""
+        cross = prior_cross @ self.T.T[:, self.seen]
+        gain = np.linalg.solve(self.cov, cross.T).T
+        return prior_mean + gain @ self.off, prior_cov - gain @ cross.T
+
+
+def target_of(missions, place, priors=None, shape=SHAPE):
+    priors = priors or Priors()
+    batch = tb.stacking.stack_missions(missions, pad=False)
+    places = visited(bounds_of(missions), place, 3, shape)
+    weight = np.ones(len(missions))
+    rows = gather_rows(batch.awareness, batch.contact_rate, places, weight, priors.x0_mean)
+    return PlaceTarget(rows, places, priors, place)
+
+
+@pytest.mark.parametrize("stationary", [False, True])
+@pytest.mark.parametrize("place", PLACES, ids=str)
+def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationary):
+    priors = Priors(stationary=stationary)
+    for seed in range(3):
+        missions = random_missions(seed)
+        target = target_of(missions, place, priors)
+        rng = np.random.default_rng(seed)
+        z = 0.7 * rng.standard_normal((4, target.n_scores))
+        theta, log_prior = target.constrain(z)
+        expected = [Dense(missions, place, t, priors).log_likelihood() for t in theta]
+        # e has variance (1e-4 tau)^2 where bounds have none, as a jitter.
+        rtol = 1e-9 if place.bounds else 1e-5
+        np.testing.assert_allclose(target.log_density(z) - log_prior, expected, rtol=rtol)
+
+
+def test_a_mission_of_weight_one_half_counts_by_the_root_of_its_density():
+    """With no effect in common, densities of missions multiply."""
+    place, priors = PlaceEffect(), Priors()
+    one, other = (random_missions(seed, 1) for seed in (3, 4))
+    theta = np.array([[0.4, 0.1, 0.2, 1e-6, 2.0, 1e-6]])
+    found = []
+    for missions, weight in ((one, [1.0]), (other, [1.0]), (one + other, [1.0, 0.5])):
+        batch = tb.stacking.stack_missions(missions, pad=False)
+        places = visited(bounds_of(missions), place, 3, SHAPE)
+        rows = gather_rows(batch.awareness, batch.contact_rate, places, np.array(weight), 0.5)
+        fixed = priors.__class__(beta=priors.beta, b=priors.b)
+        target = PlaceTarget(rows, places, fixed, place)
+        target.precision = target.precision * 1e12  # coefficients known to be 0
+        found.append(target._integrate(theta.copy(), keep=False).log_p)
+    np.testing.assert_allclose(found[2], found[0] + 0.5 * found[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("place", [PLACES[0], PLACES[2]], ids=str)
+def test_effects_given_hyperparameters_are_those_of_dense_conditioning(place):
+    missions = random_missions(1)
+    target = target_of(missions, place)
+    z = np.array([[0.2, -0.5, 0.3, 0.4, 0.1, 0.2][: target.n_scores]])
+    law = target.conditional(z)
+    dense = Dense(missions, place, law.theta[0], target.priors)
+    c_mean, _ = dense.posterior(dense.c_cov @ dense.U.T, dense.c_cov, dense.c_mean)
+    found = np.linalg.solve(law.factor[0].T, law.half[0])
+    np.testing.assert_allclose(found, c_mean, rtol=1e-8, atol=1e-9)
+    K = dense.K_s + dense.K_e
+    mean, cov = dense.posterior(K, K, 0.0)
+    right = law.of_units[0, -1] - found @ law.of_units[0, :-1]
+    g = np.linalg.solve(law.L[0].T * np.triu(np.ones_like(law.L[0])), right)
+    units = [tuple(u) for u in target.places.units.tolist()]
+    moves = {tuple(m): i for i, m in enumerate(tb.workspace.moves.MOVES[8])}
+    index = [
+        units.index((0, moves[tuple(np.subtract(c, a).tolist())], *c)) for _, a, c in dense.rows
+    ]
+    np.testing.assert_allclose(g[index], mean, atol=1e-8)
+    L = np.tril(law.L[0])
+    inverse = np.linalg.inv(L @ L.T)
+    of_c = np.linalg.solve(L.T, law.of_units[0, :-1].T)
+    whole = inverse + of_c @ np.linalg.inv(law.factor[0] @ law.factor[0].T) @ of_c.T
+    np.testing.assert_allclose(whole[np.ix_(index, index)], cov, atol=1e-9)
+
+
+@pytest.mark.parametrize("place", PLACES, ids=str)
+def test_what_nuts_sees_is_the_same_marginal(place):
+    """By dense algebra in JAX: given coefficients of sd 0, to rounding."""
+    missions = random_missions(2)
+    params = TrustParams(0.4, np.array([0.3, -0.2]), 0.1, 0.1, 0.2)
+    theta = (0.4, 0.1, 0.2, 0.3 * place.cells, 1.7, 0.2 * place.bounds)
+    dense = Dense(missions, place, theta, Priors())
+    c = np.append(params.beta, params.b)
+    inside = dense.K_s + dense.K_e
+    full = (
+        dense.cov
+        - (dense.T @ dense.U @ dense.c_cov @ dense.U.T @ dense.T.T)[np.ix_(dense.seen, dense.seen)]
+    )
+    off = dense.off - (dense.T @ dense.U @ (c - dense.c_mean))[dense.seen]
+    expected = stats.multivariate_normal(cov=full).logpdf(off)
+    assert inside.shape == dense.T.shape
+    batch = tb.stacking.stack_missions(missions)
+    shape = batch.contact_rate.shape[:2]
+    index = place_marginal.PlaceIndex.of(visited(bounds_of(missions, shape), place, 3, SHAPE))
+    with jax.enable_x64(True):
+        as64 = params.map(lambda value, _: jax.numpy.asarray(value, dtype=float))
+        hyper = place_marginal.PlaceHyper(*(jax.numpy.asarray(float(t)) for t in theta[3:]))
+        weight = np.ones(len(batch.awareness))
+        found = jax.jit(place_marginal.log_likelihood)(
+            as64.ssm(batch.awareness), batch.contact_rate, weight, hyper, index
+        )
+    assert float(found) == pytest.approx(expected, rel=1e-9 if place.bounds else 1e-5)
+
+
+def test_maps_are_those_of_dense_conditioning():
+    n, rng = 20000, np.random.default_rng(0)
+    place = PlaceEffect()
+    places = visited(bounds_of(random_missions(5)), place, 3, SHAPE)
+    ell = np.exp(0.7)  # one of the steps that length scales are rounded to
+    scales = PlaceScales(np.full(n, 0.3), np.full(n, ell), np.full(n, 0.1))
+    known = 0.2 * rng.standard_normal(len(places.cells))
+    e = np.tile(0.1 * rng.standard_normal(len(places.units)), (n, 1))
+    s, of_bounds = draw_maps(scales, places, np.tile(known, (n, 1)), e, 1)
+    grid, cells = np.indices(SHAPE).reshape(2, -1).T, places.cells[:, 1:]
+
+    def kernel(a, b):
+        h = np.sqrt(3.0) * np.linalg.norm(a[:, None] - b[None], axis=2) / ell
+        return 0.09 * (1.0 + h) * np.exp(-h)
+
+    gain = np.linalg.solve(kernel(cells, cells), kernel(cells, grid)).T
+    covariance = kernel(grid, grid) - gain @ kernel(cells, grid)
+    flat = s.reshape(n, -1)
+    np.testing.assert_allclose(flat.mean(0), gain @ known, atol=1e-8)  # centred, hence exact
+    # An entry of a covariance of 20 000 draws has a standard error of .0009 at most.
+    np.testing.assert_allclose(np.cov(flat.T), covariance, atol=5 * 0.0009)
+    np.testing.assert_array_equal(of_bounds[:, *places.units.T], e)
+    free = np.ones(of_bounds.shape[1:], bool)
+    free[*places.units.T] = False
+    np.testing.assert_allclose(of_bounds[:, free].mean(0), 0.0, atol=1e-12)
+    np.testing.assert_allclose(of_bounds[:, free].std(0), 0.1, rtol=5 * 0.005)
+
+
+def test_student_t_densities_are_scipy_s():
+    rng = np.random.default_rng(0)
+    scale = np.tril(rng.uniform(0.5, 1.0, (4, 4)))
+    center = rng.standard_normal(4)
+    z = rng.standard_normal((20, 4))
+    one, other = Student(center, scale), Student(np.zeros(4), np.eye(4), 5.0)
+    reference = [
+        stats.multivariate_t(s.center, s.scale @ s.scale.T, s.nu).logpdf(z) for s in (one, other)
+    ]
+    np.testing.assert_allclose(one.log_density(z), reference[0], rtol=1e-10)
+    mixed = np.logaddexp(reference[0] + np.log(0.25), reference[1] + np.log(0.75))
+    np.testing.assert_allclose(log_mixture([one, other], [100, 300], z), mixed, rtol=1e-10)
+    drawn = one.draw(4096, 0)
+    np.testing.assert_allclose(drawn.mean(0), center, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """Missions over a true map of effects, and the posterior of a model that learns it."""
+    rng = np.random.default_rng(0)
+    truth = TrustParams(0.2, np.array([0.2, 0.1]), 0.4, 0.03, 0.03)
+    maps = draw_maps(
+        PlaceScales(*np.array([[0.1], [2.0], [0.1]])), nowhere(SHAPE, 1),
+        np.zeros((1, 0)), np.zeros((1, 0)), 3,
+    )  # fmt: skip
+    truth = truth._replace(place=maps[0][0], place_bound=maps[1][0])
+    missions = []
+    for j in range(12):
+        path, z = walk(rng, 8), rng.uniform(size=(8, 3, 2))
+        bounds = np.column_stack([tb.workspace.moves.moves_along(path), np.array(path)[1:]])
+        sample = PooledTrust().simulate(jax.random.key(j), truth.on(bounds[None]), z[None])
+        missions.append(Mission.from_arrays(path, z, np.clip(sample.contact_rate[0], 0.0, 1.0)))
+    workspace = tb.Workspace.from_awareness(rng.uniform(size=(3, *SHAPE, 2)))
+    posterior = fit(missions, PooledTrust(place=PlaceEffect()), workspace=workspace)
+    return workspace, missions, truth, posterior
+
+
+def test_effects_of_visited_bounds_are_learned(learned):
+    _, missions, truth, posterior = learned
+    assert posterior.attrs["sampler"] == "exact"
+    params, bounds = params_of(posterior), bounds_of(missions)
+    drawn, true = (p.of_places(bounds.reshape(-1, 3))[..., 0] for p in (params, truth))
+    # The level is the intercept's as well: effects are compared with their mean taken away.
+    drawn, true = drawn - drawn.mean(-1, keepdims=True), true - true.mean()
+    error = (drawn.mean(0) - true) / drawn.std(0)
+    assert np.corrcoef(drawn.mean(0), true)[0, 1] > 0.95
+    assert (np.abs(error) < 1.645).mean() == pytest.approx(0.9, abs=0.1)
+    none = fit(missions, PooledTrust())
+    assert posterior.attrs["log_evidence"] > none.attrs["log_evidence"] + 50.0
+
+
+def test_a_filter_over_a_mission_follows_its_places(learned):
+    """After the last bound, trust is that of a dense posterior given one draw."""
+    _, missions, _, posterior = learned
+    params, mission = params_of(posterior), missions[0]
+    one = params.draw(np.array([7]))
+    live = tb.models.TrustFilter(one, 3)
+    for k in range(len(mission.bounds)):
+        live.update(mission.awareness[k], mission.contact_rate[k], mission.path[k : k + 2])
+    effect = one.of_places(bounds_of([mission])[0])[0, :, 0]
+    x, P = float(one.x0_mean), float(one.x0_sd) ** 2
+    for k, z in enumerate(mission.awareness[:, 0]):
+        x = one.beta0[0] * x + z @ one.beta[0] + one.b[0] + effect[k]
+        P = one.beta0[0] ** 2 * P + one.delta_w[0] ** 2
+        gain = P / (P + one.delta_v[0] ** 2)
+        x, P = x + gain * (mission.contact_rate[k, 0] - x), (1.0 - gain) * P
+    assert live.state.mean[0] == pytest.approx(x, rel=1e-10)
+    assert live.state.sd[0] == pytest.approx(np.sqrt(P), rel=1e-10)
+    with pytest.raises(TrustboError, match="say which 2 cells"):
+        live.update(mission.awareness[0], mission.contact_rate[0])
+
+
+def test_an_earlier_posterior_changes_the_way_and_not_the_result(learned):
+    workspace, missions, _, posterior = learned
+    model = PooledTrust(place=PlaceEffect())
+    warm = fit(missions, model, workspace=workspace, earlier=posterior, whole=False)
+    for name in ("beta0", "b", "tau_e"):
+        draws, others = (p["posterior"][name].values for p in (posterior, warm))
+        assert abs(draws.mean() - others.mean()) < 0.15 * draws.std()
+    again = fit(missions, model, workspace=workspace, earlier=posterior, whole=False)
+    np.testing.assert_array_equal(warm["places"]["place"], again["places"]["place"])
+
+
+@pytest.mark.slow  # NUTS on all hyperparameters
+def test_the_exact_sampler_agrees_with_nuts(learned):
+    workspace, missions, _, posterior = learned
+    nuts = fit(missions, PooledTrust(place=PlaceEffect()), "nuts", workspace=workspace)
+    for group in ("posterior", "places"):
+        for name, draws in posterior[group].data_vars.items():
+            if name == "length_scale":
+                continue  # next to nothing is known of it, and NUTS has heavy tails there
+            other = nuts[group][name]
+            shift = (draws.mean(("chain", "draw")) - other.mean(("chain", "draw"))).values
+            sd = draws.std(("chain", "draw")).values
+            # 4 standard errors of both, NUTS with some 800 effective draws, and smoothing.
+            assert np.abs(shift / sd).max() < 0.25, name
+            ratio = other.std(("chain", "draw")).values / sd
+            assert np.abs(ratio - 1.0).max() < 0.15, name
+
+
+def test_places_that_cannot_be_are_named():
+    missions = random_missions(0)
+    small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
+    model = PooledTrust(place=PlaceEffect())
+    with pytest.raises(TrustboError, match=r"outside the grid of 2 rows and 2 columns"):
+        fit(missions, model, workspace=small)
+    z = np.full((2, 3, 2), 0.5)
+    jump = Mission.from_arrays([(0, 0), (0, 3), (0, 4)], z, z[..., 0])
+    with pytest.raises(TrustboError, match=r"no bound leads from \(0, 0\) to \(0, 3\).*place=None"):
+        fit([jump], model)
+    with pytest.raises(TrustboError, match="effect of cells or of bounds"):
+        PlaceEffect(cells=False, bounds=False)
+    with pytest.raises(TrustboError, match=r"PlaceEffect.tau_s must be"):
+        PlaceEffect(tau_s=0.0)
+    with pytest.raises(TrustboError, match="place must be a PlaceEffect"):
+        PooledTrust(place=True)
+    with pytest.raises(TrustboError, match='"exact" cannot treat Hierarchical'):
+        fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
+    with pytest.raises(TrustboError, match='need inter_robot="none"'):
+        tb.models.CoupledTrust(place=PlaceEffect())
