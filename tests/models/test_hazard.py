@@ -105,7 +105,7 @@ def test_posterior_means_equal_those_of_a_grid():
     weight = special.softmax(log_p)
     chance = weight @ ((alpha + 3.0) / (alpha + beta + 8.0))
     alpha, beta = (part[:, 0] for part in of(points.z))
-    # 4096 quasi-random points of an effective sample of about half as many.
+    # 2048 quasi-random points of an effective sample of over half as many.
     np.testing.assert_allclose(points.weights @ points.z, weight @ z, atol=0.02)
     np.testing.assert_allclose(
         points.weights @ ((alpha + 3.0) / (alpha + beta + 8.0)), chance, atol=2e-3
