@@ -27,6 +27,13 @@ EXACT = {
     "apart exact": {"model": ("CoupledTrust", {"inter_robot": "none"})},
     **{f"policy {name}": {"policy": name} for name in tb.planning.POLICIES},
     **{f"objective {name}": {"objective": name} for name in tb.planning.OBJECTIVES},
+    "objective lost_contact": {"objective": "lost_contact", "failure_cost": 0.0},
+    "places": {
+        "objective": "lost_contact",
+        "policy": "optimistic",
+        "model": ("PooledTrust", {"place": tb.models.PlaceEffect()}),
+        "bounds": True,
+    },
     "team min": {"team": "min"},
     "belief": {"awareness": "belief", "policy": "thompson"},
     "replan": {"replan": "bound"},
@@ -52,7 +59,7 @@ NUTS = {
 
 FEW = (
     "pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan",
-    "objective lost_contact", "bounds",
+    "objective lost_contact", "bounds", "places",
 )  # fmt: skip
 
 
@@ -63,7 +70,8 @@ def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:
     bounds = options.pop("bounds", False)
     workspace = tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=bounds)
     name, fields = options.pop("model", ("PooledTrust", {}))
-    options = {"sampler": sampler, "objective": "mean", "initial": "prior_draw"} | options
+    paper = {"policy": "greedy", "objective": "mean", "initial": "prior_draw"}
+    options = {"sampler": sampler} | paper | options
     result = tb.iterate(
         workspace,
         (4, 0),

@@ -50,7 +50,7 @@ def test_the_first_plan_is_from_one_draw_of_the_prior_or_from_its_mean(workspace
 
 
 def test_the_posterior_is_that_of_all_missions_so_far(workspace):
-    campaign = Campaign(workspace, *ENDS, sampler="exact")
+    campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact")
     simulator = ModelSimulator(workspace)
     for j in range(2):
         seed = campaign.seed_of("fit")
@@ -139,7 +139,7 @@ def test_bad_names_and_ends_are_refused_at_once(workspace):
 
 
 def test_old_missions_can_be_forgotten(workspace):
-    campaign = Campaign(workspace, *ENDS, sampler="exact", forgetting=0.5)
+    campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact", forgetting=0.5)
     for seed in range(2):
         campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=seed))
     weight = campaign.posterior["constant_data"]["weight"]

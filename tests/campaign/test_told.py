@@ -25,7 +25,10 @@ def workspace():
 
 def begin(workspace, folder=None, **options):
     return tb.Campaign(
-        workspace, *ENDS, **{"sampler": "exact", "objective": "mean"} | options, directory=folder
+        workspace,
+        *ENDS,
+        **{"model": tb.models.PooledTrust(), "sampler": "exact", "objective": "mean"} | options,
+        directory=folder,
     )
 
 
@@ -486,8 +489,8 @@ def test_a_long_campaign_keeps_the_parameters_alone(workspace, tmp_path):
     simulator = ModelSimulator(workspace, blind=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        result = tb.iterate(workspace, *ENDS, sampler="exact", n_iterations=4, simulator=simulator,
-                            checkpoint=tmp_path, progress=False)  # fmt: skip
+        result = tb.iterate(workspace, *ENDS, model=tb.models.PooledTrust(), n_iterations=4,
+                            simulator=simulator, checkpoint=tmp_path, progress=False)  # fmt: skip
     sizes = [tree.nbytes for tree in result.posteriors]
     assert max(sizes) < 0.34e6  # 4000 draws of 6 numbers and 2 statistics, the prior, the hazard
     assert max(sizes) == min(sizes)  # they do not grow

@@ -131,7 +131,10 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--start", "2;0"), "--start must be two whole numbers as 9,0; got '2;0'"),
         (("--policy", "bold"), "unknown policy 'bold'; choose one of greedy, optimistic, thompson"),
         (("--objective", "best"), "unknown objective 'best'; choose one of lost_contact, terminal"),
-        (("--model", "own"), "unknown model 'own'; choose one of pooled, hierarchical, coupled"),
+        (
+            ("--model", "own"),
+            "unknown model 'own'; choose one of pooled, places, hierarchical, coupled",
+        ),
         (("--sampler", "gibbs"), "unknown sampler 'gibbs'; choose one of auto, exact, nuts, joint"),
         (("--observation", "odd"), "unknown observation 'odd'; choose one of gaussian, censored"),
         (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
@@ -179,7 +182,7 @@ def test_errors_speak_of_the_flags_that_mend_them(invoke, flags, tmp_path):
     for remedy, said in (
         ([], "pass both --crs and --resolution (metres).\n"),
         (["--crs", "EPSG:32633", "--resolution", 1], "Pass --nodata 12345.0, or set the tag"),
-        (["--nodata", "12345.0", "--model", "hierarchical"], "Use --sampler nuts.\n"),
+        (["--nodata", "12345.0", "--model", "hierarchical"], "Use --sampler auto.\n"),
     ):
         words += remedy
         done = invoke(*words)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from trustbo.data import Robot
-from trustbo.workspace.posts import _largest_region
+from trustbo.workspace.regions import largest_region
 from trustbo.workspace.routes import Routes, _a_star
 from trustbo.workspace.surface import Surface
 
@@ -59,5 +59,5 @@ def test_routes_and_regions_agree_that_corners_do_not_connect():
     passable = np.zeros((60, 60), bool)
     passable[:30, :30] = passable[30:, 30:] = True
     assert not len(_a_star(np.where(passable, 1.0, np.inf), (1.0, 1.0), (5, 5), (50, 50)))
-    region = _largest_region(passable)
+    region = largest_region(passable)
     assert region.sum() == 900

@@ -97,7 +97,7 @@ class Campaign:
             workspace: Workspace of the paths.
             start: First cell of every path.
             goal: Last cell of every path.
-            model: Trust model; by default `PooledTrust()`.
+            model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
             policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
             objective: Objective of the paths; see `Planner`.
             sampler: Sampler of the posterior; see `trustbo.models.fit`.

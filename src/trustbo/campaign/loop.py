@@ -57,7 +57,7 @@ def iterate(
         start: First cell, (row, col); row 0 is the top.
         goal: Last cell.
         n_iterations: Largest number of missions.
-        model: Trust model; by default `PooledTrust()`.
+        model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
         policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.
         objective: `"lost_contact"`, `"terminal"` (the paper's), `"mean"`, `"success"`,
             `"bottleneck"` or `"stationary"`; see `Planner`.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     Callback = Callable[[Campaign, Mission], None]
 
-POLICY, OBJECTIVE, SAMPLER = "greedy", "lost_contact", "auto"
+POLICY, OBJECTIVE, SAMPLER = "optimistic", "lost_contact", "auto"
 """Defaults of keywords that are no options; commands and studies have the same."""
 PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
 _OWN = ("awareness", "callbacks")
@@ -149,13 +149,13 @@ class CampaignOptions:
         return Planner(workspace, start, goal, objective, **law, **chosen)
 
     def learning(self, model: "TrustModel | None", sampler: str) -> "Learning":
-        """Learning of a model, by default `PooledTrust()`."""
+        """Learning of a model, by default `PooledTrust` with effects of places."""
         from trustbo.campaign.learning import Learning
-        from trustbo.models import PooledTrust
+        from trustbo.models import PlaceEffect, PooledTrust
 
-        return Learning(
-            PooledTrust() if model is None else model, sampler, self.update, self.forgetting
-        )
+        if model is None:  # moments that are matched are those of the paper's parameters
+            model = PooledTrust(place=PlaceEffect() if self.update == "refit" else None)
+        return Learning(model, sampler, self.update, self.forgetting)
 
     def belief(self, workspace: "Workspace") -> "AwarenessBelief | None":
         """Belief about the awareness; None where the map is trusted."""

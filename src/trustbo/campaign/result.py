@@ -32,6 +32,10 @@ from trustbo.workspace import netcdf as archive
 _BELIEVED = "believed.nc"
 
 
+_NEW = ("max_failure", "failure_cost")
+"""Options of planning that results of version 0.1 lack."""
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """Result of a campaign.
@@ -96,7 +100,8 @@ class Result:
     @cached_property
     def planner(self) -> Planner:
         """Planner as the campaign's, with the awareness believed in at the end."""
-        names = options_of(PLANNING)
+        # Version 0.1 knew of no failures.
+        names = [n for n in options_of(PLANNING) if n in self.settings or n not in _NEW]
         missing = [n for n in ("start", "goal", "objective", *names) if n not in self.settings]
         if missing:
             raise TrustboError(

@@ -31,7 +31,7 @@ def run(
     sight: str = "transmittance",
     objective: str = OBJECTIVE,
     policy: str = POLICY,
-    model: str = "pooled",
+    model: str = "places",
     observation: str = "gaussian",
     sampler: str = SAMPLER,
     iterations: int = 8,
@@ -96,7 +96,7 @@ def run(
 def demo(
     policy: str = POLICY,
     objective: str = OBJECTIVE,
-    model: str = "pooled",
+    model: str = "places",
     sampler: str = SAMPLER,
     iterations: int = 8,
     seed: int = 0,

@@ -35,18 +35,21 @@ Paths
 Learning
   policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb, ei,
     epsilon_greedy, cvar, random.
-  model NAME: Trust model: pooled (robots are alike), hierarchical (similar), coupled (influence
+  model NAME: Trust model: places (robots are alike, places differ), pooled (places do not, as in
+    the paper), hierarchical (robots are similar), coupled (influence
     each other).
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial.
-  sampler NAME: Sampler of the posterior: nuts; exact (importance sampling, which need not compile;
-    pooled only); joint (nuts, for other than gaussian).
+  sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
+    (importance sampling, which need not compile); nuts;
+    joint (nuts, for other than gaussian).
 Benchmark
   data FOLDER: Folder of the real terrains, wellington/dem.tif and so on; without it, synthetic ones
     only.
   world NAME: World, given once for each; by default all.
   worlds.policy NAME: Policy, given once for each: a name as for [b]trustbo run[/b], or module:name;
     by default greedy, optimistic, thompson.
-  worlds.model NAME: Model, given once for each: pooled, hierarchical, coupled, or module:name.
+  worlds.model NAME: Model, given once for each: places, pooled, hierarchical, coupled, or
+    module:name.
   simulator NAME: Your own simulator of a world, module:name.
   baseline NAME: Baseline, given once for each: random, shortest, paper, botorch, none; by default
     all of them.

@@ -17,6 +17,7 @@ from trustbo.models.place import PlaceEffect
 from trustbo.models.place_maps import place_maps
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
+from trustbo.models.prior_from import prior_from
 from trustbo.models.prior_predictive import prior_predictive, sample_prior
 from trustbo.models.priors import Priors
 from trustbo.models.risk import BoundRisk
@@ -51,6 +52,7 @@ __all__ = [
     "moment_matched",
     "params_of",
     "place_maps",
+    "prior_from",
     "prior_predictive",
     "sample_prior",
     "sample_statistics",

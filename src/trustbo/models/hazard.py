@@ -46,8 +46,8 @@ class Hazard:
     """
 
     intercept: tuple[float, float] = (-7.0, 2.0)
-    coefficient: tuple[float, float] = (2.0, 1.5)
-    log_strength: tuple[float, float] = (0.0, 1.0)
+    coefficient: tuple[float, float] = (2.0, 2.0)
+    log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
 
     def __post_init__(self) -> None:

@@ -102,14 +102,15 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
         shape = len(missions), max(len(mission.bounds) for mission in missions)
     found = np.full((*shape, 3), -1)
     for j, mission in enumerate(missions):
+        path = mission.path[: len(mission.bounds) + 1]  # one that failed has not made the rest
         try:
-            moves = moves_along(mission.path)
+            moves = moves_along(path)
         except TrustboError as error:
             raise TrustboError(
                 f"mission {j}: {error} A model with place effects needs whole paths; give "
                 "place=None, or split the mission there."
             ) from None
-        found[j, : len(mission.bounds)] = np.column_stack([moves, mission.path[1:]])
+        found[j, : len(mission.bounds)] = np.column_stack([moves, path[1:]])
     return found
 
 

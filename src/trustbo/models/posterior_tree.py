@@ -85,6 +85,8 @@ def _data_groups(
             "row": (("mission", "bound"), cell[..., 0]),
             "col": (("mission", "bound"), cell[..., 1]),
             "status": (("mission",), [mission.status for mission in missions]),
+            "start_row": (("mission",), [mission.path[0][0] for mission in missions]),
+            "start_col": (("mission",), [mission.path[0][1] for mission in missions]),
         },
         own | {"feature": coords["feature"]},
     )
@@ -92,7 +94,7 @@ def _data_groups(
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
-    """Missions that a posterior holds the data of; the first cell of a path is not among these."""
+    """Missions that a posterior holds the data of."""
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
     names = {f"{dim}s": [str(name) for name in data[dim].values] for dim in ("robot", "feature")}
@@ -101,12 +103,16 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
         one = data.isel(mission=j)
         one = one.isel(bound=one["row"].values >= 0)
         cells = list(zip(one["row"].values, one["col"].values, strict=True))
+        # Posteriors of version 0.1 do not hold the first cell.
+        start = cells[0]
+        if "start_row" in one:
+            start = (int(one["start_row"]), int(one["start_col"]))
         arrays = {
             name: one[name].values for name in ("awareness", "contact_rate", "duration", "n_ticks")
         }
         found.append(
             Mission.from_arrays(
-                [cells[0], *cells], **arrays, status=str(one["status"].values), **names
+                [start, *cells], **arrays, status=str(one["status"].values), **names
             )
         )
     return found

@@ -8,8 +8,9 @@ from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES, Policy
 from trustbo.planning.posterior import DrawnPaths
+from trustbo.planning.risk import InfeasibleError, PathRisk, Risk
 
 __all__ = [
-    "OBJECTIVES", "POLICIES", "QUANTILES", "DrawnPaths", "Dynamics", "NoPathError", "Plan",
-    "Planner", "Policy", "policies", "roll_trust",
+    "OBJECTIVES", "POLICIES", "QUANTILES", "DrawnPaths", "Dynamics", "InfeasibleError",
+    "NoPathError", "PathRisk", "Plan", "Planner", "Policy", "Risk", "policies", "roll_trust",
 ]  # fmt: skip

@@ -80,13 +80,19 @@ def _breadth_first(known, bounds, start, steps, back):
 
 
 def require_way(
-    bounds: np.ndarray, to_goal: np.ndarray, start: Cell, goal: Cell, connectivity: int
+    bounds: np.ndarray,
+    to_goal: np.ndarray,
+    start: Cell,
+    goal: Cell,
+    connectivity: int,
+    n_passable: int,
 ) -> None:
     """Refuse ends that are not connected: NoPathError, which counts the cells in reach."""
     if to_goal[start] < 0:
         n_reached = int((fewest_bounds(bounds, start, connectivity) >= 0).sum())
         n_goal = int((to_goal >= 0).sum())
         raise NoPathError(
-            f"no path from {start} to {goal}: {n_reached} cells can be reached from the start, and "
-            f"the goal from {n_goal}. Choose ends in one part, or a team with a larger max_slope."
+            f"no path from {start} to {goal}: {n_reached} of {n_passable} passable cells can be "
+            f"reached from the start, and the goal from {n_goal}. Choose ends in one part, or a "
+            "team with a larger max_slope."
         )

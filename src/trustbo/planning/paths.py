@@ -72,7 +72,9 @@ class AdmissiblePaths:
         open_ = open_ if avoided is None else open_ & ~avoided
         self.bounds = open_[move_indices(connectivity)]
         self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, connectivity, back=True)
-        require_way(self.bounds, self.bounds_to_goal, self.start, self.goal, connectivity)
+        n_passable = int(self.passable.sum())
+        ends = self.start, self.goal, connectivity
+        require_way(self.bounds, self.bounds_to_goal, *ends, n_passable)
         self.shortest = int(self.bounds_to_goal[self.start])
         self.longest = self._most_bounds(max_bounds)
         self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest

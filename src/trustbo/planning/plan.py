@@ -73,7 +73,7 @@ class Plan:
     @property
     def p_arrive_band(self) -> tuple[float, float] | None:
         """Ends of the 90 % band of `p_arrive` over draws of the risk; None without draws."""
-        return None if self.risk is None else self.risk.band
+        return None if self.risk is None else self.risk.p_arrive_band
 
     @cached_property
     def waypoints(self) -> np.ndarray | None:
@@ -105,6 +105,7 @@ class Plan:
 def plan_to_record(plan: Plan) -> dict[str, Any]:
     """Convert a plan, without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
+    values["risk"] = None if plan.risk is None else plan.risk.to_record()
     return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}
 
 
@@ -115,5 +116,7 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
         values["success_index"] = values.pop("success")
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
+    if record.get("risk"):  # unknown to version 0.1
+        values["risk"] = PathRisk.from_record(record["risk"])
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

@@ -161,7 +161,7 @@ class PlanningProblem:
         """`failure_cost` times the chance that a path fails, 0 without a risk."""
         if self.risk is None or self.failure_cost == 0.0:
             return 0.0
-        return self.failure_cost * (1.0 - self.risk.along(path).p_arrive)
+        return self.failure_cost * (1.0 - self.risk.survival(path))
 
     def onward(self, done: Sequence[Cell]) -> Self:
         """Return the problem of the rest of a mission that entered the cells `done`, start first.
@@ -172,7 +172,7 @@ class PlanningProblem:
         """
         rule, most = self.rule, self.rule.max_failure
         if self.risk is not None and most is not None and len(done) > 1:
-            survived = self.risk.along(done).p_arrive
+            survived = self.risk.survival(done)
             rule = rule._replace(max_failure=max(0.0, 1.0 - (1.0 - most) / max(survived, 1e-300)))
         return replace(self, paths=self.paths.onward(done), rule=rule)
 

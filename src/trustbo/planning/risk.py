@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,6 +14,7 @@ from trustbo.workspace.moves import MOVE_NAMES, move_indices, moves_along
 
 INFEASIBLE = ("refuse", "safest")
 """What to do where no path respects `max_failure`: raise, or plan the safest path."""
+_BAND = (0.05, 0.95)
 _CERTAIN = 700.0  # -log(1 - p) of a bound that always fails
 _ROUNDING = 1e-12  # of the risk of a path that is just within the limit
 
@@ -100,39 +101,75 @@ class Risk:
                 worst = float(p[(p < 0.0) | (p > 1.0)][0])
                 raise TrustboError(f"{name} must be in [0, 1]; got {worst:g}.")
 
+    def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Chance to reach the end of a path, the product of 1 - p_fail."""
+        return float(np.prod(1.0 - self.p_fail[_at(path)]))
+
+    def share_within(self, path: Sequence[Cell] | np.ndarray, max_failure: float) -> float:
+        """Share of the draws under which a path fails with a chance of at most `max_failure`."""
+        if self.draws is None:
+            return np.nan
+        p_fail = 1.0 - np.prod(1.0 - self.draws[_at(path)], axis=1)
+        return float((p_fail <= max_failure + _ROUNDING).mean())
+
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Select the bounds of a path."""
-        rows, cols = np.asarray(path)[1:].T
-        at = (..., moves_along(path), rows, cols)
+        at = _at(path)
+        p = self.p_fail[at]
         shares = {
-            cause: np.broadcast_to(share, self.p_fail.shape)[at] * self.p_fail[at]
-            for cause, share in self.causes.items()
+            cause: np.broadcast_to(s, self.p_fail.shape)[at] for cause, s in self.causes.items()
         }
-        return PathRisk(self.p_fail[at], None if self.draws is None else self.draws[at], shares)
+        band, arrive = np.full((2, len(p)), np.nan), (np.nan, np.nan)
+        if self.draws is not None:
+            drawn = self.draws[at]
+            band = np.quantile(drawn, _BAND, axis=0)
+            low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
+            arrive = low, high
+        by_cause = {cause: share * p for cause, share in shares.items()}
+        return PathRisk(p, band, float(np.prod(1.0 - p)), arrive, by_cause)
+
+
+def _at(path: Sequence[Cell] | np.ndarray) -> tuple[Any, ...]:
+    """Index of the bounds of a path in arrays (..., move, row, col)."""
+    rows, cols = np.asarray(path)[1:].T
+    return ..., moves_along(path), rows, cols
 
 
 class PathRisk(NamedTuple):
-    """Chance that each bound of a path ends the mission, given that it is begun."""
+    """Chance that a path's bounds end the mission, each given that it is begun."""
 
     p_fail: np.ndarray
     """Posterior mean, shape (bound,)."""
-    draws: np.ndarray | None
-    """Draws, shape (draw, bound), or None."""
+    p_fail_band: np.ndarray
+    """Ends of its 90 % band over draws, shape (end, bound); NaN without draws."""
+    p_arrive: float
+    """Chance to reach the goal at the posterior mean, the product of 1 - p_fail."""
+    p_arrive_band: tuple[float, float]
+    """Ends of its 90 % band over draws; NaN without draws."""
     by_cause: Mapping[str, np.ndarray]
     """`p_fail` by cause of the failure, each of shape (bound,)."""
 
-    @property
-    def p_arrive(self) -> float:
-        """Chance to reach the goal at the posterior mean, the product of 1 - p_fail."""
-        return float(np.prod(1.0 - self.p_fail))
+    def to_record(self) -> dict[str, Any]:
+        """Convert to plain lists and numbers."""
+        by_cause = {cause: p.tolist() for cause, p in self.by_cause.items()}
+        return {
+            **self._asdict(),
+            "p_fail": self.p_fail.tolist(),
+            "p_fail_band": self.p_fail_band.tolist(),
+            "by_cause": by_cause,
+        }
 
-    @property
-    def band(self) -> tuple[float, float]:
-        """Ends of the 90 % band of the chance to reach the goal over draws; NaN without draws."""
-        if self.draws is None:
-            return np.nan, np.nan
-        low, high = np.quantile(np.prod(1.0 - self.draws, axis=1), (0.05, 0.95))
-        return float(low), float(high)
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """Convert the record of `to_record` back."""
+        low, high = record["p_arrive_band"]
+        return cls(
+            np.array(record["p_fail"]),
+            np.array(record["p_fail_band"]),
+            record["p_arrive"],
+            (low, high),
+            {cause: np.array(p) for cause, p in record["by_cause"].items()},
+        )
 
 
 class RiskTable(NamedTuple):

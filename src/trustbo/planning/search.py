@@ -14,7 +14,7 @@ from trustbo.planning.engines.compiled_risk import safest_path
 from trustbo.planning.engines.reference import plan_networkx
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.risk import InfeasibleError, RiskTable
+from trustbo.planning.risk import FailureRule, InfeasibleError, Risk, RiskTable
 
 ENGINES = ("auto", "networkx", "numba")
 LARGEST_FOR_NETWORKX = 2500
@@ -89,7 +89,7 @@ def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T 
     assert risk is not None and problem.risk is not None  # noqa: S101, PT018
     path, limit = safest_path(problem.paths, problem.objective.name, risk.of_bounds[0])
     if problem.rule.infeasible == "refuse":
-        raise _infeasible(problem, path)
+        raise _infeasible(problem.rule, problem.risk, path)
     # The best of those that are as safe, as rounding tells them apart.
     limits = np.array([limit + 1e-12 * max(1.0, limit)])
     found = best(RiskTable(risk.of_bounds[:1], limits, 1, risk.failure_cost))
@@ -97,20 +97,16 @@ def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T 
     return found
 
 
-def _infeasible(problem: PlanningProblem, path: tuple[Cell, ...]) -> InfeasibleError:
-    rule, paths, most = problem.rule, problem.paths, problem.rule.max_failure or 0.0
-    along = problem.risk.along(path)  # pyright: ignore[reportOptionalMemberAccess]
+def _infeasible(rule: FailureRule, risk: Risk, path: tuple[Cell, ...]) -> InfeasibleError:
+    p_fail, most = 1.0 - risk.survival(path), rule.max_failure or 0.0
     sure, held = "", ""
-    if rule.confidence is not None and along.draws is not None:
-        share = (1.0 - np.prod(1.0 - along.draws, axis=1) <= most).mean()
+    if rule.confidence is not None:
         sure = f" with confidence {rule.confidence:g}"
-        held = f", and holds the limit under {share:.3g} of the draws"
-    p_fail = 1.0 - along.p_arrive
+        held = f", which holds the limit under {risk.share_within(path, most):.3g} of the draws"
     return InfeasibleError(
-        f"no admissible path from {paths.start} to {paths.goal} fails with a chance of at most "
-        f"max_failure = {most:g}{sure}; the least is {p_fail:.4g}, on the path "
-        f"{path}{held}. Raise max_failure, admit more paths by max_bounds, or plan the safest with "
-        "infeasible='safest'.",
+        f"no admissible path from {path[0]} to {path[-1]} fails with a chance of at most "
+        f"max_failure = {most:g}{sure}; the least is {p_fail:.4g}, on the path {path}{held}. Raise "
+        "max_failure, admit more paths by max_bounds, or plan the safest, infeasible='safest'.",
         path,
         p_fail,
     )

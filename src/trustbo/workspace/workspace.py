@@ -245,9 +245,10 @@ class Workspace:
         )
         names = [*self.features, *sight_features(len(self.sights))]
         like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
-        return dataclasses.replace(self, awareness=like.copy(data=found.cells)).with_bounds(
-            found.bounds
-        )
+        made = dataclasses.replace(self, awareness=like.copy(data=found.cells))
+        made = made.with_bounds(found.bounds)
+        made.__dict__["ground"] = ways  # with the posts and routes that are known by now
+        return made
 
     @cached_property
     def ground(self) -> Ways | None:

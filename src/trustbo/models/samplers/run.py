@@ -120,7 +120,7 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
     """
     if sampler == "exact" and (reason := model.why_not_exact):
         raise TrustboError(
-            f'sampler "exact" cannot treat {model.describe()}: {reason}. Use "auto", or "nuts".'
+            f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
         )
     if sampler == "joint" and model.family.integrates_out:
         raise TrustboError(
