@@ -5,6 +5,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import stats
 from scipy.linalg import block_diag
 
@@ -15,7 +16,13 @@ from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustPar
 from trustbo.models.likelihood import place_marginal
 from trustbo.models.likelihood.place_rows import gather_rows
 from trustbo.models.place import bounds_of, visited
-from trustbo.models.place_maps import PlaceScales, draw_maps, nowhere
+from trustbo.models.place_maps import (
+    PlaceScales,
+    draw_maps,
+    nowhere,
+    place_group,
+    place_maps_of,
+)
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.place_target import PlaceTarget
 from trustbo.models.samplers.student import Student, log_mixture
@@ -225,6 +232,51 @@ def test_maps_are_those_of_dense_conditioning():
     np.testing.assert_allclose(of_bounds[:, free].std(0), 0.1, rtol=5 * 0.005)
 
 
+@pytest.mark.parametrize("place", PLACES, ids=str)
+def test_place_maps_are_the_moments_of_the_drawn_maps(place):
+    n, rng = 5000, np.random.default_rng(0)
+    places = visited(bounds_of(random_missions(5, 2)), place, 3, SHAPE)
+    ell = np.exp(rng.choice([0.2, 0.7], n))  # two of the steps that length scales are rounded to
+    sites = {
+        "beta0": np.full(n, 0.3), "tau_s": rng.uniform(0.1, 0.3, n), "length_scale": ell,
+        "tau_e": rng.uniform(0.1, 0.3, n),
+    }  # fmt: skip
+    sites = {name: sites[name] for name in ("beta0", *place.names)}
+    on, sizes = (
+        (place.cells, place.bounds),
+        {"place": len(places.cells), "place_bound": len(places.units)},
+    )
+    sizes = {name: sizes[name] for name, yes in zip(sizes, on, strict=True) if yes}
+    draws = {name: 0.2 * rng.standard_normal((1, n, size)) for name, size in sizes.items()}
+    group = place_group(draws, places, 1)
+    robots = {"contact_rate": ("robot", np.zeros(3))}
+    posterior = xr.DataTree.from_dict(
+        {
+            "posterior": xr.Dataset({k: (("chain", "draw"), v[None]) for k, v in sites.items()}),
+            "places": group,
+            "observed_data": xr.Dataset(robots, {"robot": ["a", "b", "c"]}),
+        }
+    )
+    maps, drawn = tb.models.place_maps(posterior), place_maps_of(group, sites)
+    assert set(maps) == {f"{name}_{kind}" for name in draws for kind in ("mean", "sd")}
+    assert ("robot" in maps.dims) is not place.shared
+    for name, expected in drawn.items():
+        if expected is None:
+            continue
+        mean, sd = (maps[f"{name}_{kind}"].values for kind in ("mean", "sd"))
+        there = np.isfinite(mean)
+        assert there.mean() == pytest.approx(1.0 if name == "place" else 144 / 200)
+        expected = expected if not place.shared else expected[:, 0]
+        # Means of the drawn maps have no Monte Carlo error.
+        np.testing.assert_allclose(mean[there], expected.mean(0)[there], atol=1e-9)
+        # A standard deviation of n draws has a relative standard error of 1 / sqrt(2 n), and some
+        # more as tails of mixtures are heavier.
+        np.testing.assert_allclose(sd[there], expected.std(0)[there], rtol=6 / np.sqrt(2 * n))
+    if place.bounds:
+        assert maps["move"].values.tolist() == ["nw", "n", "ne", "w", "e", "sw", "s", "se"]
+        assert np.isnan(maps["place_bound_mean"].sel(row=0, move="s")).all()  # from row -1
+
+
 def test_student_t_densities_are_scipy_s():
     rng = np.random.default_rng(0)
     scale = np.tril(rng.uniform(0.5, 1.0, (4, 4)))
@@ -326,6 +378,9 @@ def test_the_exact_sampler_agrees_with_nuts(learned):
 
 
 def test_places_that_cannot_be_are_named():
+    bare = xr.DataTree.from_dict({"posterior": xr.Dataset()})
+    with pytest.raises(TrustboError, match=r"no maps of them; fit a model with place=PlaceEffect"):
+        tb.models.place_maps(bare)
     missions = random_missions(0)
     small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
     model = PooledTrust(place=PlaceEffect())

@@ -24,7 +24,7 @@ from trustbo.files import (
     write_text,
 )
 from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
-from trustbo.models import BoundRisk, params_of
+from trustbo.models import BoundRisk, params_of, place_maps
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
@@ -115,8 +115,10 @@ class Result:
         ]
         objective = self.settings["objective"]
         planner = options.planner(self.workspace, start, goal, objective, *law)
-        if "hazard" in self.posterior.children:
-            hazard = self.posterior["hazard"].to_dataset()
+        hazard = self.posterior.children.get("hazard")
+        measures = self.workspace.difficulty.shape[-1]  # none where the terrain was taken away
+        if hazard is not None and hazard.sizes.get("measure", 0) == measures:
+            hazard = hazard.to_dataset()
             planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
         if self.believed is None:
             return planner
@@ -143,7 +145,10 @@ class Result:
             Dataset over (row, col) with `trust_mean` and `trust_sd` over the posterior, the mean
             `cost` 1 - sigma(trust), `path_probability` (of a cell to be on the best path), and
             each feature's awareness, the mean over robots, by its name, or as `awareness_<name>`
-            where another map or a dim has that name. NaN where no robot can go.
+            where another map or a dim has that name. NaN where no robot can go. Where places have
+            effects, also `place_mean` and `place_sd` of the cell's, and `place_bounds_mean`, the
+            mean of those of the bounds into it (see `models.place_maps`); of robots' own effects,
+            the mean over robots.
         """
         if n_draws is None:
             mean = params_of(self.posterior).mean()
@@ -152,13 +157,29 @@ class Result:
         maps = summary.rename(mean="trust_mean", sd="trust_sd")
         share = self.planner.path_posterior(self.posterior, n_draws=n_draws, seed=seed)
         awareness = self.workspace.awareness if self.believed is None else self.believed["mean"]
-        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref"}
+        places = self._places()
+        taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
         for name in [str(feature) for feature in awareness["feature"].values]:
             values = awareness.sel(feature=name, drop=True).mean("robot")
             own = f"awareness_{name}" if name in taken else name
             maps[own] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
         maps["path_probability"] = share
+        maps = maps.assign(places.data_vars)
         return maps.where(self.workspace.passable)
+
+    def _places(self) -> xr.Dataset:
+        """Maps of the effects of places, (row, col), where there are some."""
+        if "places" not in self.posterior.children:
+            return xr.Dataset()
+        effects = place_maps(self.posterior)
+        if "place_bound_mean" in effects:
+            into = effects["place_bound_mean"].where(self.workspace.passable_bounds).mean("move")
+            into.attrs = {
+                "long_name": "mean effect on trust of the bounds into a cell", "units": "1"
+            }  # fmt: skip
+            effects["place_bounds_mean"] = into
+        found = effects.drop_vars(["place_bound_mean", "place_bound_sd", "move"], errors="ignore")
+        return found.mean("robot", keep_attrs=True) if "robot" in found.dims else found
 
     def plot_maps(self, *, n_columns: int | None = None) -> np.ndarray:
         """Plot the trust map and path of each iteration, and the last; returns the Axes."""

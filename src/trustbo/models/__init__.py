@@ -14,6 +14,7 @@ from trustbo.models.loo import loo
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
 from trustbo.models.place import PlaceEffect
+from trustbo.models.place_maps import place_maps
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import complete
 from trustbo.models.prior_from import prior_from
@@ -50,6 +51,7 @@ __all__ = [
     "loo",
     "moment_matched",
     "params_of",
+    "place_maps",
     "prior_from",
     "prior_predictive",
     "sample_prior",

@@ -10,7 +10,7 @@ What is drawn at random has mean 0 over the draws, so that the mean of the maps 
 mean of the effects, without Monte Carlo error where nothing was measured.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,13 +18,16 @@ import xarray as xr
 from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
+from trustbo.errors import TrustboError
 from trustbo.models.likelihood.place_prior import correlation, matern
 from trustbo.models.place import N_MOVES, Visited
+from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
 
 _STEP = 0.1  # of the logarithm of length scales
 _REACH = 5.0  # length scales at which the correlation is .002
 _JITTER = 1e-9
 _AXIS = {"place": "cell", "place_bound": "bound"}
+_MOMENTS = "mean", "standard deviation of the"
 _OF_CELL, _OF_BOUND = ("effect", "row", "col"), ("effect", "move", "row", "col")
 
 
@@ -86,23 +89,36 @@ def _cells(
     seed: list[int],
 ) -> np.ndarray:
     """S over the grid, (draw, row, col), given some cells."""
-    grid = np.column_stack([np.zeros(shape[0] * shape[1]), *np.indices(shape).reshape(2, -1)])
-    own = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
     flat = cells[:, 1] * shape[1] + cells[:, 2]
-    centre = np.zeros((len(known), len(grid)))
+    centre = np.zeros((len(known), shape[0] * shape[1]))
     off = np.empty(centre.shape)
-    steps = np.round(np.log(scales.length_scale) / _STEP).astype(int)
-    for step in np.unique(steps):
-        rows, length_scale = steps == step, float(np.exp(_STEP * step))
+    for step, rows, length_scale, weights, _ in _kriging(scales.length_scale, shape, cells):
         rng = np.random.default_rng([*seed, step + 1000])
         free = _prior(shape, length_scale, int(rows.sum()), rng) * scales.tau_s[rows, None]
-        if len(cells):
-            K = correlation(own, own, length_scale) + _JITTER * np.eye(len(own))
-            weights = cho_solve(cho_factor(K), correlation(own, grid, length_scale))
-            centre[rows] = known[rows] @ weights
-            free -= free[:, flat] @ weights
-        off[rows] = free
+        centre[rows] = known[rows] @ weights
+        off[rows] = free - free[:, flat] @ weights
     return (centre + _centre(off)).reshape(-1, *shape)
+
+
+def _kriging(
+    length_scale: np.ndarray, shape: tuple[int, int], cells: np.ndarray
+) -> Iterator[tuple[int, np.ndarray, float, np.ndarray, np.ndarray]]:
+    """Yield each step of length scales, its draws and length scale, and how s follows from cells.
+
+    That is weights (cell, all) of the effects of `cells` in the mean of s over the grid, and the
+    variance (all,) that is left of a prior variance of 1.
+    """
+    grid = np.column_stack([np.zeros(shape[0] * shape[1]), *np.indices(shape).reshape(2, -1)])
+    own = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
+    steps = np.round(np.log(length_scale) / _STEP).astype(int)
+    for step in np.unique(steps):
+        scale, weights = float(np.exp(_STEP * step)), np.zeros((len(own), len(grid)))
+        cross = correlation(own, grid, scale)
+        if len(own):
+            K = correlation(own, own, scale) + _JITTER * np.eye(len(own))
+            weights = cho_solve(cho_factor(K), cross)
+        left = np.maximum(1.0 - (weights * cross).sum(0), 0.0)
+        yield int(step), steps == step, scale, weights, left
 
 
 def _prior(
@@ -167,11 +183,7 @@ def place_maps_of(
         group: Group `places` of a posterior.
         sites: Its hyperparameters by name, (draw,), chains joined.
     """
-    known = {
-        name: group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
-        for name, axis in _AXIS.items()
-        if name in group
-    }
+    known = _known(group)
     maps = draw_maps(
         scales_of(sites), visited_of(group), known.get("place"), known.get("place_bound"),
         int(group.attrs["seed"]),
@@ -187,6 +199,86 @@ def prior_maps(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, 
     empty = nowhere(places.shape, places.n_effects)
     maps = draw_maps(scales, empty, no["place"], no["place_bound"], int(group.attrs["seed"]) + 1)
     return dict(zip(_AXIS, maps, strict=True))
+
+
+def place_maps(posterior: xr.DataTree) -> xr.Dataset:
+    """Mean and standard deviation of the effect of every cell and bound, over a posterior.
+
+    Exact given its draws at visited places: what was not visited enters by its conditional mean and
+    variance, and is not drawn.
+
+    Args:
+        posterior: DataTree from `fit` of a model with effects of places.
+
+    Returns:
+        place_mean and place_sd (row, col) of s, the effect of entering a cell, and place_bound_mean
+        and place_bound_sd (move, row, col) of e, the further effect of entering it by that move, as
+        the model has them. Where robots have effects of their own, axis `robot` is first. Effects
+        are added to trust at each such bound. Moves have the names of `workspace.bound_awareness`,
+        "n" towards row 0; NaN where a move would come from outside the grid.
+
+    Raises:
+        TrustboError: The model has no effects of places.
+    """
+    if "places" not in posterior.children:
+        raise TrustboError(
+            f"a posterior of {posterior.attrs.get('model', 'a model')} without effects of places "
+            "has no maps of them; fit a model with place=PlaceEffect()."
+        )
+    group = posterior["places"].to_dataset()
+    draws = posterior["posterior"].to_dataset()
+    names = ("beta0", "tau_s", "length_scale", "tau_e")
+    scales = scales_of({n: draws[n].values.reshape(-1) for n in names if n in draws})
+    places, known, maps = visited_of(group), _known(group), xr.Dataset()
+    if "place" in known:
+        moments = [
+            _moments_of_cells(scales, places.shape, places.cells[mine], known["place"][:, mine])
+            for i in range(places.n_effects)
+            for mine in [places.cells[:, 0] == i]
+        ]
+        _add(maps, "place", "effect of the cell", ("row", "col"), np.stack(moments, axis=1))
+    if "place_bound" in known:
+        e, axes = known["place_bound"], ("move", "row", "col")
+        found = np.zeros((2, places.n_effects, N_MOVES, *places.shape))
+        found[1] = np.sqrt((scales.tau_e**2).mean())
+        found[:, *places.units.T] = e.mean(0), e.std(0)
+        found[..., ~existing_bounds(np.ones(places.shape, bool))] = np.nan
+        _add(maps, "place_bound", "effect of the bound by a move", axes, found)
+        maps = maps.assign_coords(move=list(MOVE_NAMES))
+    maps = maps.assign_coords({axis: np.arange(maps.sizes[axis]) for axis in ("row", "col")})
+    if places.n_effects == 1:
+        return maps.isel(robot=0)
+    return maps.assign_coords(robot=posterior["observed_data"]["robot"].values)
+
+
+def _moments_of_cells(
+    scales: PlaceScales, shape: tuple[int, int], cells: np.ndarray, known: np.ndarray
+) -> np.ndarray:
+    """Mean and standard deviation of s over the grid, (2, row, col)."""
+    centre = np.zeros((len(known), shape[0] * shape[1]))
+    variance = np.zeros(shape[0] * shape[1])
+    for _, rows, _, weights, left in _kriging(scales.length_scale, shape, cells):
+        centre[rows] = known[rows] @ weights
+        variance += (scales.tau_s[rows] ** 2).sum() * left / len(known)
+    return np.stack([centre.mean(0), np.sqrt(centre.var(0) + variance)]).reshape(2, *shape)
+
+
+def _add(
+    maps: xr.Dataset, name: str, text: str, axes: tuple[str, ...], moments: np.ndarray
+) -> None:
+    """Add a mean and a standard deviation (2, robot, ...) to some maps."""
+    for kind, long, values in zip(("mean", "sd"), _MOMENTS, moments, strict=True):
+        attrs = {"long_name": f"{long} {text} on trust", "units": "1"}
+        maps[f"{name}_{kind}"] = ("robot", *axes), values, attrs
+
+
+def _known(group: xr.Dataset) -> dict[str, np.ndarray]:
+    """Draws at visited places by name, chains joined: (draw, cell) and (draw, unit)."""
+    return {
+        name: group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
+        for name, axis in _AXIS.items()
+        if name in group
+    }
 
 
 def scales_of(sites: Mapping[str, np.ndarray]) -> PlaceScales:

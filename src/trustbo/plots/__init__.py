@@ -13,6 +13,7 @@ from trustbo.plots.maps import (
     trust_maps,
 )
 from trustbo.plots.mission import mission_trust, plan_trust
+from trustbo.plots.places import place_map
 from trustbo.plots.plan import plan_map
 from trustbo.plots.regret import regret_curves
 from trustbo.plots.terrain import loadings, terrain_maps
@@ -20,5 +21,6 @@ from trustbo.plots.terrain import loadings, terrain_maps
 __all__ = [
     "animate_mission", "calibration", "campaign_history", "cell_map", "draw_path", "draw_scale",
     "hazard_map", "loadings", "mission_trust", "parameter_history", "path_posterior",
-    "plan_map", "plan_trust", "regret_curves", "robot_maps", "terrain_maps", "trust_maps",
+    "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps", "terrain_maps",
+    "trust_maps",
 ]  # fmt: skip

@@ -6,7 +6,7 @@ import numpy as np
 
 from trustbo import plots
 from trustbo.campaign.result import Result
-from trustbo.models import params_of
+from trustbo.models import params_of, place_maps
 from trustbo.models.posterior_tree import labelled_draws
 from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
@@ -82,6 +82,24 @@ def path_posterior(result: Result) -> Picture:
         f"at least 95 %, {counted(likely, 'more cell')} with 5 % to 95 %.",
         "Share of posterior draws whose best path enters a cell; white, the recommended path. "
         "If other cells are likely too, more missions may change the path.",
+        shrink=True,
+    )
+
+
+def places(result: Result) -> Picture:
+    """Draw the effects of places."""
+    effects = place_maps(result.posterior)
+    name = "place_mean" if "place_mean" in effects else "place_bound_mean"
+    low, high = _ends(effects[name])
+    of = "cells" if name == "place_mean" else "bounds"
+    n_visited = result.posterior["places"].sizes["bound"]
+    return picture(
+        lambda n_columns: plots.place_map(result.posterior, result.workspace, n_columns=n_columns),
+        f"Maps of the effects of places on trust: the mean of {of} goes from {low} to {high}; and "
+        f"their standard deviation. Arrows are the {counted(n_visited, 'place')} visited.",
+        "Left, the mean effect on trust of entering a cell, + or \N{MINUS SIGN} where its sign has a "
+        "probability of 95 %; right, its standard deviation. Arrows are bounds that were made, "
+        "their colour the further effect of the bound.",
         shrink=True,
     )
 

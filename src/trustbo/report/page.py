@@ -58,6 +58,13 @@ def _sections(result: Result) -> Iterator[Section]:
         "posterior, others may be.",
         [figures.path_posterior(result)],
     )
+    if "places" in result.posterior.children:
+        yield Section(
+            "places",
+            "Places",
+            "Where contact is better or worse than the terrain says, and how sure we are.",
+            [figures.places(result)],
+        )
     yield Section("cost", "Cost per robot", "", [figures.robot_costs(result)])
     if on_terrain:
         yield Section("terrain", "Terrain", "", [figures.terrain(result)])

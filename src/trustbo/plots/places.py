@@ -1,0 +1,144 @@
+"""Maps of the effects of places: what was learned beyond the terrain, and how surely."""
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, Normalize
+
+from trustbo.errors import ShapeError
+from trustbo.models import place_maps
+from trustbo.plots.layout import as_text, colour_bar, extent_of, label_maps, map_panels
+from trustbo.plots.maps import CLOSED, COLOURS, draw_hillshade, draw_scale, outlined
+from trustbo.workspace import Grid, Workspace
+from trustbo.workspace.moves import MOVES
+
+BETTER_WORSE = "RdBu"
+"""Diverging colours: red where contact is worse, blue where it is better."""
+_SURE = 1.645
+"""Standard deviations from 0 at which the sign is known with 95 %."""
+_TIP, _TAIL = 0.2, 0.47
+"""Ends of an arrow, in steps back from the centre of the cell entered."""
+
+
+def place_map(
+    posterior: xr.DataTree, workspace: Workspace, *, n_columns: int | None = None
+) -> np.ndarray:
+    """Draw where contact is better or worse than the terrain says, and how sure that is.
+
+    The left panel has the mean effect of each cell, with + or - where its sign has a probability of
+    95 %; the right one the standard deviation. Arrows, in the cell entered, are the bounds made by
+    missions: their colour is the further effect of the bound, on the same scale.
+
+    Args:
+        posterior: DataTree from `fit` of a model with `place=PlaceEffect()`, such as
+            `Result.posterior`.
+        workspace: Workspace of the cells.
+        n_columns: Panels per row, by default two.
+
+    Returns:
+        Axes of the mean and of the standard deviation, shape (2,); where robots have effects of
+        their own, those of each robot in turn, shape (2 robot,).
+
+    Raises:
+        TrustboError: The model has no effects of places.
+        ShapeError: The workspace has fewer cells than the posterior's grid.
+    """
+    maps = place_maps(posterior)
+    have, grid = (maps.sizes["row"], maps.sizes["col"]), workspace.grid
+    if have[0] > grid.shape[0] or have[1] > grid.shape[1]:
+        raise ShapeError(
+            f"the posterior's places are on {have[0]} rows and {have[1]} columns, the workspace "
+            f"has {grid.shape[0]} and {grid.shape[1]}; give the workspace that it was fitted on."
+        )
+    names = [str(name) for name in maps["robot"].values] if "robot" in maps.dims else [""]
+    maps = maps if "robot" in maps.dims else maps.expand_dims("robot")
+    units = posterior["places"].to_dataset()
+    tops = {kind: _top(maps, kind) for kind in ("mean", "sd")}
+    styles = {
+        "mean": (Normalize(-tops["mean"], tops["mean"]), colormaps[BETTER_WORSE]),
+        "sd": (Normalize(0.0, tops["sd"]), colormaps[COLOURS]),
+    }
+    titles = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
+    columns = 2 if n_columns is None else n_columns
+    figure, axes, panels = map_panels(grid, 2 * len(names), columns)
+    for i, name in enumerate(names):
+        own = maps.isel(robot=i)
+        for ax, (kind, style) in zip(panels[2 * i : 2 * i + 2], styles.items(), strict=True):
+            _draw(ax, own, kind, units, i, workspace, *style)
+            title = f"{as_text(name)}: {titles[kind]}" if name else titles[kind]
+            ax.set_title(title, fontsize=9)
+        if "place_mean" in own:
+            _signs(panels[2 * i], own, workspace)
+    draw_scale(panels[0], grid)
+    label_maps(axes)
+    labels = {"mean": "effect on trust, mean", "sd": "effect on trust, standard deviation"}
+    for k, kind in enumerate(styles):
+        colour_bar(figure, ScalarMappable(*styles[kind]), list(panels[k::2]), labels[kind])
+    return panels
+
+
+def _top(maps: xr.Dataset, kind: str) -> float:
+    """Largest absolute value of the effects of a kind of moment."""
+    values = [np.nanmax(np.abs(maps[n].values)) for n in maps if str(n).endswith(f"_{kind}")]
+    return max(1e-6, *map(float, values))
+
+
+def _draw(
+    ax: Axes,
+    maps: xr.Dataset,
+    kind: str,
+    units: xr.Dataset,
+    effect: int,
+    workspace: Workspace,
+    norm: Normalize,
+    colours: Colormap,
+) -> None:
+    """Draw cells and visited bounds of one robot, or of all of them."""
+    ax.set_facecolor(CLOSED)
+    data = np.full(workspace.passable.shape, np.nan)
+    if f"place_{kind}" in maps:
+        of_cells = maps[f"place_{kind}"].transpose("row", "col").values
+        data[: of_cells.shape[0], : of_cells.shape[1]] = of_cells
+    elif kind == "mean":
+        data[:] = 0.0
+    data[~workspace.passable.values] = np.nan
+    extent = extent_of(workspace.grid)
+    ax.imshow(data, cmap=colours, norm=norm, extent=extent, interpolation="nearest")
+    draw_hillshade(ax, workspace)
+    if f"place_bound_{kind}" in maps:
+        mine = units["bound_effect"].values == effect
+        move, row, col = (units[f"bound_{n}"].values[mine] for n in ("move", "row", "col"))
+        of_bounds = maps[f"place_bound_{kind}"].transpose("move", "row", "col").values
+        _arrows(ax, move, row, col, colours(norm(of_bounds[move, row, col])), workspace.grid)
+
+
+def _arrows(
+    ax: Axes, move: np.ndarray, row: np.ndarray, col: np.ndarray, colour: np.ndarray, grid: Grid
+) -> None:
+    """Draw bounds as arrows from the edge of the cell entered towards its centre."""
+    down, right = np.array(MOVES[8])[move].T
+    size = np.array([grid.cell_width, grid.cell_height])
+    step = np.column_stack([right, -down]) * size
+    centre = np.column_stack([col + 0.5, grid.shape[0] - row - 0.5]) * size
+    ax.quiver(
+        *(centre - _TAIL * step).T, *((_TAIL - _TIP) * step).T, color=colour, edgecolor="black",
+        linewidth=0.4, angles="xy", scale_units="xy", scale=1.0, units="xy",
+        width=0.09 * min(size), headwidth=2.4, headlength=2.0, headaxislength=2.0, minlength=0.0,
+        zorder=3,
+    )  # fmt: skip
+
+
+def _signs(ax: Axes, maps: xr.Dataset, workspace: Workspace) -> None:
+    """Write + or - into cells whose effect has a sign with 95 %: colours alone are lost in grey."""
+    grid = workspace.grid
+    score = (maps["place_mean"] / maps["place_sd"]).transpose("row", "col").values
+    inches = 2.6 / grid.shape[1]
+    size = float(np.clip(72 * 0.4 * inches, 3.0, 9.0))
+    for row, col in np.argwhere(np.abs(score) > _SURE):
+        if workspace.passable.values[row, col]:
+            x, y = (col + 0.5) * grid.cell_width, (grid.shape[0] - row - 0.5) * grid.cell_height
+            text = "+" if score[row, col] > 0.0 else "\N{MINUS SIGN}"
+            mark = ax.text(x, y, text, fontsize=size, ha="center", va="center", zorder=4)
+            mark.set_path_effects(outlined(1.2))
