@@ -53,7 +53,12 @@ def test_its_maps_are_over_the_posterior(result):
     maps = result.maps(n_draws=300)
     assert list(maps) == [
         "trust_mean", "trust_sd", "cost", "traversability", "visibility", "path_probability",
+        "place_mean", "place_sd", "place_bounds_mean",
     ]  # fmt: skip
+    places = tb.models.place_maps(result.posterior)
+    np.testing.assert_array_equal(maps["place_sd"], places["place_sd"].where(PASSABLE))
+    into = places["place_bound_mean"][:, 3, 0].sel(move=["sw", "w", "s"])  # a corner
+    np.testing.assert_allclose(maps["place_bounds_mean"][3, 0], into.mean())
     assert all(np.isnan(maps[name][1, 1]) for name in maps)
     share = maps["path_probability"]
     assert share[3, 0] == share[0, 3] == 1.0

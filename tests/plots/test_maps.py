@@ -120,19 +120,9 @@ def test_level_ground_keeps_its_colour_whatever_lies_beside_it():
     np.testing.assert_allclose(shadow[23:38, 2:18], 0.55 * (1.0 - light), rtol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def of_places(result):
-    """The same missions under models whose places have effects, shared and each robot's own."""
-    missions = [result.workspace.fill(mission) for mission in result.missions]
-    return [
-        fit(missions, PooledTrust(place=place), workspace=result.workspace, n_draws=50, whole=False)
-        for place in (PlaceEffect(), PlaceEffect(cells=False, shared=False))
-    ]
-
-
-def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(result, of_places):
-    shared, _ = of_places
-    maps, axes = tb.models.place_maps(shared), tb.plots.place_map(shared, result.workspace)
+def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(result):
+    maps = tb.models.place_maps(result.posterior)
+    axes = tb.plots.place_map(result.posterior, result.workspace)
     assert [ax.get_title() for ax in axes] == ["better (+) or worse (\N{MINUS SIGN})", "how sure"]
     for ax, kind in zip(axes, ("mean", "sd"), strict=True):
         np.testing.assert_allclose(ax.images[0].get_array(), maps[f"place_{kind}"])
@@ -144,15 +134,17 @@ def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(re
     for mission in result.missions:
         for a, c in zip(mission.path[:-1], mission.path[1:], strict=True):
             made[a, c] = (np.add(grid.center(c), grid.center(a)) / 2 - grid.corner).tolist()
-    assert len(arrows.offsets) == len(made)
+    assert len(arrows.XY) == len(made)
     step = np.array([grid.cell_width, grid.cell_height])
     for x, y in made.values():  # the tail is close to the edge, in the cell entered
-        assert (np.abs(arrows.offsets - [x, y]) <= 0.05 * step).all(1).any()
+        assert (np.abs(arrows.XY - [x, y]) <= 0.05 * step).all(1).any()
     assert len(axes[0].figure.axes) == 4  # a colour bar each
 
 
-def test_robots_of_their_own_places_have_two_panels_each(result, of_places):
-    _, own = of_places
+def test_robots_of_their_own_places_have_two_panels_each(result):
+    missions = [result.workspace.fill(mission) for mission in result.missions]
+    model = PooledTrust(place=PlaceEffect(cells=False, shared=False))
+    own = fit(missions, model, workspace=result.workspace, n_draws=50, whole=False)
     axes = tb.plots.place_map(own, result.workspace)
     assert [ax.get_title() for ax in axes[::2]] == [
         f"{name}: better (+) or worse (\N{MINUS SIGN})" for name in result.workspace.team.names
@@ -161,5 +153,3 @@ def test_robots_of_their_own_places_have_two_panels_each(result, of_places):
     small = tb.Workspace.from_awareness(np.full((3, 1, 1, 2), 0.5))
     with pytest.raises(tb.ShapeError, match="3 rows and 4 columns, the workspace has 1 and 1"):
         tb.plots.place_map(own, small)
-    with pytest.raises(tb.TrustboError, match="without effects of places"):
-        tb.plots.place_map(result.posterior, result.workspace)

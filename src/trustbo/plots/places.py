@@ -16,8 +16,11 @@ from trustbo.workspace.moves import MOVES
 
 BETTER_WORSE = "RdBu"
 """Diverging colours: red where contact is worse, blue where it is better."""
+_OF_BOUND = "effect", "move", "row", "col"
 _SURE = 1.645
 """Standard deviations from 0 at which the sign is known with 95 %."""
+_SEEN = 0.2
+"""Share of the largest effect from which cells have a sign."""
 _TIP, _TAIL = 0.2, 0.47
 """Ends of an arrow, in steps back from the centre of the cell entered."""
 
@@ -27,9 +30,9 @@ def place_map(
 ) -> np.ndarray:
     """Draw where contact is better or worse than the terrain says, and how sure that is.
 
-    The left panel has the mean effect of each cell, with + or - where its sign has a probability of
-    95 %; the right one the standard deviation. Arrows, in the cell entered, are the bounds made by
-    missions: their colour is the further effect of the bound, on the same scale.
+    The left panel has the mean effect of each cell, with + or -, large where that sign has a
+    probability of 95 %; the right one the standard deviation. Arrows, in the cell entered, are the
+    bounds made by missions: their colour is the further effect of the bound, on the same scale.
 
     Args:
         posterior: DataTree from `fit` of a model with `place=PlaceEffect()`, such as
@@ -55,10 +58,10 @@ def place_map(
     names = [str(name) for name in maps["robot"].values] if "robot" in maps.dims else [""]
     maps = maps if "robot" in maps.dims else maps.expand_dims("robot")
     units = posterior["places"].to_dataset()
-    tops = {kind: _top(maps, kind) for kind in ("mean", "sd")}
+    _, top = _ends(abs(maps), "mean", units)
     styles = {
-        "mean": (Normalize(-tops["mean"], tops["mean"]), colormaps[BETTER_WORSE]),
-        "sd": (Normalize(0.0, tops["sd"]), colormaps[COLOURS]),
+        "mean": (Normalize(-top, top), colormaps[BETTER_WORSE]),
+        "sd": (Normalize(*_ends(maps, "sd", units)), colormaps[COLOURS]),
     }
     titles = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
     columns = 2 if n_columns is None else n_columns
@@ -70,7 +73,7 @@ def place_map(
             title = f"{as_text(name)}: {titles[kind]}" if name else titles[kind]
             ax.set_title(title, fontsize=9)
         if "place_mean" in own:
-            _signs(panels[2 * i], own, workspace)
+            _signs(panels[2 * i], own, workspace, top)
     draw_scale(panels[0], grid)
     label_maps(axes)
     labels = {"mean": "effect on trust, mean", "sd": "effect on trust, standard deviation"}
@@ -79,10 +82,17 @@ def place_map(
     return panels
 
 
-def _top(maps: xr.Dataset, kind: str) -> float:
-    """Largest absolute value of the effects of a kind of moment."""
-    values = [np.nanmax(np.abs(maps[n].values)) for n in maps if str(n).endswith(f"_{kind}")]
-    return max(1e-6, *map(float, values))
+def _ends(maps: xr.Dataset, kind: str, units: xr.Dataset) -> tuple[float, float]:
+    """Least and largest value that is drawn of a kind of moment."""
+    shown = []
+    if f"place_{kind}" in maps:
+        shown.append(maps[f"place_{kind}"].values.ravel())
+    if f"place_bound_{kind}" in maps:
+        of_bounds = maps[f"place_bound_{kind}"].transpose("robot", "move", "row", "col").values
+        shown.append(of_bounds[*(units[f"bound_{n}"].values for n in _OF_BOUND)])
+    values = np.concatenate(shown)
+    low, high = float(values.min()), float(values.max())
+    return (low, high) if low < high else (low, low + 1e-6)
 
 
 def _draw(
@@ -109,7 +119,7 @@ def _draw(
     draw_hillshade(ax, workspace)
     if f"place_bound_{kind}" in maps:
         mine = units["bound_effect"].values == effect
-        move, row, col = (units[f"bound_{n}"].values[mine] for n in ("move", "row", "col"))
+        move, row, col = (units[f"bound_{n}"].values[mine] for n in _OF_BOUND[1:])
         of_bounds = maps[f"place_bound_{kind}"].transpose("move", "row", "col").values
         _arrows(ax, move, row, col, colours(norm(of_bounds[move, row, col])), workspace.grid)
 
@@ -130,15 +140,19 @@ def _arrows(
     )  # fmt: skip
 
 
-def _signs(ax: Axes, maps: xr.Dataset, workspace: Workspace) -> None:
-    """Write + or - into cells whose effect has a sign with 95 %: colours alone are lost in grey."""
+def _signs(ax: Axes, maps: xr.Dataset, workspace: Workspace, top: float) -> None:
+    """Write + or - into cells, for colours lose the sign in grey: large where it is sure."""
     grid = workspace.grid
-    score = (maps["place_mean"] / maps["place_sd"]).transpose("row", "col").values
-    inches = 2.6 / grid.shape[1]
-    size = float(np.clip(72 * 0.4 * inches, 3.0, 9.0))
-    for row, col in np.argwhere(np.abs(score) > _SURE):
-        if workspace.passable.values[row, col]:
-            x, y = (col + 0.5) * grid.cell_width, (grid.shape[0] - row - 0.5) * grid.cell_height
-            text = "+" if score[row, col] > 0.0 else "\N{MINUS SIGN}"
-            mark = ax.text(x, y, text, fontsize=size, ha="center", va="center", zorder=4)
+    mean, sd = (maps[f"place_{n}"].transpose("row", "col").values for n in ("mean", "sd"))
+    size = float(np.clip(72 * 0.4 * 2.6 / grid.shape[1], 3.0, 9.0))
+    sure = np.abs(mean) > _SURE * sd
+    for row, col in np.argwhere(sure | (np.abs(mean) > _SEEN * top)).tolist():
+        if not workspace.passable.values[row, col]:
+            continue
+        x, y = (col + 0.5) * grid.cell_width, (grid.shape[0] - row - 0.5) * grid.cell_height
+        text = "+" if mean[row, col] > 0.0 else "\N{MINUS SIGN}"
+        mark = ax.text(x, y, text, fontsize=size, ha="center", va="center", zorder=4)
+        if sure[row, col]:
             mark.set_path_effects(outlined(1.2))
+        else:
+            mark.set(fontsize=0.7 * size, color="0.25")

@@ -97,8 +97,8 @@ def places(result: Result) -> Picture:
         lambda n_columns: plots.place_map(result.posterior, result.workspace, n_columns=n_columns),
         f"Maps of the effects of places on trust: the mean of {of} goes from {low} to {high}; and "
         f"their standard deviation. Arrows are the {counted(n_visited, 'place')} visited.",
-        "Left, the mean effect on trust of entering a cell, + or \N{MINUS SIGN} where its sign has "
-        "a probability of 95 %; right, its standard deviation. Arrows are bounds that were made, "
+        "Left, the mean effect on trust of entering a cell, its sign large where it has a "
+        "probability of 95 %; right, its standard deviation. Arrows are bounds that were made, "
         "their colour the further effect of the bound.",
         shrink=True,
     )
