@@ -159,7 +159,7 @@ def _at_mode(target: PlaceTarget) -> Student:
 
 
 def _defensive(proposal: Student, target: PlaceTarget) -> Student:
-    """As told for beta0 and the noises, the prior for the scores of places."""
+    """Proposal with the same beta0 and noises, and the scores of places from their prior."""
     n = 3
     cov = 1.5 * proposal.scale @ proposal.scale.T
     cov[n:], cov[:, n:] = 0.0, 0.0
@@ -205,7 +205,7 @@ def split_units(
         g: Effects of units, (draw, unit).
         hyper: Hyperparameters by name, each (draw,).
         places: Visited places.
-        place: Which effects there are.
+        place: Effects that there are.
         rng: Random number generator.
     """
     if not place.bounds:
