@@ -80,7 +80,7 @@ def test_geojson_is_in_degrees_on_the_right_place(result, centers, tmp_path):
     assert facts["value"] == pytest.approx(result.value)
     length = np.hypot(*np.diff(centers, axis=0).T).sum()
     assert facts["length_m"] == pytest.approx(length)
-    assert points[0]["properties"] == {"bound": 0, "cell": [2, 0]}
+    assert points[0]["properties"] == {"bound": 0, "cell": [2, 0], "p_arrive": 1.0}
     for k, (point, cell) in enumerate(zip(points, result.path, strict=True)):
         said = point["properties"]
         assert (said["bound"], said["cell"]) == (k, list(cell))

@@ -105,7 +105,9 @@ def test_an_unreachable_goal_says_how_far_one_gets():
     passable = np.ones((4, 4), bool)
     passable[2] = False
     workspace = Workspace.from_awareness(np.full((1, 4, 4, 2), 0.5), passable)
-    with pytest.raises(NoPathError, match="4 cells can be reached from the start") as error:
+    with pytest.raises(
+        NoPathError, match="4 of 12 passable cells can be reached from the start"
+    ) as error:
         Planner(workspace, (3, 0), (0, 3))
     assert isinstance(error.value, nx.NetworkXNoPath)
     assert isinstance(error.value, ValueError)

@@ -45,7 +45,7 @@ class Hazard:
         TrustboError: An sd or a concentration that is not positive.
     """
 
-    intercept: tuple[float, float] = (-7.0, 2.0)
+    intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
     log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
