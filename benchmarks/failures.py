@@ -141,11 +141,11 @@ def main():
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
     parser.add_argument("--unseen", type=int, default=5000)
     parser.add_argument("--missions", type=int, default=15)
-    parser.add_argument("--policy", default="optimistic")
+    parser.add_argument("--policy")
     parser.add_argument("--max-failure", type=float)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    options = {"policy": given.policy}
+    options = {} if given.policy is None else {"policy": given.policy}
     if given.max_failure is not None:
         options["max_failure"] = given.max_failure
     names = [n for n in given.worlds if given.data or n.startswith("synthetic")]

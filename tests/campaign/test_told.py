@@ -359,7 +359,7 @@ def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, n
             assert "trustbo.logs.read_missions(" in str(error.value)
     if name != "measured.nc":  # which alone rebuilds the campaign
         old = tb.load_result(folder)
-        again = begin(old.workspace, objective="terminal")
+        again = begin(old.workspace, objective="terminal", model=None)
         for mission in tb.logs.read_missions(copy / "measured.nc"):
             again.tell(mission, other_path=True)
         np.testing.assert_array_equal(

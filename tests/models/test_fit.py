@@ -91,7 +91,7 @@ def test_latent_trust_agrees_with_its_moments(posterior):
 
 
 def test_the_same_seed_gives_the_same_posterior(posterior, missions):
-    again = fit(missions, seed=1)
+    again = fit(missions, sampler="nuts", seed=1)
     for name in SITES:
         np.testing.assert_array_equal(
             again["posterior"][name].values, posterior["posterior"][name].values
@@ -99,14 +99,14 @@ def test_the_same_seed_gives_the_same_posterior(posterior, missions):
     np.testing.assert_array_equal(
         again["latent"]["trust"].values, posterior["latent"]["trust"].values
     )
-    other = fit(missions, seed=2)
+    other = fit(missions, sampler="nuts", seed=2)
     assert (other["posterior"]["b"].values != posterior["posterior"]["b"].values).any()
 
 
 def test_more_missions_and_other_priors_meet_the_same_compiled_program(posterior):
     compiled = run_nuts._cache_size()
     for n in (3, 4, 8):  # three lengths of missions each
-        fit(simulate_missions(n), PooledTrust(Priors(x0_sd=0.1 * n)))
+        fit(simulate_missions(n), PooledTrust(Priors(x0_sd=0.1 * n)), "nuts")
     assert run_nuts._cache_size() == compiled
 
 

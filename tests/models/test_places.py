@@ -1,5 +1,7 @@
 """Effects of places against dense joint normals, which share no code with them."""
 
+import itertools
+
 import jax
 import numpy as np
 import pytest
@@ -398,3 +400,77 @@ def test_places_that_cannot_be_are_named():
         fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
     with pytest.raises(TrustboError, match='need inter_robot="none"'):
         tb.models.CoupledTrust(place=PlaceEffect())
+
+
+def test_forgetting_follows_a_place_that_changes():
+    """A jam halves contact in one bound from the seventh mission on."""
+    rng = np.random.default_rng(1)
+    path = [(k, k) for k in range(5)]
+    missions = []
+    for j in range(12):
+        z = np.full((4, 3, 2), 0.5)
+        rates = 0.8 + 0.02 * rng.standard_normal((4, 3))
+        rates[2] -= 0.4 * (j >= 8)
+        missions.append(Mission.from_arrays(path, z, np.clip(rates, 0.0, 1.0)))
+    model, found = PooledTrust(place=PlaceEffect(cells=False)), {}
+    for forgetting in (1.0, 0.5):
+        weights = forgetting ** np.arange(11, -1, -1)
+        params = params_of(fit(missions, model, weights=weights, whole=False))
+        effect = params.of_places(bounds_of(missions[:1])[0])[..., 0]
+        found[forgetting] = (effect[:, 2] - effect[:, [0, 1, 3]].mean(1)).mean()
+    # A third of the missions were jammed, and 94 % of what is not forgotten.
+    assert found[0.5] < -0.3 < -0.25 < found[1.0]
+
+
+@pytest.mark.parametrize("objective", ["mean", "lost_contact", "terminal", "success"])
+def test_plans_with_effects_of_places_are_the_best_of_all(objective):
+    """By enumeration of all admissible paths, the value by its own recursion."""
+    rng = np.random.default_rng(3)
+    for seed in range(10):
+        z = rng.uniform(size=(3, 4, 4, 2))
+        workspace = tb.Workspace.from_awareness(z)
+        place = 0.2 * rng.standard_normal((1, 4, 4))
+        place_bound = 0.2 * rng.standard_normal((1, 8, 4, 4))
+        params = TrustParams(
+            0.5, rng.uniform(-0.3, 0.3, 2), 0.2, 0.1, 0.1, 0.5, 0.5, place, place_bound
+        )
+        bounds = "shortest+1" if objective != "success" else 4
+        planner = tb.planning.Planner(workspace, (3, 0), (0, 3), objective, max_bounds=bounds)
+        plan = planner.plan(params)
+        values = []
+        for path in walks(4, (3, 0), (0, 3), 4):
+            x, trust = 0.5, []
+            for a, c in itertools.pairwise(path):
+                move = tb.workspace.moves.MOVES[8].index((c[0] - a[0], c[1] - a[1]))
+                u = z[:, *c].mean(0) @ params.beta + 0.2 + place[0, *c] + place_bound[0, move, *c]
+                if objective == "lost_contact":
+                    u = min(u, 0.5)
+                x = 0.5 * x + u
+                trust.append(x)
+            trust = np.array(trust)
+            values.append(
+                {
+                    "mean": trust.mean(),
+                    "lost_contact": -(1.0 - trust).sum(),
+                    "terminal": 1.0 / (1.0 + np.exp(-trust[-1])),
+                    "success": np.prod(1.0 / (1.0 + np.exp(-trust))),
+                }[objective]
+            )
+        assert plan.value == pytest.approx(max(values), abs=1e-9), seed
+
+
+def walks(n, start, goal, longest):
+    """Paths without U-turns from start to goal, which ends them, of at most so many bounds."""
+    found, open_paths = [], [(start,)]
+    while open_paths:
+        path = open_paths.pop()
+        for down, right in tb.workspace.moves.MOVES[8]:
+            cell = (path[-1][0] + down, path[-1][1] + right)
+            inside = 0 <= cell[0] < n and 0 <= cell[1] < n
+            if not inside or (len(path) > 1 and cell == path[-2]):
+                continue
+            if cell == goal:
+                found.append((*path, cell))
+            elif len(path) < longest:
+                open_paths.append((*path, cell))
+    return found

@@ -113,7 +113,8 @@ class Case:
 
     def limit(self):
         """A limit that few to half of the paths keep."""
-        return float(np.quantile(self.p_fail, self.rng.choice([0.001, 0.02, 0.2, 0.5])))
+        share = self.rng.choice([0.001, 0.02, 0.2, 0.5])
+        return min(float(np.quantile(self.p_fail, share)), 0.99)
 
 
 def check(plan, best, limit=None):
@@ -130,7 +131,7 @@ def test_plans_within_a_limit_are_the_best_of_all_that_keep_it(objective, n):
     for seed in range(50):
         case = Case(objective, 4 if objective == "stationary" else n, seed + 50 * n)
         limit = case.limit()
-        if limit >= 1.0:
+        if limit < case.p_fail.min():
             continue
         best = case.best(case.p_fail <= limit + 1e-12)
         for engine in ("numba", "networkx")[: 1 + (seed % 10 == 0)]:
@@ -188,32 +189,8 @@ def test_with_a_confidence_enough_draws_keep_the_limit(objective):
             assert share >= confidence - 1e-9
 
 
-def test_a_search_that_ends_at_its_limit_on_labels_says_what_no_path_exceeds(monkeypatch):
-    params, inexact = TrustParams(0.4, np.array([0.6, 0.3]), -0.2, 0.1, 0.1), 0
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        workspace = Workspace.from_awareness(rng.uniform(size=(1, 8, 12, 12, 2)))
-        p, draws = random_risk(workspace.passable.values, rng, 30)
-        p, draws = 0.3 * p, 0.3 * draws
-        planner = Planner(
-            workspace, (11, 0), (0, 11), "mean", max_failure=0.25, confidence=0.7, engine="numba"
-        ).with_risk(p, draws)
-        plan = planner.plan(params)
-        with monkeypatch.context() as patch:
-            patch.setattr("trustbo.planning.engines.compiled_risk._MAX_ENTRIES", 31 * 256)
-            try:
-                other = planner.plan(params)
-            except TrustboError as error:
-                assert "partial paths are worth keeping under max_failure" in str(error)  # noqa: PT017
-                continue
-        inexact += not other.exact
-        assert other.value <= plan.value + 1e-12 <= plan.bound + 2e-12 <= other.bound + 3e-12
-        assert planner.problem.risk.share_within(other.path, 0.25) >= 0.7
-    assert inexact > 0
-
-
 def test_lost_contact_pays_for_a_failure_with_and_without_a_limit():
-    for seed in range(30):
+    for seed in range(12):
         case = Case(
             "lost_contact", 4 + seed % 2, seed, family=("gaussian", "censored")[seed % 3 // 2]
         )
@@ -221,7 +198,9 @@ def test_lost_contact_pays_for_a_failure_with_and_without_a_limit():
             everything = np.ones(len(case.paths), bool)
             planner = case.planner(failure_cost=cost, engine="numba")
             check(planner.plan(case.params), case.best(everything, cost))
-            limit = case.limit()
+            limit = max(case.limit(), case.p_fail.min())
+            if limit >= 1.0:
+                continue
             planner = case.planner(failure_cost=cost, max_failure=limit, engine="numba")
             plan = planner.plan(case.params)
             check(plan, case.best(case.p_fail <= limit + 1e-12, cost), limit)

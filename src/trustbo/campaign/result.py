@@ -115,8 +115,10 @@ class Result:
         ]
         objective = self.settings["objective"]
         planner = options.planner(self.workspace, start, goal, objective, *law)
-        if "hazard" in self.posterior.children:
-            hazard = self.posterior["hazard"].to_dataset()
+        hazard = self.posterior.children.get("hazard")
+        measures = self.workspace.difficulty.shape[-1]  # none where the terrain was taken away
+        if hazard is not None and hazard.sizes.get("measure", 0) == measures:
+            hazard = hazard.to_dataset()
             planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
         if self.believed is None:
             return planner

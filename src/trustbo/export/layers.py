@@ -37,7 +37,10 @@ def plan_of(plan: Plan | Result, workspace: Workspace | None) -> Plan:
 
 
 def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
-    """Return a point for each cell, the centre, with the trust after the bound into it."""
+    """Return a point for each cell, the centre, with the trust after the bound into it.
+
+    Where the plan has a risk, also with the bound's chance to fail.
+    """
     row, col = np.array(plan.path).T
     x, y = np.array([plan.workspace.grid.center(cell) for cell in plan.path]).T
     columns = {"bound": np.arange(len(row)), "row": row, "col": col, "x": x, "y": y}
@@ -45,6 +48,13 @@ def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
         columns[f"trust_{robot}"] = np.insert(plan.trust[:, i], 0, np.nan)
         for end, q in _BAND.items():
             columns[f"trust_{robot}_{end}"] = np.insert(plan.bands[q, :, i], 0, np.nan)
+    if plan.risk is not None:
+        columns["p_fail"] = np.insert(plan.risk.p_fail, 0, np.nan)
+        for end, p in zip(_BAND, plan.risk.p_fail_band, strict=True):
+            columns[f"p_fail_{end}"] = np.insert(p, 0, np.nan)
+        for cause, p in plan.risk.by_cause.items():
+            columns[f"p_fail_{cause}"] = np.insert(p, 0, np.nan)
+        columns["p_arrive"] = np.insert(np.cumprod(1.0 - plan.risk.p_fail), 0, 1.0)
     return _frame(plan, columns, x, y)
 
 

@@ -29,7 +29,7 @@ from trustbo.models.samplers.laplace import laplace
 LIMIT = 0.7
 """Largest k-hat of a posterior that is not refused."""
 _GOOD = 0.5  # k-hat beyond which the proposal is fitted to its own points once more
-_LOG2_POINTS = 12
+_LOG2_POINTS = 11
 _DEGREES = 5.0
 _WIDTH = 1.2  # proposals are wider than the posterior's curvature says
 _DEFENCE = 0.1  # share of the prior, as wide as anything can be

@@ -17,7 +17,7 @@ MAX_VISITED = 4000
 
 @dataclass(frozen=True)
 class PlaceEffect:
-    """Effects of places on contact, beyond what awareness says of it.
+    """Effect of a place on trust, beyond what awareness says of it.
 
     The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
     + e(a -> c). s is a Gaussian process over cells, of sd tau_s and covariance Matern 3/2 with a
@@ -124,7 +124,7 @@ def visited(
 
     Args:
         bounds: Move, row and column, -1 in the padding.
-        place: Effects that there are.
+        place: Effects there are.
         n_robots: Number of robots.
         shape: Rows and columns of the grid; by default the fewest that hold all cells.
 

@@ -102,7 +102,7 @@ class Planner:
             failure_cost: Cost of a failure for lost_contact, in bounds: its value is less by this
                 times the chance to fail. By default the fewest bounds from start to goal, so that
                 a mission that fails counts as one that lost all contact.
-            infeasible: Where no path respects `max_failure`, `"refuse"`: InfeasibleError; or
+            infeasible: Response to a `max_failure` that no path respects, `"refuse"` or
                 `"safest"`: plan the best of the safest paths.
 
         Raises:

@@ -13,7 +13,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.workspace.moves import MOVE_NAMES, move_indices, moves_along
 
 INFEASIBLE = ("refuse", "safest")
-"""What to do where no path respects `max_failure`: raise, or plan the safest path."""
+"""Responses to a `max_failure` that no path respects: raise, or plan the safest path."""
 _BAND = (0.05, 0.95)
 _CERTAIN = 700.0  # -log(1 - p) of a bound that always fails
 _ROUNDING = 1e-12  # of the risk of a path that is just within the limit
@@ -33,7 +33,7 @@ class InfeasibleError(TrustboError):
 
 
 class FailureRule(NamedTuple):
-    """How much failure a planner accepts, and what a failure costs."""
+    """Amount of failure that a planner accepts, and the cost of a failure."""
 
     max_failure: float | None = None
     """Largest chance that a path fails, in [0, 1); None for no limit."""

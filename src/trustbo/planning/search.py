@@ -79,7 +79,7 @@ def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> F
 
 
 def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T | None]) -> T:
-    """What is best under the planner's risk, or under that of the safest path.
+    """Find the best under the planner's risk, or under that of the safest path.
 
     InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     """

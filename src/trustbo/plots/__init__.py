@@ -7,6 +7,7 @@ from trustbo.plots.maps import (
     cell_map,
     draw_path,
     draw_scale,
+    hazard_map,
     path_posterior,
     robot_maps,
     trust_maps,
@@ -19,6 +20,7 @@ from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
     "animate_mission", "calibration", "campaign_history", "cell_map", "draw_path", "draw_scale",
-    "loadings", "mission_trust", "parameter_history", "path_posterior", "place_map", "plan_map",
-    "plan_trust", "regret_curves", "robot_maps", "terrain_maps", "trust_maps",
+    "hazard_map", "loadings", "mission_trust", "parameter_history", "path_posterior",
+    "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps", "terrain_maps",
+    "trust_maps",
 ]  # fmt: skip

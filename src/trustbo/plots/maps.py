@@ -135,6 +135,30 @@ def path_posterior(
     return ax
 
 
+def hazard_map(
+    p_fail: np.ndarray, workspace: Workspace, path: Sequence[Cell] | None = None
+) -> Axes:
+    """Draw the chance of each cell that the bound into it ends the mission, from the worst side.
+
+    Args:
+        p_fail: Chances (move, row, col), NaN where there is no bound, such as
+            `planner.problem.risk.p_fail`.
+        workspace: Workspace of the cells.
+        path: Path to draw, such as the recommended one.
+
+    Returns:
+        Axes of the map.
+    """
+    worst = np.where(np.isnan(p_fail), -np.inf, p_fail).max(0)
+    hazard = workspace.passable.copy(data=np.where(worst >= 0.0, worst, np.nan))
+    figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
+    cell_map(ax, hazard, workspace, low=0.0, high=1.0)
+    if path is not None:
+        draw_path(ax, path, workspace.grid)
+    _finish(figure, axes, workspace, "P(a bound into the cell fails), at most", (0.0, 1.0))
+    return ax
+
+
 def cell_map(
     ax: Axes,
     values: xr.DataArray,

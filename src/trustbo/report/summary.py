@@ -5,7 +5,7 @@ from scipy.special import expit
 
 from trustbo.campaign.result import Result
 from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
-from trustbo.planning import Plan
+from trustbo.planning import PathRisk, Plan
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import cell_text, counted, joined, number
 
@@ -28,6 +28,7 @@ def facts_of(result: Result) -> list[Fact]:
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
         Fact("Recommended", _path(result, plan)),
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
+        *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
         Fact("Success", _success(plan)),
         _soundness(result),
         Fact("Why it ended", _end(result)),
@@ -77,6 +78,21 @@ def _exactness(plan: Plan) -> str:
     if np.isfinite(plan.bound):
         return f"It is not proven best: a path may be worth up to {number(plan.bound)}."
     return "Exactness was not checked: another path may be better."
+
+
+def _arrival(risk: PathRisk) -> str:
+    low, high = risk.p_arrive_band
+    band = f" (90 % band {number(low)} to {number(high)})" if np.isfinite(low) else ""
+    worst = int(np.argmax(risk.p_fail))
+    said = (
+        f"It reaches the goal with probability {number(risk.p_arrive)}{band}; its bound "
+        f"{worst + 1} is the likeliest to fail, with {number(risk.p_fail[worst])}."
+    )
+    if risk.by_cause:
+        causes = {cause: float(p.sum()) for cause, p in risk.by_cause.items()}
+        cause = max(causes, key=lambda name: causes[name])
+        said += f" The likeliest cause is {cause.replace('_', ' ')}."
+    return said
 
 
 def _success(plan: Plan) -> str:

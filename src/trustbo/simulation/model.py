@@ -1,14 +1,14 @@
-"""Simulator that draws contact rates from a trust model: the true parameters are known."""
+"""Simulator that draws contact rates from a trust model, and failures from given chances."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import ShapeError, TrustboError, require_whole
-from trustbo.models import PooledTrust, TrustModel
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
+from trustbo.models import CAUSES, PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.workspace import Workspace
@@ -18,7 +18,7 @@ _BUCKET = 8  # bounds: missions of about the same length share compiled code
 
 
 class ModelSimulator:
-    """Simulator that draws contact rates from a trust model with given parameters.
+    """Simulator that draws contact rates from a trust model, and failures from chances of bounds.
 
     Posteriors and plans of a campaign can be compared with the truth: `params` and `awareness` give
     the value of every path, `Planner.plan(params)` the best one.
@@ -32,8 +32,10 @@ class ModelSimulator:
         *,
         awareness: ArrayLike | None = None,
         n_ticks: int | None = None,
+        p_fail: ArrayLike | None = None,
+        causes: Mapping[str, float] | None = None,
     ) -> None:
-        """Set the true parameters and awareness.
+        """Set the true parameters, awareness and chances to fail.
 
         Args:
             workspace: Planning grid with awareness and passability.
@@ -44,10 +46,15 @@ class ModelSimulator:
                 col, feature) or of bounds (robot, move, row, col, feature); missions measure it
                 along their path.
             n_ticks: Ticks of each bound, for `"beta_binomial"`.
+            p_fail: Chance that each bound ends the mission, shape (move, row, col), such as a draw
+                of `models.BoundRisk`; None for no failures.
+            causes: Share of each of `models.CAUSES` among failures; all "stuck" by default.
 
         Raises:
-            ShapeError: Parameters or awareness of other robots or features, or of many draws.
-            TrustboError: An n_ticks that is no number of ticks, or is missing.
+            ShapeError: Parameters or awareness of other robots or features, or of many draws; or
+                chances of other bounds.
+            TrustboError: An n_ticks that is no number of ticks, or is missing; a chance outside
+                [0, 1]; an unknown cause, or shares that do not sum to 1.
         """
         self.workspace, self.params = workspace, params
         self.model = PooledTrust() if model is None else model
@@ -65,6 +72,10 @@ class ModelSimulator:
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if self.n_ticks is None and self.model.family.needs_ticks:
             raise TrustboError("the beta-binomial family counts ticks: give n_ticks.")
+        self.p_fail = (
+            None if p_fail is None else _require_chances(p_fail, (len(MOVES[8]), *shape[1:3]))
+        )
+        self.causes = _require_shares({"stuck": 1.0} if causes is None else dict(causes))
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
         """Run a path; the same seed gives the same mission."""
@@ -79,15 +90,51 @@ class ModelSimulator:
         sample = self.model.simulate(key, self.params.on(bounds), padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
-        features, robots = self.workspace.features, self.workspace.team.names
-        return Mission.from_arrays(cells, z, rates, n_ticks=ticks, features=features, robots=robots)
+        n, status = self._end(cells, seed)
+        ticks = None if ticks is None else ticks[:n]
+        names = {"features": self.workspace.features, "robots": self.workspace.team.names}
+        return Mission.from_arrays(cells, z[:n], rates[:n], status=status, n_ticks=ticks, **names)
+
+    def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
+        """Number of bounds that are run, and the status that the mission ends with."""
+        n = len(cells) - 1
+        if self.p_fail is None:
+            return n, "ok"
+        rng = np.random.default_rng([seed, 1])
+        chance = self.p_fail[moves_along(cells), *np.array(cells)[1:].T]
+        failed = np.flatnonzero(rng.random(n) < chance)
+        if not len(failed):
+            return n, "ok"
+        return int(failed[0]) + 1, str(rng.choice(list(self.causes), p=list(self.causes.values())))
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""
         fields = self.params._asdict().items()
         truth = {n: np.asarray(value).tolist() for n, value in fields if value is not None}
-        return {
+        about: dict[str, object] = {
             "simulator": type(self).__name__,
             "simulator_model": self.model.describe(),
             "truth": truth,
         }
+        if self.p_fail is not None:
+            about["p_fail"] = np.nan_to_num(self.p_fail, nan=-1.0).tolist()
+            about["causes"] = self.causes
+        return about
+
+
+def _require_chances(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Chances to fail, NaN where there is no bound, as an array (move, row, col)."""
+    chances = np.asarray(p_fail, dtype=float)
+    if chances.shape != shape:
+        raise ShapeError(f"p_fail must be (move, row, col) = {shape}; got {chances.shape}.")
+    if (bad := (chances < 0.0) | (chances > 1.0)).any():
+        raise TrustboError(f"p_fail is a chance in [0, 1]; got {chances[bad][0]:g}.")
+    return chances
+
+
+def _require_shares(causes: dict[str, float]) -> dict[str, float]:
+    for cause in causes:
+        require_choice("cause", cause, CAUSES)
+    if min(causes.values()) < 0.0 or not np.isclose(sum(causes.values()), 1.0):
+        raise TrustboError(f"causes are shares that sum to 1; got {causes}.")
+    return causes

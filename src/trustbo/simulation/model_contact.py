@@ -22,7 +22,7 @@ from trustbo.models import TrustModel
 from trustbo.models.params import CoupledParams, Params
 from trustbo.planning.dynamics import drift, roll_trust, transition
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.workspace.moves import MOVES, along, move_indices
+from trustbo.workspace.moves import MOVES, along, move_indices, moves_along
 
 _LAST = len(MOVES[8]) - 1
 """Move m is reversed by this less m."""
@@ -34,13 +34,20 @@ class ModelContact:
 
     standard_error = 0.0
 
-    def __init__(self, model: TrustModel, params: Params, awareness: np.ndarray) -> None:
-        """Take one draw of parameters, and awareness as `Workspace.bound_maps`.
+    def __init__(
+        self,
+        model: TrustModel,
+        params: Params,
+        awareness: np.ndarray,
+        p_fail: np.ndarray | None = None,
+    ) -> None:
+        """Take one draw of parameters, awareness as `Workspace.bound_maps`, and chances to fail.
 
         TrustboError: rates that measure the change of trust, which is no contact.
         """
         if model.lag:
             raise TrustboError('response="change" measures changes of trust; contact has no truth.')
+        self._p_fail = p_fail
         self._counts = model.family.needs_ticks
         self._awareness, self._params, n_robots = awareness, params, len(awareness)
         self._transition = transition(params, n_robots)
@@ -58,8 +65,10 @@ class ModelContact:
         return self._rate(trust, self._spread(len(trust)))
 
     def failure(self, path: Sequence[Cell]) -> np.ndarray:
-        """Chance to fail of the bounds of a path, shape (bound,): none."""
-        return np.zeros(len(path) - 1)
+        """Chance to fail of the bounds of a path, shape (bound,)."""
+        if self._p_fail is None:
+            return np.zeros(len(path) - 1)
+        return self._p_fail[moves_along(path), *np.asarray(path)[1:].T]
 
     def best(self, paths: AdmissiblePaths, objective: str) -> tuple[Cell, ...]:
         """Best admissible path: least contact lost, or for "mean" the largest mean contact.

@@ -123,7 +123,8 @@ class Truth:
                 f"truth needs a simulator with a workspace; {type(simulator).__name__} has none."
             )
         if isinstance(simulator, ModelSimulator):
-            bounds = ModelContact(simulator.model, simulator.params, simulator.awareness)
+            true = simulator.params, simulator.awareness, simulator.p_fail
+            bounds = ModelContact(simulator.model, *true)
             return cls(workspace, bounds)
         numbers = require_whole("seed", seed, 0), require_positive("standard_error", standard_error)
         known: dict[object, Self] = {}

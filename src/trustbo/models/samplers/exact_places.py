@@ -159,7 +159,7 @@ def _at_mode(target: PlaceTarget) -> Student:
 
 
 def _defensive(proposal: Student, target: PlaceTarget) -> Student:
-    """Proposal with the same beta0 and noises, and the scores of places from their prior."""
+    """Proposal for beta0 and the noises as told, the prior for the scores of places."""
     n = 3
     cov = 1.5 * proposal.scale @ proposal.scale.T
     cov[n:], cov[:, n:] = 0.0, 0.0
@@ -205,7 +205,7 @@ def split_units(
         g: Effects of units, (draw, unit).
         hyper: Hyperparameters by name, each (draw,).
         places: Visited places.
-        place: Effects that there are.
+        place: Effects there are.
         rng: Random number generator.
     """
     if not place.bounds:

@@ -67,7 +67,7 @@ def draw_posterior(
         batch: Missions, padded.
         weight: Weight of each mission, shape (mission,); 1 by default.
         places: Visited places, where these have effects.
-        start: First proposal of the exact sampler, from an earlier posterior with places.
+        start: First proposal of the exact sampler with places, from an earlier posterior.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
     """
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight

@@ -50,7 +50,7 @@ _AIMS = 100
 
 
 class Bounds(NamedTuple):
-    """What the edges of the DAG cost, under one draw."""
+    """Costs of the edges of the DAG, under one draw."""
 
     toll: np.ndarray  # (edge,)
     drift: np.ndarray  # (edge,)
