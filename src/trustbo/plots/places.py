@@ -66,6 +66,7 @@ def place_map(
     titles = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
     columns = 2 if n_columns is None else n_columns
     figure, axes, panels = map_panels(grid, 2 * len(names), columns)
+    figure.set_figwidth(figure.get_figwidth() + 1.2 * (axes.shape[1] - 1))  # a colour bar each
     for i, name in enumerate(names):
         own = maps.isel(robot=i)
         for ax, (kind, style) in zip(panels[2 * i : 2 * i + 2], styles.items(), strict=True):

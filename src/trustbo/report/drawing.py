@@ -18,7 +18,7 @@ from trustbo.report.blocks import Image, Picture
 PHONE = 3.55
 """Width of figures for phones, inches of 96 CSS pixels, a little less than the screen."""
 _PIXELS = 96
-_DOTS, _QUALITY = 140, 80
+_DOTS, _QUALITY = 160, 75
 """Resolution of rasters such as hillshades, dots per inch, and their quality in WebP."""
 _PNG = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
 _STYLE: dict[Any, Any] = {
