@@ -52,7 +52,7 @@ class BoundRisk:
         count = hazard["failures_by_cause"].values + hazard.attrs["cause_concentration"]
         names = [str(name) for name in hazard["cause"].values]
         terms = [hazard["intercept"].values[:, None], hazard["coefficient"].values]
-        return cls(
+        risk = cls(
             np.concatenate(terms, axis=1),
             hazard["strength"].values,
             workspace.difficulty.values - hazard.attrs["reference"],
@@ -64,6 +64,9 @@ class BoundRisk:
             hazard["place"].values,
             dict(zip(names, (count / count.sum()).tolist(), strict=True)),
         )
+        if "p_fail" in hazard:  # known already
+            risk.__dict__["_moments"] = hazard["p_fail"].values, hazard["p_fail_sd"].values
+        return risk
 
     @property
     def mean(self) -> np.ndarray:
