@@ -187,7 +187,8 @@ def test_a_campaign_with_censored_rates(workspace, monkeypatch):
     # The shortest run shows which sampler is taken.
     short = partial(fit, n_warmup=60, n_draws=20, n_chains=2, check=False)
     monkeypatch.setattr("trustbo.campaign.learning.fit", short)
-    campaign = Campaign(workspace, *ENDS, model=PooledTrust(observation="censored"))
+    model = PooledTrust(observation="censored")
+    campaign = Campaign(workspace, *ENDS, model=model, policy="greedy")
     campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
     assert campaign.posterior.attrs["sampler"] == "joint"
     assert campaign.ask().exact

@@ -360,14 +360,14 @@ def test_an_earlier_posterior_changes_the_way_and_not_the_result(learned):
     np.testing.assert_array_equal(warm["places"]["place"], again["places"]["place"])
 
 
-@pytest.mark.slow  # NUTS on all hyperparameters
+@pytest.mark.slow  # NUTS on all hyperparameters, effects integrated out by dense algebra
 def test_the_exact_sampler_agrees_with_nuts(learned):
-    workspace, missions, _, posterior = learned
-    nuts = fit(missions, PooledTrust(place=PlaceEffect()), "nuts", workspace=workspace)
+    workspace, missions, _, _ = learned
+    model = PooledTrust(place=PlaceEffect(cells=False))
+    exact = fit(missions[:4], model, workspace=workspace, whole=False)
+    nuts = fit(missions[:4], model, "nuts", workspace=workspace, whole=False)
     for group in ("posterior", "places"):
-        for name, draws in posterior[group].data_vars.items():
-            if name == "length_scale":
-                continue  # next to nothing is known of it, and NUTS has heavy tails there
+        for name, draws in exact[group].data_vars.items():
             other = nuts[group][name]
             shift = (draws.mean(("chain", "draw")) - other.mean(("chain", "draw"))).values
             sd = draws.std(("chain", "draw")).values
@@ -474,3 +474,30 @@ def walks(n, start, goal, longest):
             elif len(path) < longest:
                 open_paths.append((*path, cell))
     return found
+
+
+def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(learned):
+    _, missions, _, posterior = learned
+    draws, base = posterior["posterior"], Priors()
+    model = tb.models.prior_from([posterior])
+    b = draws["b"].values.ravel()
+    center, spread = np.median(b), 0.5 * np.subtract(*np.quantile(b, [0.841, 0.159]))
+    assert float(model.priors.b.loc) == pytest.approx(0.5 * center, rel=1e-5)
+    # Variance of a mixture of two: the mean of theirs, and a quarter of the squared distance.
+    variance = 0.5 * (spread**2 + 0.5**2) + 0.25 * center**2
+    assert float(model.priors.b.scale) == pytest.approx(np.sqrt(variance), rel=1e-5)
+    tau = draws["tau_e"].values
+    square = 0.5 * ((tau**2).mean() + 0.2**2)
+    assert model.place.tau_e == pytest.approx(np.sqrt(square), rel=1e-12)
+    # What is expected of beta0 lies between its posterior and the default's mean.
+    mean = float(np.asarray(model.priors.beta0.mean))
+    assert min(0.5, float(draws["beta0"].mean())) < mean < 0.5
+    again = fit(missions[:3], model, whole=False)
+    assert again.attrs["k_hat"] < 0.7
+    assert base.b.scale == 0.5
+    with pytest.raises(TrustboError, match="there are no posteriors"):
+        tb.models.prior_from([])
+    other = fit(missions[:2], PooledTrust(), whole=False)
+    other.attrs["model"] = "HierarchicalTrust"  # sampled in no time
+    with pytest.raises(TrustboError, match="takes posteriors of PooledTrust"):
+        tb.models.prior_from([other])

@@ -76,7 +76,7 @@ def test_nuts_starts_at_both_modes_and_knows_their_mass():
 @pytest.mark.slow  # its program compiles for this alone
 def test_chains_of_nuts_that_do_not_meet_have_a_bad_rhat():
     missions = modes.odd_missions("constant", np.random.default_rng(163))
-    posterior = fit(missions, PooledTrust(modes.REAL), check=False)
+    posterior = fit(missions, PooledTrust(modes.REAL), "nuts", check=False)
     assert diagnostics(posterior)["r_hat"] > 1.1
     middle = posterior["posterior"]["beta0"].median("draw")
     assert float(middle.min()) < -0.1
@@ -90,7 +90,7 @@ def test_nuts_gives_each_mode_its_share_or_is_refused(seed):
     truth = modes.marginal(missions, "real")
     valley = truth.valley()
     try:
-        posterior = fit(missions, PooledTrust(modes.REAL))
+        posterior = fit(missions, PooledTrust(modes.REAL), "nuts")
     except PosteriorError:
         return
     found = float((posterior["posterior"]["beta0"] < valley).mean())
