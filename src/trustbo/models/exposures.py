@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
 """Statuses that a bound fails with; an aborted mission tells nothing about its last bound."""
@@ -119,7 +119,7 @@ def _bounds_of(path: Iterable[Cell]) -> Bounds:
     cells = np.asarray(tuple(path))
     if len(cells) < 2:
         return np.empty((0, 3), int)
-    return np.column_stack([moves_along(cells), cells[1:]])
+    return bounds_along(cells)
 
 
 def _weights(what: str, given: ArrayLike | None, n: int) -> np.ndarray:

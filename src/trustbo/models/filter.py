@@ -12,7 +12,7 @@ from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.moves import bounds_along
 
 
 class TrustState(NamedTuple):
@@ -159,8 +159,7 @@ class TrustFilter:
                 f"places have effects: say which {n_bounds + 1} cells the bounds lead over, the "
                 f"cell left first; got {path!r}."
             )
-        bounds = np.column_stack([moves_along(path), np.asarray(path)[1:]])
-        return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
+        return list(np.moveaxis(self.params.of_places(bounds_along(path)), -2, 0))
 
     def _average(self, mean: np.ndarray, var: np.ndarray) -> TrustState:
         """Mean and sd of the mixture over draws."""

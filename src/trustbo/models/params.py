@@ -14,7 +14,7 @@ from trustbo.models.likelihood.live import ApartFilter, CoupledFilter
 from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.likelihood.vector import VectorSSM
 from trustbo.models.place_maps import place_maps_of
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.moves import bounds_along
 
 Numbers = Any
 """A float, a NumPy array, or a JAX array or tracer."""
@@ -95,8 +95,7 @@ class _Draws:
         """Parameters of the bounds of a path, as of one mission in `on`."""
         if not self.places:
             return self
-        bounds = np.column_stack([moves_along(path), np.asarray(path)[1:]])
-        return self.on(bounds[None])
+        return self.on(bounds_along(path)[None])
 
     def on(self, bounds: np.ndarray | None) -> Self:
         """Parameters of given missions: the effects of their bounds' places are in the intercept.

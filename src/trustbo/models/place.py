@@ -8,7 +8,7 @@ import numpy as np
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
-from trustbo.workspace.moves import MOVES, moves_along
+from trustbo.workspace.moves import MOVES, bounds_along
 
 N_MOVES = len(MOVES[8])
 MAX_VISITED = 4000
@@ -104,13 +104,12 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
     for j, mission in enumerate(missions):
         path = mission.path[: len(mission.bounds) + 1]  # one that failed has not made the rest
         try:
-            moves = moves_along(path)
+            found[j, : len(mission.bounds)] = bounds_along(path)
         except TrustboError as error:
             raise TrustboError(
                 f"mission {j}: {error} A model with place effects needs whole paths; give "
                 "place=None, or split the mission there."
             ) from None
-        found[j, : len(mission.bounds)] = np.column_stack([moves, path[1:]])
     return found
 
 

@@ -12,7 +12,7 @@ from trustbo.models import CAUSES, PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, along, moves_along
+from trustbo.workspace.moves import MOVES, along, bounds_along, moves_along
 
 _BUCKET = 8  # bounds: missions of about the same length share compiled code
 
@@ -86,7 +86,7 @@ class ModelSimulator:
         with own_settings():  # else the caller's flags decide what is drawn
             key = jax.random.key(seed)
         bounds = np.full((1, len(padded), 3), -1)
-        bounds[0, :n_bounds] = np.column_stack([moves_along(cells), np.asarray(cells)[1:]])
+        bounds[0, :n_bounds] = bounds_along(cells)
         sample = self.model.simulate(key, self.params.on(bounds), padded[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)

@@ -44,6 +44,11 @@ def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     return index - (index > 4)
 
 
+def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+    """Move, row and column of the bounds of a path, shape (bound, 3); see `moves_along`."""
+    return np.column_stack([moves_along(path), np.asarray(path)[1:]])
+
+
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
     """Whether a bound enters each cell by each move, shape (move, row, col), from (row, col).
 

@@ -75,7 +75,7 @@ class _Target(NamedTuple):
     def evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log density at each z; there the mean of (beta, b) and its precision's Cholesky factor.
 
-        The last two are laid out for `_cholesky`, the point last.
+        The last two are laid out for `small_cholesky`, the point last.
         """
         parts = [z[i : i + _CHUNK] for i in range(0, len(z), _CHUNK)]
         # Far out the noises underflow: such a point has no density, and is no reason to warn.
@@ -92,7 +92,7 @@ class _Target(NamedTuple):
         rest = (1.0 - beta0)[:, None] if self.priors.stationary else np.ones((len(z), 1))
         mean, precision = self.mean * rest, self.precision / rest**2
         diagonal = precision[:, :, None] * np.eye(len(self.mean))
-        factor = _cholesky((quadratic.P + diagonal).transpose(1, 2, 0))
+        factor = small_cholesky((quadratic.P + diagonal).transpose(1, 2, 0))
         half = _forward(factor, (quadratic.h + precision * mean).T)
         misfit = quadratic.alpha + (precision * mean**2).sum(1) - (half**2).sum(0)
         log_det = 2.0 * np.log(np.einsum("ccn->cn", factor)).sum(0)
@@ -244,12 +244,22 @@ def _weigh(
     if finite.sum() < _FEW:  # the proposal missed: equal weights, of which k-hat says so
         nothing = np.full(len(z), -np.log(len(z)))
         return _Weighted(z, log_p, nothing, mean, factor, np.inf, -np.inf)
+    log_w, khat, log_evidence = smoothed_weights(raw)
+    return _Weighted(z, log_p, log_w, mean, factor, khat, log_evidence)
+
+
+def smoothed_weights(raw: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Pareto-smooth log importance weights (point,), some of them finite.
+
+    Returns:
+        Normalised log weights, k-hat, and the log of the raw ones' mean, the evidence.
+    """
+    finite = np.isfinite(raw)
     # Minus the log weights, points without density far below all others.
     smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
     log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
     log_w = smoothed - np.logaddexp.reduce(smoothed)
-    khat = float(np.nan_to_num(khat, nan=np.inf))
-    return _Weighted(z, log_p, log_w, mean, factor, khat, log_evidence)
+    return log_w, float(np.nan_to_num(khat, nan=np.inf)), log_evidence
 
 
 def _starts(target: _Target) -> np.ndarray:
@@ -307,7 +317,7 @@ def systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndar
     return np.searchsorted(np.cumsum(weights)[:-1] / weights.sum(), points)
 
 
-def _cholesky(A: np.ndarray) -> np.ndarray:
+def small_cholesky(A: np.ndarray) -> np.ndarray:
     """Lower factors of many small matrices, (row, column, point); NaN where one is not positive.
 
     NumPy's takes the point first, one matrix at a time, and raises for all if one is not positive.

@@ -21,12 +21,11 @@ import itertools
 from typing import NamedTuple
 
 import numpy as np
-from arviz_stats.base.array import array_stats
 
 from trustbo.models.likelihood import place_prior
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.samplers.convergence import GOOD_KHAT
-from trustbo.models.samplers.exact import ExactDraws, blas, systematic
+from trustbo.models.samplers.exact import ExactDraws, blas, smoothed_weights, systematic
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.place_target import Conditional, PlaceTarget
 from trustbo.models.samplers.student import Student, log_mixture
@@ -138,14 +137,9 @@ class _Cloud:
     def points(self) -> _Points:
         z, log_p = np.concatenate(self._z), np.concatenate(self._log_p)
         raw = log_p - log_mixture(self._proposals, [len(each) for each in self._z], z)
-        finite = np.isfinite(raw)
-        if not finite.any():
+        if not np.isfinite(raw).any():
             return _Points(z, log_p, np.full(len(z), -np.log(len(z))), np.inf, -np.inf)
-        # Minus the log weights, points without density far below all others.
-        smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
-        evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
-        khat = float(np.nan_to_num(khat, nan=np.inf))
-        return _Points(z, log_p, smoothed - np.logaddexp.reduce(smoothed), khat, evidence)
+        return _Points(z, log_p, *smoothed_weights(raw))
 
 
 def _at_mode(target: PlaceTarget) -> Student:

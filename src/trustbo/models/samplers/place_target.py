@@ -19,6 +19,7 @@ from trustbo.models.likelihood.place_rows import Rows, filter_rows
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
+from trustbo.models.samplers.exact import small_cholesky
 from trustbo.models.samplers.priors_numpy import numbers
 
 _MEMORY = 8e6  # numbers per chunk of parameter values
@@ -101,7 +102,8 @@ class PlaceTarget:
         G -= of_units @ of_units.transpose(0, 2, 1)
         rest = 1.0 - theta[:, :1] if self.priors.stationary else np.ones((n, 1))
         mean, precision = self.mean * rest, self.precision / rest**2
-        factor = _cholesky(G[:, :-1, :-1] + precision[:, :, None] * np.eye(len(self.mean)))
+        of_c = G[:, :-1, :-1] + precision[:, :, None] * np.eye(len(self.mean))
+        factor = np.ascontiguousarray(small_cholesky(of_c.transpose(1, 2, 0)).transpose(2, 0, 1))
         bad = ~np.isfinite(factor).all((1, 2)) | ~(G[:, -1, -1] > 0.0)
         factor[bad] = np.eye(factor.shape[1])
         half = _forward(factor, G[:, :-1, -1] + precision * mean)
@@ -139,16 +141,6 @@ class PlaceTarget:
             if keep:
                 kept[t] = A
         return of_units, kept
-
-
-def _cholesky(A: np.ndarray) -> np.ndarray:
-    """Lower factors (point, c, c), NaN where one is not positive: NumPy's would raise for all."""
-    L = np.zeros_like(A)
-    for j in range(A.shape[1]):
-        L[:, j, j] = np.sqrt(A[:, j, j] - (L[:, j, :j] ** 2).sum(1))
-        for i in range(j + 1, A.shape[1]):
-            L[:, i, j] = (A[:, i, j] - (L[:, i, :j] * L[:, j, :j]).sum(1)) / L[:, j, j]
-    return L
 
 
 def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
