@@ -123,6 +123,7 @@ resume_or_begin(make_workspace(), Path({folder!r}), 8)
 
 def test_killed_twice_it_comes_to_the_same(workspace, tmp_path):
     whole = run(workspace, tmp_path / "whole", 8)
+    assert {"places", "hazard"} <= set(whole.posterior.children)  # effects and failures, too
     folder, here = tmp_path / "killed", Path(__file__).parent
     program = PROGRAM.format(tests=str(here.parent), here=str(here), folder=str(folder))
     command = [sys.executable, "-W", "ignore", "-c", program]

@@ -162,7 +162,7 @@ def test_dask_gives_the_same_numbers_on_a_core_for_each_worker(serial, client, t
 
 def test_dask_gives_the_same_numbers_though_a_worker_dies(client, tmp_path_factory):
     calm, hurt = (tmp_path_factory.mktemp(name) for name in ("calm", "hurt"))
-    more = {"seeds": 5, "n_iterations": 3}
+    more = {"models": ["places"], "seeds": 5, "n_iterations": 3}
     with killing_a_worker(hurt):
         result = run(hurt, client.scheduler.address, **more)
     assert result.attrs == {"n_runs": 10, "n_failed": 0}

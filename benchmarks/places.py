@@ -1,0 +1,240 @@
+"""Effects of places: what they cost, what they cost where there are none, and learned priors.
+
+Run: python benchmarks/places.py times|absent|terrains|sights|stopping [--data ../shared/data]
+
+- times: refits and draws, median of five, one core, beside NUTS on the same marginal (the peer).
+- absent: truths without effects of places; regret with them in the model and without.
+- terrains: priors from campaigns on the other terrains, leave-one-terrain-out.
+- sights: line of sight under one wrong assumption, and under three that bracket the truth.
+- stopping: campaigns that `RegretBound(eps=.05)` stopped, and how many of them were wrong.
+"""
+
+import argparse
+import os
+import time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from scipy.stats import binomtest
+
+import trustbo as tb
+from trustbo.models import PlaceEffect, PooledTrust, TrustParams, params_of, prior_from
+from trustbo.simulation import ModelSimulator, Truth
+from trustbo.study.world import COURSES, REAL
+from trustbo.study.world_set import worlds
+from trustbo.terrain import synthetic_terrain
+from trustbo.workspace.sight import Sight
+
+PLACES = PooledTrust(place=PlaceEffect())
+TARGETS = {"objective": "mean", "max_bounds": "shortest+2"}
+
+
+def median_time(function, n=5):
+    function()
+    taken = []
+    for _ in range(n):
+        started = time.perf_counter()
+        function()
+        taken.append(time.perf_counter() - started)
+    return float(np.median(taken))
+
+
+def walk(rng, shape, ends):
+    """Cells of a walk between two cells that mostly heads for the second."""
+    (row, col), goal = ends
+    cells = [(row, col)]
+    while (row, col) != goal:
+        step = np.sign([goal[0] - row, goal[1] - col])
+        if rng.random() < 0.3:
+            step = rng.integers(-1, 2, 2)
+        other = row + int(step[0]), col + int(step[1])
+        if other != (row, col) and 0 <= other[0] < shape[0] and 0 <= other[1] < shape[1]:
+            row, col = other
+            cells.append(other)
+    return cells
+
+
+def driven(side, n_missions, random_ends, missing=0.0):
+    """Missions over a random workspace whose truth has effects of places."""
+    rng = np.random.default_rng(0)
+    workspace = tb.Workspace.from_awareness(rng.uniform(size=(3, side, side, 2)))
+    place = rng.normal(0.0, 0.1, (1, side, side))
+    bounds = rng.normal(0.0, 0.1, (1, 8, side, side))
+    truth = TrustParams(0.3, np.array([0.2, 0.1]), 0.3, 0.05, 0.05, place=place, place_bound=bounds)
+    simulator = ModelSimulator(workspace, truth)
+    missions = []
+    for seed in range(n_missions):
+        ends = (side - 1, 0), (0, side - 1)
+        if random_ends:
+            while True:
+                drawn = rng.integers(side, size=(2, 2))
+                if abs(drawn[0] - drawn[1]).max() >= side // 2:
+                    break
+            ends = tuple(map(int, drawn[0])), tuple(map(int, drawn[1]))
+        mission = simulator.run(walk(rng, (side, side), ends), seed=seed)
+        rates = mission.contact_rate.copy()
+        rates[rng.random(rates.shape) < missing] = np.nan
+        missions.append(tb.Mission.from_arrays(mission.path, mission.awareness, rates))
+    return workspace, missions
+
+
+def campaign(world, workspace, course, n, seed, **options):
+    """Result of a campaign on a world, and the regret of what is recommended after each mission."""
+    truth, found = world.truth(), []
+
+    def judge(campaign, mission):
+        found.append(truth.regret(campaign.recommend(), **TARGETS))
+
+    result = tb.iterate(
+        workspace, *world.ends(course), n_iterations=n, simulator=world.simulator(workspace),
+        seed=seed, progress=False, callbacks=[judge], **TARGETS, **options,
+    )  # fmt: skip
+    return result, np.array(found)
+
+
+def times(_):
+    print("seconds\n\n| missions | visited bounds | cold | warm, one more | 1000 draws of all |")
+    print("|---|---:|---:|---:|---:|")
+    for name, side, n, random_ends, missing in (
+        ("10 x 10, 15", 10, 15, False, 0.0),
+        ("10 x 10, 15, 15 % of rates missing", 10, 15, False, 0.15),
+        ("10 x 10, 60", 10, 60, False, 0.0),
+        ("10 x 10, 60, random ends", 10, 60, True, 0.0),
+        ("30 x 30, 40, corner to corner", 30, 40, False, 0.0),
+    ):
+        workspace, missions = driven(side, n, random_ends, missing)
+        given = {"workspace": workspace, "sampler": "exact", "whole": False}
+        earlier = tb.models.fit(missions[:-1], PLACES, **given)
+        cold = median_time(lambda m=missions, g=given: tb.models.fit(m, PLACES, **g), 3)
+        warm = median_time(
+            lambda m=missions, g=given, e=earlier: tb.models.fit(m, PLACES, earlier=e, **g), 3
+        )
+        posterior = tb.models.fit(missions, PLACES, earlier=earlier, **given)
+        drawn = median_time(lambda p=posterior: params_of(p), 3)
+        n_bounds = posterior["places"].sizes.get("visited_bound", 0)
+        print(f"| {name} | {n_bounds} | {cold:.3f} | {warm:.3f} | {drawn:.3f} |", flush=True)
+    workspace, missions = driven(10, 8, False)
+    started = time.perf_counter()
+    tb.models.fit(missions, PLACES, workspace=workspace, sampler="nuts", check=False)
+    taken = time.perf_counter() - started
+    print(f"\nNUTS on the same marginal, 10 x 10, 8 missions: {taken:.0f} s")
+
+
+def absent(_):
+    """Campaigns on truths that have no effects of places."""
+    kinds = {"places": PLACES, "none": PooledTrust()}
+    found = {name: {"lost": [], "learning": [], "tau": []} for name in kinds}
+    for seed in range(24):
+        ground = synthetic_terrain((500.0, 500.0), seed=seed % 6, relief=30.0)
+        workspace = tb.Workspace.from_terrain(ground, (10, 10))
+        rng = np.random.default_rng(seed)
+        beta = np.array([0.15, 0.15, 0.35]) * rng.uniform(0.5, 1.5, 3)
+        params = TrustParams(0.4, beta, 0.55 - beta.sum() * 0.6, 0.05, 0.08, x0_sd=0.1)
+        simulator = ModelSimulator(workspace, params)
+        truth = Truth.of(simulator)
+        ends = ((9, 0), (0, 9)) if seed % 2 else ((9, 4), (0, 5))
+        best = truth.value(truth.best(*ends)).lost
+        for name, model in kinds.items():
+            result = tb.iterate(
+                workspace, *ends, n_iterations=15, simulator=simulator, model=model, seed=seed,
+                sampler="exact", progress=False, truth=truth,
+            )  # fmt: skip
+            found[name]["lost"].append(truth.value(result.plan).lost)
+            driven_on = [truth.value(m.path).lost for m in result.missions]
+            found[name]["learning"].append(np.mean(driven_on) - best)
+            if name == "places":
+                sites = result.posterior["posterior"]
+                found[name]["tau"].append(
+                    [float(sites[t].quantile(0.5)) for t in ("tau_s", "tau_e")]
+                )
+    lost = {name: np.array(each["lost"]) for name, each in found.items()}
+    print("24 campaigns of 15 missions; contact lost in bounds, expected on the path recommended")
+    for name in kinds:
+        learning = np.mean(found[name]["learning"])
+        print(f"  {name:7s} lost {lost[name].mean():.3f}, lost while learning {learning:.3f}")
+    print(f"  ratio of lost, places to none: {lost['places'].sum() / lost['none'].sum():.3f}")
+    print(f"  median of tau_s, tau_e: {np.median(found['places']['tau'], axis=0).round(3)} "
+          f"(prior {PlaceEffect().tau_s * 0.674:.3f})")  # fmt: skip
+
+
+def terrains(data):
+    """Priors of the other terrains, on worlds of an old survey."""
+    grounds = ("synthetic-0", "synthetic-1", *REAL)
+    chosen = [worlds(data)[f"{ground}-aged"] for ground in grounds]
+
+    def run(world, course, model, n):
+        return campaign(world, world.workspace(), course, n, seed=1, model=model)
+
+    posteriors = [run(world, "nw-se", PLACES, 15)[0].posterior for world in chosen]
+    print("| world | course | regret after 1, default | learned prior | after 3 | learned |")
+    print("|---|---|---:|---:|---:|---:|")
+    rows = []
+    for i, world in enumerate(chosen):
+        learned = prior_from([p for j, p in enumerate(posteriors) if j != i])
+        for course in COURSES:
+            row = []
+            for model in (PLACES, learned):
+                row += [*run(world, course, model, 3)[1][[0, 2]]]
+            rows.append(row)
+            print(f"| {world.name} | {course} | {row[0]:.2f} | {row[2]:.2f} | {row[1]:.2f} "
+                  f"| {row[3]:.2f} |", flush=True)  # fmt: skip
+    after = np.array(rows)
+    print(f"\nmedians {np.median(after, axis=0).round(2)}, means {after.mean(0).round(2)} "
+          "(default after 1, 3; learned after 1, 3)")  # fmt: skip
+
+
+def sights(data):
+    """Wrong canopy: one assumption of sight, and three that bracket the truth."""
+    three = [Sight(extinction=0.3), Sight(extinction=0.1 / 3.0), Sight(crown_base=0.0)]
+    found = {}
+    for world in worlds(data).values():
+        if world.kind != "canopy" or (data is None and not world.is_made):
+            continue
+        for name, sight in (("one, wrong", world.assumed), ("three", three)):
+            workspace = tb.Workspace.from_terrain(
+                world.true_terrain(), world.shape, world.team(), sight=sight
+            )
+            for course in COURSES:
+                _, regret = campaign(world, workspace, course, 15, seed=0)
+                found.setdefault(name, []).append(regret[[0, 2, 7, 14]])
+        print(world.name, {n: np.median(v[-4:], axis=0).round(2) for n, v in found.items()},
+              flush=True)  # fmt: skip
+    for name, values in found.items():
+        middle, n = np.median(values, axis=0).round(2), len(values)
+        print(f"{name}: regret after 1, 3, 8, 15 missions, medians of {n}: {middle}")
+
+
+def stopping(data):
+    """Stops of `RegretBound` on the worlds."""
+    stopped, wrong, missions, n = 0, 0, [], 0
+    for world in worlds(data).values():
+        if data is None and not world.is_made:
+            continue
+        for course in COURSES:
+            rule = tb.RegretBound(eps=0.05)
+            result, regret = campaign(world, world.workspace(), course, 15, seed=0, stop=rule)
+            n += 1
+            if result.stop_reason != "n_iterations":
+                stopped, wrong = stopped + 1, wrong + (regret[-1] > 5.0)
+                missions.append(len(result.missions))
+        print(f"{world.name}: {wrong} wrong of {stopped} stopped, of {n} campaigns", flush=True)
+    low, high = binomtest(wrong, stopped).proportion_ci()
+    print(f"\nwrong {wrong} of {stopped} stops ({wrong / stopped:.1%}, {low:.1%} to {high:.1%})")
+    print(f"{n} campaigns; missions {np.median(missions):g} ({np.quantile(missions, 0.9):g})")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parts = {f.__name__: f for f in (times, absent, terrains, sights, stopping)}
+    parser.add_argument("part", nargs="*", choices=[*parts, []], default=["times", "absent"])
+    parser.add_argument("--data")
+    given = parser.parse_args()
+    for part in given.part:
+        print(f"\n{part}\n")
+        parts[part](given.data)
+
+
+if __name__ == "__main__":
+    main()
