@@ -1,4 +1,4 @@
-# make demo       install into .venv and run the main job on a made terrain
+# make demo       install into .venv and run the main job on a real hillside
 # make test       install what the tests need too, and run them
 # make notebooks  run the notebooks, with fewer missions than they show
 # make slow       run the tests of models that compile for long, which make test leaves out

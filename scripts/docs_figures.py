@@ -70,11 +70,11 @@ def long_campaigns() -> Figure:
 
 
 def save(figure: Figure, name: str) -> None:
-    """Write a small PNG: 200 colours are enough on a page."""
+    """Write a PNG without an alpha channel."""
     file = io.BytesIO()
     figure.savefig(file, dpi=85)
     plt.close(figure)
-    Image.open(file).convert("RGB").quantize(200).save(FIGURES / f"{name}.png", optimize=True)
+    Image.open(file).convert("RGB").save(FIGURES / f"{name}.png", optimize=True)
 
 
 if __name__ == "__main__":

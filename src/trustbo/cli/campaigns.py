@@ -1,6 +1,8 @@
-"""`trustbo run`, `demo` and `resume`: campaigns on your own or a synthetic terrain."""
+"""`trustbo run`, `demo` and `resume`: campaigns on your own or a real terrain of ours."""
 
+from functools import partial
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
@@ -106,7 +108,7 @@ def demo(
     quiet: bool = False,
     debug: bool = False,
 ) -> None:
-    """Run a campaign on a synthetic terrain of 500 m x 500 m, and write its DEM and DSM too.
+    """Run a campaign on a real hillside, 195 m x 278 m, and write its DEM and DSM too.
 
     Example: trustbo demo --sampler exact --iterations 4 --out out/demo
 
@@ -114,16 +116,14 @@ def demo(
     which every bound changes; the paper's, terminal, is trust at the goal, which
     depends on the last few bounds.
     """
-    from trustbo import terrain
     from trustbo.files import write_file
+    from trustbo.terrain.example import example_files
 
     with one_line_errors(debug, campaign=out):
         _require_names(policy, objective, model, sampler, iterations=iterations, seed=seed)
         require_outputs(out, "dem.tif", "dsm.tif", overwrite=overwrite)
-        ground = terrain.synthetic_terrain(seed=seed)
-        for name in ("dem", "dsm"):
-            raster = ground[name].astype("float32")
-            write_file(out / f"{name}.tif", raster.rio.to_raster)
+        for file in example_files("wellington"):
+            write_file(out / Path(file).name, partial(copyfile, file))
     run(
         dem=out / "dem.tif",
         dsm=out / "dsm.tif",

@@ -43,8 +43,8 @@ Learning
     (importance sampling, which need not compile); nuts;
     joint (nuts, for other than gaussian).
 Benchmark
-  data FOLDER: Folder of the real terrains, wellington/dem.tif and so on; without it, synthetic ones
-    only.
+  data FOLDER: Folder of the real terrains, tahoe/dem.tif and so on; without it, synthetic ones and
+    wellington.
   world NAME: World, given once for each; by default all.
   worlds.policy NAME: Policy, given once for each: a name as for [b]trustbo run[/b], or module:name;
     by default greedy, optimistic, thompson.

@@ -54,7 +54,7 @@ def _program(
 ) -> None:
     """Learn the trust in robots on a terrain, and plan the most trustworthy path.
 
-    On a synthetic terrain:  trustbo demo
+    On a real hillside:  trustbo demo
     On your own:             trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
     All flags:               trustbo run --help
     """

@@ -49,8 +49,10 @@ def map_panels(
     tall = tallness(grid)
     if tall >= 2:
         width, n_columns = 0.6 * width, 5 if n_columns is None else n_columns
-    size = width, width * tall + 0.35
-    return small_multiples(n, n_columns, size, margin=1.2, sharex=True, sharey=True)
+    size = width, width * tall + 0.55
+    made = small_multiples(n, n_columns, size, margin=1.2, sharex=True, sharey=True)
+    made[0].set_layout_engine("compressed")  # panels keep the terrain's proportions
+    return made
 
 
 def colour_bar(figure, image, axes, label: str, **options) -> None:

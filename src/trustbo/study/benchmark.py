@@ -68,7 +68,8 @@ def run_worlds(
 
     Args:
         directory: Folder of the results, as of `run_study`.
-        data: Folder of the real terrains; without it, the worlds of synthetic ones are run.
+        data: Folder of the real terrains; without it, worlds of synthetic ones and of the real one
+            that comes with the package are run.
         only: Names of worlds; by default all that `data` allows.
         courses: Names in `COURSES`.
         policies: Policies: names, your own callables, or `"module:name"` of one; or only one.
@@ -151,7 +152,7 @@ def _chosen(
 ) -> list[World]:
     """Worlds to run; TrustboError: an unknown name, or absent files."""
     if only is None:
-        chosen = [world for world in known.values() if world.is_made or data is not None]
+        chosen = [world for world in known.values() if world.is_packaged or data is not None]
     else:
         chosen = [known[require_choice("world", name, known)] for name in only]
     for world in chosen:

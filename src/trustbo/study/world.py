@@ -15,6 +15,7 @@ from trustbo import terrain
 from trustbo.data import Cell, Robot, Team
 from trustbo.errors import TrustboError, require_choice
 from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 
@@ -59,8 +60,13 @@ class World:
 
     @property
     def is_made(self) -> bool:
-        """Whether the terrain is synthetic, and needs no files."""
+        """Whether the terrain is synthetic, and has no files."""
         return self.ground.startswith("synthetic")
+
+    @property
+    def is_packaged(self) -> bool:
+        """Whether the terrain comes with the package."""
+        return self.is_made or self.ground in EXAMPLES
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides its numbers; real terrains by their contents."""
@@ -74,6 +80,8 @@ class World:
         TrustboError: they are absent, with where to put them.
         """
         names = [f"{self.ground}/{name}.tif" for name in ("dem", "dsm")]
+        if self.data is None and self.is_packaged:
+            return list(example_files(self.ground))
         if self.data is None:
             raise TrustboError(
                 f"world {self.name!r} needs {' and '.join(names)}: name the folder that holds "

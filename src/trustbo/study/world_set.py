@@ -35,8 +35,8 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
     """Worlds of the benchmark by name; see docs/worlds.md.
 
     Args:
-        data: Folder with the real terrains, `wellington/dem.tif` and so on. Without it, their
-            worlds are listed too, but cannot be used.
+        data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, their worlds are
+            listed too, but those of wellington alone, which is in the package, can be used.
 
     Returns:
         29 worlds, of 3 synthetic terrains and 4 real ones.
