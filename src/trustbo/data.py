@@ -8,6 +8,8 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trustbo.display.card import Card, Displayed, number
+from trustbo.display.svg import curve_picture
 from trustbo.errors import (
     ShapeError,
     TrustboError,
@@ -26,8 +28,8 @@ LINE_OF_SIGHT = "line_of_sight"
 """Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
 
 
-@dataclass(frozen=True)
-class Robot:
+@dataclass(frozen=True, repr=False)
+class Robot(Displayed):
     """One ground robot with a lidar. The defaults describe a Husky-sized skid-steer vehicle.
 
     Attributes:
@@ -72,9 +74,26 @@ class Robot:
                     "(degrees? use numpy.deg2rad)."
                 )
 
+    def _card(self) -> Card:
+        field_of_view, max_slope = (
+            number(float(np.rad2deg(angle)), "degrees")
+            for angle in (2.0 * self.vertical_fov, self.max_slope)
+        )
+        rows = [
+            ("speed", f"{number(self.speed, 'm/s')}, turns {number(self.turn_rate, 'rad/s')}"),
+            ("slope limit", max_slope),
+            ("lidar", f"range {number(self.lidar_range, 'm')}, {field_of_view} vertically"),
+            ("sensor", f"{number(self.sensor_height, 'm')} high, aims {self.target_height:g} m"),
+            (
+                "looks",
+                f"{self.detection:.0%} found; {self.acquire} to acquire, {self.drop} to drop",
+            ),
+        ]
+        return Card("Robot", rows)
 
-@dataclass(frozen=True)
-class Team:
+
+@dataclass(frozen=True, repr=False)
+class Team(Displayed):
     """The lead T1 and the overwatching subteam T2.
 
     Attributes:
@@ -107,9 +126,17 @@ class Team:
         """Steepest slope that every member withstands, rad."""
         return min(robot.max_slope for robot in (self.lead, *self.robots))
 
+    def _card(self) -> Card:
+        members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
+        limit = number(float(np.rad2deg(self.max_slope)), "degrees")
+        alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
+        rows = [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]
+        sections = {name: robot._card().rows for name, robot in members.items()}
+        return Card(f"Team: a lead and {self.n_robots} overwatching robots", rows, (), sections)
 
-@dataclass(frozen=True, eq=False)
-class Bound:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Bound(Displayed):
     """Measurements of one bound, one row per overwatching robot.
 
     Attributes:
@@ -189,9 +216,23 @@ class Bound:
         """End of the bound, s since the mission's start."""
         return self.t0 + float(np.nanmax(self.duration, initial=0.0))
 
+    def _card(self) -> Card:
+        return Card(
+            f"Bound into cell {self.cell}: {self.status}",
+            [
+                ("contact rate", np.array2string(self.contact_rate, precision=2)),
+                ("duration", f"{np.array2string(self.duration, precision=1)} s"),
+                ("begins", number(self.t0, "s", 4)),
+            ],
+            sections={
+                f"awareness of robot {i + 1}": [("features", np.array2string(z, precision=2))]
+                for i, z in enumerate(self.awareness)
+            },
+        )
 
-@dataclass(frozen=True, eq=False)
-class Mission:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Mission(Displayed):
     """One traversal of a path: the bounds that were run, and the outcome.
 
     Attributes:
@@ -242,6 +283,34 @@ class Mission:
             if len(labels) != size:
                 raise ShapeError(f"{name} must be {size} names; got {labels}.")
             object.__setattr__(self, name, labels)
+
+    def _card(self) -> Card:
+        rates = self.contact_rate
+        measured = np.isfinite(rates)
+        mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
+        cells = [f"{row},{col}" for row, col in self.path]
+        with np.errstate(all="ignore"):
+            each = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
+        rows = [
+            ("path", f"{cells[0]} to {cells[-1]}, {len(self.path) - 1} bounds planned"),
+            ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
+            ("contact rate", f"{mean} on average; {(~measured).sum()} of {rates.size} missing"),
+            *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, each, strict=True)),
+            ("takes", number(self.bounds[-1].t1, "s", 4)),
+        ]
+
+        def picture() -> str:
+            team = np.where(measured.any(1), np.where(measured, rates, 0.0).sum(1), np.nan)
+            curves = np.vstack([team / np.maximum(measured.sum(1), 1), rates.T])
+            return curve_picture(
+                curves, label="contact rate of the team, and each", x_label="bounds"
+            )
+
+        sections = {
+            "cells": [("path", " ".join(cells))],
+            "features": [("", ", ".join(self.features))],
+        }
+        return Card(f"Mission: {self.status}, contact {mean}", rows, [picture], sections)
 
     @classmethod
     def from_arrays(

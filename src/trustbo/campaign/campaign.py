@@ -14,6 +14,7 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
+from trustbo.campaign.card import campaign_card
 from trustbo.campaign.failures import Failure, learn_hazard, to_avoid, under_risk
 from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import (
@@ -30,6 +31,7 @@ from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.result import Result
 from trustbo.campaign.told import never_to_be_learned, require_extra, require_mission, require_new
 from trustbo.data import Cell, Mission
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath
 from trustbo.models import (
@@ -57,7 +59,7 @@ _N_MAPS = 500
 _N_KEPT = 200
 
 
-class Campaign:
+class Campaign(Displayed):
     """Learns from missions and proposes the next path.
 
     A mission is planned by `ask`, then told, then learned from. One that cannot be learned from yet
@@ -155,6 +157,19 @@ class Campaign:
         self._folder: CampaignFolder | None = None
         if directory is not None:
             self._open(CampaignFolder(directory), overwrite=False)
+
+    def _card(self) -> Card:
+        told, settings = len(self.missions), self.settings
+        rows = [
+            ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
+            ("missions", f"{told} told, {len(self.waiting)} not learned from yet"),
+            ("model", self.model.describe()),
+            ("policy", f"{settings['policy']}, objective {settings['objective']}"),
+        ]
+        return campaign_card(
+            f"Campaign: {told} missions", rows, self.workspace, settings, self.history,
+            self.trust_map if told else None, lambda: self.recommend().path,
+        )  # fmt: skip
 
     @property
     def missions(self) -> list[Mission]:

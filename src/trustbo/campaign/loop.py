@@ -1,16 +1,12 @@
 """The loop: plan, run, learn, and plan again."""
 
 import json
-import logging
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from tqdm import tqdm
-
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.history import LEARNED
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
+from trustbo.campaign.progress import Progress
 from trustbo.campaign.replanning import require_bounds, run_replanning
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import (
@@ -29,8 +25,6 @@ from trustbo.simulation import KinematicSimulator, Simulator, Truth
 from trustbo.simulation.protocol import takes
 from trustbo.workspace import Workspace
 
-_log = logging.getLogger(__name__)
-
 
 def iterate(
     workspace: Workspace,
@@ -47,7 +41,7 @@ def iterate(
     stop: Stop | Sequence[Stop] | None = None,
     checkpoint: FilePath | None = None,
     seed: int = 0,
-    progress: bool = True,
+    progress: bool | str = True,
     **options: Any,
 ) -> Result:
     """Run a campaign: plan a path, run it, learn from the contact rates, plan again.
@@ -71,7 +65,8 @@ def iterate(
         checkpoint: Folder in which everything is kept as it goes, replacing another campaign in it.
             If the process dies, `resume` goes on from it.
         seed: Seed of everything random.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, and in a notebook a map that follows the
+            missions; `"bar"` for the bar alone.
         **options: Fields of `CampaignOptions`, or a whole one as `options`.
 
     Returns:
@@ -113,7 +108,7 @@ def resume(
     model: TrustModel | None = None,
     policy: Policy | None = None,
     stop: Stop | Sequence[Stop] | None = None,
-    progress: bool = True,
+    progress: bool | str = True,
     **own: Any,
 ) -> Result:
     """Go on with a campaign that `iterate(checkpoint=directory)` began, with identical results.
@@ -128,7 +123,8 @@ def resume(
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
         stop: Rules in place of those that it was begun with; needed where one was your own.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, and in a notebook a map that follows the
+            missions; `"bar"` for the bar alone.
         **own: The same `awareness` and `callbacks`; see `Campaign.load`.
 
     Raises:
@@ -164,7 +160,7 @@ def missions(
     n_iterations: int = 8,
     truth: Truth | None = None,
     stop: Stop | Sequence[Stop] | None = None,
-    progress: bool = False,
+    progress: bool | str = False,
 ) -> Iterator[tuple[Plan, Mission]]:
     """Run the missions of a campaign, one for each step of this generator.
 
@@ -174,7 +170,8 @@ def missions(
         n_iterations: Largest number of missions in all.
         truth: Truth as in `iterate`.
         stop: Rules as in `iterate`.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar, and in a notebook a map that follows the
+            missions; `"bar"` for the bar alone.
 
     Yields:
         Plan of each mission, and the mission, learned from already.
@@ -216,12 +213,9 @@ def _missions(
     n_iterations: int,
     truth: Truth | None,
     rules: list[Stop],
-    progress: bool,
+    progress: bool | str,
 ) -> Iterator[tuple[Plan, Mission]]:
-    done = len(campaign.missions)
-    silent = not progress or not sys.stderr.isatty()  # carriage returns are for a terminal
-    bar = tqdm(total=n_iterations, initial=done, desc="missions", disable=silent)
-    with bar:
+    with Progress(campaign, n_iterations, progress) as shown:
         while len(campaign.missions) < n_iterations:
             plan = campaign.ask()
             mission = _run(campaign, runner, plan)
@@ -231,12 +225,7 @@ def _missions(
                 extra["regret"] = now.regret(plan, **path_class(campaign.planner))
             # Another path is the loop's own doing, and so is a simulator that repeats itself.
             campaign.tell(mission, other_path=True, again=True, **extra)
-            bar.set_postfix_str(_report(campaign), refresh=False)
-            bar.update()
-            _log.info("mission %d: %s", len(campaign.missions), _report(campaign))
-            if progress and not sys.stderr.isatty():
-                line = f"mission {len(campaign.missions)}/{n_iterations}: {_report(campaign)}"
-                tqdm.write(line, file=sys.stderr)
+            shown.step()
             for callback in campaign.options.callbacks:
                 callback(campaign, mission)
             yield plan, mission
@@ -256,15 +245,6 @@ def _run(campaign: Campaign, runner: Any, plan: Plan) -> Mission:
     if replans:
         return run_replanning(campaign, runner, plan, seed=seed, **numbered)
     return runner.run(plan.path, seed=seed, **numbered)
-
-
-def _report(campaign: Campaign) -> str:
-    """Describe the last mission in a line."""
-    row = campaign.log.entries[-1].row
-    regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
-    name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
-    learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]
-    return f"objective {row['objective']:.3f}{regret}, {learned}, {row['status']}"
 
 
 _RENAMED = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulator"}

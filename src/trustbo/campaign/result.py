@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.card import campaign_card
 from trustbo.campaign.damage import naming_what_is_left, read_json
 from trustbo.campaign.failures import under_risk
 from trustbo.campaign.history import Kept, Posterior, Posteriors, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
 from trustbo.data import Cell, Mission
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
@@ -36,8 +38,8 @@ _NEW = ("max_failure", "failure_cost")
 """Options of planning that results of version 0.1 lack."""
 
 
-@dataclass(frozen=True, eq=False)
-class Result:
+@dataclass(frozen=True, eq=False, repr=False)
+class Result(Displayed):
     """Result of a campaign.
 
     Attributes:
@@ -73,6 +75,19 @@ class Result:
     settings: dict[str, Any]
     stop_reason: str
     believed: xr.Dataset | None = None
+
+    def _card(self) -> Card:
+        rows = [
+            ("missions", f"{len(self.missions)}; stopped: {self.stop_reason}"),
+            ("recommended", f"{self.path[0]} to {self.path[-1]}, {len(self.path) - 1} bounds"),
+            ("value", f"{self.value:.4g} ({self.settings.get('objective', 'objective unknown')})"),
+            ("contact rate", f"{self.history['contact_rate'].values[-1]:.3f} on the last mission"),
+            ("outcomes", ", ".join(map(str, self.history["status"].values))),
+        ]
+        return campaign_card(
+            f"Result: {len(self.missions)} missions", rows, self.workspace, self.settings,
+            self.history, lambda: self.trust_map, lambda: self.path,
+        )  # fmt: skip
 
     @property
     def has_posterior(self) -> bool:

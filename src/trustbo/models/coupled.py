@@ -16,7 +16,7 @@ INTER_ROBOT = ("full", "none", "ordered")
 
 
 @register
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
     """Every robot with parameters of its own, equations (1)-(2).
 

@@ -15,7 +15,7 @@ from trustbo.models.params import RobotParams
 
 
 @register
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HierarchicalTrust(TrustModel):
     """Coefficients per robot, partially pooled: between `PooledTrust` and separate robots.
 

@@ -14,6 +14,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.contact_rate import (
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 RESPONSES = ("level", "change")
 
 
-@dataclass(frozen=True)
-class TrustModel(ABC):
+@dataclass(frozen=True, repr=False)
+class TrustModel(Displayed, ABC):
     """A trust model; itself a numpyro model, so that `MCMC(NUTS(model))` works.
 
     Attributes:
@@ -339,6 +340,20 @@ class TrustModel(ABC):
                 "rates measure changes" if self.lag else "robots with nothing else in common"
             )
         return None
+
+    def _card(self) -> Card:
+        rows = [
+            ("rates", f"{self.observation}, of the {self.response} of trust"),
+            *(
+                (n, str(v))
+                for n, v in self.options().items()
+                if n not in ("observation", "response")
+            ),
+            ("places", "no effects" if self.place is None else f"{self.place}"),
+            ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),
+        ]
+        priors = () if self.priors is None else self.priors._card().rows
+        return Card(type(self).__name__, rows, (), {"priors": priors})
 
     def describe(self) -> str:
         """The model's name and options."""

@@ -9,6 +9,7 @@ import xarray as xr
 from jax import Array
 
 from trustbo.data import Cell
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models.likelihood.live import ApartFilter, CoupledFilter
 from trustbo.models.likelihood.scalar import ScalarSSM
@@ -26,14 +27,30 @@ _PLACES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-class _Draws:
+class _Draws(Displayed):
     """Methods of parameters of every kind; mixed into their tuples."""
+
+    __slots__ = ()
 
     AXES: ClassVar[Mapping[str, tuple[str, ...]]]
     """Axes of each field behind the leading ones; none where not listed."""
     WEIGHTS: ClassVar[str] = "beta"
     """Name of the field with the weights of features."""
     _fields: ClassVar[tuple[str, ...]]
+
+    def _card(self) -> Card:
+        n = int(np.prod(self.leading))
+        many = f"{n} draws, mean +- sd" if self.leading else "one draw"
+        rows: list[tuple[str, str]] = []
+
+        def add(value: Numbers, n_own: int) -> Numbers:
+            numbers = np.asarray(value, dtype=float)
+            flat = numbers.reshape(-1, *numbers.shape[numbers.ndim - n_own :])
+            rows.append((self._fields[len(rows)], _written(flat)))
+            return value
+
+        self.map(add)
+        return Card(f"{type(self).__name__}: {many}", rows)
 
     @property
     def leading(self) -> tuple[int, ...]:
@@ -153,6 +170,15 @@ class _Draws:
             if (value := getattr(self, name)) is not None
         }
         return self._replace(**values)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _written(draws: np.ndarray) -> str:
+    """Mean and sd over draws (draw, ...) of a field: of each number, or of many together."""
+    mean, sd = draws.mean(0), draws.std(0)
+    if mean.size > 6:
+        return f"{mean.shape}, {mean.min():.3g} to {mean.max():.3g}"
+    spread = zip(np.ravel(mean), np.ravel(sd), strict=True)
+    return ", ".join(f"{m:.3g}" + (f" +- {s:.2g}" if len(draws) > 1 else "") for m, s in spread)
 
 
 class _Trust(NamedTuple):

@@ -10,7 +10,7 @@ from trustbo.models.params import TrustParams
 
 
 @register
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PooledTrust(TrustModel):
     """One set of parameters for all robots, equations (3)-(4)."""
 

@@ -13,6 +13,7 @@ from numpyro.distributions import Distribution, constraints
 
 from trustbo import zheng2023
 from trustbo.data import is_line_of_sight
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.floored import Floored
@@ -22,8 +23,8 @@ from trustbo.models.samplers.priors_numpy import floored
 _SCALES = ("delta_w", "delta_v", "tau")
 
 
-@dataclass(frozen=True)
-class Priors:
+@dataclass(frozen=True, repr=False)
+class Priors(Displayed):
     """Prior of each parameter, any scalar numpyro distribution, and of trust before bound 1.
 
     `Priors()` is the default of DESIGN: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5),
@@ -65,6 +66,10 @@ class Priors:
     x0_mean: float = 0.5
     x0_sd: float = 0.5
     stationary: bool = False
+
+    def _card(self) -> Card:
+        rows = [(one.name, _as_text(getattr(self, one.name))) for one in fields(self)]
+        return Card("Priors", rows)
 
     def __post_init__(self) -> None:
         with own_settings():
@@ -214,6 +219,8 @@ jax.tree_util.register_pytree_node(Priors, _flatten, _unflatten)
 
 
 def _as_text(prior: Distribution | float) -> str:
+    if isinstance(prior, bool):
+        return "yes" if prior else "no"
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
     if isinstance(prior, Floored):  # the floor is no prior of the user's, but the data's

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Cell
+from trustbo.display.card import Card, Displayed
+from trustbo.display.svg import curve_picture, map_picture
 from trustbo.planning.risk import PathRisk
 from trustbo.workspace import Workspace
 
@@ -15,8 +17,8 @@ QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantiles of `Plan.bands`: ends of the 90 % and of the 50 % band."""
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Displayed):
     """A path with its expected trust, value and exactness.
 
     What robots are to do, `waypoints`, `posts` and `ways`, is that of successive bounding, in CRS
@@ -59,6 +61,36 @@ class Plan:
     seconds: float
     workspace: Workspace
     risk: PathRisk | None = None
+
+    def _card(self) -> Card:
+        cells = " ".join(f"{row},{col}" for row, col in self.path)
+        rows = [
+            ("path", f"{len(self.path) - 1} bounds, {self.length:.4g} m"),
+            ("value", f"{self.value:.4g} ({self.objective})"),
+            ("best", "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"),
+            ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
+        ]
+        if self.p_arrive is not None:
+            band = self.p_arrive_band
+            between = "" if band is None else f" ({band[0]:.3f} to {band[1]:.3f}, 90 %)"
+            rows.append(("chance to arrive", f"{self.p_arrive:.3f}{between}"))
+        rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
+        where, grid = self.workspace, self.workspace.grid
+
+        def area() -> str:
+            shown = where.awareness.isel(feature=-1).mean("robot").where(where.passable)
+            label, aspect = where.features[-1], grid.cell_height / grid.cell_width
+            return map_picture(shown.values, self.path, aspect=aspect, label=label)
+
+        def along() -> str:
+            curves = np.vstack([self.trust.mean(1), self.trust.T])
+            band = self.bands[0].mean(1), self.bands[-1].mean(1)
+            return curve_picture(curves, band=band, label="trust along the path", x_label="bounds")
+
+        return Card(
+            f"Plan: {self.path[0]} to {self.path[-1]}", rows, [area, along],
+            {"cells (row, col)": [("path", cells)]},
+        )  # fmt: skip
 
     @property
     def p_fail(self) -> np.ndarray | None:

@@ -12,6 +12,8 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
+from trustbo.display.card import Card, Displayed
+from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, require_choice
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
@@ -29,7 +31,7 @@ from trustbo.planning.values import evaluate
 from trustbo.workspace import Workspace
 
 
-class Planner:
+class Planner(Displayed):
     """Search for the most trustworthy path of a workspace.
 
     Attributes:
@@ -122,6 +124,26 @@ class Planner:
         chosen = Objective(objective, length_weight, self.family, self.lag)
         rule = FailureRule(max_failure, confidence, failure_cost, infeasible)
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
+
+    def _card(self) -> Card:
+        where, grid = self.workspace, self.workspace.grid
+        rows = [
+            ("from", f"{self.start} to {self.goal}, {self.connectivity} directions"),
+            ("objective", f"{self.objective}, {self.team} of the robots"),
+            ("paths", f"{self.shortest} to {self.longest} bounds ({self.max_bounds})"),
+            ("rates", f"{self.family.name}, of the {'change' if self.lag else 'level'} of trust"),
+            ("risk", "of each bound" if self.problem.risk is not None else "not known"),
+            ("engine", self.engine),
+        ]
+
+        def area() -> str:
+            shown = where.awareness.isel(feature=-1).mean("robot").where(where.passable)
+            return map_picture(
+                shown.values, [self.start, self.goal], aspect=grid.cell_height / grid.cell_width,
+                label=where.features[-1], line=False,
+            )  # fmt: skip
+
+        return Card(f"Planner: {self.start} to {self.goal}", rows, [area])
 
     def _hold(self, problem: PlanningProblem) -> None:
         paths = problem.paths

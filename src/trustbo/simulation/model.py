@@ -11,13 +11,14 @@ from trustbo.errors import ShapeError, TrustboError, require_choice, require_who
 from trustbo.models import CAUSES, PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
+from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, along, bounds_along, moves_along
 
 _BUCKET = 8  # bounds: missions of about the same length share compiled code
 
 
-class ModelSimulator:
+class ModelSimulator(DescribedSimulator):
     """Simulator that draws contact rates from a trust model, and failures from chances of bounds.
 
     Posteriors and plans of a campaign can be compared with the truth: `params` and `awareness` give

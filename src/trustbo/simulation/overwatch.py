@@ -13,6 +13,7 @@ from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive_together
+from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, detections, new_tracks
 from trustbo.simulation.world import Worlds, true_surface
 from trustbo.terrain import CompositeIndex
@@ -21,7 +22,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight, sights_of
 
 
-class KinematicSimulator:
+class KinematicSimulator(DescribedSimulator):
     """Unicycle robots on a DEM and DSM, in contact while their lidar has a line of sight.
 
     In the first phase of a bound the lead drives to its waypoint in the next cell while T2 watches

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from trustbo.data import Bound, Cell, Mission
+from trustbo.display.card import Card, Displayed
 
 
 class Simulator(Protocol):
@@ -38,6 +39,19 @@ class BoundSimulator(Simulator, Protocol):
     def close(self) -> None:
         """End the mission."""
         ...
+
+
+class DescribedSimulator(Displayed):
+    """Simulator of this package, displayed by the settings that it describes."""
+
+    def describe(self) -> dict[str, object]:
+        """Return the settings that decide what a mission measures."""
+        raise NotImplementedError
+
+    def _card(self) -> Card:
+        settings = {name: value for name, value in self.describe().items() if name != "simulator"}
+        rows = [(name, str(value)) for name, value in settings.items() if value not in (None, [])]
+        return Card(type(self).__name__, [(name, text) for name, text in rows if len(text) < 200])
 
 
 def takes(function: Callable[..., object], name: str) -> bool:

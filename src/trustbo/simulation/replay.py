@@ -9,12 +9,13 @@ from trustbo.errors import TrustboError, require_choice, require_pair
 from trustbo.files import FilePath
 from trustbo.logs.netcdf import read_missions
 from trustbo.logs.table import read_table
+from trustbo.simulation.protocol import DescribedSimulator
 
 ON_MISSING = ("error", "next")
 _NEAREST = 3
 
 
-class ReplaySimulator:
+class ReplaySimulator(DescribedSimulator):
     """Simulator that replays missions recorded by robots or another simulator.
 
     Each mission is replayed once: `run(path)` returns the first one left with that path. A campaign

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import (
     DamagedFileError,
     TrustboError,
@@ -68,7 +69,7 @@ class Contact(Protocol):
         ...
 
 
-class Truth:
+class Truth(Displayed):
     """Expected contact of every path of a simulator, in the world of a mission.
 
     Contact is expected given that no bound fails; `PathContact.p_arrive` says how probable that is.
@@ -85,6 +86,15 @@ class Truth:
         """Hold what bounds give; `at(mission)` is the truth of another mission's world."""
         self.workspace, self.bounds, self._at = workspace, bounds, at
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
+
+    def _card(self) -> Card:
+        grid = self.workspace.grid
+        rows = [
+            ("bounds", f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"),
+            ("standard error", f"{self.standard_error:.2g} of a bound's contact, mean over robots"),
+            ("worlds", "one" if self._at is None else "of each mission, see at(mission)"),
+        ]
+        return Card("Truth: expected contact of every bound", rows)
 
     @classmethod
     def of(

@@ -11,6 +11,7 @@ from rasterio.crs import CRS
 from rasterio.warp import transform as transform_points
 
 from trustbo.data import Cell
+from trustbo.display.card import Card, Displayed
 from trustbo.errors import TerrainError, TrustboError, require_pair
 
 Sums = tuple[np.ndarray, np.ndarray]
@@ -18,8 +19,8 @@ Sums = tuple[np.ndarray, np.ndarray]
 WGS84 = CRS.from_epsg(4326)
 
 
-@dataclass(frozen=True)
-class Grid:
+@dataclass(frozen=True, repr=False)
+class Grid(Displayed):
     """A regular grid of cells; row 0 at the top (north).
 
     Attributes:
@@ -65,6 +66,18 @@ class Grid:
             (right - left) / cols,
             None if crs is None else crs.to_wkt(),
         )
+
+    def _card(self) -> Card:
+        left, bottom = self.corner
+        rows = [
+            (
+                "cells",
+                f"{self.cell_height:.4g} m (north-south) x {self.cell_width:.4g} m (east-west)",
+            ),
+            ("corner", f"x {left:.10g}, y {bottom:.10g} m, lower left"),
+            ("CRS", "none" if self.crs is None else CRS.from_wkt(self.crs).to_string()),
+        ]
+        return Card(f"Grid: {self.shape[0]} x {self.shape[1]} cells", rows)
 
     def center(self, cell: Cell) -> tuple[float, float]:
         """X and y of a cell's centre, CRS metres."""

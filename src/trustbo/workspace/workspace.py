@@ -11,6 +11,8 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission, Team, default_features, is_line_of_sight
+from trustbo.display.card import Card, Displayed
+from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.terrain.composite import CompositeIndex
@@ -43,8 +45,8 @@ MAX_MISSING = 0.5
 """Largest share of missing or too steep pixels in a passable cell."""
 
 
-@dataclass(frozen=True, eq=False)
-class Workspace:
+@dataclass(frozen=True, eq=False, repr=False)
+class Workspace(Displayed):
     """Planning grid with the situational awareness of each robot in each cell.
 
     Attributes:
@@ -235,6 +237,29 @@ class Workspace:
     def features(self) -> tuple[str, ...]:
         """Names of the awareness features."""
         return tuple(str(name) for name in self.awareness["feature"].values)
+
+    def _card(self) -> Card:
+        grid, free, team = self.grid, self.passable.values, self.team
+        shown = self.awareness.mean("robot").where(self.passable)
+        spread = [
+            (name, f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
+            for name, one in ((n, shown.sel(feature=n)) for n in self.features)
+        ]
+        rows = [
+            (
+                "cells",
+                f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m, {free.mean():.0%} passable",
+            ),
+            ("team", f"a lead and {', '.join(team.names)}"),
+            ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
+            *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
+            ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
+            ("terrain", "none" if self.terrain is None else _sizes(self.terrain)),
+        ]
+        aspect, last = grid.cell_height / grid.cell_width, self.features[-1]
+        pictures = [lambda: map_picture(shown.sel(feature=last).values, aspect=aspect, label=last)]
+        sections = {"grid": grid._card().rows, "team": team._card().rows}
+        return Card(f"Workspace: {grid.shape[0]} x {grid.shape[1]} cells", rows, pictures, sections)
 
     def _with_line_of_sight(self) -> Self:
         ways, pixels = self.ground, self.pixels
@@ -442,3 +467,7 @@ class Workspace:
 def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:
     """Cell centres in CRS metres, as coordinates along row and col."""
     return {"y": ("row", grid.y), "x": ("col", grid.x)}
+
+
+def _sizes(terrain: xr.Dataset) -> str:
+    return f"{terrain.sizes['y']} x {terrain.sizes['x']} pixels"

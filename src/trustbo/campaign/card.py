@@ -1,0 +1,39 @@
+"""Card of a campaign and of its result: the map of trust, and contact over missions."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Cell
+from trustbo.display.card import Card
+from trustbo.display.svg import curve_picture, map_picture
+from trustbo.workspace import Workspace
+
+
+def campaign_card(
+    title: str,
+    rows: Sequence[tuple[str, str]],
+    workspace: Workspace,
+    settings: Mapping[str, Any],
+    history: xr.Dataset,
+    trust_map: Callable[[], xr.DataArray] | None,
+    path: Callable[[], Sequence[Cell]],
+) -> Card:
+    """Card with the map of trust, if there is one, the path on it, and the contact of missions."""
+    grid, pictures = workspace.grid, []
+    if trust_map is not None:
+        aspect = grid.cell_height / grid.cell_width
+
+        def area() -> str:
+            cells = path()
+            trust = trust_map().values.copy()
+            trust[cells[0]] = np.nan  # assumed there, and would set the limits of the colours
+            return map_picture(trust, cells, aspect=aspect, label="expected trust")
+
+        pictures.append(area)
+        rates = history["contact_rate"].values
+        pictures.append(lambda: curve_picture(rates, label="contact rate", x_label="missions"))
+    options = [(name, str(value)) for name, value in settings.items() if len(str(value)) < 200]
+    return Card(title, rows, pictures, {"options": options})

@@ -1,0 +1,87 @@
+"""A card: the few numbers of an object that matter, a picture of it, and what opens on a click."""
+
+from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from typing import NamedTuple
+
+_MOST_LINES = 12
+_STYLE = (
+    "<style>.tb-card{font:13px/1.45 sans-serif;max-width:64em;margin:.3em 0}"
+    ".tb-card table{border-collapse:collapse;margin:.2em 1.2em .2em 0}"
+    ".tb-card td{padding:.05em .9em .05em 0;text-align:left;vertical-align:top;border:0;"
+    "background:none}.tb-card td:first-child{opacity:.65;white-space:nowrap}"
+    ".tb-card .tb-body{display:flex;flex-wrap:wrap;align-items:flex-start;gap:.6em}"
+    ".tb-card svg{max-width:100%;height:auto;margin-right:1em}"
+    ".tb-card summary{cursor:pointer}</style>"
+)
+
+
+class Card(NamedTuple):
+    """Card of an object.
+
+    Attributes:
+        title: What it is, in a line.
+        rows: Names and values with their units.
+        pictures: Functions that draw pictures, as SVG; called for a notebook only.
+        sections: Rows, or text, that open on a click, by their titles.
+    """
+
+    title: str
+    rows: Sequence[tuple[str, str]] = ()
+    pictures: Sequence[Callable[[], str]] = ()
+    sections: Mapping[str, Sequence[tuple[str, str]]] = {}
+
+    def text(self) -> str:
+        """Title and rows, at most 12 lines."""
+        shown = list(self.rows)
+        if len(shown) > _MOST_LINES - 1:
+            more = len(shown) - (_MOST_LINES - 2)
+            shown = [*shown[: _MOST_LINES - 2], ("...", f"{more} more")]
+        wide = max((len(name) for name, _ in shown), default=0)
+        lines = [f"  {name:<{wide}}  {_short(value, 96 - wide)}" for name, value in shown]
+        return "\n".join([_short(self.title, 100), *lines])
+
+    def html(self) -> str:
+        """Title, pictures, table and sections, for a notebook; it takes the page's colours."""
+        pictures = "".join(draw() for draw in self.pictures)
+        folded = "".join(
+            f"<details><summary>{escape(name)}</summary>{_table(rows)}</details>"
+            for name, rows in self.sections.items()
+            if rows
+        )
+        return (
+            f'{_STYLE}<div class="tb-card"><b>{escape(self.title)}</b>'
+            f'<div class="tb-body">{pictures}<div>{_table(self.rows)}{folded}</div></div></div>'
+        )
+
+
+class Displayed:
+    """Object that a notebook shows as a card, and a terminal as its text."""
+
+    __slots__ = ()
+
+    def _card(self) -> Card:
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return self._card().text()
+
+    def _repr_html_(self) -> str:
+        return self._card().html()
+
+
+def number(value: float, unit: str = "", digits: int = 3) -> str:
+    """Write a number with its unit."""
+    return f"{value:.{digits}g}{' ' + unit if unit else ''}"
+
+
+def _table(rows: Sequence[tuple[str, str]]) -> str:
+    cells = "".join(
+        f"<tr><td>{escape(name)}</td><td>{escape(value)}</td></tr>" for name, value in rows
+    )
+    return f"<table>{cells}</table>" if rows else ""
+
+
+def _short(text: str, width: int) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= width else text[: max(width - 3, 1)] + "..."

@@ -1,0 +1,153 @@
+"""What a cell of a notebook, and a terminal, show of an object."""
+
+import base64
+import io
+import re
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import trustbo as tb
+from trustbo.display.card import Card
+from trustbo.display.svg import curve_picture, map_picture
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, TrustParams
+from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
+
+
+@pytest.fixture(scope="module")
+def shown():
+    """One of each class that is displayed."""
+    terrain = tb.terrain.synthetic_terrain((80.0, 60.0), 2.0, seed=0, relief=4.0)
+    workspace = tb.Workspace.from_terrain(terrain, (4, 3))
+    params = TrustParams(np.full(5, 0.3), np.full((5, 3), 0.1), np.full(5, 0.4), 0.05, 0.05)
+    simulator = ModelSimulator(workspace, params.mean())
+    campaign = tb.Campaign(workspace, (3, 0), (0, 2), sampler="exact")
+    fresh = repr(campaign)
+    for _ in tb.missions(campaign, simulator, n_iterations=2):
+        pass
+    result, mission = campaign.result(), campaign.missions[0]
+    objects = [
+        workspace, workspace.grid, workspace.team, workspace.team.lead, mission, mission.bounds[0],
+        result.plan, result.planner, campaign, result, params, params.mean(), Priors(),
+        PooledTrust(), HierarchicalTrust(), CoupledTrust(), simulator,
+        KinematicSimulator(workspace), Truth.of(simulator),
+    ]  # fmt: skip
+    assert "0 missions" in fresh
+    return {type(one).__name__: one for one in objects}
+
+
+def test_texts_are_short_and_cards_are_small_and_whole(shown):
+    assert len(shown) == 18
+    for name, one in shown.items():
+        lines = repr(one).splitlines()
+        assert len(lines) <= 12, name
+        assert max(map(len, lines)) <= 100, name
+        html = one._repr_html_()
+        assert len(html) < 100_000, name
+        ElementTree.fromstring(f"<div>{html}</div>")  # every tag is closed, all text escaped
+        assert not re.search(r"array\(|\[\[", html), name  # no array is dumped
+        assert re.search(r"color:\s*(#|black|white)", html) is None, name  # the page's colours
+
+
+def test_numbers_have_their_units(shown):
+    assert "20 m x 20 m" in repr(shown["Workspace"])
+    assert "slope limit  45 degrees" in repr(shown["Robot"])
+    assert "range 100 m, 45 degrees vertically" in repr(shown["Robot"])
+    assert re.search(r"contact rate +0\.\d{3} on average; 0 of \d+ missing", repr(shown["Mission"]))
+
+
+def test_params_show_each_coefficient_with_its_spread():
+    draws = TrustParams(np.array([0.1, 0.3]), np.array([[1.0], [2.0]]), np.zeros(2), 0.05, 0.05)
+    text = repr(draws)
+    assert "2 draws" in text
+    assert re.search(r"beta0 +0\.2 \+- 0\.1\n", text)
+    assert re.search(r"beta +1\.5 \+- 0\.5\n", text)
+    assert "+-" not in repr(draws.mean())
+
+
+def test_a_mission_without_any_rate_is_shown():
+    mission = tb.Mission.from_arrays([(1, 0), (0, 0)], np.zeros((1, 2, 2)), np.full((1, 2), np.nan))
+    assert "not measured" in repr(mission)
+    assert "<svg" in mission._repr_html_()
+
+
+def test_long_cards_say_how_much_is_left_out():
+    card = Card("Many", [(f"name {i}", "x" * 200) for i in range(30)])
+    lines = card.text().splitlines()
+    assert len(lines) == 12
+    assert lines[-1].split() == ["...", "20", "more"]
+    assert all(len(line) <= 100 for line in lines)
+
+
+def test_text_of_the_user_cannot_break_the_page():
+    card = Card("<b>&", [("<script>", "</td>")])
+    ElementTree.fromstring(f"<div>{card.html()}</div>")
+    assert "<script>" not in card.html()
+
+
+# --- pictures ---
+
+
+def pixels_of(picture):
+    (data,) = re.findall(r"base64,([^\"]+)", picture)
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)
+
+
+def test_a_map_has_a_pixel_for_each_cell_and_grey_where_nothing_is_known():
+    values = np.array([[0.0, 0.5, 1.0], [np.nan, 1.0, 0.0]])
+    pixels = pixels_of(map_picture(values, label="trust"))
+    assert pixels.shape == (2, 3, 3)
+    assert (pixels[1, 0] == 128).all()
+    assert (pixels[0, 0] == pixels[1, 2]).all()
+    assert (pixels[0, 0] == (68, 1, 84)).all()  # viridis from dark violet ...
+    assert (pixels[0, 2] == (253, 231, 36)).all()  # ... to yellow
+    assert "trust: 0 to 1" in map_picture(values, label="trust")
+
+
+def test_a_path_goes_through_the_centres_of_its_cells():
+    picture = map_picture(np.zeros((2, 4)), [(1, 0), (0, 1)], aspect=0.5)
+    (line, _) = re.findall(r'<polyline points="([^"]+)"', picture)
+    assert line == "30.0,45.0 90.0,15.0"  # cells of 60 x 30 px
+    assert "<polyline" not in map_picture(np.zeros((2, 4)), [(1, 0), (0, 1)], line=False)
+
+
+def test_a_curve_breaks_where_a_number_is_missing():
+    picture = curve_picture([1.0, 2.0, np.nan, 3.0, 4.0])
+    lines = [line.split() for line in re.findall(r'<polyline points="([^"]+)"', picture)]
+    heights = [[float(point.split(",")[1]) for point in line] for line in lines]
+    assert [len(line) for line in lines] == [2, 2]
+    assert heights[0][0] > heights[0][1] > heights[1][0] > heights[1][1]  # upwards
+
+
+@pytest.mark.parametrize("values", [[], [np.nan], [0.3], [0.3, 0.3]])
+def test_little_can_be_drawn_too(values):
+    ElementTree.fromstring(curve_picture(values))
+
+
+# --- the live map of a notebook ---
+
+CELL = """
+import numpy as np, trustbo as tb
+workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+params = tb.models.TrustParams(0.3, np.array([0.2, 0.1]), 0.4, 0.05, 0.05)
+simulator = tb.simulation.ModelSimulator(workspace, params)
+tb.iterate(workspace, (3, 0), (0, 3), n_iterations=2, simulator=simulator, progress={progress})
+"""
+
+
+@pytest.mark.slow  # a kernel of Jupyter
+def test_a_notebook_shows_the_campaign_while_it_runs():
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    notebook = nbformat.v4.new_notebook()
+    notebook.cells = [nbformat.v4.new_code_cell(CELL.format(progress=p)) for p in ("True", "'bar'")]
+    nbclient.NotebookClient(notebook).execute()
+    live, bar = (
+        ["".join(o.data.get("text/html", "")) for o in cell.outputs if "data" in o]
+        for cell in notebook.cells
+    )
+    assert any("Campaign: 2 missions" in html for html in live)  # the same output, renewed
+    assert not any("Campaign: 0 missions" in html for html in live)
+    assert any("Result: 2 missions" in html for html in live + bar)
+    assert not any("Campaign" in html for html in bar)
