@@ -20,7 +20,7 @@ class Card(NamedTuple):
     """Card of an object.
 
     Attributes:
-        title: What it is, in a line.
+        title: Name of the object, in a line.
         rows: Names and values with their units.
         pictures: Functions that draw pictures, as SVG; called for a notebook only.
         sections: Rows, or text, that open on a click, by their titles.
