@@ -3,6 +3,7 @@
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
+from trustbo.models.by_rate import by_rate
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.exposures import CAUSES, LostMission
 from trustbo.models.filter import TrustFilter, TrustState
@@ -44,6 +45,7 @@ __all__ = [
     "TrustParams",
     "TrustSample",
     "TrustState",
+    "by_rate",
     "complete",
     "diagnostics",
     "fit",

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 from jax import Array
 from numpyro.distributions import Distribution, LKJCholesky
@@ -106,6 +107,26 @@ class CoupledTrust(TrustModel):
             | gamma
             | self.place_dims
         )
+
+    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+        """See `TrustModel.prior_terms`: diagonals, off-diagonals and noises, correlations apart."""
+        if self.inter_robot == "none":
+            return super().prior_terms(sites)
+        if self.inter_robot == "ordered":
+            own = {name: (name, sites[name]) for name in RobotParams._fields[:5]}
+            return own | {"gamma": ("coupling", sites["gamma"])}
+        n = sites["b"].shape[-1]
+        off = ~np.eye(n, dtype=bool)
+        diagonal = {name: np.einsum("...ii->...i", sites[name]) for name in sites if name != "b"}
+        return {
+            "B0": ("beta0", diagonal["B0"]),
+            "B0_coupling": ("coupling", sites["B0"][..., off]),
+            "B": ("beta", np.swapaxes(diagonal["B"], -1, -2)),
+            "B_coupling": ("coupling", sites["B"][..., off]),
+            "b": ("b", sites["b"]),
+            "delta_w": ("delta_w", np.sqrt(diagonal["Delta_w"])),
+            "delta_v": ("delta_v", np.sqrt(diagonal["Delta_v"])),
+        }
 
     @property
     def robots_are_apart(self) -> bool:

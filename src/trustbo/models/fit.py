@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
+from trustbo.models.log_prior import log_prior
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.place import Visited, bounds_of, visited
 from trustbo.models.place_maps import place_group
@@ -65,8 +66,7 @@ def fit(
         n_warmup: Warm-up draws per chain of NUTS, not kept.
         n_draws: Draws kept per chain.
         n_chains: Number of chains.
-        n_trajectories: Draws, spread evenly over the chains, for which latent trust and predicted
-            contact rates are kept.
+        n_trajectories: Draws, spread evenly over the chains, for which latent trust is kept.
         check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
             run does not cure; `False` returns it unchecked.
         whole: Whether to add latent trust, log-likelihoods and predictions at once; where trust
@@ -76,8 +76,9 @@ def fit(
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
         delta_w, delta_v), `latent` (trust[chain, draw, mission, bound, robot] by backward sampling,
         and trust_mean and trust_sd over all draws), `posterior_predictive`, `prior`,
-        `prior_predictive`, `log_likelihood` (contact_rate[chain, draw, mission]: a whole mission is
-        one observation, so LOO leaves out missions), `sample_stats`, `observed_data` and
+        `prior_predictive`, `log_prior`, `log_likelihood` (contact_rate[chain, draw, mission]: a
+        whole mission is one observation, so LOO leaves out missions; see `by_rate`),
+        `sample_stats`, `observed_data` and
         `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are padded with NaN.
         Where all rates have an n_ticks, log-likelihoods are of the counts of ticks, on equal terms
         for all families of observations; the attribute `log_likelihood_of` says so.
@@ -108,6 +109,7 @@ def fit(
         "posterior": {name: draws.params[name] for name in model.dims},
         "sample_stats": draws.stats,
         "prior": {name: values[None] for name, values in prior.items()},
+        "log_prior": log_prior(floored, draws.params),
     }
     posterior = to_datatree(groups, missions, model.dims)
     if places is not None:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax import Array
@@ -47,6 +48,15 @@ class HierarchicalTrust(TrustModel):
         for name in ("beta0", "beta", "b"):
             numpyro.deterministic(name, getattr(params, name))
         return params
+
+    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+        """See `TrustModel.prior_terms`: means, spreads and noises."""
+        coefficients = ("beta0", "beta", "b")
+        return (
+            {f"mean_{name}": (name, sites[f"mean_{name}"]) for name in coefficients}
+            | {f"tau_{name}": ("tau", sites[f"tau_{name}"]) for name in coefficients}
+            | {name: (name, sites[name]) for name in ("delta_w", "delta_v")}
+        )
 
     @property
     def partial_pooling(self) -> "HierarchicalTrust":

@@ -122,6 +122,14 @@ class TrustModel(Displayed, ABC):
         """Whether each field of the parameters is drawn from the prior of its name, alone."""
         return False
 
+    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+        """Field of `Priors` and values of each parameter that has a prior of its own, by label.
+
+        Args:
+            sites: Parameters of a posterior, leading axes (...), with the axes of `dims`.
+        """
+        return {name: (name, sites[name]) for name in self.dims if name not in self.place_dims}
+
     @property
     def partial_pooling(self) -> "HierarchicalTrust | None":
         """The model, if its robots' coefficients are drawn from a common distribution."""

@@ -1,13 +1,16 @@
 """Effects of places on trust, and the index of the places that missions visited."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpyro.distributions as dist
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
+from trustbo.models.backend import own_settings
+from trustbo.models.samplers.priors_numpy import log_prob
 from trustbo.workspace.moves import MOVES, bounds_along
 
 N_MOVES = len(MOVES[8])
@@ -67,6 +70,16 @@ class PlaceEffect:
             "tau_e": self.tau_e * np.abs(scores[2]),
         }
         return {name: drawn[name] for name in self.names}
+
+    def log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Log prior density of the hyperparameters of draws, by name."""
+        with own_settings():
+            priors = {
+                "tau_s": dist.HalfNormal(self.tau_s),
+                "length_scale": dist.LogNormal(np.log(self.length_scale), self.length_scale_sd),
+                "tau_e": dist.HalfNormal(self.tau_e),
+            }
+        return {name: log_prob(priors[name], sites[name]) for name in self.names}
 
     def to_record(self) -> dict[str, Any]:
         """Fields by name, for JSON."""

@@ -24,7 +24,7 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
+_KEPT = ("posterior", "sample_stats", "prior", "log_prior", "places", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
@@ -67,8 +67,7 @@ def complete(
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Missions that it was fitted to; needed where it holds no data.
-        n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust and
-            predicted contact rates of.
+        n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust of.
         latents: Innovations of latent trust, where they were sampled with the parameters.
 
     Returns:
@@ -145,7 +144,7 @@ def _groups(
             "trust_sd": found["trust_sd"],
             "draw": kept,
         },
-        "posterior_predictive": {"contact_rate": by_chain(found["predicted"]), "draw": kept},
+        "posterior_predictive": {"contact_rate": by_chain(found["predicted"])},
         "prior_predictive": {"contact_rate": predict(law, prior, batch, seed + 3)[None]},
     }, of
 
@@ -180,7 +179,7 @@ def _trust_by_numpy(
         "trust": kalman_numpy.sample(few, law.lag, batch, rng, n_bounds),
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
-        "predicted": kalman_numpy.simulate(few, law.lag, batch.awareness, rng),
+        "predicted": kalman_numpy.simulate(every, law.lag, batch.awareness, rng),
     }
 
 
@@ -207,7 +206,7 @@ def _trust_compiled(
             "trust": latent.trust_draws(law.family, law.lag, few, few_latents, batch, keys[1]),
             "trust_mean": moments.mean,
             "trust_sd": moments.sd,
-            "predicted": latent.predictive(law.family, law.lag, few, batch, keys[2]),
+            "predicted": latent.predictive(law.family, law.lag, every, batch, keys[2]),
         }
         return {name: np.asarray(array) for name, array in found.items()}
 

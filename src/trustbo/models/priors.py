@@ -18,7 +18,7 @@ from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.floored import Floored
 from trustbo.models.likelihood.families import FAMILIES
-from trustbo.models.samplers.priors_numpy import floored
+from trustbo.models.samplers.priors_numpy import floored, log_prob
 
 _SCALES = ("delta_w", "delta_v", "tau")
 
@@ -155,6 +155,20 @@ class Priors(Displayed):
     @staticmethod
     def _given(rest: Array, prior: Any) -> Distribution:
         return dist.Normal(prior.loc * rest, prior.scale * rest)
+
+    def log_density(self, name: str, values: np.ndarray, beta0: np.ndarray) -> np.ndarray:
+        """Log density of the prior of that name at values of a parameter, one for each of them.
+
+        Args:
+            name: Name of a field.
+            values: Shape (...), or (..., feature) for `beta`.
+            beta0: Autoregression (...), which priors of stationary trust go by.
+        """
+        prior = getattr(self, name)
+        if not self.stationary or name not in ("beta", "b"):
+            return log_prob(prior, values)
+        rest = 1.0 - (beta0[..., None] if name == "beta" else beta0)
+        return log_prob(prior, values / rest) - np.log(rest)
 
     @classmethod
     def zheng2023(cls) -> Self:

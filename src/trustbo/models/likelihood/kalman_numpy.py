@@ -60,6 +60,24 @@ def summarize(
     return TrustSummary(mean, np.sqrt(np.maximum(squares / n - mean**2, 0.0)), log_likelihood)
 
 
+def one_step(
+    params: Params, lag: float, batch: MissionBatch, n_bounds: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and sd of each rate given the draw and the rates of bounds before.
+
+    Args as for `summarize`. Returns arrays (draw, mission, bound, robot).
+    """
+    mean = np.full((len(params.b), *batch.contact_rate.shape), np.nan)
+    sd = mean.copy()
+    for group in _groups(params, batch, n_bounds):
+        f = _filter(group.draws, lag, group)
+        for k, (expected, variance) in enumerate(zip(f.rate_mean, f.rate_var, strict=True)):
+            mean[:, group.mission, k, group.robot] = expected.T
+            spread = np.broadcast_to(np.sqrt(variance), expected.shape)
+            sd[:, group.mission, k, group.robot] = spread.T
+    return mean, sd
+
+
 def sample(
     params: Params,
     lag: float,
@@ -138,6 +156,8 @@ class _Filtered(NamedTuple):
     mean: list[np.ndarray]  # per bound, (sequence, draw)
     var: list[np.ndarray]  # per bound, (sequence or 1, draw)
     drift: list[np.ndarray]  # per bound, (sequence, draw)
+    rate_mean: list[np.ndarray]  # of each rate given those before, (sequence, draw)
+    rate_var: list[np.ndarray]  # (sequence or 1, draw)
     log_likelihood: np.ndarray  # (sequence, draw)
 
 
@@ -187,13 +207,15 @@ def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
     h, Q, R = p.beta0 - lag, p.delta_w**2, p.delta_v**2
     m = np.broadcast_to(p.x0_mean, (len(group.mission), len(p.beta0)))
     P = np.broadcast_to(p.x0_sd**2, (group.seen.shape[1], len(p.beta0)))
-    means, variances, drifts = [], [], []
+    means, variances, drifts, expected, spreads = [], [], [], [], []
     log_likelihood = np.zeros(m.shape)
     for k, (y, z, seen) in enumerate(zip(group.y, group.z, group.seen, strict=True)):
         drift = p.drift(z, k)
         S, C = innovation(p.beta0, h, Q, R, P)
         gain = np.where(seen, C / S, 0.0)
-        e = y[:, None] - h * m - drift
+        expected.append(h * m + drift)
+        spreads.append(S)
+        e = y[:, None] - expected[-1]
         m = p.beta0 * m + drift + gain * e
         P = update(p.beta0, Q, P, gain, S)
         log_likelihood -= np.where(seen, 0.5 / S, 0.0) * e**2
@@ -201,7 +223,7 @@ def _filter(p: _Draws, lag: float, group: _Group) -> _Filtered:
         means.append(m)
         variances.append(P)
         drifts.append(drift)
-    return _Filtered(means, variances, drifts, log_likelihood)
+    return _Filtered(means, variances, drifts, expected, spreads, log_likelihood)
 
 
 def _backward(p: _Draws, lag: float, group: _Group, f: _Filtered, k: int):

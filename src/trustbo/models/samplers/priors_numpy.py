@@ -25,7 +25,7 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         a, b = (number(prior, f"concentration{i}") for i in (1, 0))
         return special.xlogy(a - 1.0, x) + special.xlog1py(b - 1.0, -x) - special.betaln(a, b)
     if isinstance(prior, dist.Normal):
-        return _normal(x, number(prior, "loc"), number(prior, "scale"))
+        return _normal(x, numbers(prior, "loc"), numbers(prior, "scale"))
     if isinstance(prior, dist.LogNormal):
         log_x = np.log(x)
         return _normal(log_x, number(prior, "loc"), number(prior, "scale")) - log_x
@@ -33,7 +33,7 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
 
 
-def _normal(x: np.ndarray, loc: float, scale: float) -> np.ndarray:
+def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:
     return -0.5 * ((x - loc) / scale) ** 2 - np.log(scale * np.sqrt(2.0 * np.pi))
 
 

@@ -1,0 +1,38 @@
+"""Log prior density of the draws of a posterior, for ArviZ's analysis of sensitivity."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from trustbo.models.model import TrustModel
+
+
+def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Log prior density of each parameter that has a prior of its own, up to a constant.
+
+    Deviations of robots from a common mean are no priors to be doubted, but part of the model: of a
+    `HierarchicalTrust` the means and spreads are here. The LKJ prior of correlations R of the
+    coupled model has density det(R)^(concentration - 1).
+
+    Args:
+        model: Trust model, its delta_v floored as it was sampled.
+        sites: Parameters of the posterior, (chain, draw, ...).
+
+    Returns:
+        Log density (chain, draw) by label.
+    """
+    terms = model.prior_terms(sites)
+    (beta0,) = (values for field, values in terms.values() if field == "beta0")
+    found = {
+        label: model.priors.log_density(field, values, beta0)
+        for label, (field, values) in terms.items()
+    }
+    for noise in ("Delta_w", "Delta_v"):
+        if noise in sites:
+            sd = np.sqrt(np.einsum("...ii->...i", sites[noise]))
+            correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
+            log_det = np.linalg.slogdet(correlation)[1]
+            found[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
+    if model.place is not None:
+        found |= model.place.log_prior(sites)
+    return {label: each.reshape(*each.shape[:2], -1).sum(-1) for label, each in found.items()}

@@ -1,0 +1,196 @@
+"""Groups of a posterior that ArviZ's functions read, against numpyro and dense normals."""
+
+from dataclasses import replace
+
+import arviz as az
+import jax
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+from numpyro import handlers
+
+import trustbo as tb
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, Priors
+from trustbo.models.backend import own_settings
+from trustbo.models.log_prior import log_prior
+
+FEATURES = ("traversability", "line_of_sight")
+
+
+def campaign(n_missions=5, seed=0):
+    rng = np.random.default_rng(seed)
+    missions = []
+    for _ in range(n_missions):
+        path = [(k, int(rng.integers(2)) + 1) for k in range(7)]
+        z = rng.uniform(size=(6, 2, 2))
+        rates = np.clip(0.2 + 0.3 * z.sum(-1) + 0.05 * rng.standard_normal((6, 2)), 0.0, 1.0)
+        rates[rng.random(rates.shape) < 0.15] = np.nan
+        missions.append(tb.Mission.from_arrays(path, z, rates, features=FEATURES))
+    return missions
+
+
+@pytest.fixture(scope="module")
+def missions():
+    return campaign()
+
+
+@pytest.fixture(scope="module")
+def posterior(missions):
+    return tb.models.fit(missions, PooledTrust())
+
+
+# --- the prior ---
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        PooledTrust(),
+        PooledTrust(place=PlaceEffect()),
+        CoupledTrust(inter_robot="none"),
+        CoupledTrust(inter_robot="ordered"),
+        CoupledTrust(),
+        HierarchicalTrust(),
+    ],
+    ids=lambda model: f"{type(model).__name__}-{getattr(model, 'inter_robot', model.place)}"[:30],
+)
+@pytest.mark.parametrize("stationary", [False, True])
+def test_log_priors_are_those_of_the_sample_statements(model, stationary):
+    """Each site's own log density in a numpyro trace; of correlations, differences of draws."""
+    features = FEATURES if stationary else ("traversability", "visibility")
+    model = replace(model.for_features(features))
+    assert model.priors.stationary == stationary
+    with own_settings():
+        traces = [
+            handlers.trace(handlers.seed(model.sample_params, jax.random.key(j))).get_trace(3, 2)
+            for j in range(2)
+        ]
+    sites = {
+        name: np.stack([np.asarray(trace[name]["value"], float) for trace in traces])[:, None]
+        for name in model.dims
+        if name not in model.place_dims
+    }
+    place = {} if model.place is None else model.place.draw(2, np.random.default_rng(0))
+    found = log_prior(model, sites | {name: values[:, None] for name, values in place.items()})
+    named = {"B0": "B0_diagonal", "B": "B_diagonal"}
+    compared = 0
+    for label, values in found.items():
+        if label.startswith("correlation"):
+            label = label.replace("correlation", "corr")
+        if label in model.place_dims:
+            continue
+        with own_settings():
+            asked = [
+                float(np.sum(np.asarray(site["fn"].log_prob(site["value"]))))
+                for site in (trace[named.get(label, label)] for trace in traces)
+            ]
+        own = values[:, 0]
+        if label.startswith("corr"):
+            # numpyro's density is of the Cholesky factor L: |dR / dL| is the product of the powers
+            # n - i of its diagonal, i = 2, ..., n.
+            n, factors = 3, [np.asarray(trace[label]["value"], float) for trace in traces]
+            asked = [
+                a - sum((n - i) * np.log(L[i - 1, i - 1]) for i in range(2, n + 1))
+                for a, L in zip(asked, factors, strict=True)
+            ]
+            asked, own = np.diff(asked), np.diff(own)
+        np.testing.assert_allclose(own, asked, rtol=1e-6, atol=1e-6)  # draws are of float32 priors
+        compared += 1
+    assert compared == len(found) - len(model.place_dims)
+    for name, values in place.items():
+        priors = {
+            "tau_s": dist.HalfNormal(0.2),
+            "tau_e": dist.HalfNormal(0.2),
+            "length_scale": dist.LogNormal(np.log(2.0), 0.5),
+        }
+        np.testing.assert_allclose(found[name][:, 0], priors[name].log_prob(values), rtol=1e-5)
+
+
+def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior):
+    """The data put the intercept at a half below; the prior says 3 +- .2."""
+    assert set(posterior["log_prior"].data_vars) == {"beta0", "beta", "b", "delta_w", "delta_v"}
+    wrong = PooledTrust(Priors(b=dist.Normal(3.0, 0.2)))
+    conflict = tb.models.fit(missions, wrong)
+    calm = PooledTrust(Priors(b=dist.Normal(0.0, 5.0)))
+    vague = tb.models.fit(missions, calm)
+    verdict, other = (
+        az.psense_summary(p, var_names=["b"], prior_var_names=["b"]) for p in (conflict, vague)
+    )
+    assert "conflict" in verdict.loc["b", "diagnosis"]
+    assert float(verdict.loc["b", "prior"]) > 0.1
+    assert "✓" in other.loc["b", "diagnosis"]
+    assert float(other.loc["b", "prior"]) < 0.02
+
+
+# --- predictions and likelihoods, rate by rate ---
+
+
+def test_the_view_by_rate_is_the_mission_s_likelihood_in_pieces(missions, posterior):
+    view = tb.models.by_rate(posterior)
+    pieces = view["log_likelihood"]["contact_rate"]
+    rates = np.concatenate([m.contact_rate[np.isfinite(m.contact_rate)] for m in missions])
+    np.testing.assert_array_equal(view["observed_data"]["contact_rate"].values, rates)
+    whole = posterior["log_likelihood"]["contact_rate"].values
+    summed = pieces.groupby("mission").sum("rate").transpose("chain", "draw", "mission")
+    np.testing.assert_allclose(summed.values, whole, rtol=0, atol=1e-10)
+    assert view["posterior_predictive"]["contact_rate"].shape == pieces.shape
+    alone = tb.models.fit(missions, PooledTrust(), whole=False)
+    again = tb.models.by_rate(alone, missions)["log_likelihood"]["contact_rate"]
+    np.testing.assert_array_equal(again.values, pieces.values)
+
+
+def test_each_rate_is_predicted_by_dense_conditioning_on_those_before(missions, posterior):
+    view = tb.models.by_rate(posterior)
+    draw = tb.models.params_of(posterior).draw(7)
+    robot, mission = 1, missions[2]
+    y = mission.contact_rate[:, robot]
+    u = mission.awareness[:, robot] @ draw.beta + draw.b
+    n = len(y)
+    # x = M + L e: trust as a linear map of x_0 and process noise
+    L = np.array([[draw.beta0 ** (k - j) if j <= k else 0.0 for j in range(n)] for k in range(n)])
+    start = draw.beta0 ** np.arange(1, n + 1)
+    mean = start * draw.x0_mean + L @ u
+    cov = np.outer(start, start) * draw.x0_sd**2 + L @ L.T * draw.delta_w**2
+    cov += np.eye(n) * draw.delta_v**2
+    seen = np.flatnonzero(np.isfinite(y))
+    expected = []
+    for i, k in enumerate(seen):
+        past = seen[:i]
+        gain = np.linalg.solve(cov[np.ix_(past, past)], cov[past, k]) if i else np.zeros(0)
+        m, v = mean[k] + gain @ (y[past] - mean[past]), cov[k, k] - gain @ cov[past, k]
+        expected.append(-0.5 * (y[k] - m) ** 2 / v - 0.5 * np.log(2.0 * np.pi * v))
+    pieces = view["log_likelihood"]["contact_rate"].stack(sample=("chain", "draw"))
+    rates = pieces.coords
+    own = (rates["mission"].values == 2) & (rates["robot"].values == "r2")
+    np.testing.assert_allclose(pieces.values[own, 7], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_predictions_by_rate_are_calibrated_under_the_model():
+    """Under the model PIT values are uniform; the mean of 60 missions' is 1/2 within 4 sd."""
+    rng, z = np.random.default_rng(0), np.random.default_rng(1).uniform(size=(60, 6, 2, 2))
+    truth = tb.models.TrustParams(0.5, np.array([0.2, 0.1]), 0.2, 0.05, 0.05)
+    with own_settings():
+        sample = PooledTrust().simulate(jax.random.key(0), truth, z)
+    path = [(k, 0) for k in range(7)]
+    rates = np.clip(sample.contact_rate, 0.0, 1.0)
+    missions = [tb.Mission.from_arrays(path, *pair) for pair in zip(z, rates, strict=True)]
+    view = tb.models.by_rate(tb.models.fit(missions, PooledTrust()))
+    drawn = view["posterior_predictive"]["contact_rate"]
+    pit = (drawn < view["observed_data"]["contact_rate"]).mean(("chain", "draw")).values
+    assert abs(pit.mean() - 0.5) < 4.0 / np.sqrt(12.0 * len(pit))
+    assert 0.07 < np.mean(pit < 0.1) + rng.uniform(0.0, 1e-9) < 0.13
+
+
+def test_every_draw_has_predictions(posterior):
+    sizes = posterior["posterior"].sizes
+    for group in ("posterior_predictive", "log_likelihood", "log_prior"):
+        assert posterior[group].sizes["draw"] == sizes["draw"]
+        assert posterior[group].sizes["chain"] == sizes["chain"]
+
+
+def test_what_has_no_single_predictions_is_named(missions):
+    counted = xr.DataTree()
+    counted.attrs = {"observation": "censored", "inter_robot": "none", "response": "level"}
+    with pytest.raises(tb.TrustboError, match='observation "censored" and inter_robot="none"'):
+        tb.models.by_rate(counted)
