@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 
 from trustbo.data import Robot
+from trustbo.parallel import PART
 from trustbo.workspace.routes import speed_share
 from trustbo.workspace.surface import Surface
 
@@ -16,6 +17,7 @@ ARRIVED = 0.5
 """Distance from its goal at which a robot stops, m."""
 _LEAST_STEPS = 5
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 _STATUS = ("ok", "stuck", "tipped", "timeout")
 
 
@@ -80,12 +82,12 @@ def drive_together(
     return np.stack(held, axis=1), status
 
 
-@_compiled
+@_part
 def _squared(route, i, x, y):
     return (route[i, 0] - x) ** 2 + (route[i, 1] - y) ** 2
 
 
-@_compiled
+@_part
 def _within_a_turn(angle):
     """Angle wrapped to [-pi, pi); a remainder is slow, and rarely needed."""
     if -math.pi <= angle < math.pi:

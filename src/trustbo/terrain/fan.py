@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import over_rows
+from trustbo.parallel import PART, over_rows
 from trustbo.terrain.rays import share_inside
 
 _NO_DATA, _LEAST_NO_DATA = 1e30, 1e20  # higher than any ray, even with a small weight
@@ -19,6 +19,9 @@ _TILE = 1024  # columns at once: their buffers stay in the fastest cache
 
 _compiled = njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}
+)
+_part = njit(
+    nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}, **PART
 )
 
 
@@ -159,7 +162,7 @@ def _openness(ground, surface, fan, numbers, result, first, last):
                 result[i, tile + j] = total[j] / count[j] if known else np.nan
 
 
-@_compiled
+@_part
 def _march(ground, surface, fan, k, numbers, i, j, n, work):
     """Metres inside the canopy, and whether the ground blocks, for the rays of n pixels."""
     eye, target, reach, crown_base = numbers[0], numbers[1], numbers[2], numbers[4]
@@ -200,7 +203,7 @@ def _march(ground, surface, fan, k, numbers, i, j, n, work):
         inside[m] *= np.sqrt(reach * reach + rise[m] * rise[m])
 
 
-@_compiled
+@_part
 def _block(g0, g1, w0, w1, t, n, z, rise, through):
     """Block the rays below the ground at a crossing."""
     for m in range(n):
@@ -208,7 +211,7 @@ def _block(g0, g1, w0, w1, t, n, z, rise, through):
         through[m] = through[m] if passes else np.float32(0.0)
 
 
-@_compiled
+@_part
 def _step(g0, g1, s0, s1, w0, w1, t, dt, crown_base, n, z, rise, inside, through, above, below):
     """Advance all rays to their next crossing."""
     for m in range(n):
@@ -222,7 +225,7 @@ def _step(g0, g1, s0, s1, w0, w1, t, dt, crown_base, n, z, rise, inside, through
         below[m] = b1
 
 
-@_compiled
+@_part
 def _add(work, n, extinction, total, count):
     """Add the rays that end on data."""
     rise, inside, through = work[1], work[2], work[3]

@@ -12,11 +12,14 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import over_rows
+from trustbo.parallel import PART, over_rows
 
 # A division that checks for 0 takes as long as the rest.
 _compiled = njit(
     cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}
+)
+_part = njit(
+    nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"}, **PART
 )
 # Passing arrays to a function, which counts references, takes as long as ten crossings.
 _inlined = njit(cache=True, inline="always", nogil=True, error_model="numpy")
@@ -74,7 +77,7 @@ def work_space():
     return np.empty((4, _CHUNK + 1))
 
 
-@_compiled
+@_part
 def _crossings(x0, dx):
     """First line that x0 + t dx meets, its t, step to the next line, its t, and number of lines."""
     if dx == 0.0:

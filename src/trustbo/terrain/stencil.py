@@ -8,12 +8,15 @@ neighbours, which are exact in float32 too. A missing height makes all its windo
 import numpy as np
 from numba import njit
 
+from trustbo.parallel import PART
+
 # Flags for vectorisation, without "nnan", which lets the compiler drop NaN; a division that checks
 # for 0 would not vectorise.
 _compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+_part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
 
 
-@_compiled
+@_part
 def _rises(up, mid, down, j):
     """Horn's (1981) eastward and southward rise, each 8 pixels' worth."""
     a, b = mid[j + 2] - mid[j], down[j + 1] - up[j + 1]
@@ -134,7 +137,7 @@ def step_height(z, pixel, out):
             out[i, j] = max(top - here, here - bottom)
 
 
-@_compiled
+@_part
 def _extremes(up, mid, down, j):
     """Highest and lowest known height; the centre first, as comparisons with NaN are false."""
     here = mid[j + 1]
@@ -148,7 +151,7 @@ def _extremes(up, mid, down, j):
     return _wider(top, bottom, down[j + 2])
 
 
-@_compiled
+@_part
 def _wider(top, bottom, v):
     return (v if v > top else top), (v if v < bottom else bottom)
 
@@ -161,7 +164,7 @@ def _missing(up, mid, down, j):
     return s - s
 
 
-@_compiled
+@_part
 def _as(z, number):
     """Number in the precision of the heights: a float64 among float32 would halve the speed."""
     return np.array([number]).astype(z.dtype)[0]

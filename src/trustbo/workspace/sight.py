@@ -8,10 +8,12 @@ from numba import njit
 
 from trustbo.data import Robot
 from trustbo.errors import TrustboError, require_choice
+from trustbo.parallel import PART
 from trustbo.terrain import rays
 from trustbo.workspace.surface import Surface
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 
 SIGHT_MODES = {"bare": rays.BARE, "wall": rays.WALL, "transmittance": rays.TRANSMITTANCE}
 
@@ -143,6 +145,6 @@ def _transmittances(ground, canopy, pixel, ends, mode, extinction, crown_base):
     return result
 
 
-@_compiled
+@_part
 def _inward(x, n):
     return min(max(x, 0.0), n - 1.0) if -0.5 <= x <= n - 0.5 else x

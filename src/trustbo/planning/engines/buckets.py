@@ -23,9 +23,10 @@ from collections.abc import Callable
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import over_rows
+from trustbo.parallel import PART, over_rows
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 _MAX_BUCKETS = 1 << 16
 _MAX_SCANS = 4  # of each cell, on average, before the heap takes over
 _SETTLED = -2
@@ -129,7 +130,7 @@ def _settle_draws(costs, length_cost, steps, cols, start, goal, totals, n_cells,
         n_cells[d] = _trace(distance, by, offset, width, cols, a, b, paths[d])
 
 
-@_compiled
+@_part
 def _usual(cost):
     """Median cost of evenly spaced cells; 0 if none of them can be entered."""
     step = len(cost) // 23 + 1
@@ -138,7 +139,7 @@ def _usual(cost):
     return np.median(some) if len(some) > 0 else 0.0
 
 
-@_compiled
+@_part
 def _settle(
     cost, plane, length_cost, offset, start, goal, delta, largest, distance, by, previous, following
 ):
@@ -194,7 +195,7 @@ def _settle(
     return True
 
 
-@_compiled
+@_part
 def _remove(c, bucket, heads, tails, previous, following):
     """Remove a cell from its bucket."""
     if previous[c] >= 0:
@@ -207,7 +208,7 @@ def _remove(c, bucket, heads, tails, previous, following):
         tails[bucket] = previous[c]
 
 
-@_compiled
+@_part
 def _settle_by_heap(cost, plane, length_cost, offset, start, goal, distance, by):
     """Compute distances up to that of the goal with a binary heap."""
     distance[:] = np.inf
@@ -227,7 +228,7 @@ def _settle_by_heap(cost, plane, length_cost, offset, start, goal, distance, by)
                 heapq.heappush(queue, (reach, np.int64(other)))
 
 
-@_compiled
+@_part
 def _trace(distance, by, offset, width, cols, start, goal, path):
     """Write down the path if it fits; return its number of cells, 0 without a path."""
     if not distance[goal] < np.inf:

@@ -37,10 +37,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from trustbo.parallel import PART
 from trustbo.planning.engines.contact_loss import expected_loss, least_slope
 from trustbo.planning.engines.layers import Layers
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 SOFTPLUS, LEAST, NONE = range(2, 5)
 """Losses beside those of `contact_loss`: -log sigma(x); the largest -x; and none."""
 PRICES = 12
@@ -104,10 +106,10 @@ class _ToGo(NamedTuple):
 def safest_to_go(layers: Layers, of_bounds: np.ndarray, bound: np.ndarray) -> np.ndarray:
     """Least sum of each risk (bound, resource) from each node to the goal, (node, resource)."""
     n_nodes, n_risks = len(layers.cell), of_bounds.shape[1]
-    safest = np.full((n_nodes, n_risks), np.inf)
+    safest = np.empty((n_nodes, n_risks))
     for node in range(n_nodes):
-        if layers.left[node] == 0:
-            safest[node] = 0.0
+        for k in range(n_risks):
+            safest[node, k] = 0.0 if layers.left[node] == 0 else np.inf
         for e in range(layers.first[node], layers.first[node + 1]):
             h, b = layers.head[e], bound[e]
             for k in range(n_risks):
@@ -143,28 +145,29 @@ def best_within(
     return Best(known.path, known.cost, known.cost if proven else root)
 
 
-@_compiled
+@_part
 def _any_start(layers, bounds, risk):
     """Whether the safest path, resource by resource, could be feasible."""
+    nothing = np.zeros(len(risk.limits))
     for length in range(len(layers.starts)):
         node = layers.starts[length]
         if node >= 0 and bounds.start_cost[length] < np.inf:
-            if _can_be_feasible(risk, risk.safest[node], 0, risk.safest[node] * 0.0, 0):
+            if _can_be_feasible(risk, nothing, node):
                 return True
     return False
 
 
-@_compiled
-def _can_be_feasible(risk, safest, bound, so_far, step):
-    """Whether enough risks can stay within their limits; `step` 1 adds those of a bound."""
+@_part
+def _can_be_feasible(risk, so_far, node):
+    """Whether enough risks, summed up to a node, can stay within their limits."""
     within = 0
     for k in range(len(risk.limits)):
-        if so_far[k] + step * risk.of_bounds[bound, k] + safest[k] <= risk.limits[k]:
+        if so_far[k] + risk.safest[node, k] <= risk.limits[k]:
             within += 1
     return within >= risk.needed
 
 
-@_compiled
+@_part
 def _loss(law, x, sd):
     if law == NONE:
         return 0.0
@@ -175,7 +178,7 @@ def _loss(law, x, sd):
     return expected_loss(law, x, sd)
 
 
-@_compiled
+@_part
 def _slope(law, lo, hi, sd):
     """Least fall of the loss with trust, between lo and hi."""
     if law == NONE or law == LEAST:
@@ -185,12 +188,12 @@ def _slope(law, lo, hi, sd):
     return least_slope(law, lo, hi, sd)
 
 
-@_compiled
+@_part
 def _joined(law, loss, to_come):
     return max(loss, to_come) if law == LEAST else loss + to_come
 
 
-@_compiled
+@_part
 def _look_ahead(layers, bounds):
     """Trust at the nodes, from the start on, then what its lack costs, from the goal on."""
     n_nodes, n_edges, law = len(layers.cell), len(layers.head), bounds.law
@@ -223,7 +226,7 @@ def _look_ahead(layers, bounds):
     return _Ahead(hi, slope, after, loss)
 
 
-@_compiled
+@_part
 def _pass_back(layers, law, ahead, price):
     """Compute the least cost to go of every node at a price, in the order of the bounds left."""
     n_nodes = len(layers.cell)
@@ -250,7 +253,7 @@ def _pass_back(layers, law, ahead, price):
     return to_go
 
 
-@_compiled
+@_part
 def _to_come(layers, to_go, node, move):
     """Least cost after a node that was entered by a move, from the largest trust."""
     if layers.u_turns or to_go.by[node] != layers.n_moves - 1 - move:
@@ -258,7 +261,7 @@ def _to_come(layers, to_go, node, move):
     return to_go.second[node]
 
 
-@_compiled
+@_part
 def _prices(bounds, risk, on_priced, on_first):
     """Tolls of edges with prices on the priced risk and on that of the first resource."""
     price = bounds.toll.copy()
@@ -268,7 +271,7 @@ def _prices(bounds, risk, on_priced, on_first):
     return price
 
 
-@_compiled
+@_part
 def _root(layers, bounds, to_go):
     """Start node from which the cost to go is least, and that cost."""
     least, at = np.inf, -1
@@ -279,7 +282,7 @@ def _root(layers, bounds, to_go):
     return least, at
 
 
-@_compiled
+@_part
 def _follow(layers, bounds, risk, ahead, to_go, node, cost, path):
     """Follow the best edges to go; write down the path. Return its cost, risks and priced risk."""
     law, x, came = bounds.law, bounds.x0, -1
@@ -303,18 +306,19 @@ def _follow(layers, bounds, risk, ahead, to_go, node, cost, path):
             return np.inf, total, priced, 0
         x, came, node = reached, layers.move[chosen], layers.head[chosen]
         cost = _joined(law, cost, _loss(law, x, bounds.noise_sd)) + bounds.toll[chosen]
-        total += risk.of_bounds[risk.bound[chosen]]
+        for i in range(len(total)):
+            total[i] += risk.of_bounds[risk.bound[chosen], i]
         priced += risk.priced[risk.bound[chosen]]
         path[k + 1] = layers.cell[node]
     return cost, total, priced, n + 1
 
 
-@_compiled
+@_part
 def _failure(risk, total):
     return -risk.failure_cost * math.expm1(-total) if risk.failure_cost > 0.0 else 0.0
 
 
-@_compiled
+@_part
 def _lagrangian(layers, bounds, risk, ahead, best):
     """Try prices of risk: the best path known, costs to go at price 0 and at the best price.
 
@@ -360,7 +364,7 @@ def _lagrangian(layers, bounds, risk, ahead, best):
     return known, cheap, priced, offset, root
 
 
-@_compiled
+@_part
 def _tried(layers, bounds, risk, ahead, to_go, start, known, path):
     """Try the path of some costs to go: the best path known; its cost, risks and if feasible."""
     cost = 0.0
@@ -370,14 +374,14 @@ def _tried(layers, bounds, risk, ahead, to_go, start, known, path):
     cost, total, priced, n = _follow(layers, bounds, risk, ahead, to_go, start, cost, path)
     if n == 0:
         return known, np.inf, np.inf, np.inf, False
-    feasible = _can_be_feasible(risk, total, 0, total * 0.0, 0)
+    feasible = _can_be_feasible(risk, total, 0)  # at the goal
     whole = cost + _failure(risk, total[0])
     if feasible and whole < known.cost:
         known = Best(path[:n].copy(), whole, whole)
     return known, cost, total[0], priced, feasible
 
 
-@_compiled
+@_part
 def _dual(layers, bounds, risk, ahead, known, mu, base, priced, offset, root, path):
     """Maximise the Lagrangian bound over the price of the limited risk; and see its paths.
 
@@ -410,7 +414,7 @@ def _dual(layers, bounds, risk, ahead, known, mu, base, priced, offset, root, pa
     return known, priced, offset, root
 
 
-@_compiled
+@_part
 def next_price(
     price: float,
     excess: float,
@@ -438,20 +442,21 @@ class _Labels(NamedTuple):
     risk: np.ndarray  # (label, resource)
 
 
-@_compiled
+@_part
 def _search(layers, bounds, risk, ahead, cheap, priced, offset, best, max_labels):
     """Find a path that costs less than `best`, empty if none; its cost, and if all was seen."""
     n_risks, law = len(risk.limits), bounds.law
-    labels = _Labels(np.empty((256, 4), np.int64), np.empty((256, 3)), np.empty((256, n_risks)))
+    labels = _Labels(np.empty((256, 4), np.int64), np.empty((256, 3)), np.zeros((256, n_risks)))
     heads = np.full(len(layers.cell), -1, np.int64)
-    n, found = 0, -1
+    n, found = np.int64(0), np.int64(-1)  # not literals, for which callees are compiled again
     for length in range(len(layers.starts)):
         node = layers.starts[length]
         if node >= 0 and bounds.start_cost[length] < np.inf:
             first = -np.inf if law == LEAST else bounds.start_cost[length]
-            labels.link[n], heads[node] = (node, -1, -1, -1), n
-            labels.state[n] = (first, bounds.x0, 0.0)
-            labels.risk[n] = 0.0
+            link, state = labels.link[n], labels.state[n]
+            link[0], link[1], link[2], link[3] = node, -1, -1, -1
+            state[0], state[1], state[2] = first, bounds.x0, 0.0
+            heads[node] = n
             n += 1
     of_risk = priced.price - bounds.toll
     for node in range(len(heads) - 1, -1, -1):
@@ -478,7 +483,7 @@ def _search(layers, bounds, risk, ahead, cheap, priced, offset, best, max_labels
     return _path_of(layers, labels, found), best, True
 
 
-@_compiled
+@_part
 def _extend(
     layers, bounds, risk, ahead, cheap, priced, of_risk, offset, best, label, labels, heads, n
 ):
@@ -489,30 +494,29 @@ def _extend(
         h, m, b = layers.head[e], layers.move[e], risk.bound[e]
         if not layers.u_turns and came >= 0 and m == layers.n_moves - 1 - came:
             continue
-        if not _can_be_feasible(risk, risk.safest[h], b, labels.risk[label], 1):
+        for k in range(len(risk.limits)):
+            labels.risk[n, k] = labels.risk[label, k] + risk.of_bounds[b, k]
+        if not _can_be_feasible(risk, labels.risk[n], h):
             continue
         after = bounds.beta0 * x + bounds.drift[e]
         now = _joined(law, cost, _loss(law, after, bounds.noise_sd)) + bounds.toll[e]
         lack = ahead.slope[h] * (ahead.hi[h] - after)
-        first = labels.risk[label, 0] + risk.of_bounds[b, 0]
         least = _joined(law, now, _to_come(layers, cheap, h, m) + lack)
-        if least + _failure(risk, first + risk.safest[h, 0]) >= best:
+        if least + _failure(risk, labels.risk[n, 0] + risk.safest[h, 0]) >= best:
             continue
         paid = so_far + of_risk[e]
         least = _joined(law, now, _to_come(layers, priced, h, m) + lack)
         if least + paid + offset >= best:
             continue
-        link = labels.link[n]
+        link, state = labels.link[n], labels.state[n]
         link[0], link[1], link[2], link[3] = h, m, label, heads[h]
-        labels.state[n] = (now, after, paid)
-        for k in range(len(risk.limits)):
-            labels.risk[n, k] = labels.risk[label, k] + risk.of_bounds[b, k]
+        state[0], state[1], state[2] = now, after, paid
         heads[h] = n
         n += 1
     return n
 
 
-@_compiled
+@_part
 def _is_dominated(layers, risk, labels, other, label, law):
     """True if labels of the same node have all the completions of one, at no higher cost."""
     came, by = labels.link[label, 1], -1
@@ -530,7 +534,7 @@ def _is_dominated(layers, risk, labels, other, label, law):
     return False
 
 
-@_compiled
+@_part
 def _covers(risk, labels, a, b, node, law):
     """2 if label a is better than b, 1 if it is equal, in all that matters; else 0."""
     cost_a, x_a, _ = labels.state[a]
@@ -551,7 +555,7 @@ def _covers(risk, labels, a, b, node, law):
     return 1 if equal else 2
 
 
-@_compiled
+@_part
 def _path_of(layers, labels, label):
     """Cells of the path of a label; none for label -1."""
     n, at = 0, label

@@ -19,9 +19,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from trustbo.parallel import PART
 from trustbo.planning.engines.constrained import PRICES, Best, next_price
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 
 
 class Network(NamedTuple):
@@ -74,7 +76,7 @@ def best_within(network: Network, max_labels: int) -> Best:
     return _search(network, cheap, priced, price, root, known, max_labels)
 
 
-@_compiled
+@_part
 def _dual(network):
     """Maximise the Lagrangian bound over the price of risk, see `constrained`.
 
@@ -106,14 +108,14 @@ def _dual(network):
     return known, cheap, priced, best_price, root
 
 
-@_compiled
+@_part
 def _to_go(network, price):
     """Least cost with a price on risk from each cell to the goal, (cell,)."""
     tolls = network.cost + price * network.priced
     return least_to_goal(network.neighbours, tolls.reshape(-1, 1), network.goal)[:, 0]
 
 
-@_compiled
+@_part
 def _follow(network, to_go, price):
     """Follow the least costs to go: the path, its cost, priced risk, and if it is feasible."""
     n_cells, n_moves = network.neighbours.shape
@@ -135,22 +137,23 @@ def _follow(network, to_go, price):
         cell = network.neighbours[cell, chosen]
         b = chosen * n_cells + cell
         cost, used = cost + network.cost[b], used + network.priced[b]
-        total += network.of_bounds[b]
+        for k in range(len(total)):
+            total[k] += network.of_bounds[b, k]
         path[n] = cell
         n += 1
     feasible = cell == network.goal and (total <= network.limits).sum() >= network.needed
     return path[:n].copy(), cost, used, feasible
 
 
-@_compiled
+@_part
 def _search(network, cheap, priced, price, root, known, max_labels):
     """Find the best path by labels, or return the best one known with the least estimate left."""
     link = np.empty((256, 3), np.int64)  # cell, parent, next of the cell
-    state = np.empty((256, 2))  # cost, priced risk
-    risks = np.empty((256, len(network.limits)))
+    state = np.zeros((256, 2))  # cost, priced risk
+    risks = np.zeros((256, len(network.limits)))
     heads = np.full(len(network.neighbours), -1, np.int64)
-    link[0], state[0], risks[0] = (network.start, -1, -1), (0.0, 0.0), 0.0
-    n, queue = 1, [(root, np.int64(0))]
+    link[0, 0], link[0, 1], link[0, 2] = network.start, -1, -1
+    n, queue = np.int64(1), [(root, np.int64(0))]  # no literal, for which callees are compiled
     while queue:
         estimate, label = heapq.heappop(queue)
         cell = link[label, 0]
@@ -174,7 +177,7 @@ def _search(network, cheap, priced, price, root, known, max_labels):
     return Best(known.path, known.cost, known.cost)
 
 
-@_compiled
+@_part
 def _extend(network, cheap, priced, price, link, state, risks, label, move, n):
     """Write down label n, one more bound; the estimate of its cost, inf if there is no path on."""
     other = network.neighbours[link[label, 0], move]
@@ -193,7 +196,7 @@ def _extend(network, cheap, priced, price, link, state, risks, label, move, n):
     return max(cost + cheap[other], cost + paid + priced[other])
 
 
-@_compiled
+@_part
 def _is_dominated(network, link, state, risks, other, label):
     """True if an expanded label of the cell costs no more and keeps every limit as well."""
     cell = link[label, 0]
@@ -210,7 +213,7 @@ def _is_dominated(network, link, state, risks, other, label):
     return False
 
 
-@_compiled
+@_part
 def _path_of(link, label):
     n, at = 0, label
     while at >= 0:

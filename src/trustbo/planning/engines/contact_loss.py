@@ -32,10 +32,11 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import over_rows
+from trustbo.parallel import PART, over_rows
 from trustbo.planning.engines.layers import Layers
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 LOGISTIC, CLIPPED = range(2)
 LAWS = {"logistic": LOGISTIC, "clipped": CLIPPED}
 """Expected rates that are not linear in trust; see `Family.expected_rate`."""
@@ -74,7 +75,7 @@ def least_loss(
     return losses, paths
 
 
-@_compiled
+@_part
 def expected_loss(law: int, x: float, sd: float) -> float:
     """1 - E[rate] of a bound with trust x: `Family.rate_moments`, one number at a time."""
     if law == LOGISTIC:
@@ -85,7 +86,7 @@ def expected_loss(law: int, x: float, sd: float) -> float:
     return 1.0 - mean
 
 
-@_compiled
+@_part
 def least_slope(law: int, lo: float, hi: float, sd: float) -> float:
     """Least fall of the expected loss with trust, between lo and hi."""
     middle = 0.0 if law == LOGISTIC else 0.5
@@ -96,12 +97,12 @@ def least_slope(law: int, lo: float, hi: float, sd: float) -> float:
     return max(0.0, 1.0 - _normal_cdf(-x / sd) - _normal_cdf((x - 1.0) / sd))
 
 
-@_compiled
+@_part
 def _normal_cdf(z):
     return 0.5 * math.erfc(-z * math.sqrt(0.5))
 
 
-@_compiled
+@_part
 def _normal_pdf(z):
     return math.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
 
@@ -128,17 +129,17 @@ def _least_losses(layers, drift, beta0, x0, noise_sd, length_cost, law, max_labe
             _write_path(layers, labels, found, paths[d])
 
 
-@_compiled
+@_part
 def _search(layers, u, beta0, x0, hi, W, t, length_cost, law, sd, best, max_labels, heads):
     """Find a path that loses less than `best`: all labels, its last label or -1, and its loss."""
     # Of a label: node, move by which it came, parent, next label of the node; trust and loss.
     labels, state = np.empty((512, 4), np.int64), np.empty((512, 2))
     heads[:] = -1
-    n, found = 0, -1
+    n, found = np.int64(0), np.int64(-1)  # not literals, for which callees are compiled again
     for start in layers.starts:
         if start >= 0:
-            labels[n], heads[start] = (start, -1, -1, -1), n
-            state[n] = (x0, 0.0)
+            labels[n, 0], labels[n, 1], labels[n, 2], labels[n, 3] = start, -1, -1, -1
+            state[n, 0], state[n, 1], heads[start] = x0, 0.0, n
             n += 1
     for node in range(len(heads) - 1, -1, -1):
         label = heads[node]
@@ -159,7 +160,7 @@ def _search(layers, u, beta0, x0, hi, W, t, length_cost, law, sd, best, max_labe
     return labels, found, best
 
 
-@_compiled
+@_part
 def _extend(layers, u, beta0, hi, W, t, length_cost, law, sd, best, label, labels, state, heads, n):
     """Add the labels of one more bound that may lead to less than `best`; their number so far."""
     node, came, x, loss = labels[label, 0], labels[label, 1], state[label, 0], state[label, 1]
@@ -178,7 +179,7 @@ def _extend(layers, u, beta0, hi, W, t, length_cost, law, sd, best, label, label
     return n
 
 
-@_compiled
+@_part
 def _write_path(layers, labels, label, path):
     """Write down the path of a label at the goal."""
     k, first = 0, label
@@ -190,7 +191,7 @@ def _write_path(layers, labels, label, path):
         label = labels[label, 2]
 
 
-@_compiled
+@_part
 def _ranges(layers, u, beta0, x0, hi, lo):
     """Compute the largest and least trust with which each node can be entered."""
     hi[:], lo[:] = -np.inf, np.inf
@@ -205,7 +206,7 @@ def _ranges(layers, u, beta0, x0, hi, lo):
             lo[h] = min(lo[h], beta0 * lo[node] + step)
 
 
-@_compiled
+@_part
 def _bounds(layers, u, beta0, hi, lo, length_cost, law, sd, W, t):
     """Compute W and t of each node, from the goal on."""
     for node in range(len(hi)):
@@ -223,7 +224,7 @@ def _bounds(layers, u, beta0, hi, lo, length_cost, law, sd, W, t):
         t[node] = least_slope(law, lo[node], hi[node], sd) + s
 
 
-@_compiled
+@_part
 def _follow_bound(layers, u, beta0, x, hi, W, t, length_cost, law, sd, node, best, path):
     """Follow the bound's best edges; write the path down if it loses less than `best`."""
     start, loss, came, n = node, 0.0, -1, layers.left[node]
@@ -250,7 +251,7 @@ def _follow_bound(layers, u, beta0, x, hi, W, t, length_cost, law, sd, node, bes
     return loss
 
 
-@_compiled
+@_part
 def _is_dominated(labels, state, other, label, u_turns):
     """True if labels of the same node have all the completions of one, at no higher loss."""
     x, loss, came = state[label, 0], state[label, 1], labels[label, 1]

@@ -30,11 +30,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from trustbo.parallel import PART
 from trustbo.planning.engines.contact_loss import CLIPPED, LOGISTIC, expected_loss
 from trustbo.planning.engines.dominance import Heuristic
 from trustbo.planning.objectives import Objective
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_part = njit(nogil=True, error_model="numpy", **PART)
 SUCCESS, BOTTLENECK, LOGISTIC_LOSS, CLIPPED_LOSS, TERMINAL, MEAN = range(6)
 _LOSSES = {"identity": MEAN, "logistic": LOGISTIC_LOSS, "clipped": CLIPPED_LOSS}
 _MODES = {"success": SUCCESS, "bottleneck": BOTTLENECK, "terminal": TERMINAL, "mean": MEAN}
@@ -165,7 +167,7 @@ def _search(problem, tolerance, max_labels):
     return np.empty(0, np.int64), np.inf, least_dropped, True
 
 
-@_compiled
+@_part
 def _is_open(problem, seen, move, by, n_bounds, other):
     """Whether a move, after the move `by`, may enter a cell as bound number `n_bounds`."""
     if other < 0 or (
@@ -180,7 +182,7 @@ def _is_open(problem, seen, move, by, n_bounds, other):
     return problem.revisit or not seen[other // 64] >> np.uint64(other % 64) & np.uint64(1)
 
 
-@_compiled
+@_part
 def _spend(risk, tested, label, parent, bound, cell):
     """Write down a label's risks after a bound; whether enough can stay within their limits."""
     n_risks, within = len(risk.limits), 0
@@ -192,7 +194,7 @@ def _spend(risk, tested, label, parent, bound, cell):
     return within >= risk.needed
 
 
-@_compiled
+@_part
 def _add_cost(mode, cost, trust, length_cost, noise_sd):
     """Cost of a label after one more bound."""
     if mode == LOGISTIC_LOSS:
@@ -206,7 +208,7 @@ def _add_cost(mode, cost, trust, length_cost, noise_sd):
     return cost + length_cost - (trust if mode == MEAN else 0.0)
 
 
-@_compiled
+@_part
 def _estimate(mode, heuristic, x, cost, cell, left, noise_sd):
     """Lower bound on the cost of a label's completions."""
     if mode == TERMINAL:
@@ -219,7 +221,7 @@ def _estimate(mode, heuristic, x, cost, cell, left, noise_sd):
     return cost
 
 
-@_compiled
+@_part
 def _max_trust(heuristic, x, j, cell):
     """Upper bound on the team's trust after j more bounds."""
     powers, gains = heuristic.powers, heuristic.gains
@@ -232,7 +234,7 @@ def _max_trust(heuristic, x, j, cell):
     return least
 
 
-@_compiled
+@_part
 def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
     """1 if an expanded label dominates, 2 if one does up to the tolerance, 0 if none does."""
     verdict = 0
@@ -254,12 +256,12 @@ def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
     return verdict
 
 
-@_compiled
+@_part
 def _softplus(x):
     return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
 
 
-@_compiled
+@_part
 def _path_of(labels, label):
     n = labels[label, 1] + 1
     path = np.empty(n, np.int64)
