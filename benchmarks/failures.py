@@ -1,50 +1,47 @@
-"""Failures: reliability of the chance to arrive, Brier skill, and arrivals of campaigns.
+"""Failures: the table of docs/failures.md, in Markdown.
 
-    python benchmarks/failures.py --data ../shared/data [quick] [--worlds synthetic-0:14:4 ...]
+    python benchmarks/failures.py --data ../shared/data --out out/failures
 
-Kinematic worlds with tight slope limits, named ground:limit:excess. The assumed limit is the true
-one plus the excess, in degrees: 0, geometry knows all that it can; above, ways lead over ground
-that stops robots. Random missions are drawn from all admissible paths of the first course.
+Worlds with tight slope limits, named ground:limit:excess. The assumed limit is the true one plus
+the excess, in degrees: 0, geometry knows all that it can; above, ways lead over ground that stops
+robots; `aged`, the limit is right and the DEM an old one. Each part of a world is kept in a file of
+its own in --out; called again, it goes on where it stopped. --csv writes the bins of reliability.
 """
 
 import argparse
+import json
 import time
 import warnings
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from scipy import sparse
 
 import trustbo as tb
 from trustbo.models import CAUSES, BoundRisk, fit_hazard
 from trustbo.planning.path_sampling import path_sampler
-from trustbo.simulation import KinematicSimulator
+from trustbo.simulation import KinematicSimulator, MujocoSimulator, Truth
 from trustbo.study.world import COURSES, World
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.moves import bounds_along
 
-WORLDS = [
-    f"{ground}:{limit}:{excess}"
-    for ground, limit in (
-        ("topography", 18),
-        ("tahoe", 18),
-        ("synthetic-0", 14),
-        ("wellington", 38),
-    )
-    for excess in (0, 4, 8)
-]
+GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
+WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 4, 8)]
 LEAST = 100
 """Missions in a bin of predicted chances from which on its reliability counts."""
+SAFE = 0.9
+"""Share of missions that arrive on a safe path."""
+LIMITS = (0.05, 0.1, 0.2)
 
 
-def team_of(limit):
-    robot = tb.Robot(max_slope=float(np.deg2rad(limit)))
-    return tb.Team(robots=(robot,) * 3, lead=robot)
-
-
-def world_of(name, data):
+def world_of(name, data, simulate=KinematicSimulator):
     """World with the assumed slope limit, and the simulator of the true one."""
     ground, limit, excess = name.split(":")
-    world = World(name, "slopes", ground, max_slope=float(limit) + float(excess), data=data)
-    workspace = world.workspace()
-    return world, KinematicSimulator(workspace, team=team_of(float(limit)))
+    kind, more = ("aged", 0.0) if excess == "aged" else ("slopes", float(excess))
+    world = World(name, kind, ground, max_slope=float(limit) + more, data=data)
+    robot = tb.Robot(max_slope=float(np.deg2rad(float(limit))))
+    team = tb.Team(robots=(robot,) * 3, lead=robot)
+    return world, simulate(world.workspace(), terrain=world.true_terrain(), team=team)
 
 
 def random_missions(workspace, simulator, ends, n, seed):
@@ -56,120 +53,232 @@ def random_missions(workspace, simulator, ends, n, seed):
 
 def outcomes(missions):
     """Bounds that were begun, (bound, 3), whether each failed, and whether missions arrived."""
-    rows, failed = [], []
-    for mission in missions:
-        path = mission.path[: len(mission.bounds) + 1]
-        rows.append(np.column_stack([moves_along(path), np.array(path)[1:]]))
-        failed += [bound.status in CAUSES for bound in mission.bounds]
+    rows = [bounds_along(np.array(m.path[: len(m.bounds) + 1])) for m in missions]
+    failed = [bound.status in CAUSES for mission in missions for bound in mission.bounds]
     arrived = np.array([mission.status == "ok" for mission in missions])
     return np.concatenate(rows), np.array(failed), arrived
 
 
-def p_arrive(risk, missions, n_draws=500):
-    chances = risk.draw(n_draws, seed=1)
-    paths = [np.column_stack([moves_along(m.path), np.array(m.path)[1:]]) for m in missions]
-    return np.array([(1.0 - chances[:, *path.T]).prod(1).mean() for path in paths])
+def p_arrive(p_fail, missions):
+    """Chance to arrive over each mission's path, (..., mission), of chances (..., 8, row, col)."""
+    shape = p_fail.shape[-3:]
+    paths = [bounds_along(np.array(mission.path)) for mission in missions]
+    flat = np.concatenate([np.ravel_multi_index(tuple(path.T), shape) for path in paths])
+    row = np.repeat(np.arange(len(paths)), [len(path) for path in paths])
+    met = sparse.csr_matrix((np.ones(len(row)), (row, flat)), (len(paths), int(np.prod(shape))))
+    log = np.log1p(-np.minimum(np.nan_to_num(p_fail), 1.0 - 1e-12)).reshape(-1, np.prod(shape))
+    return np.exp(met @ log.T).T.reshape(*p_fail.shape[:-3], -1)
 
 
 def skill(predicted, happened):
-    """Brier skill over the rate of the missions that are judged."""
+    """Brier skill over the rate of what is judged."""
     base = np.mean((happened - happened.mean()) ** 2)
-    return 1.0 - np.mean((happened - predicted) ** 2) / base if base > 0.0 else np.nan
+    return float(1.0 - np.mean((happened - predicted) ** 2) / base) if base > 0.0 else np.nan
 
 
-def reliability(predicted, arrived):
-    """Rows (bin, missions, predicted, arrived) and the largest error of a bin that counts."""
-    rows, worst = [], 0.0
-    which = np.minimum((10 * predicted).astype(int), 9)
-    for b in range(10):
-        own = which == b
-        if own.any():
-            rows.append((b, int(own.sum()), predicted[own].mean(), arrived[own].mean()))
-            if own.sum() >= LEAST:
-                worst = max(worst, abs(rows[-1][2] - rows[-1][3]))
-    return rows, worst
+def learn(world, simulator, given):
+    """Random missions: skill by bound, and reliability by bin, after 15 and 60 of them."""
+    workspace, found = simulator.workspace, {"failed": [], "15": [], "60": [], "bins": {}}
+    n_unseen, n_sets = given.unseen // len(given.courses), 1 if given.quick else 3
+    bins = {n: np.zeros((2, 10, 3)) for n in (15, 60)}  # (mean of draws or chances, bin, sum)
+    for c, course in enumerate(given.courses):
+        ends = world.ends(course)
+        unseen = random_missions(workspace, simulator, ends, n_unseen, seed=1000 + c)
+        bounds, failed, arrived = outcomes(unseen)
+        found["failed"].append(1.0 - float(arrived.mean()))
+        for j in range(n_sets):
+            seen = random_missions(workspace, simulator, ends, 60, seed=100 * c + j)
+            for n in (15, 60):
+                risk = BoundRisk.of(fit_hazard(seen[:n], workspace), workspace)
+                found[str(n)].append((c, skill(risk.mean[*bounds.T], failed)))
+                drawn = p_arrive(risk.draw(200, seed=1), unseen).mean(0)
+                for i, chance in enumerate((drawn, p_arrive(risk.mean, unseen))):
+                    which = np.minimum((10.0 * chance).astype(int), 9)
+                    for k, values in enumerate((np.ones(n_unseen), chance, arrived)):
+                        bins[n][i, :, k] += np.bincount(which, values, minlength=10) / n_sets
+    return found | {"bins": {str(n): bins[n].tolist() for n in bins}}
 
 
-def learn(name, world, simulator, n_unseen):
-    """Brier skill after 15 and 60 missions, and reliability after 15."""
-    workspace, ends = simulator.workspace, world.ends(COURSES[0])
-    unseen = random_missions(workspace, simulator, ends, n_unseen, seed=0)
-    bounds, failed, arrived = outcomes(unseen)
-    seen, row, shown = random_missions(workspace, simulator, ends, 60, seed=1), [], None
-    for n in (0, 15, 60):
-        group = fit_hazard(seen[:n], workspace)
-        risk = BoundRisk.of(group, workspace)
-        chance = p_arrive(risk, unseen)
-        rows, worst = reliability(chance, arrived)
-        shown = rows if n == 15 else shown
-        by_bound = skill(risk.mean[*bounds.T], failed)
-        row += [by_bound, skill(chance, arrived), worst, group.attrs["seconds"]]
-    cells = " | ".join(f"{value:.2f}" for value in row)
-    print(f"| {name} | {1.0 - arrived.mean():.2f} | {failed.mean():.3f} | {cells} |", flush=True)
-    return shown
+def safe_paths(world, simulator, given):
+    """Share of 100 missions that arrive on the safest path, by course and by its class."""
+    truth, found = Truth.of(simulator, standard_error=0.02), {}
+    data = truth.bounds.data
+    fails = np.clip(1.0 - data["outcome"].sel(status="ok").values, 0.0, 1.0 - 1e-9)
+    # The best path by this contact has the least sum of -log(1 - p).
+    contact = np.broadcast_to(1.0 + np.log1p(-fails), data["contact"].shape)
+    table = replace(truth.bounds, data=data.assign(contact=data["contact"].copy(data=contact)))
+    for course in given.courses:
+        ends, shares = world.ends(course), []
+        for most in ("shortest+4", "shortest+12"):
+            planner = tb.planning.Planner(simulator.workspace, *ends, max_bounds=most)
+            path = table.best(planner.paths, "lost_contact")
+            runs = [simulator.run(path, seed=seed) for seed in range(100)]
+            shares.append(float(np.mean([run.status == "ok" for run in runs])))
+        found[course] = shares
+    return found
 
 
-def campaigns(name, world, simulator, courses, n_missions, options):
-    """Share of missions that arrive, and of later plans over a bound that stopped a robot."""
-    workspace, arrived, again, seconds = simulator.workspace, [], [], []
-    for course in courses:
-        stopped, ok = set(), []
-        campaign = tb.Campaign(workspace, *world.ends(course), sampler="exact", **options)
-        for _ in range(n_missions):
-            plan = campaign.ask()
-            bounds = set(zip(plan.path[:-1], plan.path[1:], strict=True))
-            if stopped:
-                again.append(bool(bounds & stopped))
-            mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
-            campaign.tell(mission, again=True)
-            seconds.append(campaign.hazard.attrs["seconds"])
-            ok.append(mission.status == "ok")
-            if not ok[-1]:
-                k = len(mission.bounds)
-                stopped.add((plan.path[k - 1], plan.path[k]))
-        arrived.append(ok)
-    ok = np.array(arrived)
-    entered = f"{np.mean(again):.2f}" if again else "none stopped"
-    share = " | ".join(f"{part.mean():.2f}" for part in (ok[:, :3], ok, ok[:, -5:]))
-    print(f"| {name} | {share} | {entered} | {np.max(seconds):.2f} |", flush=True)
+def one_campaign(world, simulator, course, n_missions, options, n_after=0):
+    """Outcomes of a campaign, of its later plans, and of runs of its next plan."""
+    campaign = tb.Campaign(
+        simulator.workspace, *world.ends(course), sampler="exact", **options
+    )  # fmt: skip
+    ok, again, stopped, seconds = [], [], set(), []
+    for _ in range(n_missions):
+        plan = campaign.ask()
+        bounds = set(zip(plan.path[:-1], plan.path[1:], strict=True))
+        if stopped:
+            again.append(bool(bounds & stopped))
+        mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
+        campaign.tell(mission, again=True)
+        seconds.append(campaign.hazard.attrs["seconds"])
+        ok.append(mission.status == "ok")
+        if not ok[-1]:
+            k = len(mission.bounds)
+            stopped.add((plan.path[k - 1], plan.path[k]))
+    found = {"ok": ok, "again": again, "seconds": max(seconds)}
+    if n_after:
+        plan = campaign.ask()
+        runs = [simulator.run(plan.path, seed=10_000 + seed) for seed in range(n_after)]
+        failed = float(np.mean([run.status != "ok" for run in runs]))
+        found |= {"p_arrive": plan.p_arrive, "failed": failed}
+    return found
+
+
+def campaigns(world, simulator, given):
+    """Campaigns with the defaults, or with the options given."""
+    options = {} if given.policy is None else {"policy": given.policy}
+    return {
+        course: one_campaign(world, simulator, course, given.missions, options)
+        for course in given.courses
+    }
+
+
+def limits(world, simulator, given):
+    """Failures of the plan after 8 missions under each `max_failure`."""
+    return {
+        str(most): {
+            course: one_campaign(world, simulator, course, 8, {"max_failure": most}, 200)
+            for course in given.courses
+        }
+        for most in LIMITS
+    }
+
+
+PARTS = {"safe": safe_paths, "campaigns": campaigns, "learn": learn, "limits": limits}
+
+
+def measure(name, given):
+    """Results of a world by part, those that the folder lacks found now."""
+    file = Path(given.out) / f"{name.replace(':', '_')}.json"
+    known = json.loads(file.read_text()) if file.exists() else {}
+    if missing := [part for part in given.parts if part not in known]:
+        simulate = MujocoSimulator if given.simulator == "mujoco" else KinematicSimulator
+        world, simulator = world_of(name, given.data, simulate)
+        for part in missing:
+            started = time.perf_counter()
+            known[part] = PARTS[part](world, simulator, given)
+            print(f"{name} {part}: {time.perf_counter() - started:.0f} s", flush=True)
+            file.write_text(json.dumps(known) + "\n")
+    return known
+
+
+def shown(values):
+    return f"{np.mean(values):.2f}" if len(values) else "-"
+
+
+def print_campaigns(results):
+    print("\n| world | safe path | first 3 | all 15 | last 5 | entered again | slowest fit, s |")
+    print("|---|---:|---:|---:|---:|---:|---:|")
+    whole = []
+    for name, found in results.items():
+        safe = found.get("safe", {course: (1.0, 1.0) for course in found["campaigns"]})
+        kept = [c for c in found["campaigns"] if safe[c][0] >= SAFE]
+        far = sum(safe[c][1] >= SAFE for c in safe) - len(kept)
+        runs = [found["campaigns"][c] for c in kept]
+        ok = np.array([run["ok"] for run in runs]).reshape(len(runs), -1)
+        again = [entered for run in runs for entered in run["again"]]
+        whole += [(ok, again)] if kept else []
+        longer = f" (+{far})" if far else ""
+        parts = " | ".join(shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:]))
+        slowest = max(run["seconds"] for run in found["campaigns"].values())
+        print(
+            f"| {name} | {len(kept)} of {len(safe)}{longer} | {parts} | {shown(again)} | "
+            f"{slowest:.2f} |"
+        )
+    ok = np.concatenate([ok for ok, _ in whole])
+    again = [entered for _, part in whole for entered in part]
+    parts = " | ".join(shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:]))
+    print(f"| all | {len(ok)} | {parts} | {shown(again)} | |")
+
+
+def print_learning(results, csv):
+    print("\n| world | missions fail | skill after 15 | after 60 | error after 15 | after 60 |")
+    print("|---|---:|---:|---:|---:|---:|")
+    lines, total = ["world,missions,bin,n,predicted,arrived"], {}
+    for name, found in results.items():
+        learnt = found["learn"]
+        often = [c for c, share in enumerate(learnt["failed"]) if share > 0.2]
+        cells = [shown([s for c, s in learnt[n] if c in often]) for n in ("15", "60")]
+        for n in ("15", "60"):
+            bins = np.array(learnt["bins"][n])
+            total[n] = total.get(n, 0.0) + bins
+            cells.append(f"{error_of(bins[0]):.2f}")
+            for b, (count, predicted, arrived) in enumerate(bins[0]):
+                if count > 0.0:
+                    shares = f"{predicted / count:.4f},{arrived / count:.4f}"
+                    lines.append(f"{name},{n},{b},{count:.0f},{shares}")
+        print(f"| {name} | {np.mean(learnt['failed']):.2f} | {' | '.join(cells)} |")
+    for i, what in enumerate(("mean over draws", "at the posterior mean")):
+        errors = [f"{error_of(bins[i]):.2f}" for bins in total.values()]
+        print(f"| all, {what} | | | | {' | '.join(errors)} |")
+    if csv is not None:
+        Path(csv).write_text("\n".join(lines) + "\n")
+
+
+def error_of(bins):
+    """Largest difference of the shares predicted and observed in a bin with enough missions."""
+    n, predicted, arrived = bins[bins[:, 0] >= LEAST].T
+    return float(np.max(np.abs(predicted - arrived) / n, initial=0.0))
+
+
+def print_limits(results):
+    print("\n| max_failure | plans within it | predicted failures | realised | others: realised |")
+    print("|---:|---:|---:|---:|---:|")
+    for most in LIMITS:
+        runs = [run for r in results.values() for run in r["limits"][str(most)].values()]
+        held = [run for run in runs if 1.0 - run["p_arrive"] <= most + 1e-9]
+        other = [run["failed"] for run in runs if run not in held]
+        cells = shown([1.0 - r["p_arrive"] for r in held]), shown([r["failed"] for r in held])
+        print(f"| {most} | {len(held)} of {len(runs)} | {' | '.join(cells)} | {shown(other)} |")
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("quick", nargs="?", choices=["quick"])
     parser.add_argument("--data")
+    parser.add_argument("--out", default="out/failures")
+    parser.add_argument("--csv")
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
+    parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS))
+    parser.add_argument("--courses", nargs="*", default=COURSES, choices=COURSES)
+    parser.add_argument("--simulator", default="kinematic", choices=["kinematic", "mujoco"])
     parser.add_argument("--unseen", type=int, default=5000)
     parser.add_argument("--missions", type=int, default=15)
     parser.add_argument("--policy")
-    parser.add_argument("--max-failure", type=float)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    options = {} if given.policy is None else {"policy": given.policy}
-    if given.max_failure is not None:
-        options["max_failure"] = given.max_failure
+    if given.quick:
+        given.out, given.unseen, given.courses = f"{given.out}-quick", 300, given.courses[:1]
+    Path(given.out).mkdir(parents=True, exist_ok=True)
     names = [n for n in given.worlds if given.data or n.startswith("synthetic")]
-    n_unseen, courses = (300, COURSES[:1]) if given.quick else (given.unseen, COURSES)
-    made = {name: world_of(name, given.data) for name in names}
-    print(
-        "random missions; after 0, 15 and 60: skill by bound, by mission, error of reliability, s"
-    )
-    print("\n| world | missions fail | bounds fail |" + " skill | mission | error | s |" * 3)
-    print("|---|" + "---:|" * 14)
-    tables = {}
-    for name, (world, simulator) in made.items():
-        tables[name] = learn(name, world, simulator, n_unseen)
-    print("\nreliability after 15 missions: missions, predicted and observed share that arrives\n")
-    for name, rows in tables.items():
-        cells = "; ".join(f"{n}: {p:.2f} {a:.2f}" for _, n, p, a in rows)
-        print(f"- {name}: {cells}")
-    print("\ncampaigns: share that arrives, first 3, all, last 5; later plans over a bound that")
-    print("stopped a robot; slowest fit of the hazard, s\n")
-    print("| world | first 3 | all | last 5 | entered again | s |\n|---|---:|---:|---:|---:|---:|")
-    started = time.perf_counter()
-    for name, (world, simulator) in made.items():
-        campaigns(name, world, simulator, courses, given.missions, options)
-    print(f"\n{time.perf_counter() - started:.0f} s of campaigns")
+    results = {name: measure(name, given) for name in names}
+    if "campaigns" in given.parts:
+        print_campaigns(results)
+    if "learn" in given.parts:
+        print_learning(results, given.csv)
+    if "limits" in given.parts:
+        print_limits(results)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,8 @@ def exposures(n, failed, lost=(), weights=None):
 
 
 def law(difficulty):
-    return Hazard().law(np.asarray(difficulty, dtype=float))
+    x = np.asarray(difficulty, dtype=float)
+    return Hazard().law(x, ("tilt", "narrowness")[: x.shape[1]])
 
 
 def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
@@ -120,7 +121,7 @@ def test_the_hazard_is_calibrated():
     ranks = []
     for seed in range(n_sets):
         x = rng.uniform(size=(n_bounds, 2)) * 1.5
-        of = prior.law(x)
+        of = prior.law(x, ("tilt", "narrowness"))
         z = rng.standard_normal((1, 4))
         p = rng.beta(*(part[0] for part in of(z)))
         n, failed, lost = np.zeros(n_bounds), np.zeros(n_bounds), []

@@ -71,7 +71,7 @@ def test_without_a_terrain_every_bound_between_passable_cells_is_passable():
     assert workspace.difficulty.shape == (8, 2, 2, 0)
 
 
-def test_difficulty_is_that_of_the_steepest_pixel_and_the_least_room():
+def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
     """A plane of tan 0.3, under limits of tan 1 and tan 0.4; then gaps of two widths."""
     rows, found = np.arange(60.0), []
     for limit in (1.0, 0.4):
@@ -82,8 +82,9 @@ def test_difficulty_is_that_of_the_steepest_pixel_and_the_least_room():
         team = tb.Team(robots=(robot,) * 2, lead=robot)
         workspace = tb.Workspace.from_terrain(terrain, (3, 3), team, sight="bare")
         found.append(workspace.difficulty.sel(move="e").values[1, 1])
-    for (_, steep, narrow, tight), limit in zip(found, (1.0, 0.4), strict=True):
-        np.testing.assert_allclose(steep, 0.3 / limit, rtol=1e-10)
+    for (_, tilt, narrow, tight), limit in zip(found, (1.0, 0.4), strict=True):
+        # Roll along the contour; no robot's way is but straight down, with the whole as pitch.
+        np.testing.assert_allclose(tilt, 0.3 / limit, rtol=1e-10)
         assert narrow == tight == 0.0  # no impassable pixel
     wide, slim = (walled(gap).difficulty.values for gap in (slice(20, 40), slice(28, 32)))
     assert np.nanmean(slim[..., 2]) > np.nanmean(wide[..., 2])

@@ -27,6 +27,7 @@ from trustbo.files import (
 )
 from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
 from trustbo.models import BoundRisk, params_of, place_maps
+from trustbo.models.hazard import measures_of
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
@@ -130,11 +131,11 @@ class Result(Displayed):
         ]
         objective = self.settings["objective"]
         planner = options.planner(self.workspace, start, goal, objective, *law)
-        hazard = self.posterior.children.get("hazard")
-        measures = self.workspace.difficulty.shape[-1]  # none where the terrain was taken away
-        if hazard is not None and hazard.sizes.get("measure", 0) == measures:
-            hazard = hazard.to_dataset()
-            planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
+        if "hazard" in self.posterior.children:
+            hazard = self.posterior["hazard"].to_dataset()
+            # None of the workspace's measures where the terrain was taken away.
+            if hazard["measure"].values.tolist() == measures_of(self.workspace):
+                planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
         if self.believed is None:
             return planner
         return planner.with_awareness(self.believed["draws"].values, self.believed["mean"].values)

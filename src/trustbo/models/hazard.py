@@ -36,7 +36,9 @@ class Hazard:
     Attributes:
         intercept: Prior of the logit of the mean chance at medium difficulty.
         coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
-            limit (1).
+            limit (1), but for
+        tilt: that of the tilt, with which the chance rises steeply where the true limit is passed:
+            by a weight of w, from .1 to .9 within 4.4 / w of the assumed limit.
         log_strength: Prior of the log of the strength s: the failures and successes that the mean
             is worth, few where bounds fail always or never.
         cause: Concentration of the Dirichlet over the causes of failure, for each.
@@ -47,19 +49,21 @@ class Hazard:
 
     intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
+    tilt: tuple[float, float] = (8.0, 6.0)
     log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("intercept", "coefficient", "log_strength"):
+        for name in _NORMALS:
             mean, sd = getattr(self, name)
             value = float(mean), require_positive(f"sd of {name}", sd)
             object.__setattr__(self, name, value)
         require_positive("cause", self.cause)
 
-    def law(self, difficulty: np.ndarray) -> Law:
-        """Law of bounds of these difficulties, (bound, measure)."""
-        priors = [self.intercept, *[self.coefficient] * difficulty.shape[1], self.log_strength]
+    def law(self, difficulty: np.ndarray, measures: Sequence[str]) -> Law:
+        """Law of bounds of these difficulties, (bound, measure), from the names of the measures."""
+        weights = [self.tilt if name == "tilt" else self.coefficient for name in measures]
+        priors = [self.intercept, *weights, self.log_strength]
         center, scale = np.array(priors).T
         return Law(center, scale, difficulty - REFERENCE)
 
@@ -112,12 +116,13 @@ def fit_hazard(
     started, hazard = time.perf_counter(), Hazard() if hazard is None else hazard
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     exposures = Exposures.of(missions, lost, weights, lost_weights)
-    difficulty = workspace.difficulty.values
+    difficulty, names = workspace.difficulty.values, measures_of(workspace)
     _require_on_grid(exposures, difficulty.shape[1:3])
-    measures = difficulty[*exposures.bounds.T]
+    met = difficulty[*exposures.bounds.T]
     # A bound that the map says does not exist was driven all the same: as hard as can be.
-    points = sample(hazard.law(np.nan_to_num(measures, nan=1.0)), exposures, seed)
-    group = _dataset(hazard, exposures, points, workspace, n_draws, seed)
+    law = hazard.law(np.nan_to_num(met, nan=1.0), names)
+    points = sample(law, exposures, seed)
+    group = _dataset(hazard, law, exposures, points, workspace, n_draws, seed)
     risk = BoundRisk.of(group, workspace)
     dims = ("move", "row", "col")
     group = group.assign(p_fail=(dims, risk.mean), p_fail_sd=(dims, risk.sd))
@@ -138,8 +143,14 @@ def _require_on_grid(exposures: Exposures, shape: tuple[int, ...]) -> None:
         raise TrustboError(f"a mission enters {cell}, outside the grid of {shape} rows and cols.")
 
 
+def measures_of(workspace: Workspace) -> list[str]:
+    """Names of the measures of difficulty that a hazard of a workspace has weights of."""
+    return [str(name) for name in workspace.difficulty["measure"].values]
+
+
 def _dataset(
     hazard: Hazard,
+    law: Law,
     exposures: Exposures,
     points: Points,
     workspace: Workspace,
@@ -151,7 +162,6 @@ def _dataset(
     # Systematic resampling: equally weighted draws, in random order.
     grid = (rng.random() + np.arange(n_draws)) / n_draws
     chosen = rng.permutation(np.searchsorted(np.cumsum(points.weights)[:-1], grid))
-    law = hazard.law(np.empty((0, points.z.shape[1] - 2)))
     values = law.center + law.scale * points.z[chosen]
     shape = workspace.difficulty.shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)
@@ -175,7 +185,7 @@ def _dataset(
         },
         {
             "draw": np.arange(n_draws),
-            "measure": list(workspace.difficulty["measure"].values),
+            "measure": measures_of(workspace),
             "cause": list(CAUSES),
             "axis": list(maps),
             "move": list(MOVE_NAMES),
@@ -191,4 +201,4 @@ def _dataset(
     )
 
 
-_NORMALS = ("intercept", "coefficient", "log_strength")
+_NORMALS = ("intercept", "coefficient", "tilt", "log_strength")

@@ -28,7 +28,11 @@ from trustbo.models.samplers.laplace import laplace
 
 LIMIT = 0.7
 """Largest k-hat of a posterior that is not refused."""
-_GOOD = 0.5  # k-hat beyond which the proposal is fitted to its own points once more
+_GOOD = 0.5  # k-hat beyond which the proposal is fitted to its own points
+_PASSES = 3  # at most
+_KERNELS, _NARROW = 32, 0.9  # components of that proposal, and their width in units of all points'
+_STRONGEST = 50.0
+"""Largest log strength: the mode search may try what overflows."""
 _LOG2_POINTS = 11
 _DEGREES = 5.0
 _WIDTH = 1.2  # proposals are wider than the posterior's curvature says
@@ -58,7 +62,7 @@ class Law(NamedTuple):
         """Alpha and beta of each Beta, each (point, bound)."""
         values = self.center + self.scale * z
         logit = values[:, :1] + values[:, 1:-1] @ self.difficulty.T
-        strength = np.exp(values[:, -1:])
+        strength = np.exp(np.minimum(values[:, -1:], _STRONGEST))
         return strength * special.expit(logit) + FLOOR, strength * special.expit(-logit) + FLOOR
 
 
@@ -75,19 +79,25 @@ def sample(law: Law, exposures: Exposures, seed: int) -> Points:
         if min(gap) > 1.0 and values[i] > values.max() - 8.0:
             apart.append(i)
     proposal = _Mixture.around(modes[apart], _WIDTH * factors[apart], values[apart])
-    points = _weigh(law, exposures, density, proposal, seed)
-    if points.k_hat > _GOOD:
+    points = best = _weigh(law, exposures, density, proposal, seed)
+    for _ in range(_PASSES):
+        if best.k_hat <= _GOOD:
+            break
         mean = points.weights @ points.z
         off = points.z - mean
         covariance = (off * points.weights[:, None]).T @ off + 1e-3 * np.eye(d)
-        whole = _WIDTH * np.linalg.cholesky(covariance)
+        # Kernels around points of equal weight follow a posterior that is bent.
+        share = (np.arange(_KERNELS) + 0.5) / _KERNELS
+        kernels = points.z[np.searchsorted(points.weights.cumsum()[:-1], share)]
+        width = np.repeat(_NARROW * np.linalg.cholesky(covariance)[None], _KERNELS, axis=0)
         again = _Mixture.around(
-            np.vstack([modes[apart], mean]),
-            np.concatenate([_WIDTH * factors[apart], whole[None]]),
-            np.append(values[apart], values.max()),
+            np.vstack([modes[apart], kernels]),
+            np.concatenate([_WIDTH * factors[apart], width]),
+            np.zeros(len(apart) + _KERNELS),
         )
         points = _weigh(law, exposures, density, again, seed)
-    return points
+        best = min(best, points, key=lambda found: found.k_hat)
+    return best
 
 
 def _weigh(
@@ -190,7 +200,8 @@ class _Density:
         total += _rising(beta, n - failed).sum(1) + _rising(alpha[:, bad], failed[bad]).sum(1)
         many, index = np.unique(n, return_inverse=True)
         counts = np.bincount(index, minlength=len(many))
-        strength = np.exp(self._law.center[-1] + self._law.scale[-1] * z[:, -1:])
+        log_strength = self._law.center[-1] + self._law.scale[-1] * z[:, -1:]
+        strength = np.exp(np.minimum(log_strength, _STRONGEST))
         return total - _rising(strength + 2.0 * FLOOR, many) @ counts
 
     def __call__(self, z: np.ndarray) -> np.ndarray:

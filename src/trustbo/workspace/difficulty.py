@@ -1,22 +1,25 @@
 """Difficulty of bounds: how near the ways come to what the robots can drive at all.
 
-Each measure is 0 where all ways are easy and about 1 at the team's limit: that of the way which is
-worst in it, of the lead and of T2. T2's ways go on to the next cell straight ahead; where no pixel
-around is impassable, the lead's stands for them, which spares their search.
+Each measure is 0 where all ways are easy and about 1 at the robots' limit: that of the way which is
+worst in it, of the lead and of T2. T2's ways go on to the next cell straight ahead.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
 from trustbo.data import Cell
 from trustbo.workspace.moves import MOVES
+from trustbo.workspace.surface import Surface
 from trustbo.workspace.ways import Ways
 
-MEASURES = ("untraversable", "steepness", "narrowness", "tightness")
+MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty, see `bound_difficulty`."""
-_ASIDE = 1.5  # m that a robot may leave its route by, in curves
+_AHEAD = 1.5  # m along its way to the point that a robot faces
+_STEP, _SUSTAINED = 0.25, 4  # m between samples of a way, and samples that a tilt is the mean of
 _WIDTH = 2.0  # m of room on either side that count as half narrow
 _MOST = 2.0  # a cliff is no worse than twice the limit
 _TIGHT = 3.0  # log(1 + m) along impassable ground that count as 1: 19 m
@@ -26,21 +29,19 @@ class _Pixels(NamedTuple):
     """Maps of pixels (row, col)."""
 
     traversability: np.ndarray
-    steepness: np.ndarray  # the largest within reach, as a share of the limit
     room: np.ndarray  # distance to the nearest impassable pixel, m
 
 
-def bound_difficulty(
-    ways: Ways, traversability: np.ndarray, exists: np.ndarray, max_slope: float
-) -> np.ndarray:
+def bound_difficulty(ways: Ways, traversability: np.ndarray, exists: np.ndarray) -> np.ndarray:
     """Compute the difficulty of bounds that exist, (move, row, col, measure); NaN elsewhere.
 
-    Of a way, `untraversable` is one minus the mean traversability of its pixels; `steepness` the
-    tangent of the steepest slope within 1.5 m, as a share of that of `max_slope`, rad;
-    `narrowness` 1 / (1 + w / 2 m) with w the least distance to an impassable pixel; `tightness`
-    log(1 + l / 1 m) / 3 with l the length of its pixels that touch an impassable one.
+    Of a way, `untraversable` is one minus the mean traversability of its pixels; `tilt` the tangent
+    of the largest pitch or roll of a robot that faces a point 1.5 m ahead on it, mean over 1 m, as
+    a share of that of its `max_slope`; `narrowness` 1 / (1 + w / 2 m) with w the least distance to
+    an impassable pixel; `tightness` log(1 + l / 1 m) / 3 with l the length of its pixels that touch
+    an impassable one.
     """
-    maps = _pixel_maps(ways, traversability, max_slope)
+    maps = _pixel_maps(ways.posts.surface, traversability)
     out = np.full((*exists.shape, len(MEASURES)), np.nan)
     for m, row, col in np.argwhere(exists).tolist():
         (down, right), cell = MOVES[8][m], (row, col)
@@ -52,23 +53,20 @@ def bound_difficulty(
 
 
 def _of_bound(ways: Ways, maps: _Pixels, a: Cell, c: Cell, onward: Cell | None) -> np.ndarray:
-    surface = ways.posts.surface
-    high, wide = surface.pixel
-    top, bottom, left, right = ways.posts.window(a, c)
-    others = []
-    if not surface.passable[top:bottom, left:right].all():
-        others = ways.closing(a, c, onward)
+    surface, team = ways.posts.surface, ways.posts.team
+    ground = surface.gradient, surface.pixel, surface.origin
+    robots = team.lead, *team.robots
     worst = np.zeros(len(MEASURES))
-    for way in (ways.lead(a, c), *others):
+    for robot, way in zip(robots, (ways.lead(a, c), *ways.closing(a, c, onward)), strict=True):
         if way is None:
             continue  # two posts may be in one pixel, and their way of no length
         at = surface.nearest(*way.T)
-        easy, steep, room = (values[at] for values in maps)
+        easy, room = (values[at] for values in maps)
         easy = easy[np.isfinite(easy)]
-        tight = (room <= 1.001 * max(high, wide)).sum() * min(high, wide)
+        tight = (room <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
         measures = (
             1.0 - easy.mean() if len(easy) else 0.5,
-            steep.max(),
+            min(_tilt(way, *ground) / np.tan(robot.max_slope), _MOST),
             1.0 / (1.0 + room.min() / _WIDTH),
             np.log1p(tight) / _TIGHT,
         )
@@ -76,12 +74,39 @@ def _of_bound(ways: Ways, maps: _Pixels, a: Cell, c: Cell, onward: Cell | None) 
     return worst
 
 
-def _pixel_maps(ways: Ways, traversability: np.ndarray, max_slope: float) -> _Pixels:
-    surface = ways.posts.surface
-    size = [2 * max(1, round(_ASIDE / step)) + 1 for step in surface.pixel]
-    steep = np.hypot(*surface.gradient) / np.tan(max_slope)
-    steep = np.minimum(ndimage.maximum_filter(steep, size), _MOST)
-    room = np.full(steep.shape, np.inf)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tilt(way, gradient, pixel, origin):
+    """Tangent of the largest pitch or roll along a way (point, 2), mean over a short distance."""
+    along = np.zeros(len(way))
+    for k in range(1, len(way)):
+        along[k] = along[k - 1] + math.hypot(way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1])
+    n = int(along[-1] / _STEP) + 1
+    tilt, sums, rows, cols = np.empty(n), np.zeros(n + 1), gradient.shape[1], gradient.shape[2]
+    for k in range(n):
+        x, y = _point(way, along, k * _STEP)
+        ahead_x, ahead_y = _point(way, along, k * _STEP + _AHEAD)
+        i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
+        j = min(cols - 1, max(0, int((x - origin[0]) / pixel[1] + 0.5)))
+        gx, gy, heading = gradient[0, i, j], gradient[1, i, j], math.atan2(ahead_y - y, ahead_x - x)
+        east, north = math.cos(heading), math.sin(heading)
+        tilt[k] = max(abs(gx * east + gy * north), abs(gy * east - gx * north))
+        sums[k + 1] = sums[k] + tilt[k]
+    m = min(n, _SUSTAINED)
+    return ((sums[m:] - sums[:-m]) / m).max()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _point(way, along, s):
+    """Position at a distance along a way, its end beyond."""
+    k = min(np.searchsorted(along, s, side="right"), len(way) - 1)
+    length = along[k] - along[k - 1]
+    share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0
+    x = way[k - 1, 0] + share * (way[k, 0] - way[k - 1, 0])
+    return x, way[k - 1, 1] + share * (way[k, 1] - way[k - 1, 1])
+
+
+def _pixel_maps(surface: Surface, traversability: np.ndarray) -> _Pixels:
+    room = np.full(surface.ground.shape, np.inf)
     if not surface.passable.all():
         room = np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
-    return _Pixels(traversability, steep, room)
+    return _Pixels(traversability, room)

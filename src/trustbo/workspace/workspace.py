@@ -320,7 +320,7 @@ class Workspace(Displayed):
             names, shape = MEASURES, ground.posts.surface.ground.shape
             known = self.pixels.get(TRAVERSABLE)
             easy = np.full(shape, np.nan) if known is None else known.values
-            values = bound_difficulty(ground, easy, exists.values, self.team.max_slope)
+            values = bound_difficulty(ground, easy, exists.values)
         coords = {**exists.coords, "measure": list(names)}
         return xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
 
