@@ -112,8 +112,13 @@ class Team(Displayed):
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if isinstance(self.robots, Robot):
-            raise TrustboError(f"Team.robots must be a sequence of robots; got {self.robots!r}.")
+        if not isinstance(self.robots, Sequence) or not all(
+            isinstance(robot, Robot) for robot in self.robots
+        ):
+            raise TrustboError(
+                "Team.robots must be a sequence of Robot; for a number of equal ones give "
+                f"n_robots=; got {type(self.robots).__name__}."
+            )
         robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
         names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
         if not len(set(names)) == len(names) == len(robots):
@@ -125,6 +130,13 @@ class Team(Displayed):
     def max_slope(self) -> float:
         """Steepest slope that every member withstands, rad."""
         return min(robot.max_slope for robot in (self.lead, *self.robots))
+
+    @classmethod
+    def of(cls, team: Self | None, n_robots: int = 3) -> Self:
+        """Team as it is, or one of equal robots for None; TrustboError: it is no team."""
+        if team is not None and not isinstance(team, Team):
+            raise TrustboError(f"team must be a Team, e.g. Team(n_robots=3); got {team!r}.")
+        return cls(n_robots=n_robots) if team is None else team
 
     def _card(self) -> Card:
         members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
@@ -474,4 +486,5 @@ def _require_unit_interval(what: str, values: np.ndarray) -> None:
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
         index = ", ".join(str(i) for i in np.argwhere(bad)[0])
-        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1].")
+        percent = " (percent? divide by 100)" if (values[~np.isnan(values)] >= 0.0).all() else ""
+        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{percent}.")

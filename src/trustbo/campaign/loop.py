@@ -181,8 +181,11 @@ def missions(
     """
     require_whole("n_iterations", n_iterations, 1)
     runner: Any = KinematicSimulator(campaign.workspace) if simulator is None else simulator
-    if not callable(getattr(runner, "run", None)):
-        raise TrustboError(f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}.")
+    if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
+        made = "; make one of the class" if isinstance(runner, type) else ""
+        raise TrustboError(
+            f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}{made}."
+        )
     if campaign.options.replan == "bound":
         require_bounds(runner, campaign.model)
     if truth is not None:

@@ -90,13 +90,13 @@ class Priors(Displayed):
             scalar = isinstance(prior, Distribution) and not prior.event_shape
             if not scalar or len(prior.batch_shape) > (name == "beta"):
                 raise TrustboError(
-                    f"Priors.{name} must be a scalar numpyro distribution, e.g. {default!r}; "
-                    f"got {prior!r}."
+                    f"Priors.{name} must be a scalar numpyro distribution, e.g. "
+                    f"numpyro.distributions.{_as_text(default)}; got {prior!r}."
                 )
             if name in _SCALES and not _is_positive(prior):
                 raise TrustboError(
                     f"Priors.{name} is a standard deviation: its prior must live on (0, inf) or "
-                    f"part of it, e.g. {default!r}; got {prior!r}."
+                    f"part of it, e.g. numpyro.distributions.{_as_text(default)}; got {prior!r}."
                 )
         require_positive("Priors.concentration", self.concentration)
         if not np.isfinite(self.x0_mean):

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
-from trustbo.errors import ShapeError, require_choice
+from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
@@ -235,10 +235,15 @@ class Planner(Displayed):
 
         Raises:
             ShapeError: Parameters with leading axes, or of other robots or features.
-            TrustboError: beta0 is outside the range the objective is exact for.
+            TrustboError: A posterior instead of parameters; beta0 outside the range that the
+                objective is exact for.
             InfeasibleError: No path respects `max_failure`.
         """
         started = time.perf_counter()
+        if isinstance(params, xr.DataTree):
+            raise TrustboError(
+                "plan takes one set of parameters; of a posterior, params_of(posterior).mean()."
+            )
         if params.leading:
             raise ShapeError(
                 f"give one draw at a time: the parameters have leading axes {params.leading}. Use "

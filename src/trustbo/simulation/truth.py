@@ -311,10 +311,15 @@ def _code() -> str:
     return digest.hexdigest()
 
 
-def _differences(a: Workspace, b: Workspace) -> list[tuple[str, object, object]]:
+def _differences(a: Workspace, b: Workspace) -> list[tuple[str, str, str]]:
     """Names of what differs, with both values in words."""
     if a.grid != b.grid:
-        return [("grid", a.grid, b.grid)]
+        own, theirs = (
+            f"{g.shape[0]} x {g.shape[1]} cells of {g.cell_height:g} m x {g.cell_width:g} m at "
+            f"{g.left:g}, {g.top:g}"
+            for g in (a.grid, b.grid)
+        )
+        return [("grid", own, theirs)]
     if not np.array_equal(a.passable.values, b.passable.values):
         n, other = (f"{int(w.passable.sum())} passable cells" for w in (a, b))
         return [("passability", n, other)]

@@ -133,7 +133,7 @@ class Workspace(Displayed):
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
         require_formation(formation_radius)
-        team = Team() if team is None else team
+        team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
             require_sight(terrain, sights, features or {})
@@ -203,7 +203,7 @@ class Workspace(Displayed):
             TrustboError: A value outside [0, 1], NaN in a passable cell, or no passable cell.
         """
         z, free, bounds = of_cells(awareness, passable)
-        team = Team(n_robots=len(z)) if team is None else team
+        team = Team.of(team, len(z))
         if len(team.robots) != len(z):
             raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
         if not free.any():

@@ -1,0 +1,149 @@
+"""What a newcomer gets wrong: each gives one line that says what was wrong, and what to do."""
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.models import PooledTrust, Priors, TrustFilter, TrustParams, fit, params_of
+from trustbo.planning import Planner
+from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
+
+ENDS = (5, 0), (0, 5)
+TRUTH = TrustParams(0.5, np.array([0.2, 0.1]), 0.2, 0.05, 0.05)
+
+
+def made(*shape):
+    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=shape))
+
+
+class Case:
+    """A mission that is as it should be, and its parts."""
+
+    workspace = made(3, 6, 6, 2)
+    simulator = ModelSimulator(workspace, TRUTH)
+    path = tb.Campaign(workspace, *ENDS).ask().path
+    mission = simulator.run(path, seed=0)
+    z, y = mission.awareness, mission.contact_rate
+
+    def tell(self, path=None, z=None, y=None):
+        z, y = (self.z if z is None else z), (self.y if y is None else y)
+        campaign = tb.Campaign(self.workspace, *ENDS)
+        campaign.tell(tb.Mission.from_arrays(path or self.path, z, y))
+
+    def iterate(self, *ends, simulator=None, **options):
+        simulator = self.simulator if simulator is None else simulator
+        options = {"n_iterations": 1, "progress": False} | options
+        return tb.iterate(self.workspace, *(ends or ENDS), simulator=simulator, **options)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return Case()
+
+
+@pytest.fixture(scope="module")
+def posterior(case):
+    return fit([case.mission], PooledTrust())
+
+
+MISTAKES = {
+    # missions
+    "row and col swapped": (lambda c: c.tell([(b, a) for a, b in c.path]), "were row and col swap"),
+    "rates in percent": (lambda c: c.tell(y=100 * c.y), "percent. divide by 100"),
+    "other robots": (lambda c: c.tell(z=c.z[:, :2], y=c.y[:, :2]), "has robots .* not .'r1'"),
+    "another grid": (
+        lambda c: c.tell([(r + 20, k) for r, k in c.path]), "outside the grid of 6 rows"
+    ),
+    "a rate too few": (lambda c: c.tell(y=c.y[:-1]), "and contact_rate .bound, robot.; got"),
+    "a mission, no list": (lambda c: fit(c.mission), "Write .mission."),
+    "no missions": (lambda c: fit([]), "give at least one"),
+    # places
+    "start off the grid": (lambda c: c.iterate((6, 0), (0, 5)), "rows are 0..5 from the top"),
+    "start of floats": (lambda c: c.iterate((5.0, 0.5), (0, 5)), "two whole numbers .row, col."),
+    "start as text": (lambda c: c.iterate("5,0", (0, 5)), "row, col.; got '5,0'"),
+    "start is goal": (lambda c: c.iterate((5, 0), (5, 0)), "same cell .5, 0.; choose two"),
+    # workspaces
+    "awareness without robots": (
+        lambda c: tb.Workspace.from_awareness(np.ones((6, 6, 2))), "must be .robot, row, col, feat"
+    ),
+    "awareness of 0 to 10": (
+        lambda c: tb.Workspace.from_awareness(np.full((3, 6, 6, 2), 9.0)), "9 is outside .0, 1."
+    ),
+    "passable of another shape": (
+        lambda c: tb.Workspace.from_awareness(np.ones((3, 6, 6, 2)) / 2, passable=np.ones((5, 5))),
+        "passable must be .row, col. = .6, 6.",
+    ),
+    "no such file": (lambda c: tb.terrain.read_terrain("no.tif", "no.tif"), "no file 'no.tif'"),
+    "a shape of one number": (
+        lambda c: tb.Workspace.from_terrain(tb.terrain.example(), shape=10), "two whole numbers"
+    ),
+    "a path for a terrain": (
+        lambda c: tb.Workspace.from_terrain("dem.tif"), "as read_terrain gives it; got str"
+    ),
+    "a number for a team": (
+        lambda c: tb.Workspace.from_awareness(np.ones((3, 6, 6, 2)) / 2, team=3), "Team.n_robots=3"
+    ),
+    "robots=3": (lambda c: tb.Team(robots=3), "give n_robots="),
+    "degrees for radians": (lambda c: tb.Robot(max_slope=45), "degrees. use numpy.deg2rad"),
+    # campaigns
+    "n_iteration": (lambda c: c.iterate(n_iteration=3), "did you mean n_iterations"),
+    "max_bound": (lambda c: c.iterate(max_bound=12), "did you mean max_bounds"),
+    "2.5 missions": (lambda c: c.iterate(n_iterations=2.5), "a whole number from 1 on; got 2.5"),
+    "no missions at all": (lambda c: c.iterate(n_iterations=0), "from 1 on; got 0"),
+    "too few bounds": (lambda c: c.iterate(max_bounds=2), "below the fewest possible"),
+    "a negative seed": (lambda c: c.iterate(seed=-1), "a whole number from 0 on; got -1"),
+    "a key for a seed": (lambda c: c.iterate(seed=np.array([1, 2])), "a whole number from 0 on"),
+    "a model's class": (lambda c: c.iterate(model=PooledTrust), "e.g. PooledTrust.."),
+    "a model's name": (lambda c: c.iterate(model="pooled"), "e.g. PooledTrust..; got 'pooled'"),
+    "a simulator's class": (
+        lambda c: c.iterate(simulator=KinematicSimulator), "make one of the class"
+    ),
+    "no terrain to drive on": (
+        lambda c: tb.iterate(c.workspace, *ENDS, progress=False), "make the workspace with Work"
+    ),
+    "a rule's name": (lambda c: c.iterate(stop="converged"), "stop"),
+    "the truth of another grid": (
+        lambda c: c.iterate(truth=Truth.of(ModelSimulator(made(3, 5, 5, 2), TRUTH))),
+        "its grid is 5 x 5 cells of 50 m x 50 m at 0, 250, the campaign's 6 x 6",
+    ),
+    "an unknown policy, of numpy": (
+        lambda c: c.iterate(policy=np.str_("greedyy")), "choose one of greedy, optimistic"
+    ),
+    "a folder of nothing": (lambda c: tb.load_result("nothing"), "give a folder written by save"),
+    # models and planners
+    "NUTS in capitals": (lambda c: fit([c.mission], sampler="NUTS"), "one of auto, exact, nuts"),
+    "a number for a prior": (lambda c: Priors(beta0=0.5), "e.g. numpyro.distributions.Beta.con"),
+    "a pair for a prior": (lambda c: Priors(b=(0, 1)), "numpyro.distributions.Normal.loc=0"),
+    "an unknown objective": (
+        lambda c: Planner(c.workspace, *ENDS, objective="trust"), "choose one of lost_contact"
+    ),
+    "weights of other features": (
+        lambda c: Planner(made(3, 6, 6, 3), *ENDS).plan(TRUTH), "2 weights, but awareness has 3"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_gives_one_line_that_says_what_to_do(name, case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    attempt, message = MISTAKES[name]
+    with pytest.raises(tb.TrustboError, match=message) as caught:
+        attempt(case)
+    assert isinstance(caught.value, ValueError)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []  # nothing was begun
+
+
+def test_a_posterior_is_no_single_set_of_parameters(case, posterior):
+    with pytest.raises(tb.TrustboError, match=r"of a posterior, params_of\(posterior\).mean\(\)"):
+        Planner(case.workspace, *ENDS).plan(posterior)
+    with pytest.raises(tb.TrustboError, match="say how many robots: n_robots="):
+        TrustFilter(params_of(posterior))
+
+
+def test_numpy_s_text_and_numbers_are_as_good_as_python_s(case):
+    campaign = tb.Campaign(
+        case.workspace, np.array([5, 0]), (np.int64(0), 5), policy=np.str_("greedy"),
+        seed=np.int32(1), objective=np.str_("mean"),
+    )  # fmt: skip
+    assert campaign.ask().path[0] == (5, 0)
