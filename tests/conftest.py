@@ -7,6 +7,8 @@ import matplotlib as mpl
 import pytest
 from matplotlib.figure import Figure
 
+from trustbo.report.blocks import Image, Picture
+
 mpl.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -15,13 +17,20 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def leave_figures_blank():
-    """Save figures without what they show: to draw all those of a report takes seconds."""
+    """Save figures without what they show, and draw none in a report, which takes seconds."""
     save = Figure.savefig
 
     def save_blank(figure, file, **options):
         save(Figure(figure.get_size_inches()), file, **options)
 
-    return lambda monkeypatch: monkeypatch.setattr(Figure, "savefig", save_blank)
+    def picture(_, alt, caption, **__):
+        return Picture(alt, caption, *2 * [Image("data:image/svg+xml;base64,PHN2Zy8+", 800, 400)])
+
+    def leave(monkeypatch):
+        monkeypatch.setattr(Figure, "savefig", save_blank)
+        monkeypatch.setattr("trustbo.report.figures.picture", picture)
+
+    return leave
 
 
 @pytest.fixture

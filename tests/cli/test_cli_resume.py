@@ -29,36 +29,41 @@ def fill_disk(process):
     resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (1000, hard))
 
 
-@pytest.mark.usefixtures("blank_figures")
-@pytest.mark.parametrize(
-    ("strike", "code", "message"),
-    [
-        (lambda p: p.send_signal(signal.SIGINT), 130, "kept: trustbo resume {} goes on."),
-        (lambda p: p.send_signal(signal.SIGTERM), 130, "kept: trustbo resume {} goes on."),
-        (fill_disk, 2, "error: the disk is full: '{}/"),
-    ],
-    ids=["ctrl-c", "sigterm", "full disk"],
-)
-def test_what_is_done_is_kept_and_resume_goes_on(strike, code, message, invoke, flags, tmp_path):
-    """To the same result as without the interruption."""
-    out = tmp_path / "out"
-    words = ["run", *flags, "--seed", 2, "--quiet", "--iterations"]
-    command = [sys.executable, "-c", PROGRAM, *(str(a) for a in (*words, 500, "--out", out))]
+def struck(words, out, n_posteriors, strike):
+    """Exit code and stderr of the program that is struck when so many posteriors are written."""
+    command = [sys.executable, "-c", PROGRAM, *(str(a) for a in words)]
+    awaited = out / "posteriors" / f"{n_posteriors:04d}.nc"
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + 120
-            while not (out / "posteriors" / "0004.nc").exists() and time.monotonic() < deadline:
+            while not awaited.exists() and time.monotonic() < deadline:
                 assert process.poll() is None, process.communicate()[1]
                 time.sleep(0.05)
             strike(process)
             said = process.communicate(timeout=60)[1]
         finally:
             process.kill()  # or a test that fails would wait for it
-    assert process.returncode == code, said
-    assert message.format(out) in said.splitlines()[-1]
     assert "Traceback" not in said
-    n = json.loads((out / "campaign.json").read_text())["n_missions"]
-    assert 1 <= n < 500
+    return process.returncode, said
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_what_is_done_is_kept_and_resume_goes_on(invoke, flags, tmp_path):
+    """To the same result as without the interruptions: Ctrl-C, SIGTERM and a full disk."""
+    out, n = tmp_path / "out", 0
+    words = ["run", *flags, "--seed", 2, "--quiet", "--iterations"]
+    for command, strike, code, message in (
+        (words, lambda p: p.send_signal(signal.SIGINT), 130, "kept: trustbo resume {} goes on."),
+        (None, lambda p: p.send_signal(signal.SIGTERM), 130, "kept: trustbo resume {} goes on."),
+        (None, fill_disk, 2, "error: the disk is full: '{}/"),
+    ):
+        again = ["resume", out, "--quiet", "--iterations", 500]
+        ran = again if command is None else [*command, 500, "--out", out]
+        found, said = struck(ran, out, n + 2, strike)
+        assert found == code, said
+        assert message.format(out) in said.splitlines()[-1]
+        before, n = n, json.loads((out / "campaign.json").read_text())["n_missions"]
+        assert before < n < 500
     done = invoke("resume", out, "--iterations", n + 1, "--quiet")
     assert done.exit_code == 0, done.output
     assert invoke(*words, n + 1, "--out", tmp_path / "whole").exit_code == 0

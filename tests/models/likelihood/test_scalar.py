@@ -1,7 +1,6 @@
 """The scalar state space against joint normals written out in full."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from references import dense_log_likelihood, dense_posterior_of_trust
@@ -86,10 +85,11 @@ def test_an_intercept_may_move_into_a_constant_feature():
     )
 
 
-def _filtered(params, mission):
-    ssm = params.ssm(jnp.asarray(mission.awareness[None]))
-    rates = jnp.swapaxes(jnp.asarray(mission.contact_rate[None]), 0, 1)
-    return ssm, ssm.filter(rates), rates
+@jax.jit
+def _posterior_of(params, awareness, rates, noise):
+    ssm = params.ssm(awareness[None])
+    filtered = ssm.filter(rates[:, None])
+    return ssm.smooth(filtered), jax.vmap(lambda e: ssm.sample_backward(filtered, e))(noise)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -98,10 +98,9 @@ def test_the_smoother_and_backward_sampling_have_the_exact_moments(seed):
     params, (mission, *_) = random_params(rng), random_missions(rng, missing=0.3)
     n_draws = 20_000
     with jax.enable_x64(True):
-        ssm, filtered, rates = _filtered(params, mission)
-        smoothed = ssm.smooth(filtered)
-        noise = jax.random.normal(jax.random.key(seed), (n_draws, *rates.shape))
-        draws = jax.vmap(lambda e: ssm.sample_backward(filtered, e))(noise)
+        awareness, rates = mission.awareness, mission.contact_rate
+        noise = rng.normal(size=(n_draws, len(rates), 1, 3))
+        smoothed, draws = _posterior_of(params, awareness, rates, noise)
         draws = np.asarray(draws)[:, :, 0]
     for i in range(3):
         mean, cov = dense_posterior_of_trust(

@@ -35,6 +35,24 @@ def random_rates(rng, ssm, missing):
     return y
 
 
+# Compiled whole: step by step, each operation would be a program of its own.
+@jax.jit
+def posterior_of(ssm, y):
+    """Filter, smoother, and the affine map from noise to draws: its centre and its slope."""
+    filtered = ssm.filter(y)
+
+    def draw(noise):
+        return ssm.sample_backward(filtered, noise)
+
+    zero = jnp.zeros(y.shape)
+    return filtered, ssm.smooth(filtered), draw(zero), jax.jacfwd(draw)(zero)
+
+
+@jax.jit
+def of_complete(ssm, y):
+    return ssm.filter(y, complete=True).log_likelihood, dense.log_likelihood(ssm, y)
+
+
 def by_hand(ssm, y, j):
     args = [np.asarray(a) for a in (ssm.B0, ssm.drift[:, j], ssm.Q, ssm.R)]
     return dense_coupled(*args, float(ssm.x0_mean), float(ssm.x0_sd), y[:, j], float(ssm.lag))
@@ -47,15 +65,7 @@ def test_coupled_filter_smoother_and_sampling_are_the_joint_normal_s(seed, lag):
     ssm = random_vector_ssm(rng, lag=lag)
     y = random_rates(rng, ssm, missing=0.25 * (seed % 2))
     with jax.enable_x64(True):
-        filtered = ssm.filter(jnp.asarray(y))
-        smoothed = ssm.smooth(filtered)
-
-        def draw(noise):
-            return ssm.sample_backward(filtered, noise)
-
-        zero = jnp.zeros(y.shape)
-        results = (filtered, smoothed, draw(zero), jax.jacfwd(draw)(zero))
-        filtered, smoothed, centre, spread = jax.tree.map(np.asarray, results)
+        filtered, smoothed, centre, spread = jax.tree.map(np.asarray, posterior_of(ssm, y))
     spread = spread.reshape(*y.shape, -1)
     for j in range(y.shape[1]):
         log_density, mean, covariance = by_hand(ssm, y, j)
@@ -76,12 +86,11 @@ def test_complete_missions_of_any_length_need_one_factor_or_one_covariance(lag):
     y = random_rates(rng, ssm, missing=0.0)
     y[5:, 1] = np.nan
     with jax.enable_x64(True):
-        filtered = jax.tree.map(np.asarray, ssm.filter(jnp.asarray(y), complete=True))
-        at_once = np.asarray(dense.log_likelihood(ssm, jnp.asarray(y)))
+        log_likelihood, at_once = (np.asarray(a) for a in of_complete(ssm, y))
     expected = [by_hand(ssm, y[:n], j)[0] for j, n in ((0, 7), (2, 7))]
     short = VectorSSM(*ssm)._replace(drift=ssm.drift[:5])
     expected.insert(1, by_hand(short, y[:5], 1)[0])
-    np.testing.assert_allclose(filtered.log_likelihood.sum((0, 2)), expected, rtol=1e-9)
+    np.testing.assert_allclose(log_likelihood.sum((0, 2)), expected, rtol=1e-9)
     np.testing.assert_allclose(at_once[:, 0], expected, rtol=1e-9)
 
 
@@ -99,13 +108,10 @@ def test_robots_apart_are_coupled_ones_with_diagonal_matrices(lag, own):
     B0, Q, R = matrices
     coupled = VectorSSM(B0, drift, Q, R, 0.5, 0.3, lag)
     with jax.enable_x64(True):
-        noise = jax.random.normal(jax.random.key(0), y.shape)
         results = []
         for ssm in (apart, coupled):
-            filtered = ssm.filter(jnp.asarray(y))
-            smoothed = ssm.smooth(filtered)
-            drawn = ssm.sample_backward(filtered, noise)
-            found = (filtered.log_likelihood, filtered.mean, *smoothed, drawn)
+            filtered, smoothed, *drawn = posterior_of(ssm, y)
+            found = (filtered.log_likelihood, filtered.mean, *smoothed, *drawn)
             results.append(jax.tree.map(np.asarray, found))
     for one, other in zip(*results, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-10)
@@ -116,7 +122,7 @@ def test_log_likelihood_equals_statsmodels():
     ssm = random_vector_ssm(rng, n_bounds=9)
     y = random_rates(rng, ssm, missing=0.3)
     with jax.enable_x64(True):
-        found = np.asarray(ssm.filter(jnp.asarray(y)).log_likelihood.sum((0, 2)))
+        found = np.asarray(posterior_of(ssm, y)[0].log_likelihood.sum((0, 2)))
     for j in range(y.shape[1]):
         reference = KalmanFilter(k_endog=3, k_states=3)
         reference.bind(np.ascontiguousarray(y[:, j]))
@@ -137,7 +143,8 @@ def test_simulated_missions_have_the_right_moments():
     n = 40_000
     with jax.enable_x64(True):
         many = ssm._replace(drift=np.repeat(ssm.drift, n, axis=1))
-        trust, y = (np.asarray(a) for a in many.simulate(jax.random.key(0)))
+        simulate = jax.jit(VectorSSM.simulate)
+        trust, y = (np.asarray(a) for a in simulate(many, jax.random.key(0)))
     nothing = np.full((3, 1, 2), np.nan)
     _, mean, covariance = by_hand(ssm, nothing, 0)
     flat = np.swapaxes(trust, 0, 1).reshape(n, -1)
