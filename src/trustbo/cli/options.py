@@ -47,9 +47,9 @@ Benchmark
     wellington.
   world NAME: World, given once for each; by default all.
   worlds.policy NAME: Policy, given once for each: a name as for [b]trustbo run[/b], or module:name;
-    by default greedy, optimistic, thompson.
-  worlds.model NAME: Model, given once for each: places, pooled, hierarchical, coupled, or
-    module:name.
+    by default optimistic.
+  worlds.model NAME: Model, given once for each: places (the default), pooled, hierarchical,
+    coupled, or module:name.
   simulator NAME: Your own simulator of a world, module:name.
   baseline NAME: Baseline, given once for each: random, shortest, paper, botorch, none; by default
     all of them.

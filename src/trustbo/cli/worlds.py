@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from trustbo.campaign.options import OBJECTIVE
+from trustbo.campaign.options import OBJECTIVE, POLICY
 from trustbo.cli.errors import FAILED, one_line_errors
 
 
@@ -44,8 +44,8 @@ def worlds(
         if executor is None:
             executor = "loky" if find_spec("loky") and not quick else "serial"
         chosen = {
-            "policies": policy or ("greedy", "optimistic", "thompson"),
-            "models": model or ("pooled",),
+            "policies": policy or (POLICY,),
+            "models": model or ("places",),
             "baselines": BASELINES if baseline is None else [b for b in baseline if b != "none"],
         }
         results = run_worlds(

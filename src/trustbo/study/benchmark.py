@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from trustbo.campaign.options import OBJECTIVE, SAMPLER
+from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import FilePath
 from trustbo.models.samplers.run import resolve_sampler
@@ -48,8 +48,8 @@ def run_worlds(
     data: FilePath | None = None,
     only: Sequence[str] | None = None,
     courses: Sequence[str] = COURSES,
-    policies: Any = ("greedy", "optimistic", "thompson"),
-    models: Any = ("pooled",),
+    policies: Any = (POLICY,),
+    models: Any = ("places",),
     simulator: Simulate | str | None = None,
     baselines: Sequence[str] = BASELINES,
     objective: str = OBJECTIVE,
