@@ -21,6 +21,7 @@ from scipy.linalg import cho_factor, cho_solve
 from trustbo.errors import TrustboError
 from trustbo.models.likelihood.place_prior import correlation, matern
 from trustbo.models.place import N_MOVES, Visited
+from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
 
 _STEP = 0.1  # of the logarithm of length scales
@@ -81,6 +82,7 @@ def nowhere(shape: tuple[int, int], n_effects: int) -> Visited:
     return Visited(shape, *nothing, np.zeros((0, 0, n_effects), dtype=int))
 
 
+@one_blas_thread()
 def _cells(
     scales: PlaceScales,
     shape: tuple[int, int],
@@ -251,6 +253,7 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     return maps.assign_coords(robot=posterior["observed_data"]["robot"].values)
 
 
+@one_blas_thread()
 def _moments_of_cells(
     scales: PlaceScales, shape: tuple[int, int], cells: np.ndarray, known: np.ndarray
 ) -> np.ndarray:

@@ -110,9 +110,8 @@ def test_modes_of_a_normal_mixture_are_found_with_their_mass():
 
     starts = np.array([[0.5, 0.0], [-0.55, 0.0], [0.1, 9.0], [-0.2, -9.0]])
     with own_settings():
-        found = find_modes(
-            lambda x: -log_density(x), log_density, starts, jnp.array([0.05, np.inf])
-        )
+        find = jax.jit(lambda x, most: find_modes(lambda x: -log_density(x), log_density, x, most))
+        found = find(starts, np.array([0.05, np.inf]))
         starts_of_chains, _ = found.spread(3)
     distinct = np.flatnonzero(found.share)
     assert len(distinct) == 2

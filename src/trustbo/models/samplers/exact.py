@@ -20,7 +20,6 @@ how fast. It is exact but for the number of points and the smoothing of the larg
 `MAX_KHAT` the caller falls back on NUTS. Derivation: docs/derivations/exact-sampler.md.
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +28,6 @@ from arviz_stats.base.array import array_stats
 from numpyro.distributions import constraints
 from scipy import special
 from scipy.ndimage import maximum_filter
-from threadpoolctl import ThreadpoolController
 
 from trustbo.errors import TrustboError
 from trustbo.models.floored import Floored
@@ -39,6 +37,7 @@ from trustbo.models.samplers.convergence import GOOD_KHAT
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.priors_numpy import log_prob, number, numbers
 from trustbo.models.samplers.proposal import Mixture
+from trustbo.parallel import one_blas_thread
 
 _LOG2_POINTS, _LOG2_AROUND = 12, 10
 _FEW = 50  # points
@@ -154,7 +153,7 @@ def sample_exact(
     if reason := why_not_conjugate(priors):
         raise TrustboError(f'sampler "exact": {reason}. Use sampler="nuts", which takes any.')
     # Matrices are small: a second BLAS thread costs more than it brings.
-    with blas().limit(limits=1, user_api="blas"):
+    with one_blas_thread():
         target = _target(statistics, priors)
         first = _matched(target, _modes(target), seed)
         points = last = _weigh(target, first, seed)
@@ -179,12 +178,6 @@ def sample_exact(
     kish = float(1.0 / (weights**2).sum())
     log_w, log_p = points.log_w[chosen], points.log_p[chosen]
     return ExactDraws(params, log_w, log_p, points.khat, kish, points.log_evidence)
-
-
-@cache
-def blas() -> ThreadpoolController:
-    """Loaded BLAS libraries: the search for them takes a fifth as long as the sampling."""
-    return ThreadpoolController()
 
 
 def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:

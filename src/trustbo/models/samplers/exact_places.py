@@ -25,10 +25,11 @@ import numpy as np
 from trustbo.models.likelihood import place_prior
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.samplers.convergence import GOOD_KHAT
-from trustbo.models.samplers.exact import ExactDraws, blas, smoothed_weights, systematic
+from trustbo.models.samplers.exact import ExactDraws, smoothed_weights, systematic
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.place_target import Conditional, PlaceTarget
 from trustbo.models.samplers.student import Student, log_mixture
+from trustbo.parallel import one_blas_thread
 
 _PILOT, _FINAL = 256, 512
 _MAX_ROUNDS, _MAX_FINAL = 4, 3
@@ -73,7 +74,7 @@ def sample_places(
         start: Proposal of an earlier posterior to begin with.
     """
     # Matrices are small: a second BLAS thread costs more than it brings.
-    with blas().limit(limits=1, user_api="blas"):
+    with one_blas_thread():
         points, proposal = _weigh(target, seed, start)
         rng = np.random.default_rng(seed)
         weights = np.exp(points.log_w)
