@@ -15,7 +15,7 @@ from trustbo.models.model import TrustModel, require_model
 from trustbo.models.place import Visited, bounds_of, visited
 from trustbo.models.place_maps import place_group
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.posterior_groups import complete
+from trustbo.models.posterior_groups import Law, complete
 from trustbo.models.posterior_tree import to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.samplers.nuts import NutsSettings
@@ -51,8 +51,8 @@ def fit(
         model: Trust model; by default `PooledTrust()`.
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
             attributes say which, and why. `"exact"`: near-independent draws by importance sampling,
-            without compiling, for Gaussian observations of robots that share their parameters or
-            have nothing in common; it falls back on NUTS, with a warning, where its weights are too
+            without compiling, for robots that share their parameters, have nothing in common, or
+            are partially pooled; it falls back on NUTS, with a warning, where its weights are too
             uneven. `"nuts"`. Or `"joint"`: NUTS on parameters and latent trust together, which
             `"nuts"` is too where trust does not integrate out.
         workspace: Workspace of the missions. A model with effects of places then knows them over
@@ -69,8 +69,8 @@ def fit(
             contact rates are kept.
         check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
             run does not cure; `False` returns it unchecked.
-        whole: Whether to add latent trust, log-likelihoods and predictions at once; where trust
-            integrates out, `complete` adds them later.
+        whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
+            them later, where trust follows from the parameters.
 
     Returns:
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
@@ -132,7 +132,7 @@ def fit(
         counted = xr.DataArray(weight[: len(missions)], dims="mission")
         posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
         posterior.attrs["weights"] = counted.values.tolist()
-    if whole or not model.family.integrates_out:
+    if whole or not Law.of(posterior).keeps_trust:
         posterior = complete(
             posterior, missions, n_trajectories=n_trajectories, latents=draws.latents
         )

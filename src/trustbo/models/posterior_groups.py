@@ -12,6 +12,7 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood import kalman_numpy, latent
 from trustbo.models.likelihood.contact_rate import mission_log_likelihood
+from trustbo.models.likelihood.ep import trust
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.params import Params, assemble_params, params_of
 from trustbo.models.place import bounds_of
@@ -41,7 +42,7 @@ class Law(NamedTuple):
     family: Family
     lag: float
     by_numpy: bool
-    """Whether scalar recursions suffice, which NumPy runs faster than they compile."""
+    """Whether scalar recursions suffice, which run faster than JAX compiles them."""
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
@@ -49,7 +50,12 @@ class Law(NamedTuple):
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
-        return cls(family, lag, family.integrates_out and apart)
+        return cls(family, lag, apart and (family.integrates_out or not lag))
+
+    @property
+    def keeps_trust(self) -> bool:
+        """Whether trust follows from the parameters, without what was sampled with them."""
+        return self.by_numpy or self.family.integrates_out
 
 
 def complete(
@@ -91,7 +97,7 @@ def complete(
                 "as complete(result.posteriors[j], result.missions[: j + 1])."
             )
         missions = missions_of(posterior)
-    if not law.family.integrates_out and latents is None:
+    if not law.keeps_trust and latents is None:
         raise TrustboError(
             f'trust under observation "{law.family.name}" was sampled with the parameters and not '
             "kept; fit these missions anew."
@@ -172,15 +178,20 @@ def _trust_by_numpy(
     n_bounds: np.ndarray,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Latent trust, log-likelihood and predictions of robots apart, without compiling."""
+    """Latent trust, log-likelihood and predictions of robots apart, without JAX."""
     rng = np.random.default_rng([seed, 1])
-    summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
+    if law.family.integrates_out:
+        summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
+        trajectories = kalman_numpy.sample(few, law.lag, batch, rng, n_bounds)
+    else:
+        summary = trust.summarize(law.family, every, batch, n_bounds, rng)
+        trajectories = trust.sample(law.family, few, batch, n_bounds, rng)
     return {
         "log_likelihood": summary.log_likelihood,
-        "trust": kalman_numpy.sample(few, law.lag, batch, rng, n_bounds),
+        "trust": trajectories,
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
-        "predicted": kalman_numpy.simulate(few, law.lag, batch.awareness, rng),
+        "predicted": kalman_numpy.simulate(law.family, few, law.lag, batch, rng),
     }
 
 
@@ -193,7 +204,7 @@ def _trust_compiled(
     batch: MissionBatch,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """The same for coupled robots and families that do not integrate out."""
+    """The same for coupled robots, and changes of trust that do not integrate out."""
     few_latents = latents
     if (innovations := latents.innovations) is not None:
         shape = (-1, *innovations.shape[2:])
@@ -216,7 +227,7 @@ def predict(law: Law, params: Params, batch: MissionBatch, seed: int) -> np.ndar
     """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
     if law.by_numpy:
         rng = np.random.default_rng(seed)
-        return kalman_numpy.simulate(params, law.lag, batch.awareness, rng)
+        return kalman_numpy.simulate(law.family, params, law.lag, batch, rng)
     with own_settings():
         return np.asarray(latent.predictive(law.family, law.lag, params, batch, random.key(seed)))
 
