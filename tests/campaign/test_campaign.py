@@ -1,7 +1,6 @@
 """Ask and tell: whatever runs the missions."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -176,21 +175,19 @@ def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
     censored = PooledTrust(observation="censored")
     with pytest.raises(TrustboError, match=r'forgetting = 0.9 needs update "refit" and Gaussian'):
         Campaign(workspace, *ENDS, model=censored, forgetting=0.9)
-    with pytest.raises(TrustboError, match="its observations are not Gaussian"):
-        Campaign(workspace, *ENDS, model=censored, sampler="exact")
+    changes = PooledTrust(observation="censored", response="change")
+    with pytest.raises(TrustboError, match="it measures changes of trust, and its observations"):
+        Campaign(workspace, *ENDS, model=changes, sampler="exact")
     with pytest.raises(TrustboError, match="unknown update 'online'"):
         Campaign(workspace, *ENDS, update="online")
 
 
-@pytest.mark.slow  # it samples trust
-def test_a_campaign_with_censored_rates(workspace, monkeypatch):
-    # The shortest run shows which sampler is taken.
-    short = partial(fit, n_warmup=60, n_draws=20, n_chains=2, check=False)
-    monkeypatch.setattr("trustbo.campaign.learning.fit", short)
+def test_a_campaign_with_censored_rates(workspace):
     model = PooledTrust(observation="censored")
     campaign = Campaign(workspace, *ENDS, model=model, policy="greedy")
     campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
-    assert campaign.posterior.attrs["sampler"] == "joint"
+    assert campaign.posterior.attrs["sampler"] == "exact"
+    assert "latent" not in campaign.posterior.children  # `complete` adds it
     assert campaign.ask().exact
 
 

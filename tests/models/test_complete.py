@@ -47,7 +47,7 @@ def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
 
 def test_trust_that_was_sampled_cannot_be_added_later(missions):
     bare = fit(missions, sampler="exact", n_draws=100, whole=False)
-    bare.attrs["observation"] = "censored"
+    bare.attrs |= {"observation": "censored", "response": "change"}
     with pytest.raises(TrustboError, match='under observation "censored" was sampled with'):
         complete(bare)
 

@@ -37,7 +37,6 @@ from trustbo.stacking import stack_missions
 
 N = 40
 AS_MANY_AS_PRIOR_DRAWS = 500  # then replicated and prior missions are of one compiled program
-SHORT = {"n_warmup": 300, "n_draws": 500, "n_trajectories": AS_MANY_AS_PRIOR_DRAWS}
 MODELS = {
     "pooled": PooledTrust(),
     "hierarchical": HierarchicalTrust(),
@@ -267,13 +266,12 @@ def require_trust_followed_in_real_time(posterior, model, mission):
     np.testing.assert_allclose(ahead.sd[0], nothing.sd, rtol=1e-10)
 
 
-@pytest.mark.slow  # two families that sample trust
 @pytest.mark.filterwarnings("ignore:Estimated shape parameter of Pareto")  # 6 missions
 def test_families_are_compared_on_equal_terms_and_predict_in_their_own():
     """One test, not three: two workers would sample the posteriors twice."""
     missions = counted_missions()
     families = {"gaussian": fit(missions, sampler="exact")} | {
-        family: fit(missions, PooledTrust(observation=family), **SHORT)
+        family: fit(missions, PooledTrust(observation=family))
         for family in ("censored", "beta_binomial")
     }
     require_equal_terms(families)
@@ -283,12 +281,7 @@ def test_families_are_compared_on_equal_terms_and_predict_in_their_own():
 
 def require_equal_terms(families):
     for family, posterior in families.items():
-        found = diagnostics(posterior)
-        if posterior.attrs["sampler"] == "exact":
-            assert found["k_hat"] <= 0.7, family
-        else:
-            assert found["divergences"] == 0, family
-            assert found["r_hat"] <= 1.01, family
+        assert diagnostics(posterior)["k_hat"] <= 0.7, family
         assert posterior.attrs["log_likelihood_of"] == "ticks"
         # Probabilities of counts: none can be positive.
         assert float(posterior["log_likelihood"]["contact_rate"].max()) < 0.0
@@ -317,16 +310,6 @@ def require_predicted_counts(posterior):
     np.testing.assert_allclose(predicted, np.round(predicted), atol=1e-9)
     share = float((predicted / N).mean())
     assert abs(share - float(posterior["observed_data"]["contact_rate"].mean())) < 0.05
-
-
-@pytest.mark.slow  # a family that samples trust
-def test_rates_all_at_one_end_have_a_posterior_when_censored():
-    missions = counted_missions()  # as many as above: the same program
-    same = [
-        Mission.from_arrays(m.path, m.awareness, np.ones_like(m.contact_rate)) for m in missions
-    ]
-    posterior = fit(same, PooledTrust(observation="censored"), **SHORT, check=False)
-    assert float(posterior["latent"]["trust_mean"].mean()) > 0.9
 
 
 # Not hierarchical, coupled and change: counts and censored have their sites, apart their rates.

@@ -198,7 +198,7 @@ class Campaign(Displayed):
         if last is None:
             return None
         if self._whole is None or self._whole[0] is not last:
-            self._whole = last, whole_posterior(last(), self.missions)
+            self._whole = last, whole_posterior(last(), self.missions, self.model)
         whole = self._whole[1]
         whole["hazard"] = xr.DataTree(self.hazard)
         return whole

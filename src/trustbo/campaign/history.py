@@ -16,7 +16,7 @@ from trustbo.data import Mission
 from trustbo.errors import DamagedFileError
 from trustbo.files import checksum
 from trustbo.logs.netcdf import read_tree
-from trustbo.models import complete
+from trustbo.models import TrustModel, complete
 from trustbo.models.posterior_groups import parameters_alone
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -81,17 +81,20 @@ class Posteriors(Sequence[xr.DataTree]):
         return None if one is None else one()
 
 
-def whole_posterior(kept: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+def whole_posterior(
+    kept: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None = None
+) -> xr.DataTree:
     """Posterior with all groups, its missions labelled by their numbers in the campaign, from 0.
 
     Args:
         kept: Posterior as a campaign keeps it.
         missions: All missions told so far, their awareness filled in.
+        model: Its model, for `log_prior`; needed where the priors are the user's own.
     """
     if "missions" not in kept.attrs:  # of version 0.1, whole already
         return kept
     numbers = np.atleast_1d(kept.attrs["missions"]).astype(int)
-    whole = complete(kept, [missions[j] for j in numbers])
+    whole = complete(kept, [missions[j] for j in numbers], model=model)
     parts = {name: part.to_dataset() for name, part in whole.children.items()}
     for name, part in parts.items():
         if "mission" in part.dims:

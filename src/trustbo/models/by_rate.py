@@ -38,7 +38,7 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
             other; or see `complete`.
     """
     law = Law.of(posterior)
-    if not law.by_numpy:
+    if not (law.by_numpy and law.family.integrates_out):
         raise TrustboError(
             "rates are predicted one by one for Gaussian observations of robots that do not "
             f'influence each other; this posterior has observation "{law.family.name}" and '

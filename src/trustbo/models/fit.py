@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
-from trustbo.models.log_prior import log_prior
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.place import Visited, bounds_of, visited
 from trustbo.models.place_maps import place_group
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.posterior_groups import complete
+from trustbo.models.posterior_groups import Law, complete
 from trustbo.models.posterior_tree import to_datatree
 from trustbo.models.prior_predictive import draw_sites
+from trustbo.models.record import model_to_record
 from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import draw_posterior, resolve_sampler
 from trustbo.models.samplers.student import Student
@@ -52,8 +52,8 @@ def fit(
         model: Trust model; by default `PooledTrust()`.
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
             attributes say which, and why. `"exact"`: near-independent draws by importance sampling,
-            without compiling, for Gaussian observations of robots that share their parameters or
-            have nothing in common; it falls back on NUTS, with a warning, where its weights are too
+            without compiling, for robots that share their parameters, have nothing in common, or
+            are partially pooled; it falls back on NUTS, with a warning, where its weights are too
             uneven. `"nuts"`. Or `"joint"`: NUTS on parameters and latent trust together, which
             `"nuts"` is too where trust does not integrate out.
         workspace: Workspace of the missions. A model with effects of places then knows them over
@@ -69,8 +69,8 @@ def fit(
         n_trajectories: Draws, spread evenly over the chains, for which latent trust is kept.
         check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
             run does not cure; `False` returns it unchecked.
-        whole: Whether to add latent trust, log-likelihoods and predictions at once; where trust
-            integrates out, `complete` adds them later.
+        whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
+            them later, where trust follows from the parameters.
 
     Returns:
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
@@ -109,7 +109,6 @@ def fit(
         "posterior": {name: draws.params[name] for name in model.dims},
         "sample_stats": draws.stats,
         "prior": {name: values[None] for name, values in prior.items()},
-        "log_prior": log_prior(floored, draws.params),
     }
     posterior = to_datatree(groups, missions, model.dims)
     if places is not None:
@@ -120,6 +119,7 @@ def fit(
         "inter_robot": "none",
         **model.options(),
         "place": "none" if model.place is None else json.dumps(model.place.to_record()),
+        "model_record": json.dumps(model_to_record(model)),
         "sampler": draws.sampler,
         "sampler_reason": reason if draws.sampler == chosen else "weights were too uneven",
         "seed": seed,
@@ -134,9 +134,9 @@ def fit(
         counted = xr.DataArray(weight[: len(missions)], dims="mission")
         posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
         posterior.attrs["weights"] = counted.values.tolist()
-    if whole or not model.family.integrates_out:
+    if whole or not Law.of(posterior).keeps_trust:
         posterior = complete(
-            posterior, missions, n_trajectories=n_trajectories, latents=draws.latents
+            posterior, missions, model=model, n_trajectories=n_trajectories, latents=draws.latents
         )
     posterior.attrs["seconds"] = time.perf_counter() - started
     if complaints:

@@ -1,10 +1,14 @@
 """Log prior density of the draws of a posterior, for ArviZ's analysis of sensitivity."""
 
+import json
 from collections.abc import Mapping
 
 import numpy as np
+import xarray as xr
 
+from trustbo.errors import TrustboError
 from trustbo.models.model import TrustModel
+from trustbo.models.record import model_from_record
 
 
 def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -15,7 +19,7 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
     coupled model has density det(R)^(concentration - 1).
 
     Args:
-        model: Trust model, its delta_v floored as it was sampled.
+        model: Trust model.
         sites: Parameters of the posterior, (chain, draw, ...).
 
     Returns:
@@ -36,3 +40,17 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
     if model.place is not None:
         found |= model.place.log_prior(sites)
     return {label: each.reshape(*each.shape[:2], -1).sum(-1) for label, each in found.items()}
+
+
+def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> xr.Dataset | None:
+    """Group `log_prior` of a posterior; None where its model is not given and not on record."""
+    try:
+        recorded = model or model_from_record(json.loads(posterior.attrs["model_record"]))
+    except (KeyError, TrustboError):  # of an older version, or with priors of the user's own
+        return None
+    draws = posterior["posterior"].to_dataset()
+    recorded = recorded.for_features([str(name) for name in draws["feature"].values])
+    sites = {str(n): a.transpose("chain", "draw", ...).values for n, a in draws.items()}
+    densities = log_prior(recorded, sites)
+    index = {"chain": draws["chain"], "draw": draws["draw"]}
+    return xr.Dataset({n: (("chain", "draw"), d) for n, d in densities.items()}, index)

@@ -319,11 +319,14 @@ class TrustModel(Displayed, ABC):
     def gather(self, batch: MissionBatch, weight: np.ndarray | None = None) -> Statistics:
         """Sufficient statistics of a batch, each mission weighted."""
         args = (self.priors.x0_mean, self.lag, weight)
+        return tuple(sufficient_statistics(one, *args) for one in self.robots_of(batch))
+
+    def robots_of(self, batch: MissionBatch) -> list[MissionBatch]:
+        """Missions of all robots together, or of each, if they have nothing in common."""
         if self.robot_sets == "all":
-            return (sufficient_statistics(batch, *args),)
+            return [batch]
         n_robots = batch.contact_rate.shape[2]
-        apart = [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
-        return tuple(sufficient_statistics(one, *args) for one in apart)
+        return [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
 
     def require_statistics(self) -> None:
         """Refuse a model that has no sufficient statistics.
@@ -333,16 +336,25 @@ class TrustModel(Displayed, ABC):
                 influence each other; or places have effects, which no sum over missions knows.
         """
         reason = self.why_not_exact or (self.place and "places have effects")
+        if not self.family.integrates_out:
+            reason = "its observations are not Gaussian"
+        elif self.robot_sets is None:
+            reason = "its robots share some parameters only, or influence each other"
         if reason:
             raise TrustboError(f"{self.describe()} has no sufficient statistics: {reason}.")
 
     @property
     def why_not_exact(self) -> str | None:
         """Reason why the exact sampler cannot treat the model; None if it can."""
-        if not self.family.integrates_out:
-            return "its observations are not Gaussian"
-        if self.robot_sets is None:
+        if self.robot_sets is None and self.partial_pooling is None:
             return "its robots share some parameters only, or influence each other"
+        if self.partial_pooling is not None:
+            if not self.family.integrates_out:
+                return "its robots are partially pooled, and its observations are not Gaussian"
+            return "it has effects of places, and robots partially pooled" if self.place else None
+        if not self.family.integrates_out and (self.place is not None or self.lag):
+            what = "has effects of places" if self.place else "measures changes of trust"
+            return f"it {what}, and its observations are not Gaussian"
         if self.place is not None and (self.robot_sets == "each" or self.lag):
             return "it has effects of places, and " + (
                 "rates measure changes" if self.lag else "robots with nothing else in common"

@@ -12,7 +12,10 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood import kalman_numpy, latent
 from trustbo.models.likelihood.contact_rate import mission_log_likelihood
+from trustbo.models.likelihood.ep import trust
 from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.log_prior import log_prior_group
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, assemble_params, params_of
 from trustbo.models.place import bounds_of
 from trustbo.models.place_maps import prior_maps
@@ -24,7 +27,7 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior", "log_prior", "places", "hazard")
+_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
@@ -41,7 +44,7 @@ class Law(NamedTuple):
     family: Family
     lag: float
     by_numpy: bool
-    """Whether scalar recursions suffice, which NumPy runs faster than they compile."""
+    """Whether scalar recursions suffice, which run faster than JAX compiles them."""
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
@@ -49,13 +52,19 @@ class Law(NamedTuple):
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
-        return cls(family, lag, family.integrates_out and apart)
+        return cls(family, lag, apart and (family.integrates_out or not lag))
+
+    @property
+    def keeps_trust(self) -> bool:
+        """Whether trust follows from the parameters, without what was sampled with them."""
+        return self.by_numpy or self.family.integrates_out
 
 
 def complete(
     posterior: xr.DataTree,
     missions: Sequence[Mission] | None = None,
     *,
+    model: TrustModel | None = None,
     n_trajectories: int = _N_TRAJECTORIES,
     latents: latent.Latents | None = None,
 ) -> xr.DataTree:
@@ -67,14 +76,15 @@ def complete(
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Missions that it was fitted to; needed where it holds no data.
+        model: Its model, for `log_prior`; needed where the priors are your own.
         n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust of.
         latents: Innovations of latent trust, where they were sampled with the parameters.
 
     Returns:
-        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive` and
-        `log_likelihood`; itself, if it has them. Where missions have weights, the last is called
-        `mission_log_likelihood`: `az.loo` would take it for that of an unweighted posterior; use
-        `trustbo.models.loo`.
+        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
+        `log_prior` and `log_likelihood`; itself, if it has them. Where missions have weights, the
+        last is called `mission_log_likelihood`: `az.loo` would take it for that of an unweighted
+        posterior; use `trustbo.models.loo`.
 
     Raises:
         TrustboError: The posterior holds no data and no missions are given; or its trust does not
@@ -90,7 +100,7 @@ def complete(
                 "as complete(result.posteriors[j], result.missions[: j + 1])."
             )
         missions = missions_of(posterior)
-    if not law.family.integrates_out and latents is None:
+    if not law.keeps_trust and latents is None:
         raise TrustboError(
             f'trust under observation "{law.family.name}" was sampled with the parameters and not '
             "kept; fit these missions anew."
@@ -100,6 +110,8 @@ def complete(
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
+    if (densities := log_prior_group(posterior, model)) is not None:
+        whole["log_prior"] = xr.DataTree(densities)
     whole.attrs = posterior.attrs | {"log_likelihood_of": of}
     if "weights" in posterior.attrs:
         weight = xr.DataArray(np.atleast_1d(posterior.attrs["weights"]), dims="mission")
@@ -171,15 +183,20 @@ def _trust_by_numpy(
     n_bounds: np.ndarray,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """Latent trust, log-likelihood and predictions of robots apart, without compiling."""
+    """Latent trust, log-likelihood and predictions of robots apart, without JAX."""
     rng = np.random.default_rng([seed, 1])
-    summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
+    if law.family.integrates_out:
+        summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
+        trajectories = kalman_numpy.sample(few, law.lag, batch, rng, n_bounds)
+    else:
+        summary = trust.summarize(law.family, every, batch, n_bounds, rng)
+        trajectories = trust.sample(law.family, few, batch, n_bounds, rng)
     return {
         "log_likelihood": summary.log_likelihood,
-        "trust": kalman_numpy.sample(few, law.lag, batch, rng, n_bounds),
+        "trust": trajectories,
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
-        "predicted": kalman_numpy.simulate(every, law.lag, batch.awareness, rng),
+        "predicted": kalman_numpy.simulate(law.family, every, law.lag, batch, rng),
     }
 
 
@@ -192,7 +209,7 @@ def _trust_compiled(
     batch: MissionBatch,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """The same for coupled robots and families that do not integrate out."""
+    """The same for coupled robots, and changes of trust that do not integrate out."""
     few_latents = latents
     if (innovations := latents.innovations) is not None:
         shape = (-1, *innovations.shape[2:])
@@ -215,7 +232,7 @@ def predict(law: Law, params: Params, batch: MissionBatch, seed: int) -> np.ndar
     """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
     if law.by_numpy:
         rng = np.random.default_rng(seed)
-        return kalman_numpy.simulate(params, law.lag, batch.awareness, rng)
+        return kalman_numpy.simulate(law.family, params, law.lag, batch, rng)
     with own_settings():
         return np.asarray(latent.predictive(law.family, law.lag, params, batch, random.key(seed)))
 

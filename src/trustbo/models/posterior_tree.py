@@ -15,7 +15,6 @@ _DIMS = {
     "trust_sd": ("mission", "bound", "robot"),
     "contact_rate": ("mission", "bound", "robot"),
 }
-_LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 
 
 def to_datatree(
@@ -47,8 +46,11 @@ def to_datatree(
         draw = arrays.pop("draw", None)
         variables, used, shape = {}, set(), (0, 0)
         for name, array in arrays.items():
-            whole = {"log_prior": ()} | dict.fromkeys(_LIKELIHOODS, ("mission",))
-            dims = whole.get(group, (_DIMS | site_dims).get(name, ()))
+            dims = (
+                ("mission",)
+                if group.endswith("log_likelihood")
+                else (_DIMS | site_dims).get(name, ())
+            )
             kept = array[(..., *(slice(len(coords[d])) for d in dims))]
             if "bound" in dims:
                 kept = np.where(ended, np.nan, kept)

@@ -21,8 +21,11 @@ PARAMS = {
 }
 
 
-def on_a_grid(family, p, z, y, n_points=1201):
-    """p(y) of one robot by filtering point masses of trust: the trapezoid rule, bound by bound."""
+def on_a_grid(family, p, z, y, n_points=1201, *, last_trust=False):
+    """p(y) of one robot by filtering point masses of trust: the trapezoid rule, bound by bound.
+
+    Log p(y), or the mean and sd of trust at the last bound.
+    """
     width = 9.0 if family == "beta_binomial" else 2.5
     x = np.linspace(0.5 - width, 0.5 + width, n_points)
     step = x[1] - x[0]
@@ -47,6 +50,9 @@ def on_a_grid(family, p, z, y, n_points=1201):
         weights = weights * likelihood
         log_total += np.log(weights.sum())
         weights /= weights.sum()
+    if last_trust:
+        mean = weights @ x
+        return mean, np.sqrt(weights @ (x - mean) ** 2)
     return log_total
 
 

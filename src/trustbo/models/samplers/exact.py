@@ -92,7 +92,7 @@ class _Target(NamedTuple):
         mean, precision = self.mean * rest, self.precision / rest**2
         diagonal = precision[:, :, None] * np.eye(len(self.mean))
         factor = small_cholesky((quadratic.P + diagonal).transpose(1, 2, 0))
-        half = _forward(factor, (quadratic.h + precision * mean).T)
+        half = forward(factor, (quadratic.h + precision * mean).T)
         misfit = quadratic.alpha + (precision * mean**2).sum(1) - (half**2).sum(0)
         log_det = 2.0 * np.log(np.einsum("ccn->cn", factor)).sum(0)
         log_likelihood = -0.5 * (
@@ -107,7 +107,7 @@ class _Target(NamedTuple):
             + log_prob(self.priors.delta_w, delta_w)
             + log_prob(self.priors.delta_v, delta_v)
         )
-        return log_likelihood + log_jacobian + log_prior, _backward(factor, half), factor
+        return log_likelihood + log_jacobian + log_prior, backward(factor, half), factor
 
     def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """beta0, delta_w, delta_v, and the log Jacobian of the way there."""
@@ -167,7 +167,7 @@ def sample_exact(
     chosen = rng.permutation(systematic(weights, n_draws, rng))
     beta0, delta_w, delta_v, _ = target.constrain(points.z[chosen])
     mean, factor = points.mean[:, chosen], points.factor[..., chosen]
-    coefficients = mean + _backward(factor, rng.standard_normal(mean.shape))
+    coefficients = mean + backward(factor, rng.standard_normal(mean.shape))
     params = {
         "beta0": beta0,
         "beta": coefficients[:-1].T,
@@ -323,7 +323,7 @@ def small_cholesky(A: np.ndarray) -> np.ndarray:
     return L
 
 
-def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+def forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     """L^-1 b for factors (row, column, point) and vectors (row, point)."""
     x = np.empty_like(b)
     for i in range(len(b)):
@@ -331,7 +331,7 @@ def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     return x
 
 
-def _backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
+def backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     """L'^-1 b for factors (row, column, point) and vectors (row, point)."""
     x = np.empty_like(b)
     for i in reversed(range(len(b))):

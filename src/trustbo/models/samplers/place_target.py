@@ -20,9 +20,13 @@ from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
 from trustbo.models.samplers.exact import small_cholesky
+from trustbo.models.samplers.laplace import laplace
+from trustbo.models.samplers.place_draws import split_units
 from trustbo.models.samplers.priors_numpy import numbers
+from trustbo.models.samplers.student import Student
 
 _MEMORY = 8e6  # numbers per chunk of parameter values
+_NUMBERS = 2e8  # bytes of factors kept at once
 
 
 class Conditional(NamedTuple):
@@ -38,6 +42,11 @@ class Conditional(NamedTuple):
 
 class PlaceTarget:
     """Log posterior density of the scores."""
+
+    n_pilot, widths = 256, (1.25, 1.1)
+    n_final = 512
+    """Points of the last proposal."""
+    n_corrected = None
 
     def __init__(self, rows: Rows, places: Visited, priors: Priors, place: PlaceEffect) -> None:
         """Take the rows of all missions and the priors."""
@@ -56,20 +65,15 @@ class PlaceTarget:
 
     def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Theta (point, 6) and the log prior density of scores (point, score)."""
-        size, (r, *others) = np.exp(z[:, 1]), z[:, 2:].T
         theta = np.zeros((len(z), 6))
-        theta[:, 0] = scores.quantile(self.priors.beta0, z[:, 0])
-        for i, prior, side in ((1, self.priors.delta_w, 1.0), (2, self.priors.delta_v, -1.0)):
-            angle = 0.5 * np.pi * scores.special.ndtr(side * r)
-            theta[:, i] = scores.noise(prior, size * np.sin(angle))
-        theta[:, 4], p, rest = 1.0, self.place, iter(others)
+        theta[:, :3] = scores.beta0_and_noises(self.priors, z)
+        theta[:, 4], p, rest = 1.0, self.place, iter(z[:, 3:].T)
         if p.cells:
             theta[:, 3] = scores.half_normal(next(rest), p.tau_s)
             theta[:, 4] = p.length_scale * np.exp(p.length_scale_sd * next(rest))
         if p.bounds:
             theta[:, 5] = scores.half_normal(next(rest), p.tau_e)
-        normal = scores.log_normal_density(np.delete(z, 1, axis=1))
-        return theta, 2.0 * z[:, 1] - 0.5 * size**2 + normal
+        return theta, scores.log_prior(z)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density, normalised by nothing but the evidence; shape (point,)."""
@@ -79,6 +83,47 @@ class PlaceTarget:
     def conditional(self, z: np.ndarray) -> Conditional:
         """Law of coefficients and effects given scores (point, score)."""
         return self._evaluate(z, keep=True)
+
+    def first(self) -> Student:
+        """Gaussian fit at the best mode, found from the priors' middle and from little noise."""
+        rates = self.rows.y[self.rows.seen]
+        start = np.zeros((2, self.n_scores))
+        start[:, 1] = np.log(np.clip(np.std(rates) / 0.2, 1e-2, 3.0)) - np.array([0.7, 2.5])
+        z, value, scale = laplace(self.log_density, start, n_steps=12)
+        best = int(np.argmax(value))
+        return Student(z[best], scale[best])
+
+    def defensive(self, proposal: Student) -> Student:
+        """Proposal for beta0 and the noises as told, the prior for the scores of places."""
+        n = 3
+        cov = 1.5 * proposal.scale @ proposal.scale.T
+        cov[n:], cov[:, n:] = 0.0, 0.0
+        cov[n:, n:] = np.eye(self.n_scores - n)
+        center = np.append(proposal.center[:n], np.zeros(self.n_scores - n))
+        return proposal._replace(center=center, scale=np.linalg.cholesky(cov))
+
+    def draw(
+        self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
+    ) -> tuple[dict[str, np.ndarray], None]:
+        """Parameters and effects at the points of sorted indices; these draws need no weights."""
+        n, places, place = len(chosen), self.places, self.place
+        n_units, n_coefficients = len(places.units), len(self.mean)
+        c, g = rng.standard_normal((n, n_coefficients)), rng.standard_normal((n, n_units))
+        theta, at = np.empty((n, 6)), 0
+        unique, count = np.unique(chosen, return_counts=True)
+        step = max(1, int(_NUMBERS / (8 * n_units**2)))
+        for i in range(0, len(unique), step):
+            law = self.conditional(z[unique[i : i + step]])
+            for k, of in enumerate(count[i : i + step]):
+                rows = slice(at, at := at + int(of))
+                theta[rows] = law.theta[k]
+                c[rows], g[rows] = _given_theta(law, k, c[rows], g[rows])
+        params = dict(zip(("beta0", "delta_w", "delta_v"), theta.T, strict=False))
+        names = ("tau_s", "length_scale", "tau_e")
+        hyper: dict[str, np.ndarray] = dict(zip(names, theta[:, 3:].T, strict=True))
+        params |= {"beta": c[:, :-1], "b": c[:, -1]}
+        params |= {name: hyper[name] for name in place.names}
+        return params | split_units(g, hyper, places, place, rng), None
 
     def _evaluate(self, z: np.ndarray, *, keep: bool = False) -> Conditional:
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
@@ -146,3 +191,12 @@ class PlaceTarget:
 def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     """L^-1 b for factors (point, c, c) and vectors (point, c)."""
     return np.linalg.solve(L, b[..., None])[..., 0]
+
+
+def _given_theta(
+    law: Conditional, k: int, c: np.ndarray, g: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients and effects of standard normal numbers (draw, ...), at the k-th point."""
+    c = np.linalg.solve(law.factor[k].T, law.half[k][:, None] + c.T).T
+    right = law.of_units[k, -1] - c @ law.of_units[k, :-1]
+    return c, place_prior.solve(law.L[k], right + g, transposed=True)

@@ -11,6 +11,7 @@ from jax import Array, random
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import own_settings
+from trustbo.models.likelihood.ep.chains import gather_chains
 from trustbo.models.likelihood.gram_jax import spectrum
 from trustbo.models.likelihood.latent import Latents
 from trustbo.models.likelihood.place_marginal import PlaceIndex
@@ -19,10 +20,14 @@ from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
 from trustbo.models.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
-from trustbo.models.samplers.exact_places import sample_places, split_units
+from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
+from trustbo.models.samplers.importance import ScoreTarget, sample_scores
+from trustbo.models.samplers.latent_target import LatentTarget
 from trustbo.models.samplers.modes import visits
 from trustbo.models.samplers.nuts import NutsDraws, NutsSettings, run_nuts
+from trustbo.models.samplers.place_draws import split_units
 from trustbo.models.samplers.place_target import PlaceTarget
+from trustbo.models.samplers.scores import why_no_quantiles
 from trustbo.models.samplers.student import Student
 from trustbo.models.samplers.target import NutsData
 from trustbo.stacking import MissionBatch
@@ -74,8 +79,8 @@ def draw_posterior(
     if sampler == "exact":
         exact = (
             _sample_exact(model, settings, seed, batch, weight)
-            if places is None
-            else _sample_places(model, settings, seed, batch, weight, places, start)
+            if places is None and model.family.integrates_out and model.robot_sets
+            else _sample_scores(model, settings, seed, batch, weight, places, start)
         )
         if exact is not None:
             return exact, []
@@ -114,9 +119,9 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
     """Refuse a sampler that cannot treat the model.
 
     Raises:
-        TrustboError: The sampler is `"exact"`, and observations are not Gaussian, or robots share
-            some parameters only or influence each other; or it is `"joint"`, and trust integrates
-            out.
+        TrustboError: The sampler is `"exact"`, and robots share some parameters only or influence
+            each other, or what else `TrustModel.why_not_exact` says; or it is `"joint"`, and trust
+            integrates out.
     """
     if sampler == "exact" and (reason := model.why_not_exact):
         raise TrustboError(
@@ -138,9 +143,15 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
     if sampler != "auto":
         return sampler, "asked for"
+    pooling = model.partial_pooling is not None
+    by_scores = model.place or pooling or not model.family.integrates_out
     reason = model.why_not_exact or why_not_conjugate(model.priors)
+    reason = reason or (
+        why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
+    )
     if reason is None:
-        return "exact", "trust and coefficients integrate out"
+        by = "" if model.family.integrates_out else " by expectation propagation, and weights"
+        return "exact", f"trust and coefficients integrate out{by}"
     return ("nuts" if model.family.integrates_out else "joint"), reason
 
 
@@ -157,46 +168,61 @@ def _sample_exact(
         sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
         for i, statistics in enumerate(model.gather(batch, weight))
     ]
-    khat = max(exact.khat for exact in each)
-    if not _is_even(khat):
+    if not _is_even(max(exact.khat for exact in each)):
         return None
-    summary = {
-        "k_hat": khat,
-        "kish": min(exact.kish for exact in each),
-        "log_evidence": sum(exact.log_evidence for exact in each),
-    }
     params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
-    return Draws(params, stats, summary, "exact")
+    return Draws(params, stats, _summarize(each), "exact")
 
 
-def _sample_places(
+def _sample_scores(
     model: TrustModel,
     settings: NutsSettings,
     seed: int,
     batch: MissionBatch,
     weight: np.ndarray,
-    places: Visited,
+    places: Visited | None,
     start: Student | None,
 ) -> Draws | None:
-    """The same for a model with effects of places."""
+    """The same for effects of places, partial pooling, and rates that are not Gaussian."""
     shape = (settings.n_chains, settings.n_draws)
-    rates = batch.awareness, batch.contact_rate
-    rows = gather_rows(*rates, places, weight, float(model.priors.x0_mean))
-    target = PlaceTarget(rows, places, model.priors, cast(PlaceEffect, model.place))
-    drawn, proposal = sample_places(target, shape[0] * shape[1], seed, start)
-    if not _is_even(drawn.khat):
+    targets = _targets(model, batch, weight, places)
+    found = [sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)]
+    each = [one.draws for one in found]
+    if not _is_even(max(drawn.khat for drawn in each)):
         return None
-    params = {name: of.reshape(*shape, *of.shape[1:]) for name, of in drawn.params.items()}
+    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
-    stats = {"lp": drawn.lp.reshape(shape), "log_weight": drawn.log_weight.reshape(shape)}
-    summary = {
-        "k_hat": drawn.khat,
-        "kish": drawn.kish,
-        "log_evidence": drawn.log_evidence,
-        "proposal_center": proposal.center.tolist(),
-        "proposal_scale": proposal.scale.ravel().tolist(),
-    }
+    summary = _summarize(each)
+    if places is not None:
+        proposal = found[0].proposal
+        summary["proposal_center"] = proposal.center.tolist()
+        summary["proposal_scale"] = proposal.scale.ravel().tolist()
     return Draws(params, stats, summary, "exact", places=effects)
+
+
+def _targets(
+    model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None
+) -> list[ScoreTarget]:
+    """Posterior of the scores of all robots, or of each where they have nothing in common."""
+    priors = model.priors
+    if places is not None:
+        rates = batch.awareness, batch.contact_rate
+        rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
+        return [PlaceTarget(rows, places, priors, cast(PlaceEffect, model.place))]
+    if model.partial_pooling is not None:
+        return [HierarchicalTarget(model.gather(batch, weight), priors)]
+    return [
+        LatentTarget(*gather_chains(model.family, one), priors) for one in model.robots_of(batch)
+    ]
+
+
+def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
+    """Diagnostics of independent posteriors together."""
+    return {
+        "k_hat": max(exact.khat for exact in each),
+        "kish": min(exact.kish for exact in each),
+        "log_evidence": sum(exact.log_evidence for exact in each),
+    }
 
 
 def _is_even(khat: float) -> bool:

@@ -15,6 +15,7 @@ from scipy import special
 from trustbo.errors import TrustboError
 from trustbo.models.backend import own_settings
 from trustbo.models.floored import Floored
+from trustbo.models.priors import Priors
 from trustbo.models.samplers.priors_numpy import number
 
 LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
@@ -23,6 +24,23 @@ LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
 def log_normal_density(scores: np.ndarray) -> np.ndarray:
     """Log density of independent standard normals (..., score), shape (...,)."""
     return -0.5 * (scores**2).sum(-1) - scores.shape[-1] * LOG_ROOT_2PI
+
+
+def log_prior(z: np.ndarray) -> np.ndarray:
+    """Log prior density of scores (point, score), the second being the log size of the noises."""
+    normal = log_normal_density(np.delete(z, 1, axis=1))
+    return 2.0 * z[:, 1] - 0.5 * np.exp(z[:, 1]) ** 2 + normal
+
+
+def beta0_and_noises(priors: Priors, z: np.ndarray) -> np.ndarray:
+    """Parameters beta0, delta_w and delta_v (point, 3) of the first three scores."""
+    size, r = np.exp(z[:, 1]), z[:, 2]
+    theta = np.zeros((len(z), 3))
+    theta[:, 0] = quantile(priors.beta0, z[:, 0])
+    for i, prior, side in ((1, priors.delta_w, 1.0), (2, priors.delta_v, -1.0)):
+        angle = 0.5 * np.pi * special.ndtr(side * r)
+        theta[:, i] = noise(prior, size * np.sin(angle))
+    return theta
 
 
 def half_normal(score: np.ndarray, scale: float) -> np.ndarray:
@@ -39,6 +57,8 @@ def quantile(prior: Distribution, score: np.ndarray) -> np.ndarray:
         low = special.betaincinv(a, b, special.ndtr(np.minimum(score, 0.0)))
         high = 1.0 - special.betaincinv(b, a, special.ndtr(-np.maximum(score, 0.0)))
         return np.where(score < 0.0, low, high)
+    if isinstance(prior, dist.HalfNormal):
+        return half_normal(score, number(prior, "scale"))
     if isinstance(prior, dist.Normal):
         return number(prior, "loc") + number(prior, "scale") * score
     if isinstance(prior, dist.LogNormal):
@@ -59,12 +79,24 @@ def noise(prior: Distribution, size: np.ndarray) -> np.ndarray:
     return _by_numpyro(base, below + (1.0 - below) * special.erf(size / np.sqrt(2.0)))
 
 
+def why_no_quantiles(priors: Priors, *, partial_pooling: bool) -> str | None:
+    """Reason why priors have no scores: one has no quantiles. None if all have."""
+    for name in ("beta0", "delta_w", "delta_v", *("tau",) * partial_pooling):
+        prior = getattr(priors, name)
+        prior = prior.base if isinstance(prior, Floored) else prior
+        try:
+            quantile(prior, np.zeros(1))
+        except TrustboError:
+            return f"the prior of {name} has no quantiles; got {prior!r}"
+    return None
+
+
 def _by_numpyro(prior: Distribution, p: np.ndarray) -> np.ndarray:
     try:
         with own_settings():
             return np.asarray(prior.icdf(jnp.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))), dtype=float)
-    except NotImplementedError:
+    except (NotImplementedError, ImportError):  # quantiles of a few need another package
         raise TrustboError(
-            f'sampler "exact" with place effects needs the quantiles of each prior; {prior!r} has '
-            'none. Use another prior, or sampler="nuts".'
+            f'sampler "exact" needs the quantiles of priors here; {prior!r} has none. Use another '
+            'prior, or sampler="nuts".'
         ) from None

@@ -1,11 +1,23 @@
 """Mixtures of multivariate Student-t densities, by components: proposals of any dimension."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from scipy import special, stats
 from scipy.linalg import solve_triangular
+
+
+class Proposal(Protocol):
+    """A density to draw from."""
+
+    def draw(self, n: int, seed: int) -> np.ndarray:
+        """Points (point, axis)."""
+        ...
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Log density (point,)."""
+        ...
 
 
 class Student(NamedTuple):
@@ -49,7 +61,52 @@ class Student(NamedTuple):
         )
 
 
-def log_mixture(components: Sequence[Student], sizes: Sequence[int], z: np.ndarray) -> np.ndarray:
+class Spanning(NamedTuple):
+    """Proposal that spans the prior of one score, N(0, 1); the others follow as far as they can.
+
+    They have a Student-t around their regression on the share Phi(score), which is smooth up to
+    the prior's ends: far out, where a score of a noise has a long, thin tail, they stay.
+    """
+
+    axis: int
+    slope: np.ndarray  # (other,), in Phi(score)
+    others: Student
+    sd: float = 1.3
+
+    @classmethod
+    def of(cls, proposal: Student, axis: int, widen: float = 1.4) -> Self:
+        """Proposal with the regression, and the spread around it, of another."""
+        cov = proposal.scale @ proposal.scale.T
+        rest = np.delete(np.arange(len(cov)), axis)
+        mean, sd = proposal.center[axis], np.sqrt(cov[axis, axis])
+        x, weights = np.polynomial.hermite_e.hermegauss(30)
+        weights = weights / weights.sum()
+        share = special.ndtr(mean + sd * x)
+        center = weights @ share
+        var = weights @ (share - center) ** 2
+        slope = cov[rest, axis] / sd * (weights @ (x * (share - center))) / var
+        left = cov[np.ix_(rest, rest)] - var * np.outer(slope, slope)
+        scale = widen * np.linalg.cholesky(left)
+        intercept = proposal.center[rest] - slope * center
+        return cls(axis, slope, Student(intercept, scale, proposal.nu))
+
+    def draw(self, n: int, seed: int) -> np.ndarray:
+        """See `Student.draw`; the score in a sequence of its own."""
+        rng = np.random.default_rng([seed, 1])
+        u = stats.qmc.Sobol(1, scramble=True, rng=rng).random(n)[:, 0]
+        score = self.sd * special.ndtri(np.clip(u, 1e-12, 1.0 - 1e-12))
+        others = self.others.draw(n, seed) + special.ndtr(score)[:, None] * self.slope
+        return np.insert(others, self.axis, score, axis=1)
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """See `Student.log_density`."""
+        score = z[:, self.axis]
+        others = np.delete(z, self.axis, axis=1) - special.ndtr(score)[:, None] * self.slope
+        own = -0.5 * (score / self.sd) ** 2 - np.log(self.sd * np.sqrt(2.0 * np.pi))
+        return own + self.others.log_density(others)
+
+
+def log_mixture(components: Sequence[Proposal], sizes: Sequence[int], z: np.ndarray) -> np.ndarray:
     """Log density of the mixture that `sizes` points of each component are drawn from."""
     shares = np.log(np.asarray(sizes, dtype=float) / sum(sizes))
     terms = [s + each.log_density(z) for s, each in zip(shares, components, strict=True)]

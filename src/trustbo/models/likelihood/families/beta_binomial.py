@@ -16,6 +16,7 @@ from jax.scipy.special import gammaln
 from scipy.special import expit
 
 from trustbo.models.backend import own_settings
+from trustbo.models.likelihood.ep.terms import COUNT, NONE, Terms
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.linearised import Data, Linearised
 
@@ -109,6 +110,33 @@ class BetaBinomial(Linearised):
         p, N = expit(trust), _N_TICKS
         excess = 1.0 / (1.0 + 1.0 / (noise_sd**2 + 1e-6))  # correlation of two ticks of a bound
         return p, p * (1.0 - p), p * (1.0 - p) * (1.0 + (N - 1.0) * excess) / N
+
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """See `Family.draw_rates`."""
+        phi = 1.0 / (noise_sd**2 + 1e-6)
+        p = rng.beta(phi * expit(trust), phi * expit(-trust))
+        N = np.where(n_ticks > 0.0, n_ticks, np.nan)
+        return rng.binomial(np.where(np.isnan(N), 0.0, N).astype(int), p) / N
+
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """See `Family.terms`; each distinct count is a case."""
+        seen = ~np.isnan(y) & (n_ticks > 0.0)
+        N = np.where(seen, n_ticks, 1.0)
+        n = np.where(seen, np.round(np.where(seen, y, 0.0) * N), 0.0)
+        # An empirical logit and its variance, that of trust at one bound of typical noise added.
+        lam = np.where(seen, 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2), 0.0)
+        counts, case = np.unique(np.stack([n, N], -1).reshape(-1, 2), axis=0, return_inverse=True)
+        kind = np.where(seen, COUNT, NONE)
+        return Terms.of(
+            kind, lam, lam * np.log((n + 0.5) / (N - n + 0.5)), case.reshape(y.shape), counts
+        )
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: counts have probabilities."""

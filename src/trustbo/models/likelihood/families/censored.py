@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 from scipy.stats import norm
 
+from trustbo.models.likelihood.ep.terms import AT_ONE, AT_ZERO, Terms
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.gaussian import Gaussian
 from trustbo.models.likelihood.scalar import Censoring, Filtered
@@ -51,6 +52,24 @@ class Censored(Gaussian):
         mean = trust * inside + noise_sd * first + above
         square = trust**2 * inside + 2.0 * trust * noise_sd * first + noise_sd**2 * second + above
         return mean, inside, np.maximum(square - mean**2, 1e-12)
+
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """See `Family.draw_rates`."""
+        return np.clip(y, 0.0, 1.0)
+
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """See `Family.terms`."""
+        inside = super().terms(y, n_ticks).kind
+        kind = np.where(y >= 1.0, AT_ONE, np.where(y <= 0.0, AT_ZERO, inside))
+        lam = np.where(kind >= AT_ONE, 10.0, 0.0)
+        return Terms.of(kind, lam, lam * np.where(kind == AT_ONE, 1.1, -0.1))
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: rates of 0 and 1 have a probability."""

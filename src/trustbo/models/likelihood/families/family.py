@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
 
+from trustbo.models.likelihood.ep.terms import Terms
 from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.likelihood.vector import VectorSSM
 
@@ -92,6 +93,21 @@ class Family(ABC):
     @abstractmethod
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
         """Contact rates given simulated trust, and given the linear Gaussian rates `y` of it."""
+
+    @abstractmethod
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """`measure` in NumPy; `noise_sd` is delta_v, all arrays broadcast to trust."""
+
+    @abstractmethod
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`."""
 
     @abstractmethod
     def is_density(self, y: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 from jax import Array, random
 
+from trustbo.models.likelihood.ep.terms import GAUSSIAN, NONE, Terms
 from trustbo.models.likelihood.families.family import SSM, Family, Observed
 from trustbo.models.likelihood.scalar import Filtered
 
@@ -43,6 +44,21 @@ class Gaussian(Family):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `Family.rate_moments`."""
         return trust, np.ones(trust.shape), np.broadcast_to(noise_sd**2, trust.shape)
+
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """See `Family.draw_rates`."""
+        return y
+
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """See `Family.terms`."""
+        return Terms.of(np.where(np.isnan(y), NONE, GAUSSIAN))
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: all have."""

@@ -1,0 +1,1 @@
+"""Expectation propagation for rates that are no linear function of trust; see `joint`."""

@@ -1,0 +1,213 @@
+"""The exact sampler of partially pooled robots: its integrals, its draws, its evidence."""
+
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from models.conftest import simulate_missions
+from scipy import special, stats
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.models import CoupledTrust, HierarchicalTrust, Priors, complete, diagnostics, fit
+from trustbo.models.model import TrustModel
+from trustbo.models.samplers import scores
+from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
+from trustbo.models.samplers.importance import sample_scores
+from trustbo.stacking import stack_missions
+
+
+def small(n_missions=2, n_bounds=3, n_robots=2, seed=0):
+    rng = np.random.default_rng(seed)
+    path = [(0, k) for k in range(n_bounds + 1)]
+    return [
+        Mission.from_arrays(path, rng.uniform(size=(n_bounds, n_robots, 2)),
+                            rng.uniform(0.3, 0.9, (n_bounds, n_robots)))
+        for _ in range(n_missions)
+    ]  # fmt: skip
+
+
+def target_of(missions, model: TrustModel):
+    return HierarchicalTarget(model.gather(stack_missions(missions)), model.priors)
+
+
+@pytest.mark.parametrize("stationary", [False, True])
+def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
+    """Weights, intercepts and their means are in the covariance of all rates of all robots."""
+    missions, rng = small(), np.random.default_rng(1)
+    priors = Priors(
+        beta=dist.Normal(np.array([0.2, -0.1]), np.array([0.7, 0.5])),
+        b=dist.Normal(0.1, 0.4),
+        stationary=stationary,
+    )
+    target = target_of(missions, HierarchicalTrust(priors))
+    target._look(np.zeros(9))
+    z = 0.7 * rng.standard_normal((4, 9))
+    found = target.log_density(z)
+    theta, log_prior = target._constrain(z)
+    for t in range(len(z)):
+        delta_w, delta_v = theta["delta_w"][t], theta["delta_v"][t]
+        tau, rest = theta["tau"][t], 1.0
+        if stationary:
+            rest = 1.0 - special.expit(theta["mean"][t])
+        mean_of_mu = rest * np.array([0.2, -0.1, 0.1])
+        sd_of_mu = rest * np.array([0.7, 0.5, 0.4])
+        X, centre, own, robots = [], [], [], []
+        for m in missions:
+            for i in range(2):
+                a, n = special.expit(theta["beta0"][t, i]), len(m.contact_rate)
+                roll = np.linalg.inv(np.eye(n) - a * np.eye(n, k=-1))
+                X.append(roll @ np.c_[m.awareness[:, i], np.ones(n)])
+                centre.append(roll[:, 0] * a * 0.5)
+                own.append(delta_w**2 * roll @ roll.T + delta_v**2 * np.eye(n))
+                own[-1] += np.outer(roll[:, 0], roll[:, 0]) * (a * 0.5) ** 2
+                robots += [i] * n
+        X, robots = np.concatenate(X), np.array(robots)
+        cov = (X * sd_of_mu**2) @ X.T
+        cov += (X * tau**2) @ X.T * (robots[:, None] == robots)
+        cov[np.kron(np.eye(4), np.ones((3, 3))) > 0] += np.concatenate([c.ravel() for c in own])
+        y = np.concatenate([m.contact_rate[:, i] for m in missions for i in range(2)])
+        law = stats.multivariate_normal(np.concatenate(centre) + X @ mean_of_mu, cov)
+        np.testing.assert_allclose(found[t] - log_prior[t], law.logpdf(y), rtol=1e-9)
+
+
+def test_coordinates_leave_the_priors_as_they_are():
+    """With the Jacobian, the density of (mean, beta0_i, noises, tau) is that of their priors."""
+    target = target_of(small(), HierarchicalTrust())
+    target._look(np.zeros(9))
+    z = 0.5 * np.random.default_rng(0).standard_normal(9)
+
+    def natural(z):
+        theta, _ = target._constrain(z[None])
+        noises = np.log([theta["delta_w"][0], theta["delta_v"][0]])
+        taus = np.log([theta["tau_beta0"][0], *theta["tau"][0]])
+        return np.concatenate([theta["mean"], theta["beta0"][0], noises, taus])
+
+    h = 1e-5
+    jacobian = np.array([(natural(z + h * e) - natural(z - h * e)) / (2 * h) for e in np.eye(9)])
+    theta, log_prior = target._constrain(z[None])
+    mean, beta0 = theta["mean"][0], theta["beta0"][0]
+    expected = stats.beta(2, 2).logpdf(special.expit(mean))
+    expected += special.log_expit(mean) + special.log_expit(-mean)
+    expected += stats.norm.logpdf(beta0, mean, theta["tau_beta0"][0]).sum()
+    for name in ("delta_w", "delta_v"):
+        expected += stats.halfnorm.logpdf(theta[name][0], scale=0.2) + np.log(theta[name][0])
+    for tau in (theta["tau_beta0"][0], *theta["tau"][0]):
+        expected += stats.halfnorm.logpdf(tau, scale=0.3) + np.log(tau)
+    log_det = np.linalg.slogdet(jacobian)[1]
+    assert abs(log_prior[0] - expected - log_det) < 1e-6
+
+
+def from_the_prior(missions, n, rng):
+    """Parameters drawn from the prior, and the log likelihood of the rates (Kalman filter)."""
+    mean, taus = rng.beta(2, 2, n), np.abs(rng.normal(0, 0.3, (n, 4)))
+    mu = np.c_[rng.normal(0, 1, (n, 2)), rng.normal(0, 0.5, n)]
+    delta_w, delta_v = np.abs(rng.normal(0, 0.2, (2, n)))
+    log_weight, own = np.zeros(n), []
+    for i in range(2):
+        beta0 = special.expit(special.logit(mean) + taus[:, 0] * rng.standard_normal(n))
+        c = mu + taus[:, 1:] * rng.standard_normal((n, 3))
+        own.append(np.c_[beta0, c])
+        for mission in missions:
+            m, v = np.full(n, 0.5), np.full(n, 0.25)
+            for z, y in zip(mission.awareness[:, i], mission.contact_rate[:, i], strict=True):
+                m, v = beta0 * m + c[:, :2] @ z + c[:, 2], beta0**2 * v + delta_w**2
+                S = v + delta_v**2
+                log_weight += stats.norm.logpdf(y, m, np.sqrt(S))
+                m, v = m + v / S * (y - m), v * delta_v**2 / S
+    named = {"mean_beta0": mean, "mean_beta": mu[:, :2], "mean_b": mu[:, 2], "delta_w": delta_w,
+             "delta_v": delta_v, "tau_beta0": taus[:, 0], "tau_beta": taus[:, 1:3],
+             "tau_b": taus[:, 3]}  # fmt: skip
+    own = np.stack(own, axis=1)
+    named |= {"beta0": own[..., 0], "beta": own[..., 1:3].reshape(n, -1), "b": own[..., 3]}
+    return named, log_weight
+
+
+def test_draws_and_evidence_are_those_of_the_weighted_prior():
+    missions = small(1, 3, seed=3)
+    drawn = sample_scores(target_of(missions, HierarchicalTrust()), 4000, 0).draws
+    assert drawn.khat < 0.5
+    prior, log_weight = from_the_prior(missions, 600_000, np.random.default_rng(0))
+    weight = np.exp(log_weight - log_weight.max())
+    kish = weight.sum() ** 2 / (weight**2).sum()
+    assert kish > 1500
+    expected = special.logsumexp(log_weight) - np.log(len(weight))
+    assert abs(drawn.log_evidence - expected) < 4 / np.sqrt(kish) + 0.02
+    weight /= weight.sum()
+    for name, draws in drawn.params.items():
+        theirs = prior[name].reshape(len(weight), -1)
+        for a, b in zip(draws.reshape(4000, -1).T, theirs.T, strict=True):
+            mean = weight @ b
+            sd = np.sqrt(weight @ (b - mean) ** 2)
+            # Effective numbers above 1500 on both sides: a standard error of .036 sd; 4 of it.
+            assert abs(a.mean() - mean) < 0.15 * sd, name
+            assert abs(np.log(a.std() / sd)) < 0.12, name
+
+
+def test_fit_takes_it_and_adds_trust_later():
+    missions = simulate_missions(5)
+    rates = missions[0].contact_rate.copy()
+    rates[2:4, 1] = np.nan
+    gap = Mission.from_arrays(missions[0].path, missions[0].awareness, rates)
+    model = HierarchicalTrust()
+    weights = 0.9 ** np.arange(5)[::-1]
+    bare = fit([gap, *missions[1:]], model, weights=weights, n_draws=100, whole=False)
+    assert bare.attrs["sampler"] == "exact"
+    assert diagnostics(bare)["k_hat"] < 0.5
+    assert bare["posterior"]["beta"].dims == ("chain", "draw", "robot", "feature")
+    assert set(bare["posterior"].data_vars) == set(model.dims)
+    trust = complete(bare)["latent"]["trust_mean"]
+    assert trust.sel(mission=0).notnull().sum() == 7 * 3
+
+
+def test_changes_of_trust_and_real_beta0_are_no_obstacle():
+    missions = simulate_missions(4)
+    priors = Priors(beta0=dist.Normal(0.3, 0.3), tau=dist.HalfCauchy(0.1))
+    posterior = fit(missions, HierarchicalTrust(priors, response="change"), n_draws=100,
+                    whole=False)  # fmt: skip
+    assert posterior.attrs["sampler"] == "exact"
+
+
+@pytest.mark.parametrize("rates", ["equal", "one robot", "one rate"])
+def test_odd_data_have_a_posterior(rates):
+    missions = small(3, 4, 3)
+    y = {"equal": np.ones((4, 3)), "one robot": np.full((4, 3), np.nan)}.get(rates)
+    if rates == "one rate":
+        missions, y = missions[:1], np.full((4, 3), np.nan)
+        y[1, 1] = 0.5
+    elif rates == "one robot":
+        y[:, 0] = [0.3, 0.5, 0.4, 0.6]
+    missions = [Mission.from_arrays(m.path, m.awareness, y) for m in missions]
+    posterior = fit(missions, HierarchicalTrust(), n_draws=100)
+    assert diagnostics(posterior)["k_hat"] < 0.7
+    for values in posterior["posterior"].data_vars.values():
+        assert np.isfinite(values).all()
+
+
+def test_what_it_cannot_treat_is_refused():
+    missions = small()
+    with pytest.raises(TrustboError, match="partially pooled, and its observations are not Gaus"):
+        fit(missions, HierarchicalTrust(observation="censored"), "exact")
+    with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
+        HierarchicalTrust().update(None, missions)
+    with pytest.raises(TrustboError, match="share some parameters only, or influence each other"):
+        fit(missions, CoupledTrust(), "exact")
+
+
+def test_half_normal_quantiles_are_scipy_s():
+    score = np.linspace(-4.0, 6.0, 11)
+    found = scores.quantile(dist.HalfNormal(0.3), score)
+    np.testing.assert_allclose(
+        found, stats.halfnorm(scale=0.3).isf(special.ndtr(-score)), rtol=1e-9
+    )
+
+
+@pytest.mark.slow  # the weighted prior, above, says the same for little data
+def test_draws_and_a_long_run_of_nuts_agree():
+    missions = simulate_missions(12, seed=3)
+    exact = fit(missions, HierarchicalTrust(), "exact")["posterior"]
+    nuts = fit(missions, HierarchicalTrust(), "nuts", n_draws=4000)["posterior"]
+    for name in exact.data_vars:
+        ours, theirs = (p[name].values.reshape(4 * p.sizes["draw"], -1) for p in (exact, nuts))
+        for a, b in zip(ours.T, theirs.T, strict=True):
+            assert abs(a.mean() - b.mean()) < 0.12 * b.std(), name
+            assert abs(np.log(a.std() / b.std())) < 0.1, name
