@@ -35,7 +35,6 @@ from trustbo.files import FilePath
 from trustbo.models import (
     CAUSES,
     BoundRisk,
-    Hazard,
     TrustModel,
     diagnostics,
     fit_hazard,
@@ -74,7 +73,6 @@ class Campaign:
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
             first mission, one from the prior.
         awareness: Belief about the awareness; None where the map is trusted.
-        prior_hazard: Priors of the chance that a bound fails; see `hazard` and `risk`.
     """
 
     def __init__(
@@ -121,7 +119,6 @@ class Campaign:
         self.awareness = self.options.belief(workspace)
         self._plan: Plan | None = None
         self._believed: Planner | None = None
-        self.prior_hazard = Hazard()
         self._hazard: xr.Dataset | None = None
         self._risk: BoundRisk | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
@@ -194,13 +191,13 @@ class Campaign:
         if self._hazard is None:
             log, last = self.log, self.log.last_tree
             self._hazard = learn_hazard(
-                log.entries, log.failures, self.workspace, self.prior_hazard,
+                log.entries, log.failures, self.workspace, self.options.prior_hazard,
                 self.options.forgetting, self.seed_of("hazard"),
             )  # fmt: skip
             if self._hazard is None and last is not None and "hazard" in last.children:
                 self._hazard = last["hazard"].to_dataset()
             if self._hazard is None:
-                self._hazard = fit_hazard([], self.workspace, self.prior_hazard)
+                self._hazard = fit_hazard([], self.workspace, self.options.prior_hazard)
         return self._hazard
 
     @property
