@@ -9,7 +9,7 @@ from simulators import ModelSimulator
 import trustbo as tb
 from trustbo.campaign.failures import to_avoid
 from trustbo.errors import PosteriorError
-from trustbo.models import BoundRisk, LostMission, fit_hazard
+from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.workspace.moves import moves_along
 
 ENDS = ((3, 0), (0, 3))
@@ -167,3 +167,20 @@ def test_older_failures_weigh_less_under_forgetting(workspace):
         simulator = ModelSimulator(workspace, fail_at=fail_at)
         campaign.tell(simulator.run(campaign.ask().path, seed=seed))
     assert campaign.hazard["failures"].values.sum() == 0.25
+
+
+def test_priors_of_the_hazard_are_an_option_that_is_kept(workspace, tmp_path):
+    prior = Hazard(intercept=(-3.0, 1.0), cause=0.5)
+    campaign = begin(workspace, hazard=prior, directory=tmp_path)
+    expected = fit_hazard([], workspace, prior, seed=campaign.seed_of("hazard"))
+    assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
+    assert campaign.options == begin(workspace, hazard={"intercept": [-3, 1], "cause": 0.5}).options
+    campaign.ask()
+    campaign.close()
+    with tb.Campaign.load(tmp_path) as again:
+        assert again.options.hazard == prior
+        assert again.risk.mean[4, 0, 1] == campaign.risk.mean[4, 0, 1]
+    with pytest.raises(tb.TrustboError, match="unknown prior of the hazard 'intercpt'; did you"):
+        begin(workspace, hazard={"intercpt": (0.0, 1.0)})
+    with pytest.raises(tb.TrustboError, match=r"hazard must be a models\.Hazard"):
+        begin(workspace, hazard=0.1)

@@ -202,3 +202,18 @@ def test_a_file_is_replaced_whole(result, tmp_path):
         write_path(file, result)
         assert b"an older file" not in file.read_bytes()
     assert len(list(tmp_path.iterdir())) == 6  # with tables of posts and of ways
+
+
+def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
+    table, risk = path_frame(result), result.plan.risk
+    assert np.isnan(table["p_fail"][0])
+    np.testing.assert_array_equal(table["p_fail"][1:], risk.p_fail)
+    for end, p in zip(("low", "high"), risk.p_fail_band, strict=True):
+        np.testing.assert_array_equal(table[f"p_fail_{end}"][1:], p)
+    arrive = [1.0]
+    for p in risk.p_fail:
+        arrive.append(arrive[-1] * (1.0 - p))
+    np.testing.assert_allclose(table["p_arrive"], arrive, rtol=1e-12)
+    assert table["p_arrive"].iloc[-1] == pytest.approx(result.plan.p_arrive)
+    causes = [table[f"p_fail_{cause}"][1:] for cause in tb.models.CAUSES]
+    np.testing.assert_allclose(sum(causes), risk.p_fail, rtol=1e-12)

@@ -227,3 +227,27 @@ def test_policies_have_names_and_can_be_one_s_own():
         resolve_policy("bold")
     with pytest.raises(TrustboError, match="policy must be a name or a callable; got None"):
         resolve_policy(None)
+
+
+@pytest.mark.parametrize("policy", ["random", "information", "epsilon_greedy"])
+def test_policies_that_explore_respect_max_failure(workspace, policy):
+    p_fail = np.random.default_rng(1).uniform(0.0, 0.25, (8, 4, 4))
+    planner = Planner(workspace, *ENDS, "terminal", max_failure=0.45).with_risk(p_fail)
+    free = Planner(workspace, *ENDS, "terminal").with_risk(p_fail)
+    chosen, without = (
+        [resolve_policy(policy)(jax.random.key(i), prior_draws(), which) for i in range(20)]
+        for which in (planner, free)
+    )
+    assert max(1.0 - plan.p_arrive for plan in chosen) <= 0.45
+    assert len({plan.path for plan in chosen}) > 1 or policy == "information"
+    if policy == "random":
+        assert max(1.0 - plan.p_arrive for plan in without) > 0.45
+
+
+def test_a_random_path_is_greedy_s_where_next_to_none_keeps_the_limit(workspace):
+    """Only one path, of thousands, is free of risk; walks drawn at random miss it."""
+    path, p_fail = ((3, 0), (3, 1), (3, 2), (3, 3), (2, 3), (1, 3), (0, 3)), np.ones((8, 4, 4))
+    p_fail[4, 3, 1:], p_fail[1, :3, 3] = 0.0, 0.0
+    planner = Planner(workspace, *ENDS, "terminal", max_bounds="shortest+4", max_failure=0.1)
+    plan = policies.random(jax.random.key(0), prior_draws(), planner.with_risk(p_fail))
+    assert plan.path == path

@@ -301,3 +301,40 @@ def test_what_cannot_be_is_refused():
         bare.with_risk(np.full((8, 4, 4), 1.5))
     with pytest.raises(TrustboError, match="is NaN; give a chance to every possible bound"):
         bare.with_risk(np.full((8, 4, 4), np.nan)).plan(case.params)
+
+
+@pytest.mark.parametrize(
+    ("objective", "n", "max_bounds"),
+    [
+        ("lost_contact", 12, None),
+        ("success", 8, 11),
+        ("bottleneck", 8, 11),
+        ("stationary", 15, None),
+    ],
+)
+def test_a_search_that_is_cut_short_keeps_the_limit_and_its_bound_holds(
+    objective, n, max_bounds, monkeypatch
+):
+    """Against the search without a cut, which other tests compare with enumeration."""
+    rng, cut, most = np.random.default_rng(3), 0, 0.3
+    params = TrustParams(0.5, np.array([0.6, 0.3]), -0.2, 0.1, 0.1)
+    for _ in range(4):
+        workspace = Workspace.from_awareness(rng.uniform(size=(1, 8, n, n, 2)))
+        p = rng.uniform(0.0, 0.6 / n, (8, n, n))
+        draws = rng.beta(6.0 * p + 0.1, 6.0 * (1.0 - p) + 0.1, (10, 8, n, n))
+        options = {"max_bounds": max_bounds, "max_failure": most, "confidence": 0.6}
+        planner = Planner(workspace, (n - 1, 0), (0, n - 1), objective, engine="numba", **options)
+        planner = planner.with_risk(p, draws)
+        whole = planner.plan(params)
+        monkeypatch.setattr("trustbo.planning.engines.compiled_risk._MAX_LABELS", 1)
+        try:
+            plan = planner.plan(params)
+        except TrustboError:  # no feasible path was known by then
+            continue
+        finally:
+            monkeypatch.undo()
+        assert whole.exact
+        assert planner.problem.risk.share_within(plan.path, most) >= 0.6
+        assert plan.value <= whole.value + 1e-9 <= plan.bound + 2e-9
+        cut += not plan.exact
+    assert cut > 0

@@ -57,3 +57,14 @@ def test_figures_are_vectors_but_for_the_maps(result, tmp_path):
     text = (tmp_path / "maps.svg").read_text()
     assert text.count("<path") > 20  # lines and letters
     assert text.count("<image") <= 2 * len(axes) + 1  # colours and shadows of each, the bar
+
+
+def test_the_hazard_of_a_cell_is_that_from_its_worst_side(result):
+    p_fail = result.planner.problem.risk.p_fail
+    ax = tb.plots.hazard_map(p_fail, result.workspace, result.path)
+    shown = np.ma.filled(ax.images[0].get_array(), np.nan)
+    for row, col in np.ndindex(shown.shape):
+        into = [p for p in p_fail[:, row, col] if not np.isnan(p)]
+        np.testing.assert_equal(shown[row, col], max(into, default=np.nan))
+    assert ax.images[0].get_clim() == (0.0, 1.0)
+    assert ax.lines[0].get_xdata().size == len(result.path)

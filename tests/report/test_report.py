@@ -118,7 +118,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page, text):
 
 def test_every_figure_has_a_phone_s_variant_with_text_as_outlines(page):
     phone = [own for tag, own in page.tags if tag == "source"]
-    assert len(phone) == len([1 for tag, _ in page.tags if tag == "img"]) == 9
+    assert len(phone) == len([1 for tag, _ in page.tags if tag == "img"]) == 10
     assert all(int(own["width"]) <= 350 for own in phone)
     for own in phone:
         svg = base64.b64decode(own["srcset"].partition(",")[2]).decode()

@@ -37,7 +37,6 @@ from trustbo.files import FilePath
 from trustbo.models import (
     CAUSES,
     BoundRisk,
-    Hazard,
     TrustModel,
     diagnostics,
     fit_hazard,
@@ -76,7 +75,6 @@ class Campaign(Displayed):
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
             first mission, one from the prior.
         awareness: Belief about the awareness; None where the map is trusted.
-        prior_hazard: Priors of the chance that a bound fails; see `hazard` and `risk`.
     """
 
     def __init__(
@@ -123,7 +121,6 @@ class Campaign(Displayed):
         self.awareness = self.options.belief(workspace)
         self._plan: Plan | None = None
         self._believed: Planner | None = None
-        self.prior_hazard = Hazard()
         self._hazard: xr.Dataset | None = None
         self._risk: BoundRisk | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
@@ -209,13 +206,13 @@ class Campaign(Displayed):
         if self._hazard is None:
             log, last = self.log, self.log.last_tree
             self._hazard = learn_hazard(
-                log.entries, log.failures, self.workspace, self.prior_hazard,
+                log.entries, log.failures, self.workspace, self.options.prior_hazard,
                 self.options.forgetting, self.seed_of("hazard"),
             )  # fmt: skip
             if self._hazard is None and last is not None and "hazard" in last.children:
                 self._hazard = last["hazard"].to_dataset()
             if self._hazard is None:
-                self._hazard = fit_hazard([], self.workspace, self.prior_hazard)
+                self._hazard = fit_hazard([], self.workspace, self.options.prior_hazard)
         return self._hazard
 
     @property

@@ -5,8 +5,8 @@ Importing it loads nothing heavy, for `trustbo --help` is made from its fields.
 
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from trustbo.errors import TrustboError, require_choice
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
     from trustbo.campaign.learning import Learning
     from trustbo.data import Cell, Mission
-    from trustbo.models import TrustModel
+    from trustbo.models import Hazard, TrustModel
     from trustbo.planning import Planner
     from trustbo.workspace import AwarenessBelief, Workspace
 
@@ -58,6 +58,8 @@ class CampaignOptions:
             environment is followed; for `"refit"` with Gaussian observations.
         awareness: Trust in the awareness map: map (blind) or belief (missions correct it). Under
             `"belief"`, or an `AwarenessBelief` of your own, policies draw from it too.
+        hazard: Priors of the chance that a bound fails. A `models.Hazard`, or some of its fields
+            by name.
         replan: Replanning after each mission or after each bound. Under `"bound"` the rest is
             planned from the trust of now, see `replanning.run_replanning`; for `iterate` and
             `missions`.
@@ -80,6 +82,7 @@ class CampaignOptions:
     awareness: "str | AwarenessBelief" = field(
         default="map", metadata=_of(LEARNING, "map", "belief")
     )
+    hazard: "Hazard | Mapping[str, Any]" = field(default_factory=dict, metadata=_of(LEARNING))
     replan: str = field(default="mission", metadata=_of(RUNNING, "mission", "bound"))
     callbacks: "Sequence[Callback]" = field(default=(), metadata=_of(RUNNING))
 
@@ -91,6 +94,7 @@ class CampaignOptions:
             if choices and not (option.name == "awareness" and self.own_awareness):
                 require_choice(option.name, getattr(self, option.name), choices)
         require_forgetting(self.forgetting)
+        object.__setattr__(self, "hazard", _hazard_of(self.hazard))
         object.__setattr__(self, "callbacks", tuple(self.callbacks))
         for callback in self.callbacks:
             if not callable(callback):
@@ -121,6 +125,11 @@ class CampaignOptions:
                 f"{whole!r}{' and ' if others else ''}{', '.join(others)}."
             )
         return whole
+
+    @property
+    def prior_hazard(self) -> "Hazard":
+        """Priors of the chance that a bound fails."""
+        return cast("Hazard", self.hazard)
 
     @property
     def own_awareness(self) -> bool:
@@ -168,6 +177,7 @@ class CampaignOptions:
     def to_record(self) -> dict[str, Any]:
         """Options as JSON can hold them, callbacks left out."""
         record = {o.name: getattr(self, o.name) for o in fields(self) if o.name != "callbacks"}
+        record["hazard"] = asdict(self.prior_hazard)
         return record | ({"awareness": "belief"} if self.own_awareness else {})
 
     @classmethod
@@ -188,6 +198,25 @@ class CampaignOptions:
                 raise unknown("option of one's own", name, _OWN)
         awareness = again("awareness", record["awareness"], own.get("awareness"), own_awareness)
         return cls.of({**record, **own, "awareness": awareness})
+
+
+def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
+    """Priors of a hazard, as they are or by name.
+
+    Raises:
+        TrustboError: An unknown name, or neither.
+    """
+    from trustbo.models import Hazard
+
+    if isinstance(given, Hazard):
+        return given
+    if not isinstance(given, Mapping):
+        raise TrustboError(f"hazard must be a models.Hazard, or some of its fields; got {given!r}.")
+    names = [prior.name for prior in fields(Hazard)]
+    for name in given:
+        if name not in names:
+            raise unknown("prior of the hazard", name, names)
+    return Hazard(**given)
 
 
 def options_of(part: str) -> list[str]:

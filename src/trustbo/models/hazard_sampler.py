@@ -20,10 +20,10 @@ depends on it.
 from typing import Any, NamedTuple
 
 import numpy as np
-from arviz_stats.base.array import array_stats
 from scipy import special, stats
 
 from trustbo.models.exposures import Exposures
+from trustbo.models.samplers.exact import smoothed_weights
 from trustbo.models.samplers.laplace import laplace
 
 LIMIT = 0.7
@@ -106,12 +106,8 @@ def _weigh(
     z = proposal.draw(2**_LOG2_POINTS, seed)
     places, log_fail = impute(law, exposures, z, np.random.default_rng([seed, 1]))
     raw = density.known(z) + log_fail - proposal.log_density(z)
-    finite = np.isfinite(raw)
-    smoothed, k_hat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
-    weights = np.exp(smoothed - smoothed.max())
-    # Of nearly equal weights none is in a tail, and the fit of one fails.
-    k_hat = float(np.nan_to_num(k_hat, nan=-np.inf if np.ptp(raw[finite]) < 1e-6 else np.inf))
-    return Points(z, places, weights / weights.sum(), k_hat)
+    log_w, k_hat, _ = smoothed_weights(raw)
+    return Points(z, places, np.exp(log_w), k_hat)
 
 
 def impute(

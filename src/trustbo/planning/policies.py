@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jax import Array
 
+from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
@@ -25,6 +26,8 @@ Policy = Callable[[Array, Params, Planner], Plan]
 
 N_DRAWS = 200
 """Number of draws under which policies plan to compare paths."""
+_TRIES = 1000
+"""Number of random paths drawn to find some that respect `max_failure`."""
 
 
 def greedy(key: Array, posterior: Params, planner: Planner) -> Plan:
@@ -87,12 +90,11 @@ def cvar(key: Array, posterior: Params, planner: Planner, *, alpha: float = 0.2)
 def information(key: Array, posterior: Params, planner: Planner, *, n_random: int = 50) -> Plan:
     """Path that most reduces the entropy of the parameters (see `information_gain`).
 
-    Candidates are the draws' best paths and `n_random` random ones.
+    Candidates are the draws' best paths and `n_random` random ones that respect `max_failure`.
     """
     drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=seed_of(key))
     rng = np.random.default_rng(seed_of(key))
-    sampler = path_sampler(planner.paths)
-    paths = list(drawn.candidates) + [sampler.draw(rng) for _ in range(n_random)]
+    paths = list(drawn.candidates) + _random_paths(planner, rng, n_random)
     params, _ = choose_draws(posterior, N_DRAWS, seed_of(key))
     gains = information_gain(params, planner.mean_awareness, paths, planner.family, planner.lag)
     return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
@@ -111,13 +113,17 @@ def random(key: Array, posterior: Params, planner: Planner) -> Plan:
     """Path drawn uniformly from the admissible ones, independent of the posterior.
 
     For `stationary`, which admits simple paths of any length, from those of up to two bounds more
-    than the fewest.
+    than the fewest. Under a `max_failure`, from those that respect it; where none of 1000 does,
+    the greedy path.
 
     Raises:
         TrustboError: Revisits are forbidden, and each of 10 000 walks drawn had one.
+        InfeasibleError: No path respects `max_failure`.
     """
-    path = path_sampler(planner.paths).draw(np.random.default_rng(seed_of(key)))
-    return planner.evaluate(path, posterior.mean())
+    found = _random_paths(planner, np.random.default_rng(seed_of(key)), 1)
+    return (
+        planner.evaluate(found[0], posterior.mean()) if found else greedy(key, posterior, planner)
+    )
 
 
 POLICIES: Mapping[str, Policy] = {
@@ -141,6 +147,18 @@ def resolve_policy(policy: str | Policy) -> Policy:
     if not isinstance(policy, str):
         raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
     return POLICIES[require_choice("policy", policy, POLICIES)]
+
+
+def _random_paths(planner: Planner, rng: np.random.Generator, n: int) -> list[tuple[Cell, ...]]:
+    """Draw up to n paths that respect `max_failure`, each equally likely, in `_TRIES` tries."""
+    sampler, risk, found = path_sampler(planner.paths), planner.problem.risk_table, []
+    for _ in range(n if risk is None else _TRIES):
+        path = sampler.draw(rng)
+        if risk is None or risk.is_feasible(risk.along(path, planner.paths.passable.shape)):
+            found.append(path)
+            if len(found) == n:
+                break
+    return found
 
 
 def _best_candidate(

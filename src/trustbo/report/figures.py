@@ -86,6 +86,21 @@ def path_posterior(result: Result) -> Picture:
     )
 
 
+def hazard(result: Result) -> Picture:
+    """Draw the chance to fail of the bounds into each cell."""
+    risk = result.planner.problem.risk
+    assert risk is not None  # noqa: S101
+    low, high = _ends(risk.p_fail)
+    return picture(
+        lambda _: plots.hazard_map(risk.p_fail, result.workspace, path=result.path),
+        f"Map of the chance that a bound into each cell fails, from the worst side. Over bounds it "
+        f"goes from {low} to {high}.",
+        "Chance that a bound into a cell ends the mission, from the side where it is largest; "
+        "white, the recommended path.",
+        shrink=True,
+    )
+
+
 def places(result: Result) -> Picture:
     """Draw the effects of places."""
     effects = place_maps(result.posterior)

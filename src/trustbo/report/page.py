@@ -65,6 +65,13 @@ def _sections(result: Result) -> Iterator[Section]:
             "Where contact is better or worse than the terrain says, and how sure we are.",
             [figures.places(result)],
         )
+    if result.planner.problem.risk is not None:
+        yield Section(
+            "hazard",
+            "Failures",
+            "Where robots are likely to fail, as the terrain and the missions so far say.",
+            [figures.hazard(result)],
+        )
     yield Section("cost", "Cost per robot", "", [figures.robot_costs(result)])
     if on_terrain:
         yield Section("terrain", "Terrain", "", [figures.terrain(result)])

@@ -252,7 +252,9 @@ def smoothed_weights(raw: np.ndarray) -> tuple[np.ndarray, float, float]:
     smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
     log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
     log_w = smoothed - np.logaddexp.reduce(smoothed)
-    return log_w, float(np.nan_to_num(khat, nan=np.inf)), log_evidence
+    # Of nearly equal weights none is in a tail, and the fit of one fails.
+    unknown = -np.inf if finite.all() and np.ptp(raw) < 1e-6 else np.inf
+    return log_w, float(np.nan_to_num(khat, nan=unknown)), log_evidence
 
 
 def _starts(target: _Target) -> np.ndarray:
