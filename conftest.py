@@ -12,6 +12,6 @@ for _name, _value in {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     "PYTHONHASHSEED": "0",
-    "OPENBLAS_NUM_THREADS": "1",  # a worker for each core already; its threads would wait by spinning
+    "OPENBLAS_NUM_THREADS": "1",  # there is a worker for each core, and threads spin
 }.items():
     os.environ.setdefault(_name, _value)
