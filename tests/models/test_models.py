@@ -406,5 +406,5 @@ def test_covariances_and_sizes_that_do_not_fit_are_named():
         PooledTrust(3)
     with pytest.raises(TrustboError, match="model must be a trust model"):
         fit(missions, "pooled")
-    with pytest.raises(TrustboError, match=r'"exact" cannot treat Hierarchical.*share some'):
-        fit(missions, HierarchicalTrust(), sampler="exact")
+    with pytest.raises(TrustboError, match=r'"exact" cannot treat CoupledTrust.*share some'):
+        fit(missions, CoupledTrust(), sampler="exact")

@@ -12,8 +12,18 @@ from scipy.linalg import block_diag
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams, fit, params_of
+from trustbo.models import (
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    TrustParams,
+    complete,
+    fit,
+    params_of,
+)
 from trustbo.models.likelihood import place_marginal
+from trustbo.models.likelihood.ep.chains import gather_chains
+from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.likelihood.place_rows import gather_rows
 from trustbo.models.place import bounds_of, visited
 from trustbo.models.place_maps import (
@@ -24,6 +34,8 @@ from trustbo.models.place_maps import (
     place_maps_of,
 )
 from trustbo.models.priors import Priors
+from trustbo.models.samplers.importance import sample_scores
+from trustbo.models.samplers.latent_target import LatentTarget
 from trustbo.models.samplers.place_target import PlaceTarget
 from trustbo.models.samplers.student import Student, log_mixture
 
@@ -129,6 +141,12 @@ def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationa
         # e has variance (1e-4 tau)^2 where bounds have none, as a jitter.
         rtol = 1e-9 if place.bounds else 1e-5
         np.testing.assert_allclose(target.log_density(z) - log_prior, expected, rtol=rtol)
+        # No rate is at a limit: expectation propagation is exact.
+        batch = tb.stacking.stack_missions(missions)
+        places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
+        gathered = gather_chains(FAMILIES["censored"], batch, places=places)
+        latent = LatentTarget(*gathered, priors, (place, places))
+        np.testing.assert_allclose(latent.log_density(z) - log_prior, expected, rtol=10 * rtol)
 
 
 def test_a_mission_of_weight_one_half_counts_by_the_root_of_its_density():
@@ -375,6 +393,59 @@ def test_the_exact_sampler_agrees_with_nuts(learned):
             assert np.abs(shift / sd).max() < 0.25, name
             ratio = other.std(("chain", "draw")).values / sd
             assert np.abs(ratio - 1.0).max() < 0.15, name
+
+
+def test_rates_within_the_limits_have_the_gaussian_effects_of_places():
+    """Draws by expectation propagation and its weights, against those of the exact marginal."""
+    missions = random_missions(5, n_missions=5, gaps=False)
+    rng, place = np.random.default_rng(0), PlaceEffect()
+    missions = [
+        Mission.from_arrays(m.path, m.awareness, rng.normal(0.5, 0.1, m.contact_rate.shape))
+        for m in missions
+    ]
+    exact = target_of(missions, place)
+    gathered = gather_chains(FAMILIES["censored"], tb.stacking.stack_missions(missions, pad=False),
+                             places=exact.places)  # fmt: skip
+    latent = LatentTarget(*gathered, exact.priors, (place, exact.places))
+    theirs = sample_scores(exact, 2000, 0).draws
+    ours = [sample_scores(latent, 1000, seed).draws for seed in range(3)]
+    assert max(one.khat for one in ours) < 0.7
+    # Weights of a wide proposal of 26 effects and 3 coefficients: even to a third.
+    assert min(one.kish for one in ours) > 80
+    evidence = np.mean([one.log_evidence for one in ours])
+    assert abs(evidence - theirs.log_evidence) < 0.15
+    for name, draws in theirs.params.items():
+        drawn = np.concatenate([one.params[name] for one in ours]).reshape(3000, -1)
+        other = draws.reshape(2000, -1)
+        gap = (drawn.mean(0) - other.mean(0)) / other.std(0)
+        # Three runs of some 120 points, against one of some 300: .08 sd; 4 of it at most.
+        assert np.abs(gap).max() < 0.33, name
+        assert np.sqrt((gap**2).mean()) < 0.16, name
+
+
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+def test_families_have_effects_of_places(family):
+    rng = np.random.default_rng(3)
+    missions = []
+    for _ in range(6):
+        path = walk(rng, 6)
+        z = rng.uniform(size=(6, 3, 2))
+        mean = 0.7 + 0.4 * (np.array(path[1:])[:, :1] > 2) + 0.1 * rng.standard_normal((6, 3))
+        rates = np.round(np.clip(mean, 0.0, 1.0) * 20) / 20
+        missions.append(Mission.from_arrays(path, z, rates, n_ticks=np.full((6, 3), 20)))
+    model = PooledTrust(observation=family, place=PlaceEffect())
+    bare = fit(missions, model, n_draws=100, whole=False)
+    assert bare.attrs["sampler"] == "exact"
+    whole = complete(bare)
+    assert whole["latent"]["trust_mean"].notnull().all()
+    place = params_of(whole).flat().place.mean((0, 1))
+    cells = np.array(sorted({c for m in missions for c in m.path[1:]}))
+    south = cells[:, 0] > 2
+    assert place[tuple(cells[south].T)].mean() > place[tuple(cells[~south].T)].mean()
+    again = fit(missions, model, earlier=bare, n_draws=100, whole=False)
+    for name in ("beta0", "delta_w", "b"):
+        one, other = (p["posterior"][name].values for p in (bare, again))
+        assert abs(one.mean() - other.mean()) < 0.4 * one.std()
 
 
 def test_places_that_cannot_be_are_named():

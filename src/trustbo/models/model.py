@@ -352,9 +352,8 @@ class TrustModel(Displayed, ABC):
             if not self.family.integrates_out:
                 return "its robots are partially pooled, and its observations are not Gaussian"
             return "it has effects of places, and robots partially pooled" if self.place else None
-        if not self.family.integrates_out and (self.place is not None or self.lag):
-            what = "has effects of places" if self.place else "measures changes of trust"
-            return f"it {what}, and its observations are not Gaussian"
+        if not self.family.integrates_out and self.lag:
+            return "it measures changes of trust, and its observations are not Gaussian"
         if self.place is not None and (self.robot_sets == "each" or self.lag):
             return "it has effects of places, and " + (
                 "rates measure changes" if self.lag else "robots with nothing else in common"

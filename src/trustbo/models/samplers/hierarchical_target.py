@@ -67,10 +67,10 @@ class HierarchicalTarget:
                                     indexing="ij"), axis=-1).reshape(-1, 2)  # fmt: skip
         z = np.zeros((len(grid), 4 + self.n_coefficients + self.n_robots))
         z[:, 1:3] = grid
-        self._look(z[len(z) // 2])
+        self.look(z[len(z) // 2])
         z = z[[self.log_density(z).argmax()]]
         for n_steps in (8, 12):  # coordinates move with what the noises leave of beta0
-            self._look(z[0])
+            self.look(z[0])
             z[:, 0], z[:, -self.n_robots :] = 0.0, 0.0
             z, _, scale = laplace(self.log_density, z, n_steps)
         return Student(z[0], scale[0])
@@ -167,7 +167,7 @@ class HierarchicalTarget:
         theta = np.stack([self._from_line(beta0), delta_w**2, delta_v**2], axis=1)
         return statistics.evaluate(theta, self.priors.x0_sd)
 
-    def _look(self, z: np.ndarray) -> None:
+    def look(self, z: np.ndarray) -> None:
         """See what rates leave of each robot's beta0 at the noises of one point."""
         theta, _ = self._constrain(z[None])
         grid = np.linspace(-3.5, 4.5, 49) if self._unit else np.linspace(-1.5, 1.5, 49)

@@ -67,6 +67,10 @@ class ScoreTarget(Protocol):
         """Gaussian fit at the best mode."""
         ...
 
+    def look(self, z: np.ndarray) -> None:
+        """Take a point (score,) as the middle of the posterior, to approximate the density from."""
+        ...
+
     def defensive(self, proposal: Student) -> Proposal:
         """Proposal that covers what the given one may miss."""
         ...
@@ -151,7 +155,11 @@ def _kish(log_w: np.ndarray) -> float:
 def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Points, Student]:
     """Weighted points, and the Student-t with their moments."""
     cloud = _Cloud(target)
-    proposal, warm = (start, True) if start is not None else (target.first(), False)
+    proposal, warm = start, start is not None
+    if proposal is None:
+        proposal = target.first()
+    else:
+        target.look(proposal.center)
     for k in range(1, _MAX_ROUNDS + 1):
         cloud.add(proposal.widened(target.widths[0]), target.n_pilot // 2, seed + k)
         cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)

@@ -40,6 +40,29 @@ class Conditional(NamedTuple):
     L: np.ndarray  # (point, unit, unit), factor of P
 
 
+def hyperparameters(priors: Priors, place: PlaceEffect, z: np.ndarray) -> np.ndarray:
+    """Theta (point, 6) of scores (point, score)."""
+    theta = np.zeros((len(z), 6))
+    theta[:, :3] = scores.beta0_and_noises(priors, z)
+    theta[:, 4], rest = 1.0, iter(z[:, 3:].T)
+    if place.cells:
+        theta[:, 3] = scores.half_normal(next(rest), place.tau_s)
+        theta[:, 4] = place.length_scale * np.exp(place.length_scale_sd * next(rest))
+    if place.bounds:
+        theta[:, 5] = scores.half_normal(next(rest), place.tau_e)
+    return theta
+
+
+def prior_of_places(proposal: Student) -> Student:
+    """Proposal for beta0 and the noises as told, the prior for the scores of places."""
+    n, d = 3, len(proposal.center)
+    cov = 1.5 * proposal.scale @ proposal.scale.T
+    cov[n:], cov[:, n:] = 0.0, 0.0
+    cov[n:, n:] = np.eye(d - n)
+    center = np.append(proposal.center[:n], np.zeros(d - n))
+    return proposal._replace(center=center, scale=np.linalg.cholesky(cov))
+
+
 class PlaceTarget:
     """Log posterior density of the scores."""
 
@@ -65,15 +88,7 @@ class PlaceTarget:
 
     def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Theta (point, 6) and the log prior density of scores (point, score)."""
-        theta = np.zeros((len(z), 6))
-        theta[:, :3] = scores.beta0_and_noises(self.priors, z)
-        theta[:, 4], p, rest = 1.0, self.place, iter(z[:, 3:].T)
-        if p.cells:
-            theta[:, 3] = scores.half_normal(next(rest), p.tau_s)
-            theta[:, 4] = p.length_scale * np.exp(p.length_scale_sd * next(rest))
-        if p.bounds:
-            theta[:, 5] = scores.half_normal(next(rest), p.tau_e)
-        return theta, scores.log_prior(z)
+        return hyperparameters(self.priors, self.place, z), scores.log_prior(z)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density, normalised by nothing but the evidence; shape (point,)."""
@@ -94,13 +109,11 @@ class PlaceTarget:
         return Student(z[best], scale[best])
 
     def defensive(self, proposal: Student) -> Student:
-        """Proposal for beta0 and the noises as told, the prior for the scores of places."""
-        n = 3
-        cov = 1.5 * proposal.scale @ proposal.scale.T
-        cov[n:], cov[:, n:] = 0.0, 0.0
-        cov[n:, n:] = np.eye(self.n_scores - n)
-        center = np.append(proposal.center[:n], np.zeros(self.n_scores - n))
-        return proposal._replace(center=center, scale=np.linalg.cholesky(cov))
+        """See `prior_of_places`."""
+        return prior_of_places(proposal)
+
+    def look(self, z: np.ndarray) -> None:
+        """Nothing: the density is exact everywhere."""
 
     def draw(
         self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
@@ -118,12 +131,7 @@ class PlaceTarget:
                 rows = slice(at, at := at + int(of))
                 theta[rows] = law.theta[k]
                 c[rows], g[rows] = _given_theta(law, k, c[rows], g[rows])
-        params = dict(zip(("beta0", "delta_w", "delta_v"), theta.T, strict=False))
-        names = ("tau_s", "length_scale", "tau_e")
-        hyper: dict[str, np.ndarray] = dict(zip(names, theta[:, 3:].T, strict=True))
-        params |= {"beta": c[:, :-1], "b": c[:, -1]}
-        params |= {name: hyper[name] for name in place.names}
-        return params | split_units(g, hyper, places, place, rng), None
+        return name_draws(theta, c, g, places, place, rng), None
 
     def _evaluate(self, z: np.ndarray, *, keep: bool = False) -> Conditional:
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
@@ -191,6 +199,23 @@ class PlaceTarget:
 def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     """L^-1 b for factors (point, c, c) and vectors (point, c)."""
     return np.linalg.solve(L, b[..., None])[..., 0]
+
+
+def name_draws(
+    theta: np.ndarray,
+    c: np.ndarray,
+    g: np.ndarray,
+    places: Visited,
+    place: PlaceEffect,
+    rng: np.random.Generator,
+) -> dict[str, np.ndarray]:
+    """Parameters by name of theta (draw, 6), coefficients c and effects of units g."""
+    params = dict(zip(("beta0", "delta_w", "delta_v"), theta.T, strict=False))
+    names = ("tau_s", "length_scale", "tau_e")
+    hyper: dict[str, np.ndarray] = dict(zip(names, theta[:, 3:].T, strict=True))
+    params |= {"beta": c[:, :-1], "b": c[:, -1]}
+    params |= {name: hyper[name] for name in place.names}
+    return params | split_units(g, hyper, places, place, rng)
 
 
 def _given_theta(

@@ -204,16 +204,18 @@ def _targets(
     model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
-    priors = model.priors
+    priors, family = model.priors, model.family
     if places is not None:
+        place = cast(PlaceEffect, model.place)
+        if not family.integrates_out:
+            gathered = gather_chains(family, batch, places=places)
+            return [LatentTarget(*gathered, priors, (place, places))]
         rates = batch.awareness, batch.contact_rate
         rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
-        return [PlaceTarget(rows, places, priors, cast(PlaceEffect, model.place))]
+        return [PlaceTarget(rows, places, priors, place)]
     if model.partial_pooling is not None:
         return [HierarchicalTarget(model.gather(batch, weight), priors)]
-    return [
-        LatentTarget(*gather_chains(model.family, one), priors) for one in model.robots_of(batch)
-    ]
+    return [LatentTarget(*gather_chains(family, one), priors) for one in model.robots_of(batch)]
 
 
 def _summarize(each: list[ExactDraws]) -> dict[str, Any]:

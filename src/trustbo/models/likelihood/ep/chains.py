@@ -5,6 +5,7 @@ import numpy as np
 from trustbo.models.likelihood.ep.joint import Chains
 from trustbo.models.likelihood.ep.terms import AT_ONE, GAUSSIAN, count_tables
 from trustbo.models.likelihood.families import Family
+from trustbo.models.place import Visited
 from trustbo.stacking import MissionBatch
 
 
@@ -12,7 +13,7 @@ def gather_chains(
     family: Family,
     batch: MissionBatch,
     *,
-    by_robot: bool = False,
+    places: Visited | None = None,
     whole: np.ndarray | None = None,
 ) -> tuple[Chains, np.ndarray]:
     """Chains of a batch, and the sites to begin with, (2, chain, bound).
@@ -20,12 +21,12 @@ def gather_chains(
     Args:
         family: Family of observations.
         batch: Missions, padded with NaN.
-        by_robot: Whether each robot has weights and an intercept of its own.
+        places: Visited places, where these have effects.
         whole: Bounds of each mission, (mission,): chains are as long, and those without a rate
             are kept; by default they end at their last rate.
 
     Returns:
-        Chains whose gamma is (weights, intercept), of each robot in turn if they have their own.
+        Chains whose gamma is (weights, intercept, effects of visited units).
     """
     n_robots = batch.contact_rate.shape[2]
     # One row per mission and robot: (chain, bound[, column]).
@@ -35,8 +36,13 @@ def gather_chains(
     u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
     seen = ~np.isnan(y)
     kept = np.flatnonzero(seen.any(1)) if whole is None else np.arange(len(y))
-    robot = (kept % n_robots) * by_robot
-    column = robot[:, None] * u.shape[-1] + np.arange(u.shape[-1])
+    column = np.broadcast_to(np.arange(u.shape[-1]), (len(kept), u.shape[-1]))
+    drift = u[kept]
+    if places is not None:  # each bound has the effect of its unit, one column for each bound
+        own = np.minimum(kept % n_robots, places.unit.shape[2] - 1)
+        unit = places.unit[kept // n_robots, :, own]
+        drift = np.concatenate([drift, np.eye(y.shape[1]) * (unit >= 0)[..., None]], axis=-1)
+        column = np.concatenate([column, u.shape[-1] + np.maximum(unit, 0)], axis=1)
     length = y.shape[1] - np.argmax(seen[kept][:, ::-1], axis=1)
     if whole is not None:
         length = np.repeat(whole, n_robots)
@@ -46,9 +52,9 @@ def gather_chains(
         np.where(seen[kept], y[kept], 0.0),
         terms.kind,
         terms.case,
-        np.ascontiguousarray(u[kept]),
-        column,
-        robot,
+        np.ascontiguousarray(drift),
+        np.ascontiguousarray(column),
+        np.zeros(len(kept), dtype=int),
         length,
         np.where(late.any(1), np.argmax(late, axis=1), length),
         np.stack([gaussian.sum(1), (np.where(gaussian, y[kept], 0.0) ** 2).sum(1)], axis=1),

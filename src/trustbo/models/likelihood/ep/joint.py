@@ -32,6 +32,8 @@ from trustbo.models.likelihood.ep.terms import (
     table_at,
 )
 
+_BY_LOOPS = 24  # coefficients from which on LAPACK is faster than loops
+
 
 class Chains(NamedTuple):
     """Sequences of rates, one for each mission and robot with a rate; the kernels' arguments."""
@@ -122,10 +124,14 @@ def backward(L, b):
 @njit(**OPTIONS)
 def _solve(Q, h, L, mean, covariance):
     """Factor of Q, mean Q^-1 h and covariance Q^-1; returns h'Q^-1 h - log |Q|, or NaN."""
-    D = len(h)
-    if not cholesky(Q, L):
+    D, total = len(h), 0.0
+    if D > _BY_LOOPS:
+        try:
+            L[:] = np.linalg.cholesky(Q)
+        except Exception:  # not positive definite: numba knows no narrower one
+            return np.nan
+    elif not cholesky(Q, L):
         return np.nan
-    total = 0.0
     for i in range(D):
         z = h[i]
         for k in range(i):
@@ -133,6 +139,12 @@ def _solve(Q, h, L, mean, covariance):
         mean[i] = z / L[i, i]
         total += mean[i] * mean[i] - 2.0 * np.log(L[i, i])
     backward(L, mean)
+    if D > _BY_LOOPS:
+        for i in range(D):
+            for j in range(i):
+                Q[j, i] = Q[i, j]
+        covariance[:] = np.linalg.inv(Q)
+        return total
     inverse = np.zeros((D, D))  # L^-1
     for j in range(D):
         inverse[j, j] = 1.0 / L[j, j]
