@@ -1,5 +1,6 @@
 """Settings of every test, and fixtures that several rooms share."""
 
+import shutil
 from pathlib import Path
 
 import jax
@@ -37,6 +38,25 @@ def leave_figures_blank():
 def blank_figures(monkeypatch, leave_figures_blank):
     """The same for one test."""
     leave_figures_blank(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """A headless browser that selenium drives; skips where there is none."""
+    program, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if program is None or driver is None:
+        pytest.skip("no chromium and chromedriver on the path")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    browser = webdriver.Chrome(options=options, service=Service(driver))
+    yield browser
+    browser.quit()
 
 
 @pytest.fixture

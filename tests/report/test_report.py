@@ -2,8 +2,10 @@
 
 import base64
 import dataclasses
+import html
 import html.parser
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -106,14 +108,33 @@ def test_the_page_is_whole_and_needs_nothing_else(page, text):
     for tag, own in page.tags:
         for name in ("src", "srcset", "href"):
             if name in own:
-                assert own[name].startswith(("data:", "#")), own[name][:80]
+                if own[name] != "explore.html":  # the interactive page beside it
+                    assert own[name].startswith(("data:", "#")), own[name][:80]
         if tag == "img":
             assert len(own["alt"]) > 30
             assert own["src"].startswith("data:image/svg+xml;base64,")
-    anchors = {own["href"][1:] for tag, own in page.tags if tag == "a"}
+    links = {own["href"] for tag, own in page.tags if tag == "a"}
+    anchors = {link[1:] for link in links - {"explore.html"}}
     assert anchors < {own.get("id") for _, own in page.tags}
     assert "url(" not in text
     assert "@import" not in text
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_the_interactive_page_is_a_file_beside_it_where_bokeh_is_installed(
+    result, tmp_path, monkeypatch
+):
+    text = write(result, tmp_path)
+    assert '<a href="explore.html">' in text
+    assert (tmp_path / "explore.html").stat().st_size < 5e6
+    write_report(tmp_path / "north.html", result)
+    assert '<a href="north-explore.html">' in (tmp_path / "north.html").read_text()
+    assert (tmp_path / "north-explore.html").exists()
+    monkeypatch.setitem(sys.modules, "bokeh", None)
+    (tmp_path / "without").mkdir()
+    without = write(result, tmp_path / "without")
+    assert 'pip install "trustbo[notebook]"' in html.unescape(without)
+    assert [file.name for file in (tmp_path / "without").iterdir()] == ["report.html"]
 
 
 def test_every_figure_has_a_phone_s_variant_with_text_as_outlines(page):

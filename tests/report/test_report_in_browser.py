@@ -1,17 +1,11 @@
 """The report page in a real browser, at the widths of a desk and of a phone."""
 
-import shutil
-
 import numpy as np
 import pytest
 
 import trustbo as tb
 from trustbo.report import write_report
 
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None or DRIVER is None, reason="no chromium and chromedriver on the path"
-)
 WIDTHS = {"wide": (1280, 900, False), "phone": (390, 844, True)}
 
 
@@ -34,21 +28,6 @@ def page(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
     write_report(path, result)
     return path.as_uri()
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(DRIVER))
-    yield driver
-    driver.quit()
 
 
 @pytest.fixture(params=WIDTHS.values(), ids=list(WIDTHS))

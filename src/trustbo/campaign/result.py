@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -31,6 +31,9 @@ from trustbo.models.hazard import measures_of
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
+
+if TYPE_CHECKING:
+    from trustbo.plots import Explorer
 
 _BELIEVED = "believed.nc"
 
@@ -166,6 +169,15 @@ class Result(Displayed):
             mean of those of the bounds into it (see `models.place_maps`); of robots' own effects,
             the mean over robots.
         """
+        if n_draws is None and seed == 0:
+            return self._maps.copy()
+        return self._compute_maps(n_draws, seed)
+
+    @cached_property
+    def _maps(self) -> xr.Dataset:
+        return self._compute_maps(None, 0)
+
+    def _compute_maps(self, n_draws: int | None, seed: int) -> xr.Dataset:
         if n_draws is None:
             mean = params_of(self.posterior).mean()
             n_draws = 1000 if self.planner.dynamics(mean).is_scalar else 100
@@ -204,6 +216,22 @@ class Result(Displayed):
         return plots.trust_maps(
             self.history, self.trust_map, self.path, self.workspace, n_columns=n_columns
         )
+
+    def explore(self) -> "Explorer":
+        """Draw an interactive page: layers of the map, missions on a slider, numbers of places.
+
+        Layers are those of `maps`, the awareness of each robot, the chance to fail, and the trust
+        map that each mission was planned on. A notebook's cell shows the page; `.save(path)` writes
+        it as one HTML file that needs no network.
+
+        Raises:
+            TrustboError: Bokeh is not installed, or nothing could be learned yet.
+        """
+        from trustbo.campaign.exploring import scene_of  # imports matplotlib
+        from trustbo.plots.explorer import draw_explorer, require_bokeh
+
+        require_bokeh()  # before the maps, which take a while
+        return draw_explorer(scene_of(self, self.maps()))
 
     def save(self, directory: FilePath) -> None:
         """Write everything to a folder that `load_result` reads.

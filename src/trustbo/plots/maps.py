@@ -196,11 +196,22 @@ def draw_hillshade(
 
     `heights` is `"dem"` or `"dsm"`, `exaggerate` a factor of the slopes.
     """
+    shadow = hillshade(workspace, heights, exaggerate=exaggerate)
+    if shadow is None:
+        return
+    pixels = np.zeros((*shadow.shape, 4))
+    pixels[..., 3] = shadow
+    ax.imshow(pixels, extent=extent_of(workspace.grid), interpolation="bilinear")
+
+
+def hillshade(
+    workspace: Workspace, heights: str = "dem", *, exaggerate: float = 2.0, most: int = 800
+) -> np.ndarray | None:
+    """Opacity of the terrain's shadows, (y, x) of some `most` pixels a side; None without one."""
     terrain = workspace.terrain
     if terrain is None or workspace.pixels is None:
-        return
-    # At most some 800 pixels a side; more would not be visible.
-    step = -(-max(terrain["dem"].shape) // 800)
+        return None
+    step = -(-max(terrain["dem"].shape) // most)  # more would not be visible
     dem = terrain[heights].values[::step, ::step]
     height, width = pixel_size(terrain)
     known = np.isfinite(dem)
@@ -209,9 +220,7 @@ def draw_hillshade(
     # Sun in the north-west at 45 degrees. Level ground has a light of 1 and keeps the colour of the
     # colour bar, unlike in matplotlib's shading, which stretches the light to its extremes.
     light = (1.0 + (east + south) / np.sqrt(2.0)) / np.sqrt(1.0 + east**2 + south**2)
-    shadow = np.zeros((*dem.shape, 4))
-    shadow[..., 3] = np.where(known, SHADOW * np.clip(1.0 - light, 0.0, 1.0), 0.0)
-    ax.imshow(shadow, extent=extent_of(workspace.grid), interpolation="bilinear")
+    return np.where(known, SHADOW * np.clip(1.0 - light, 0.0, 1.0), 0.0)
 
 
 def draw_ground(ax: Axes, workspace: Workspace, heights: str = "dsm") -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from importlib.metadata import version
+from importlib.util import find_spec
 
 import jinja2
 
@@ -17,6 +18,11 @@ from trustbo.report.summary import facts_of
 def write_report(path: FilePath, result: Result, *, title: str | None = None) -> None:
     """Write a result as one HTML page with its figures; equal results give equal bytes.
 
+    Where Bokeh is installed (`pip install "trustbo[notebook]"`), the interactive page of
+    `Result.explore` is written beside it, which it links to: `explore.html` beside `report.html`,
+    `north-explore.html` beside `north.html`. In the page itself it would not fit, for Bokeh's
+    library alone has half the size that a page may have to be sent by mail, some 3 MB.
+
     Args:
         path: HTML file to write, or to replace.
         result: Result of a campaign.
@@ -28,6 +34,11 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     target = require_file(path)
     if not result.missions:
         raise TrustboError("the result has no mission; run one first.")
+    explorer = None
+    if find_spec("bokeh") is not None:
+        own = "explore.html" if target.name == "report.html" else f"{target.stem}-explore.html"
+        explorer = require_file(target.with_name(own))
+        result.explore().save(explorer)
     name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("trustbo.report", "."),
@@ -40,6 +51,7 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
         title=name,
         facts=facts_of(result),
         sections=list(_sections(result)),
+        explorer=explorer and explorer.name,
         version=result.settings.get("trustbo_version", version("trustbo")),
     )
     write_text(target, page)

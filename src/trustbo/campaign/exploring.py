@@ -1,0 +1,261 @@
+"""Content of a result's interactive page: layers of the map, and its missions step by step."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+import xarray as xr
+
+from trustbo.campaign.result import Result
+from trustbo.data import Cell, Mission
+from trustbo.models import params_of, place_maps
+from trustbo.planning import QUANTILES
+from trustbo.planning.posterior import choose_draws
+from trustbo.planning.values import team_trust
+from trustbo.plots.explorer import Layer, Scene, Step
+from trustbo.plots.places import BETTER_WORSE
+from trustbo.workspace import Workspace
+from trustbo.workspace.moves import bounds_along
+
+_FIVE = (*QUANTILES[:2], 0.5, *QUANTILES[2:])
+_Moments = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Mean and sd by name, each (move, row, col)."""
+_SIGN = "\N{PLUS-MINUS SIGN}"
+
+
+def scene_of(result: Result, maps: xr.Dataset) -> Scene:
+    """Lay out the page of a result.
+
+    Args:
+        result: Result with a posterior.
+        maps: Maps of the result, see `Result.maps`.
+    """
+    n = len(result.missions)
+    of_bounds = _bound_maps(result)
+    steps = [_mission_step(result, j, of_bounds) for j in range(n)]
+    title = f"{_counted(result)}: trust, place by place"
+    layers = _layers(result, maps, of_bounds)
+    return Scene(title, result.workspace, layers, [*steps, _last_step(result, of_bounds)])
+
+
+def _layers(result: Result, maps: xr.Dataset, of_bounds: _Moments) -> list[Layer]:
+    """Layers by group, the most important first."""
+    there = {str(name): maps[name].transpose("row", "col").values for name in maps.data_vars}
+    learned = there["trust_mean"].copy()
+    learned[result.path[0]] = np.nan  # assumed there, and would set the limits of the colours
+
+    def layer(name: str, label: str, group: str, limits: tuple[float, float], **more) -> Layer:
+        return Layer(name, label, group, there[name], limits, **more)
+
+    def sd_layer(name: str, label: str, group: str) -> Layer:
+        return layer(name, f"{label}, sd", group, (0.0, _top(there[name])))
+
+    best, group = "P(cell on the best path)", "Trust"
+    layers = [
+        layer("trust_mean", "expected trust", group, _ends(learned), sd="trust_sd"),
+        sd_layer("trust_sd", "expected trust", group),
+        layer("path_probability", best, "Path", (0.0, 1.0)),
+    ]
+    cell, bounds, group = "effect of the cell", "effect of the bounds into it", "Places"
+    for name, label, sd in (("place_mean", cell, "place_sd"), ("place_bounds_mean", bounds, None)):
+        if name in there:
+            top = _top(np.abs(there[name]))
+            layers.append(layer(name, label, group, (-top, top), colours=BETTER_WORSE, sd=sd))
+            layers += [sd_layer(sd, label, group)] if sd else []
+    return [*layers, *_failure(of_bounds), *_awareness(result, there), *_as_planned(result)]
+
+
+def _failure(of_bounds: _Moments) -> list[Layer]:
+    """Chance to fail of the bound into a cell from its worst side, and the sd of that one."""
+    chances = of_bounds.get("chance to fail")
+    if chances is None:
+        return []
+    mean, sd = (np.where(np.isnan(chances[0]), -np.inf, part) for part in chances)
+    worst = mean.argmax(0)[None]
+    mean, sd = (np.take_along_axis(part, worst, 0)[0] for part in (mean, sd))
+    mean, sd = (np.where(np.isfinite(part), part, np.nan) for part in (mean, sd))
+    label, group = "chance to fail, from the worst side", "Failure"
+    return [
+        Layer("p_fail", label, group, mean, (0.0, _top(mean)), sd="p_fail_sd"),
+        Layer("p_fail_sd", f"{label}, sd", group, sd, (0.0, _top(sd))),
+    ]
+
+
+def _awareness(result: Result, there: Mapping[str, np.ndarray]) -> list[Layer]:
+    """Awareness by feature and robot; one map for all robots where they are alike."""
+    believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
+    layers = []
+    for name in [str(feature) for feature in believed["feature"].values]:
+        own = believed.sel(feature=name).transpose("robot", "row", "col").values
+        text = name.replace("_", " ")
+        if np.allclose(own, own[:1], equal_nan=True):
+            layers.append(_index(name, text, own[0]))
+            continue
+        mean = there[f"awareness_{name}" if f"awareness_{name}" in there else name]
+        layers.append(_index(name, f"{text}, mean of the robots", mean))
+        for robot, values in zip(result.workspace.team.names, own, strict=True):
+            layers.append(_index(f"{name} {robot}", f"{text}, {robot}", values))
+    return layers
+
+
+def _index(name: str, label: str, values: np.ndarray) -> Layer:
+    return Layer(name, label, "Awareness (0 worst, 1 best)", values, (0.0, 1.0))
+
+
+def _as_planned(result: Result) -> list[Layer]:
+    """Trust map that each mission was planned on, and the last one."""
+    planned = result.history["trust_map"].transpose("iteration", "row", "col").values
+    every = np.concatenate([planned, result.trust_map.transpose("row", "col").values[None]])
+    learned = every[1:].copy()
+    learned[:, *result.path[0]] = np.nan
+    label = "expected trust when the path was planned"
+    return [Layer("trust_planned", label, "Trust, mission by mission", every, _ends(learned))]
+
+
+def _mission_step(result: Result, j: int, of_bounds: _Moments) -> Step:
+    """Path, posts, contact and trust of a mission."""
+    mission, row = result.missions[j], result.history.isel(iteration=j)
+    n = len(mission.path) - 1
+    contact = mission.contact_rate
+    mean = float(np.nanmean(contact)) if np.isfinite(contact).any() else np.nan
+    said = [f"Mission {j + 1} of {len(result.missions)}: {mission.status.replace('_', ' ')}"]
+    said.append(f"contact {mean:.3f}" if np.isfinite(mean) else "no contact rate measured")
+    if len(mission.bounds) < n:
+        said.append(f"ended in bound {len(mission.bounds)} of {n}")
+    said.append(f"{_worth(result, row['objective'].item())} when planned")
+    stops, posts = _recorded(mission, result.workspace)
+    return Step(
+        f"mission {j + 1}",
+        ", ".join(said) + ".",
+        "Trust along the mission, given all missions",
+        mission.path,
+        stops,
+        posts,
+        contact,
+        _latent_trust(result, j, n),
+        _numbers(result, mission.path, mission.awareness, of_bounds),
+    )
+
+
+def _last_step(result: Result, of_bounds: _Moments) -> Step:
+    """Recommended path, with the trust expected along it."""
+    path, planner = result.path, result.planner
+    params, chosen = choose_draws(params_of(result.posterior), None, 0)
+    expected = team_trust(planner.dynamics(params, draws=chosen).along(path))
+    stops, posts = _planned(path, result.workspace)
+    moves, rows, cols = bounds_along(path).T
+    z = planner.mean_awareness[:, moves if planner.mean_awareness.shape[1] > 1 else 0, rows, cols]
+    return Step(
+        "recommended",
+        f"Recommended after {_counted(result)}: {len(path) - 1} bounds, "
+        f"{_worth(result, result.value)}.",
+        "Expected trust along the recommended path",
+        path,
+        stops,
+        posts,
+        np.full(result.trust.shape, np.nan),
+        np.quantile(expected, _FIVE, axis=0),
+        _numbers(result, path, z.transpose(1, 0, 2), of_bounds),
+    )
+
+
+def _latent_trust(result: Result, j: int, n_bounds: int) -> np.ndarray:
+    """Quantiles of the team's trust along a mission given all missions, (quantile, bound)."""
+    along = np.full((len(_FIVE), n_bounds), np.nan)
+    latent = result.posterior["latent"]["trust"]
+    if j not in latent.indexes["mission"]:  # never learned from
+        return along
+    of_team = latent.sel(mission=j).transpose("chain", "draw", "bound", "robot").values
+    team = of_team.min(-1) if result.settings.get("team") == "min" else of_team.mean(-1)
+    known = team.reshape(-1, team.shape[-1])[:, :n_bounds]
+    along[:, : known.shape[1]] = np.quantile(known, _FIVE, axis=0)
+    return along
+
+
+def _recorded(mission: Mission, workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
+    """Stops and posts as they were recorded; as planned for bounds without a record."""
+    stops, posts = _planned(mission.path, workspace)
+    n_robots = len(mission.robots)
+    for k, bound in enumerate(mission.bounds):
+        if bound.poses is None or not len(bound.poses):
+            continue
+        if posts is None:
+            posts = np.full((len(mission.path) - 1, n_robots, 2), np.nan)
+        here = bound.poses[0, :, :2] - workspace.grid.corner
+        stops[k], posts[k] = here[0], here[1:]
+    return stops, posts
+
+
+def _planned(path: Sequence[Cell], workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
+    """Stops and posts in m from the lower left corner: centres and None without a terrain."""
+    corner = np.array(workspace.grid.corner)
+    if (ground := workspace.ground) is None:
+        return np.array([workspace.grid.center(cell) for cell in path]) - corner, None
+    stops = np.stack([ground.posts.waypoint(cell) for cell in path])
+    posts = np.stack([ground.posts.at(a, c) for a, c in pairwise(path)])
+    return stops - corner, posts - corner
+
+
+def _numbers(
+    result: Result, path: Sequence[Cell], awareness: np.ndarray, of_bounds: _Moments
+) -> dict[str, list[str]]:
+    """Further numbers of the bounds of a path, as text; `awareness` is (bound, robot, feature)."""
+    where = tuple(bounds_along(path).T)
+    numbers = {
+        name: [_with_sd(*moments) for moments in zip(means[where], sds[where], strict=True)]
+        for name, (means, sds) in of_bounds.items()
+    }
+    robots = result.workspace.team.names
+    for m, feature in enumerate(result.workspace.features):
+        text, own = feature.replace("_", " "), awareness[..., m]
+        if np.allclose(own, own[:, :1], equal_nan=True):
+            own = own[:, :1]
+        elif len(robots) > 1:
+            text += f" ({' / '.join(robots)})"
+        numbers[text] = [" / ".join(f"{z:.2f}" for z in row if np.isfinite(z)) for row in own]
+    return numbers
+
+
+def _with_sd(mean: float, sd: float) -> str:
+    """Mean and sd as text, with the digits that two of the sd allow; empty where there is none."""
+    if not np.isfinite(mean):
+        return ""
+    decimals = max(1 - int(np.floor(np.log10(sd))), 0) if sd > 0.0 else 3
+    return f"{mean:.{decimals}f} {_SIGN} {sd:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def _bound_maps(result: Result) -> _Moments:
+    """Mean and sd of what is known of bounds, by its name, each (move, row, col)."""
+    found, children = {}, result.posterior.children
+    if "hazard" in children and "p_fail" in result.posterior["hazard"]:
+        hazard = result.posterior["hazard"]
+        found["chance to fail"] = hazard["p_fail"].values, hazard["p_fail_sd"].values
+    if "places" in children:
+        effects = place_maps(result.posterior)
+        if "place_bound_mean" in effects:
+            if "robot" in effects.dims:
+                effects = effects.mean("robot")
+            mean, sd = (
+                effects[f"place_bound_{n}"].transpose("move", "row", "col") for n in ("mean", "sd")
+            )
+            found["effect of the bound"] = mean.values, sd.values
+    return found
+
+
+def _counted(result: Result) -> str:
+    n = len(result.missions)
+    return f"{n} mission{'s' if n > 1 else ''}"
+
+
+def _worth(result: Result, value: float) -> str:
+    text = f"{value:.3g}".replace("-", "\N{MINUS SIGN}")
+    return f"objective {text} ({result.settings['objective'].replace('_', ' ')})"
+
+
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return (low, high) if low < high else (low, low + 1e-6)
+
+
+def _top(values: np.ndarray) -> float:
+    return max(float(np.nanmax(values)), 1e-6)

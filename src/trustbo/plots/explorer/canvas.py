@@ -1,0 +1,185 @@
+"""Figures of the interactive page as Bokeh models, which the page's script fills."""
+
+import base64
+import io
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex
+from PIL import Image, features
+
+from trustbo.errors import TrustboError
+from trustbo.planning import QUANTILES
+from trustbo.plots.explorer.scene import Scene
+from trustbo.plots.layout import extent_of, tallness
+from trustbo.plots.maps import CLOSED, COLOURS, hillshade
+from trustbo.plots.mission import INNER
+from trustbo.plots.plan import COLOURS as ROBOTS
+
+MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "star", "plus", "x")
+"""Markers by robot, in Bokeh's names."""
+CONTACT = LinearSegmentedColormap.from_list("contact", ["#d55e00", "#ffffff"])
+"""Colours of contact rates, from vermilion for the least to white for full contact."""
+SHADES = 64
+_WIDTH, _TALLEST = 640, 1.35  # px; height over width
+_BESIDE, _BELOW = 62, 128  # px of axes, tools and the colour bar
+_TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
+_SIGHT = "#e8e8e8"
+
+
+def require_bokeh() -> tuple[Any, Any]:
+    """Return Bokeh's models and its `figure`; TrustboError if Bokeh is not installed."""
+    try:
+        from bokeh import models
+        from bokeh.plotting import figure
+    except ImportError:
+        raise TrustboError('explore needs Bokeh: pip install "trustbo[notebook]".') from None
+    return models, figure
+
+
+def palette(colours: str | Colormap) -> list[str]:
+    """Return colours of matplotlib, or of those with a name, as hexadecimal text."""
+    shades = colormaps.get_cmap(colours)(np.linspace(0.0, 1.0, SHADES))
+    return [to_hex(colour) for colour in shades]
+
+
+def robot_marks(n: int) -> list[tuple[str, str]]:
+    """Return marker and colour of each robot."""
+    return [(MARKERS[i % len(MARKERS)], ROBOTS[i % len(ROBOTS)]) for i in range(n)]
+
+
+def draw_map(scene: Scene) -> Any:
+    """Make the figure of the map: cells under the hillshade, the path, posts, and what is chosen.
+
+    Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
+    marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` and `sight` (x0, y0, x1, y1);
+    its colours `colours` and `contact`.
+    """
+    models, figure = require_bokeh()
+    grid = scene.workspace.grid
+    size = {"width": grid.cell_width, "height": grid.cell_height}
+    height = round((_WIDTH - _BESIDE) * min(tallness(grid), _TALLEST)) + _BELOW
+    plot = figure(
+        name="map", width=_WIDTH, height=height, sizing_mode="scale_width", tools=_TOOLS,
+        active_drag=None, active_scroll=None, toolbar_location="above", match_aspect=True,
+        x_range=models.DataRange1d(range_padding=0.0),
+        y_range=models.DataRange1d(range_padding=0.0),
+        x_axis_label="east (m)", y_axis_label="north (m)",
+    )  # fmt: skip
+    col, row = np.meshgrid(np.arange(grid.shape[1]), np.arange(grid.shape[0]))
+    cells = _source(
+        "cells",
+        x=((col + 0.5) * grid.cell_width).ravel().tolist(),
+        y=((grid.shape[0] - row - 0.5) * grid.cell_height).ravel().tolist(),
+        value=[0.0] * col.size,
+    )
+    mapper = models.LinearColorMapper(name="colours", palette=palette(COLOURS), low=0.0, high=1.0)
+    mapper.nan_color = to_hex(CLOSED)
+    field = {"field": "value", "transform": mapper}
+    drawn = plot.rect("x", "y", source=cells, fill_color=field, line_color=field, **size)
+    plot.x_range.renderers = plot.y_range.renderers = [drawn]
+    _draw_hillshade(plot, scene)
+    _draw_path(plot)
+    focus = {"fill_color": None, "line_color": "#ffffff", "line_width": 2}
+    shadow = focus | {"line_color": "#000000", "line_width": 4}
+    chosen = _source("cell", x=[], y=[])
+    for style in (shadow, focus):
+        plot.rect("x", "y", source=chosen, **size, **style)
+    bar = models.ColorBar(color_mapper=mapper, height=12, padding=4, background_fill_color=None)
+    plot.add_layout(bar, "below")
+    return _plain(plot)
+
+
+def _draw_path(plot: Any) -> None:
+    """Draw the bounds in the colours of contact, the posts, and the chosen bound's sight lines."""
+    models, _ = require_bokeh()
+    ends = {"x0": "x0", "y0": "y0", "x1": "x1", "y1": "y1"}
+    bounds, bound, sight = (
+        _source(name, **{axis: [] for axis in ends}, **more)
+        for name, more in (("bounds", {"contact": []}), ("bound", {}), ("sight", {}))
+    )
+    contact = models.LinearColorMapper(name="contact", palette=palette(CONTACT), low=0.0, high=1.0)
+    contact.nan_color = "#ffffff"
+    colour = {"field": "contact", "transform": contact}
+    plot.segment(**ends, source=bound, line_color="#ffe600", line_width=17, line_cap="round")
+    plot.segment(**ends, source=bounds, line_color="#000000", line_width=7, line_cap="round")
+    plot.segment(**ends, source=bounds, line_color=colour, line_width=4, line_cap="round")
+    plot.segment(**ends, source=sight, line_color="#000000", line_width=2.5)
+    plot.segment(**ends, source=sight, line_color=_SIGHT, line_width=1.2)
+    posts = _source("posts", x=[], y=[], marker=[], colour=[])
+    plot.scatter(
+        "x", "y", source=posts, marker="marker", fill_color="colour", line_color="#ffffff",
+        line_width=0.7, size=7, name="post marks",
+    )  # fmt: skip
+    stops = _source("ends", x=[], y=[], marker=[], size=[])
+    plot.scatter(
+        "x", "y", source=stops, marker="marker", size="size", fill_color="#ffffff",
+        line_color="#000000", line_width=1.2,
+    )  # fmt: skip
+
+
+def draw_chart(scene: Scene) -> Any:
+    """Make the figure of trust along the path, beside the contact that was measured.
+
+    Its sources are named `trust` (bound, q0, ..., q4), `rates` (bound, rate, marker, colour) and
+    `chosen` (bound).
+    """
+    models, figure = require_bokeh()
+    seen = np.concatenate([np.r_[s.trust.ravel(), s.contact.ravel()] for s in scene.steps])
+    low, high = float(np.nanmin(seen)), float(np.nanmax(seen))
+    margin = 0.06 * max(high - low, 0.05)
+    longest = max(len(step.path) - 1 for step in scene.steps)
+    plot = figure(
+        name="chart", height=290, sizing_mode="stretch_width", tools="save", toolbar_location=None,
+        x_range=models.Range1d(0.4, longest + 0.6),
+        y_range=models.Range1d(low - margin, high + margin),
+        x_axis_label="bound", y_axis_label="trust, contact rate",
+    )  # fmt: skip
+    every = -(-longest // 14)
+    plot.xaxis.ticker = models.FixedTicker(ticks=list(range(1, longest + 1, every)))
+    chosen = _source("chosen", bound=[])
+    plot.vspan("bound", source=chosen, line_color="#e0b400", line_width=10, line_alpha=0.45)
+    trust = _source("trust", bound=[], **{f"q{i}": [] for i in range(len(QUANTILES) + 1)})
+    for inner, outer, alpha in (("q0", "q4", 0.35), ("q1", "q3", 0.6)):
+        plot.varea("bound", inner, outer, source=trust, fill_color=INNER, fill_alpha=alpha)
+    plot.line("bound", "q2", source=trust, line_width=2, name="median")
+    rates = _source("rates", bound=[], rate=[], marker=[], colour=[])
+    plot.scatter(
+        "bound", "rate", source=rates, marker="marker", fill_color="colour", line_color="#ffffff",
+        line_width=0.7, size=8,
+    )  # fmt: skip
+    return _plain(plot)
+
+
+def _draw_hillshade(plot: Any, scene: Scene) -> None:
+    """Draw the shadows of the terrain, where there is one, as an image that shades the cells."""
+    shadow = hillshade(scene.workspace, exaggerate=1.0, most=500)
+    if shadow is None:
+        return
+    left, right, bottom, top = extent_of(scene.workspace.grid)
+    kind = "WEBP" if features.check("webp") else "PNG"
+    file = io.BytesIO()
+    pixels = np.zeros((*shadow.shape, 4), dtype=np.uint8)
+    pixels[..., 3] = np.round(255.0 * shadow)
+    Image.fromarray(pixels).save(file, kind, quality=80)
+    uri = f"data:image/{kind.lower()};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+    plot.image_url(
+        [uri], x=left, y=top, w=right - left, h=top - bottom, anchor="top_left", name="hillshade"
+    )
+
+
+def _source(name: str, **columns: Any) -> Any:
+    return require_bokeh()[0].ColumnDataSource(columns, name=name)
+
+
+def _plain(plot: Any) -> Any:
+    """Remove what the page has of its own, or takes from its colours."""
+    plot.toolbar.logo = None
+    plot.background_fill_color = plot.border_fill_color = plot.outline_line_color = None
+    plot.grid.visible = plot.name == "chart"
+    plot.xgrid.visible = False
+    plot.axis.minor_tick_line_color = None
+    plot.axis.axis_label_text_font_style = "normal"
+    plot.axis.axis_label_text_font_size = plot.axis.major_label_text_font_size = "12px"
+    return plot

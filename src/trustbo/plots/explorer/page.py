@@ -1,0 +1,95 @@
+"""Interactive page: one HTML file with Bokeh's library in it, which a notebook shows in a frame."""
+
+import html
+import json
+from dataclasses import dataclass, field
+from importlib.metadata import version
+
+import jinja2
+
+from trustbo.files import FilePath, require_file, write_text
+from trustbo.plots.explorer import canvas
+from trustbo.plots.explorer.scene import Scene
+
+_SYMBOLS = {
+    "circle": "\N{BLACK CIRCLE}", "square": "\N{BLACK SQUARE}", "diamond": "\N{BLACK DIAMOND}",
+    "triangle": "\N{BLACK UP-POINTING TRIANGLE}", "star": "\N{BLACK STAR}", "plus": "+",
+    "inverted_triangle": "\N{BLACK DOWN-POINTING TRIANGLE}", "x": "\N{MULTIPLICATION SIGN}",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Explorer:
+    """Interactive page of a campaign; the last expression of a notebook's cell shows it.
+
+    Attributes:
+        title: Heading of the page.
+        html: The page. It needs no network and no other file.
+    """
+
+    title: str
+    html: str = field(repr=False)
+
+    def save(self, path: FilePath) -> None:
+        """Write the page as an HTML file.
+
+        Raises:
+            TrustboError: The file cannot be written, or its name does not end in .html.
+        """
+        write_text(require_file(path, ".html", ".htm"), self.html)
+
+    def _repr_html_(self) -> str:
+        """Page in a frame of its own, so that neither its style nor its script meets others."""
+        return (
+            f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.html)}" '
+            'style="width:100%;height:820px;border:0" loading="lazy"></iframe>'
+        )
+
+
+def draw_explorer(scene: Scene) -> Explorer:
+    """Draw the interactive page of a scene.
+
+    Raises:
+        TrustboError: Bokeh is not installed.
+    """
+    canvas.require_bokeh()
+    from bokeh.embed import json_item
+    from bokeh.resources import Resources
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("trustbo.plots.explorer", "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    record = scene.record()
+    colours = {layer["colours"] for layer in record["layers"]}
+    marks = canvas.robot_marks(len(record["robots"]))
+    record["palettes"] = {name: canvas.palette(name) for name in sorted(colours)}
+    record["marks"] = [list(mark) for mark in marks]
+    groups: dict[str, list[tuple[int, str]]] = {}
+    for i, layer in enumerate(record["layers"]):
+        groups.setdefault(layer["group"], []).append((i, layer["label"]))
+    figures = {"map": canvas.draw_map(scene), "chart": canvas.draw_chart(scene)}
+    page = environment.get_template("page.html").render(
+        title=scene.title,
+        groups=groups,
+        n_steps=len(scene.steps),
+        robots=[
+            (name, _SYMBOLS[marker], colour)
+            for name, (marker, colour) in zip(record["robots"], marks, strict=True)
+        ],
+        has_posts=any(step.posts is not None for step in scene.steps),
+        left_out=record["left_out"],
+        library=Resources(mode="inline", components=["bokeh"], log_level="error").render_js(),
+        scene=_script(record),
+        figures={name: _script(json_item(figure)) for name, figure in figures.items()},
+        version=version("trustbo"),
+    )
+    return Explorer(scene.title, page)
+
+
+def _script(record: object) -> str:
+    """JSON that cannot end the script element it stands in."""
+    return json.dumps(record, separators=(",", ":")).replace("<", "\\u003c")

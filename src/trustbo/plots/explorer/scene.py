@@ -1,0 +1,139 @@
+"""Content of the interactive page: layers of the map, and paths that its slider goes through."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.plots.maps import COLOURS
+from trustbo.workspace import Workspace
+
+MOST_VALUES = 350_000
+"""Number of values of cells on a page, some 2.5 MB; layers beyond it are left out."""
+_DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Map of the planning cells.
+
+    Attributes:
+        name: Name, such as that of `Result.maps()`.
+        label: Name for a reader, with the unit if there is one.
+        group: Heading in the list of layers.
+        values: Shape (row, col), or (step, row, col) of a map for each step of the slider; NaN
+            where there is no value.
+        limits: Values of the first and the last colour.
+        colours: Name of matplotlib's colours.
+        sd: Name of the layer with its standard deviation.
+    """
+
+    name: str
+    label: str
+    group: str
+    values: np.ndarray
+    limits: tuple[float, float]
+    colours: str = COLOURS
+    sd: str | None = None
+
+    def record(self, passable: np.ndarray) -> dict[str, Any]:
+        """Layer as JSON can hold it, without values where cells are impassable."""
+        values = np.where(passable, self.values, np.nan)
+        maps = [to_list(one.ravel()) for one in values.reshape(-1, *passable.shape)]
+        return {
+            "name": self.name, "label": self.label, "group": self.group, "sd": self.sd,
+            "low": self.limits[0], "high": self.limits[1], "colours": self.colours, "maps": maps,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Path of one step of the slider.
+
+    Attributes:
+        title: Name of the step, such as "mission 3".
+        note: Outcome, in a line.
+        heading: Heading of the trust along the path.
+        path: Cells, start first.
+        stops: Stops of the lead, x and y in m from the map's lower left corner, (cell, 2).
+        posts: Posts of the robots while the lead runs each bound, (bound, robot, 2); None where
+            they are not known.
+        contact: Contact rates measured, (bound, robot), NaN where there are none.
+        trust: Quantiles of the team's trust after each bound, (quantile, bound), those of
+            `QUANTILES` with the median in their middle; NaN where it is not known.
+        numbers: Further numbers of each bound as text, by their names; (bound,) each.
+    """
+
+    title: str
+    note: str
+    heading: str
+    path: Sequence[Cell]
+    stops: np.ndarray
+    posts: np.ndarray | None
+    contact: np.ndarray
+    trust: np.ndarray
+    numbers: dict[str, list[str]] = field(default_factory=dict)
+
+    def record(self) -> dict[str, Any]:
+        """Step as JSON can hold it."""
+        return {
+            "title": self.title,
+            "note": self.note,
+            "heading": self.heading,
+            "path": [list(cell) for cell in self.path],
+            "stops": to_list(self.stops.round(2)),
+            "posts": None if self.posts is None else to_list(self.posts.round(2)),
+            "contact": to_list(self.contact),
+            "trust": to_list(self.trust),
+            "numbers": self.numbers,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Content of the page.
+
+    Attributes:
+        title: Heading.
+        workspace: Workspace of the cells.
+        layers: Layers, the most important first.
+        steps: Paths, the last of them the recommended one.
+    """
+
+    title: str
+    workspace: Workspace
+    layers: Sequence[Layer]
+    steps: Sequence[Step]
+
+    def shown(self) -> list[Layer]:
+        """Layers that the page has room for."""
+        kept, room = [], MOST_VALUES
+        for layer in self.layers:
+            if layer.values.size <= room:
+                kept.append(layer)
+                room -= layer.values.size
+        return kept
+
+    def record(self) -> dict[str, Any]:
+        """Content as JSON can hold it."""
+        grid, passable = self.workspace.grid, self.workspace.passable.values
+        shown = self.shown()
+        return {
+            "shape": list(grid.shape),
+            "cell": [grid.cell_height, grid.cell_width],
+            "robots": list(self.workspace.team.names),
+            "layers": [layer.record(passable) for layer in shown],
+            "left_out": [layer.label for layer in self.layers if layer not in shown],
+            "steps": [step.record() for step in self.steps],
+        }
+
+
+def to_list(values: np.ndarray) -> Any:
+    """Values as nested lists of at most six digits; None for NaN."""
+    if values.ndim > 1:
+        return [to_list(part) for part in values]
+    numbers = (float(f"{value:.{_DIGITS}g}") for value in values.tolist())
+    return [number if math.isfinite(number) else None for number in numbers]
