@@ -58,7 +58,7 @@ NUTS = {
 }
 
 FEW = (
-    "pooled exact", "apart exact", "policy cvar", "objective success", "belief", "replan",
+    "pooled exact", "apart exact", "policy ucb", "objective success", "belief", "replan",
     "objective lost_contact", "bounds", "places",
 )  # fmt: skip
 

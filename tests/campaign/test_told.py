@@ -295,7 +295,7 @@ def test_replanning_by_bounds_is_refused_with_a_family_it_cannot_follow(workspac
         )  # fmt: skip
 
 
-@pytest.mark.parametrize("policy", ["thompson", "epsilon_greedy"])
+@pytest.mark.parametrize("policy", ["thompson", "random"])
 def test_the_caller_s_jax_flags_do_not_change_a_campaign(workspace, policy):
     def paths(*flags):
         campaign = begin(workspace, policy=policy, seed=3)

@@ -167,7 +167,7 @@ def test_shells_complete_commands_flags_and_names():
     assert complete("trustbo re") == ["resume", "report"]
     assert complete("trustbo run --pol") == ["--policy"]
     assert complete("trustbo run --policy ") == [*POLICIES]
-    assert complete("trustbo demo --policy e") == ["ei", "epsilon_greedy"]
+    assert complete("trustbo demo --policy g") == ["greedy"]
     script = complete("", _TRUSTBO_COMPLETE="source_bash")
     assert "_TRUSTBO_COMPLETE=complete_bash" in script
 

@@ -33,8 +33,8 @@ Paths
     the paper), mean (on the way), success (of every bound), bottleneck (the least on the way),
     stationary.
 Learning
-  policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb, ei,
-    epsilon_greedy, cvar, random.
+  policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb,
+    random.
   model NAME: Trust model: places (robots are alike, places differ), pooled (places do not, as in
     the paper), hierarchical (robots are similar), coupled (influence
     each other).

@@ -57,34 +57,11 @@ def optimistic(key: Array, posterior: Params, planner: Planner, *, quantile: flo
 
 
 def ucb(key: Array, posterior: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Path with the highest mean plus `kappa` sd of its value over draws."""
-    return _best_candidate(
-        key, posterior, planner, lambda values: values.mean(0) + kappa * values.std(0)
-    )
-
-
-def ei(key: Array, posterior: Params, planner: Planner) -> Plan:
-    """Path with the largest expected improvement on the path that is best on average.
-
-    E[max(0, value - incumbent's value)] over draws, both under the same draw; the incumbent itself
-    where no path is expected to improve on it.
-    """
-
-    def improvement(values: np.ndarray) -> np.ndarray:
-        incumbent = values[:, [np.argmax(values.mean(0))]]
-        return np.maximum(0.0, values - incumbent).mean(0) + 1e-12 * values.mean(0)
-
-    return _best_candidate(key, posterior, planner, improvement)
-
-
-def cvar(key: Array, posterior: Params, planner: Planner, *, alpha: float = 0.2) -> Plan:
-    """Path with the best mean over its worst share `alpha` of draws (risk-averse)."""
-
-    def tail(values: np.ndarray) -> np.ndarray:
-        n_worst = max(1, round(alpha * len(values)))
-        return np.sort(values, axis=0)[:n_worst].mean(0)
-
-    return _best_candidate(key, posterior, planner, tail)
+    """Path with the highest mean plus `kappa` sd of its value, of the draws' best paths."""
+    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=seed_of(key))
+    values = drawn.values_of(drawn.candidates)
+    chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
+    return planner.evaluate(drawn.candidates[chosen], posterior.mean())
 
 
 def information(key: Array, posterior: Params, planner: Planner, *, n_random: int = 50) -> Plan:
@@ -98,15 +75,6 @@ def information(key: Array, posterior: Params, planner: Planner, *, n_random: in
     params, _ = choose_draws(posterior, N_DRAWS, seed_of(key))
     gains = information_gain(params, planner.mean_awareness, paths, planner.family, planner.lag)
     return planner.evaluate(paths[int(np.argmax(gains))], posterior.mean())
-
-
-def epsilon_greedy(
-    key: Array, posterior: Params, planner: Planner, *, epsilon: float = 0.1
-) -> Plan:
-    """Greedy; with probability `epsilon`, a random path."""
-    chance, other = jax.random.split(key)
-    explores = float(jax.random.uniform(chance, dtype=np.float32)) < epsilon
-    return (random if explores else greedy)(other, posterior, planner)
 
 
 def random(key: Array, posterior: Params, planner: Planner) -> Plan:
@@ -132,9 +100,6 @@ POLICIES: Mapping[str, Policy] = {
     "thompson": thompson,
     "information": information,
     "ucb": ucb,
-    "ei": ei,
-    "epsilon_greedy": epsilon_greedy,
-    "cvar": cvar,
     "random": random,
 }
 """Policies by name."""
@@ -159,15 +124,6 @@ def _random_paths(planner: Planner, rng: np.random.Generator, n: int) -> list[tu
             if len(found) == n:
                 break
     return found
-
-
-def _best_candidate(
-    key: Array, posterior: Params, planner: Planner, score: Callable[[np.ndarray], np.ndarray]
-) -> Plan:
-    """Plan the path with the best score of its values (draw, path) among the draws' best paths."""
-    drawn = planner.plan_draws(posterior, n_draws=N_DRAWS, seed=seed_of(key))
-    chosen = int(np.argmax(score(drawn.values_of(drawn.candidates))))
-    return planner.evaluate(drawn.candidates[chosen], posterior.mean())
 
 
 def seed_of(key: Array) -> int:
