@@ -21,12 +21,14 @@ COMMANDS = ("demo", "run", "resume", "report", "export", "study")
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_report_writes_one_page(invoke, finished, tmp_path):
+def test_report_writes_a_page_and_an_interactive_one_beside_it(invoke, finished, tmp_path):
     folder, _ = finished
     page = tmp_path / "mine.html"
     done = invoke("report", folder, "--out", page, "--title", "Two missions")
     assert done.exit_code == 0, done.output
-    assert done.output == f"the report is {page}\n"
+    interactive = tmp_path / "mine-explore.html"
+    assert done.output == f"the report is {page}\nthe interactive page is {interactive}\n"
+    assert interactive.exists()
     assert "<h1>Two missions</h1>" in page.read_text()
 
 

@@ -20,6 +20,7 @@ def test_run_writes_every_file_and_says_where(finished):
         "maps.png",
         "terrain.png",
         "report.html",
+        "explore.html",
         "maps.tif",
         "maps.qml",
         "path.geojson",
@@ -28,6 +29,7 @@ def test_run_writes_every_file_and_says_where(finished):
     }
     assert "trust_map.tif" not in names
     assert f"results are in {out}/: report.html, maps.png, terrain.png, maps.tif" in done.output
+    assert "path.geojson, explore.html,\n" in done.output
     assert "mission  status  contact  objective  k-hat  path" in done.output
     assert "stopped: n_iterations" in done.output
     assert "recommended: 2,0 " in done.output

@@ -8,7 +8,15 @@ from trustbo.errors import TrustboError
 if TYPE_CHECKING:
     from trustbo.campaign.result import Result
 
-_FILES = ("report.html", "maps.png", "terrain.png", "maps.tif", "maps.qml", "path.geojson")
+_FILES = (
+    "report.html",
+    "explore.html",
+    "maps.png",
+    "terrain.png",
+    "maps.tif",
+    "maps.qml",
+    "path.geojson",
+)
 
 
 def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
@@ -53,7 +61,8 @@ def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
         from trustbo.export import export_result
 
         written += [file.name for file in export_result(result, out, ("geotiff", "geojson"))]
-    write_report(out / "report.html", result)
+    _, *others = write_report(out / "report.html", result)
+    written += [file.name for file in others]
     if table:
         _print_table(result)
     print(f"results are in {out}/: {', '.join(written)},")

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 
 import jinja2
 
@@ -15,18 +16,21 @@ from trustbo.report.numbers import counted
 from trustbo.report.summary import facts_of
 
 
-def write_report(path: FilePath, result: Result, *, title: str | None = None) -> None:
+def write_report(path: FilePath, result: Result, *, title: str | None = None) -> list[Path]:
     """Write a result as one HTML page with its figures; equal results give equal bytes.
 
     Where Bokeh is installed (`pip install "trustbo[notebook]"`), the interactive page of
-    `Result.explore` is written beside it, which it links to: `explore.html` beside `report.html`,
-    `north-explore.html` beside `north.html`. In the page itself it would not fit, for Bokeh's
-    library alone has half the size that a page may have to be sent by mail, some 3 MB.
+    `Result.explore` is written beside it, and linked to: `explore.html` beside `report.html`,
+    `north-explore.html` beside `north.html`. It is a second file because Bokeh's library, 1.4 MB,
+    would take the page beyond the 3 MB that it may have.
 
     Args:
         path: HTML file to write, or to replace.
         result: Result of a campaign.
         title: Title of the page; by default it has the number of missions.
+
+    Returns:
+        Files written, the page first.
 
     Raises:
         TrustboError: The result has no mission, or the file cannot be written.
@@ -55,6 +59,7 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
         version=result.settings.get("trustbo_version", version("trustbo")),
     )
     write_text(target, page)
+    return [target] if explorer is None else [target, explorer]
 
 
 def _sections(result: Result) -> Iterator[Section]:

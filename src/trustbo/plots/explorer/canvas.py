@@ -25,7 +25,6 @@ SHADES = 64
 _WIDTH, _TALLEST = 640, 1.35  # px; height over width
 _BESIDE, _BELOW = 62, 128  # px of axes, tools and the colour bar
 _TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
-_SIGHT = "#e8e8e8"
 
 
 def require_bokeh() -> tuple[Any, Any]:
@@ -53,8 +52,8 @@ def draw_map(scene: Scene) -> Any:
     """Make the figure of the map: cells under the hillshade, the path, posts, and what is chosen.
 
     Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
-    marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` and `sight` (x0, y0, x1, y1);
-    its colours `colours` and `contact`.
+    marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and `sight` (the same, colour); its
+    colours `colours` and `contact`.
     """
     models, figure = require_bokeh()
     grid = scene.workspace.grid
@@ -97,16 +96,16 @@ def _draw_path(plot: Any) -> None:
     ends = {"x0": "x0", "y0": "y0", "x1": "x1", "y1": "y1"}
     bounds, bound, sight = (
         _source(name, **{axis: [] for axis in ends}, **more)
-        for name, more in (("bounds", {"contact": []}), ("bound", {}), ("sight", {}))
+        for name, more in (("bounds", {"contact": []}), ("bound", {}), ("sight", {"colour": []}))
     )
     contact = models.LinearColorMapper(name="contact", palette=palette(CONTACT), low=0.0, high=1.0)
     contact.nan_color = "#ffffff"
     colour = {"field": "contact", "transform": contact}
     plot.segment(**ends, source=bound, line_color="#ffe600", line_width=17, line_cap="round")
+    plot.segment(**ends, source=sight, line_color="#ffffff", line_width=3)
+    plot.segment(**ends, source=sight, line_color="colour", line_width=1.6)
     plot.segment(**ends, source=bounds, line_color="#000000", line_width=7, line_cap="round")
     plot.segment(**ends, source=bounds, line_color=colour, line_width=4, line_cap="round")
-    plot.segment(**ends, source=sight, line_color="#000000", line_width=2.5)
-    plot.segment(**ends, source=sight, line_color=_SIGHT, line_width=1.2)
     posts = _source("posts", x=[], y=[], marker=[], colour=[])
     plot.scatter(
         "x", "y", source=posts, marker="marker", fill_color="colour", line_color="#ffffff",

@@ -139,14 +139,17 @@ async function start() {
       at("place").textContent = `Bound ${k + 1}, ${path[k]} to ${path[k + 1]}`
       at("numbers").replaceChildren(table(ofBound(k)))
       fill("bound", {x0: [x0], y0: [y0], x1: [x1], y1: [y1]})
-      const seen = (posts?.[k] ?? []).filter((post) => post[0] !== null)
-      fill("sight", {x0: seen.map((p) => p[0]), y0: seen.map((p) => p[1]), x1: seen.map(() => x1), y1: seen.map(() => y1)})
+      const seen = (posts?.[k] ?? []).map((xy, i) => [...xy, scene.marks[i][1]]).filter((p) => p[0] !== null)
+      fill("sight", {
+        x0: seen.map((p) => p[0]), y0: seen.map((p) => p[1]), x1: seen.map(() => x1), y1: seen.map(() => y1),
+        colour: seen.map((p) => p[2]),
+      })
       fill("chosen", {bound: [k + 1]})
       fill("cell", {x: [], y: []})
       return
     }
     fill("bound", empty)
-    fill("sight", empty)
+    fill("sight", {...empty, colour: []})
     fill("chosen", {bound: []})
     if (chosen === null) {
       at("place").textContent = "Numbers"
