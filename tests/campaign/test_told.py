@@ -281,20 +281,6 @@ def test_what_is_told_beside_the_mission_is_checked_before(workspace, tmp_path, 
     assert not (tmp_path / "measured.nc").exists()
 
 
-def test_replanning_by_bounds_is_refused_with_a_family_it_cannot_follow(workspace):
-    class Bounds(ModelSimulator):
-        reset = run_bound = ModelSimulator.run
-
-    model = tb.models.PooledTrust(observation="censored")
-    with pytest.raises(
-        tb.TrustboError, match=r'replan="bound" follows trust by a filter, which ne'
-    ):
-        tb.iterate(
-            workspace, *ENDS, model=model, replan="bound", simulator=Bounds(workspace),
-            progress=False,
-        )  # fmt: skip
-
-
 @pytest.mark.parametrize("policy", ["thompson", "random"])
 def test_the_caller_s_jax_flags_do_not_change_a_campaign(workspace, policy):
     def paths(*flags):

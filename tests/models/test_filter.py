@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from models.likelihood.test_families import PARAMS, N, on_a_grid, sequences
 from models.likelihood.test_scalar import random_params
 from references import dense_log_likelihood, dense_posterior_of_trust
+from scipy import stats
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import TrustFilter, TrustParams
+from trustbo.models import CoupledParams, TrustFilter, TrustParams
 
 
 def mixture(n_draws=4, seed=0):
@@ -85,3 +87,109 @@ def test_bad_input_is_named():
     with pytest.raises(ShapeError, match=r"awareness must be \(bound, 3 robots"):
         live.predict(good)
     assert live.n_bounds == 0
+
+
+def constant(p, n=2):
+    """The same parameters as draws."""
+    return TrustParams(*(np.repeat(np.asarray(v)[None], n, 0) for v in p[:7]))
+
+
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+def test_families_are_followed_to_the_trust_of_a_grid(family):
+    """Moments are matched bound by bound: within .05 sd of the exact posterior."""
+    p = PARAMS[family]
+    z, y, _ = sequences(family)
+    live = TrustFilter(constant(p), n_robots=1, observation=family)
+    for j in range(len(y)):
+        live.reset()
+        for k in range(5):
+            state = live.update(z[j, k], y[j, k], n_ticks=N)
+        mean, sd = on_a_grid(family, p, z[j, :, 0], y[j, :, 0], 2401, last_trust=True)
+        assert abs(state.mean[0] - mean) < 0.05 * sd
+        assert abs(state.sd[0] / sd - 1.0) < 0.05
+        # The constant of each density within the limits is left out of the weights.
+        found = live._log_weight[0]
+        if family == "censored":
+            found -= 0.5 * np.log(2.0 * np.pi) * (~np.isnan(y[j])).sum()
+        expected = on_a_grid(family, p, z[j, :, 0], y[j, :, 0], 2401)
+        assert abs(found - expected) < 0.03
+
+
+@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
+def test_ticks_add_up_to_the_bound(family):
+    p, rng = PARAMS[family], np.random.default_rng(0)
+    params = constant(p, 3)._replace(b=p.b + np.array([-0.1, 0.0, 0.1]))
+    ticks, bounds = rng.uniform(size=(4, 25, 3)) < 0.8, rng.uniform(size=(4, 3, 2))
+    by_tick, by_bound = (TrustFilter(params, 3, observation=family) for _ in range(2))
+    for seen, z in zip(ticks, bounds, strict=True):
+        by_tick.begin_bound(z)
+        for one in seen:
+            running = by_tick.update_tick(one)
+        ended = by_tick.end_bound()
+        np.testing.assert_array_equal(running.mean, ended.mean)
+        state = by_bound.update(z, seen.mean(0), n_ticks=25)
+        np.testing.assert_allclose(ended.mean, state.mean, rtol=1e-12)
+        np.testing.assert_allclose(ended.sd, state.sd, rtol=1e-12)
+        np.testing.assert_allclose(by_tick.weights, by_bound.weights, rtol=1e-10)
+    assert by_tick.n_bounds == 4
+
+
+def test_a_robot_that_did_not_look_is_not_measured():
+    params = constant(PARAMS["censored"])
+    live, other = (TrustFilter(params, 2, observation="censored") for _ in range(2))
+    live.begin_bound(np.full((2, 2), 0.5))
+    live.update_tick([1.0, np.nan])
+    np.testing.assert_allclose(
+        live.end_bound().mean, other.update(np.full((2, 2), 0.5), [1.0, np.nan]).mean
+    )
+    with pytest.raises(TrustboError, match="no bound runs: call begin_bound"):
+        live.update_tick([1.0, 1.0])
+    live.begin_bound(np.full((2, 2), 0.5))
+    with pytest.raises(TrustboError, match="a bound runs: call end_bound"):
+        live.update(np.full((2, 2), 0.5), [1.0, 1.0])
+    with pytest.raises(ShapeError, match=r"in_contact must be \(2,\); got shape \(3,\)"):
+        live.update_tick([1.0, 1.0, 0.0])
+    counting = TrustFilter(constant(PARAMS["beta_binomial"]), 2, observation="beta_binomial")
+    with pytest.raises(TrustboError, match="The beta-binomial family counts ticks"):
+        counting.update(np.full((2, 2), 0.5), [1.0, 1.0])
+
+
+@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
+def test_coupled_robots_without_a_coupling_are_robots_apart(family):
+    p, rng, eye = PARAMS[family], np.random.default_rng(1), np.eye(2)[None]
+    coupled = CoupledParams(
+        p.beta0 * eye,
+        np.stack([b * np.eye(2) for b in p.beta])[None],
+        np.full((1, 2), p.b),
+        p.delta_w**2 * eye,
+        p.delta_v**2 * eye,
+        np.array([p.x0_mean]),
+        np.array([p.x0_sd]),
+    )
+    together = TrustFilter(coupled, observation=family)
+    apart = TrustFilter(constant(p, 1), 2, observation=family)
+    for y in ([1.0, 0.5], [0.0, np.nan], [0.9, 1.0]):
+        z = rng.uniform(size=(2, 2))
+        one, other = (live.update(z, y, n_ticks=N) for live in (together, apart))
+        np.testing.assert_allclose(one.mean, other.mean, rtol=1e-7)
+        np.testing.assert_allclose(one.sd, other.sd, rtol=1e-7)
+    ahead = together.predict(rng.uniform(size=(3, 2, 2)))
+    assert ahead.rate.shape == ahead.rate_low.shape == (3, 2)
+
+
+def test_rates_ahead_have_the_interval_of_the_model():
+    rng, n = np.random.default_rng(3), 4000
+    p = PARAMS["gaussian"]
+    live = TrustFilter(constant(p, n), 2, max_draws=n)
+    live.update(rng.uniform(size=(2, 2)), [0.4, 0.8])
+    ahead = live.predict(rng.uniform(size=(3, 2, 2)))
+    law = stats.norm(ahead.mean, np.hypot(ahead.sd, p.delta_v))
+    # 4000 draws: 5 standard errors of a mean, and of a 5 % quantile (2.1 times as wide).
+    error = 5 * law.std() / np.sqrt(n)
+    assert (np.abs(ahead.rate - ahead.mean) < error).all()
+    assert (np.abs(ahead.rate_low - law.ppf(0.05)) < 2.2 * error).all()
+    assert (np.abs(ahead.rate_high - law.ppf(0.95)) < 2.2 * error).all()
+    cut = TrustFilter(constant(PARAMS["censored"], n), 2, observation="censored", max_draws=n)
+    for _ in range(6):
+        cut.update(np.ones((2, 2)), [1.0, 1.0])
+    assert (cut.predict(np.ones((1, 2, 2))).rate_high == 1.0).all()

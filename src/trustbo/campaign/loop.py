@@ -187,7 +187,7 @@ def missions(
             f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}{made}."
         )
     if campaign.options.replan == "bound":
-        require_bounds(runner, campaign.model)
+        require_bounds(runner)
     if truth is not None:
         truth.require_workspace(campaign.workspace)
     rules = require_stops(stop)

@@ -8,7 +8,7 @@ import numpy as np
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.models import TrustFilter, TrustModel, params_of
+from trustbo.models import TrustFilter, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.simulation.protocol import takes
@@ -18,17 +18,12 @@ THRESHOLD = 0.01
 """Least gain in the objective's value for which another continuation is taken."""
 
 
-def require_bounds(simulator: Any, model: TrustModel) -> None:
-    """Refuse a simulator that cannot run one bound after the other, or a model without a filter.
+def require_bounds(simulator: Any) -> None:
+    """Refuse a simulator that cannot run one bound after the other.
 
     Raises:
-        TrustboError: It has no `reset` or `run_bound`; or observations are not Gaussian.
+        TrustboError: It has no `reset` or `run_bound`.
     """
-    if not model.family.integrates_out:
-        raise TrustboError(
-            'replan="bound" follows trust by a filter, which needs observation "gaussian"; the '
-            f'model has "{model.observation}". Use replan="mission".'
-        )
     missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
     if missing:
         raise TrustboError(
@@ -72,7 +67,8 @@ def run_replanning(
         if live is not None and k + 1 < len(path):
             planner = campaign.planner_now().onward(path[: k + 1])
             awareness = _known(campaign, path[k - 1], bound)
-            live.update(awareness, bound.contact_rate, (path[k - 1], bound.cell))
+            crossed = path[k - 1], bound.cell
+            live.update(awareness, bound.contact_rate, crossed, n_ticks=bound.n_ticks)
             path = [*path[:k], *better_rest(planner, live, path[k:], threshold)]
         k += 1
     getattr(simulator, "close", lambda: None)()
@@ -87,7 +83,10 @@ def _live(campaign: Campaign) -> TrustFilter | None:
     last, n_robots = campaign.log.last_tree, campaign.workspace.awareness.sizes["robot"]
     if last is None:
         return None
-    return TrustFilter(params_of(last), n_robots, response=campaign.model.response)
+    model = campaign.model
+    return TrustFilter(
+        params_of(last), n_robots, response=model.response, observation=model.observation
+    )
 
 
 def better_rest(

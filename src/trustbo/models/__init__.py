@@ -6,7 +6,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 from trustbo.models.by_rate import by_rate
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.exposures import CAUSES, LostMission
-from trustbo.models.filter import TrustFilter, TrustState
+from trustbo.models.filter import TrustFilter, TrustForecast, TrustState
 from trustbo.models.fit import fit
 from trustbo.models.hazard import Hazard, fit_hazard
 from trustbo.models.hierarchical import HierarchicalTrust
@@ -41,6 +41,7 @@ __all__ = [
     "Priors",
     "RobotParams",
     "TrustFilter",
+    "TrustForecast",
     "TrustModel",
     "TrustParams",
     "TrustSample",

@@ -1,7 +1,7 @@
-"""Trust in real time, bound by bound of a running mission."""
+"""Trust in real time, bound by bound or tick by tick of a running mission."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -9,9 +9,11 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError, require_choice
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.likelihood.live import Effect, Rates
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
+from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.moves import bounds_along
 
 
@@ -24,13 +26,32 @@ class TrustState(NamedTuple):
     """Standard deviation, of the same shape."""
 
 
+class TrustForecast(NamedTuple):
+    """Trust and contact rates along bounds to come, averaged over parameter draws."""
+
+    mean: np.ndarray
+    """Mean of trust, (bound, robot)."""
+    sd: np.ndarray
+    """Standard deviation of trust."""
+    rate: np.ndarray
+    """Mean contact rate."""
+    rate_low: np.ndarray
+    """5 % quantile of the contact rate."""
+    rate_high: np.ndarray
+    """95 % quantile of the contact rate."""
+
+
 class TrustFilter:
     """Follows the trust of each robot during a mission (a Rao-Blackwellised filter).
 
-    Given a draw of the parameters, trust is Gaussian and the Kalman filter exact; the draws
-    themselves are reweighted by the density with which they predicted each contact rate. So after
-    bound k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly but for
-    the number of draws.
+    Given a draw of the parameters, trust under Gaussian rates is Gaussian and the Kalman filter
+    exact; under other families its moments are matched after each rate (assumed-density filtering).
+    The draws themselves are reweighted by the density with which they predicted each contact rate.
+    So after bound k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly
+    but for the number of draws and the moments.
+
+    A bound is taken in when it is over, by `update`; or while it runs, tick by tick, by
+    `begin_bound`, `update_tick` and `end_bound`: then `state` is that of the bound if it ended now.
 
     Attributes:
         params: Parameter draws, leading axis (draw,).
@@ -44,28 +65,26 @@ class TrustFilter:
         n_robots: int | None = None,
         *,
         response: str = "level",
+        observation: str = "gaussian",
         max_draws: int = 1000,
     ) -> None:
         """Start before the first bound of a mission.
 
         Args:
-            posterior: DataTree from `fit` for any model with Gaussian observations, or draws with
-                leading axis (draw,).
+            posterior: DataTree from `fit`, or draws with leading axis (draw,).
             n_robots: Number of robots; needed with `TrustParams`, others know their own.
             response: `"level"` or `"change"`; needed with draws, a posterior knows its own.
+            observation: Family of observations; needed with draws, a posterior knows its own.
             max_draws: Largest number of draws to follow; they are evenly spaced.
 
         Raises:
             ShapeError: Draws of another number of robots.
-            TrustboError: `TrustParams` without `n_robots`, or other observations than Gaussian.
+            TrustboError: `TrustParams` without `n_robots`, or an unknown response or family.
         """
         if isinstance(posterior, xr.DataTree):
             n_robots = posterior["constant_data"].sizes["robot"]
             response = posterior.attrs["response"]
-            if not FAMILIES[family := posterior.attrs["observation"]].integrates_out:
-                raise TrustboError(
-                    f'TrustFilter needs Gaussian observations; this posterior has "{family}".'
-                )
+            observation = posterior.attrs["observation"]
             posterior = params_of(posterior)
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
@@ -77,6 +96,7 @@ class TrustFilter:
         kept = np.linspace(0, n - 1, min(n, max_draws)).astype(int)
         self.params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
         self._n_robots = n_robots
+        self._family = FAMILIES[require_choice("observation", observation, FAMILIES)]
         lag = float(require_choice("response", response, RESPONSES) == "change")
         self._core = self.params.live(lag, n_robots)
         self.reset()
@@ -87,7 +107,7 @@ class TrustFilter:
         self._mean, self._var = self._core.start()
         self._log_weight = np.zeros(n)
         self.weights = np.full(n, 1.0 / n)
-        self.n_bounds = 0
+        self.n_bounds, self._running = 0, None
 
     @property
     def state(self) -> TrustState:
@@ -99,6 +119,8 @@ class TrustFilter:
         awareness: ArrayLike,
         contact_rate: ArrayLike,
         bound: tuple[Cell, Cell] | None = None,
+        *,
+        n_ticks: ArrayLike | None = None,
     ) -> TrustState:
         """Take in one bound.
 
@@ -106,30 +128,72 @@ class TrustFilter:
             awareness: Shape (robot, feature).
             contact_rate: Shape (robot,); NaN where not measured.
             bound: Cell left and cell entered; needed where places have effects.
+            n_ticks: Ticks of the bound, () or (robot,); the beta-binomial family needs them.
 
         Returns:
             Trust after it, shapes (robot,).
 
         Raises:
             ShapeError: Another number of robots or features.
-            TrustboError: Awareness that is NaN, a rate outside [0, 1], or a bound that is missing
-                or none.
+            TrustboError: Awareness that is NaN, a rate outside [0, 1], ticks that are missing, a
+                bound that is missing or none, or one that is running.
         """
+        self._require_running(running=False)
         z, y = self._checked(awareness, 2), np.asarray(contact_rate, dtype=float)
         effect = self._effects(bound, 1)[0]
         if y.shape != (self._n_robots,):
             raise ShapeError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
         if ((y < 0.0) | (y > 1.0)).any():
             raise TrustboError(f"contact_rate must be in [0, 1]; got {y}.")
-        self._mean, self._var, increment = self._core.update(self._mean, self._var, z, y, effect)
-        self._log_weight += increment
-        weights = np.exp(self._log_weight - self._log_weight.max())
-        self.weights = weights / weights.sum()
-        self.n_bounds += 1
+        ticks = broadcast_ticks(self._family, n_ticks, y.shape)
+        self._commit(z, effect, Rates(self._family, y, ticks))
         return self.state
 
-    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustState:
-        """Trust along the bounds to come, none of them measured yet.
+    def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
+        """Begin a bound whose ticks `update_tick` takes in; arguments as those of `update`."""
+        self._require_running(running=False)
+        z, effect = self._checked(awareness, 2), self._effects(bound, 1)[0]
+        self._running = _Running(z, effect, *np.zeros((2, self._n_robots)))
+
+    def update_tick(self, in_contact: ArrayLike) -> TrustState:
+        """Take in one tick of the bound that runs.
+
+        Args:
+            in_contact: Whether each robot has contact, (robot,); NaN where it did not look.
+
+        Returns:
+            Trust after the bound if it ended now, with the rate so far; shapes (robot,).
+
+        Raises:
+            ShapeError: Another number of robots.
+            TrustboError: No bound was begun.
+        """
+        running = self._require_running(running=True)
+        seen = np.asarray(in_contact, dtype=float)
+        if seen.shape != (self._n_robots,):
+            raise ShapeError(f"in_contact must be ({self._n_robots},); got shape {seen.shape}.")
+        running.contacts[:] += np.nan_to_num(seen)
+        running.ticks[:] += ~np.isnan(seen)
+        mean, var, increment = self._core.update(
+            self._mean, self._var, running.z, running.rates(self._family), running.effect
+        )
+        return self._average(mean, var, _normalised(self._log_weight + increment))
+
+    def end_bound(self) -> TrustState:
+        """End the bound that runs: its rate is taken in as `update` would.
+
+        Raises:
+            TrustboError: No bound was begun.
+        """
+        running = self._require_running(running=True)
+        self._running = None
+        self._commit(running.z, running.effect, running.rates(self._family))
+        return self.state
+
+    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
+        """Trust and contact rates along the bounds to come, none of them measured yet.
+
+        Rates are drawn, one for each parameter draw, in bounds of 200 ticks where these count.
 
         Args:
             awareness: Shape (bound, robot, feature).
@@ -144,11 +208,34 @@ class TrustFilter:
             TrustboError: Awareness that is NaN.
         """
         mean, var, ahead = self._mean, self._var, []
-        zs = self._checked(awareness, 3)
+        zs, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
+        x = self._core.draw(rng, mean, var)
         for z, effect in zip(zs, self._effects(path, len(zs)), strict=True):
             mean, var = self._core.predict(mean, var, z, effect)
-            ahead.append(self._average(mean, var))
-        return TrustState(*(np.stack(column) for column in zip(*ahead, strict=True)))
+            x, rates = self._core.roll(rng, self._family, x, z, effect)
+            order = np.argsort(rates, axis=0)
+            below = np.cumsum(self.weights[order], axis=0)
+            low, high = (np.argmax(below >= share, axis=0) for share in (0.05, 0.95))
+            ranked = np.take_along_axis(rates, order, axis=0)
+            each = np.arange(self._n_robots)
+            forecast = self.weights @ rates, ranked[low, each], ranked[high, each]
+            ahead.append((*self._average(mean, var), *forecast))
+        return TrustForecast(*(np.stack(column) for column in zip(*ahead, strict=True)))
+
+    def _commit(self, z: np.ndarray, effect: Effect, rates: Rates) -> None:
+        known = self._mean, self._var, z, rates, effect
+        self._mean, self._var, increment = self._core.update(*known)
+        self._log_weight += increment
+        self.weights = _normalised(self._log_weight)
+        self.n_bounds += 1
+
+    def _require_running(self, *, running: bool) -> Any:
+        """The bound that runs, or None; refused where it should be the other."""
+        if running and self._running is None:
+            raise TrustboError("no bound runs: call begin_bound(awareness) first.")
+        if not running and self._running is not None:
+            raise TrustboError("a bound runs: call end_bound() first.")
+        return self._running
 
     def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[np.ndarray | float]:
         """Effect of each bound's place (draw, robot or 1); 0 where there are none."""
@@ -161,11 +248,14 @@ class TrustFilter:
             )
         return list(np.moveaxis(self.params.of_places(bounds_along(path)), -2, 0))
 
-    def _average(self, mean: np.ndarray, var: np.ndarray) -> TrustState:
+    def _average(
+        self, mean: np.ndarray, var: np.ndarray, weights: np.ndarray | None = None
+    ) -> TrustState:
         """Mean and sd of the mixture over draws."""
+        weights = self.weights if weights is None else weights
         var = var if var.ndim == 2 else np.diagonal(var, axis1=1, axis2=2)
-        center = self.weights @ mean
-        spread = self.weights @ (var + (mean - center) ** 2)
+        center = weights @ mean
+        spread = weights @ (var + (mean - center) ** 2)
         return TrustState(center, np.sqrt(spread))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
@@ -179,3 +269,22 @@ class TrustFilter:
         if np.isnan(z).any():
             raise TrustboError("awareness must not be NaN; take unmeasured values from the map.")
         return z
+
+
+class _Running(NamedTuple):
+    """A bound that runs."""
+
+    z: np.ndarray  # (robot, feature)
+    effect: Effect
+    contacts: np.ndarray  # (robot,), ticks in contact
+    ticks: np.ndarray  # (robot,)
+
+    def rates(self, family: Family) -> Rates:
+        """Rates so far."""
+        with np.errstate(invalid="ignore"):
+            return Rates(family, self.contacts / self.ticks, self.ticks)
+
+
+def _normalised(log_weight: np.ndarray) -> np.ndarray:
+    weights = np.exp(log_weight - log_weight.max())
+    return weights / weights.sum()

@@ -1,10 +1,11 @@
 """One bound of the Kalman filter under many parameter draws, in NumPy, for `TrustFilter`."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from trustbo.models.likelihood import kalman
+from trustbo.models.likelihood.families import Family
 
 if TYPE_CHECKING:
     from trustbo.models.params import CoupledParams, RobotParams, TrustParams
@@ -12,6 +13,15 @@ if TYPE_CHECKING:
 Moments = tuple[np.ndarray, np.ndarray]
 Effect = np.ndarray | float
 """Effect of a place, shape (draw, robot or 1)."""
+_TICKS = np.asarray(200.0)  # of bounds to come, whose ticks nobody knows
+
+
+class Rates(NamedTuple):
+    """Rates of one bound and their family."""
+
+    family: Family
+    y: np.ndarray  # (robot,), NaN where not measured
+    n_ticks: np.ndarray  # (robot,), NaN where not known
 
 
 class ApartFilter:
@@ -43,17 +53,46 @@ class ApartFilter:
         return self._beta0 * mean + self._drift(z) + effect, ahead
 
     def update(
-        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray, effect: Effect = 0.0
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, rates: Rates, effect: Effect = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same given rates y (robot,), and their log density but for a constant, (draw,)."""
-        seen = ~np.isnan(y)
-        drift = self._drift(z) + effect
-        S, C = kalman.innovation(self._beta0, self._h, self._Q, self._R, var)
-        e = np.where(seen, y - self._h * mean - drift, 0.0)
+        """The same given rates, and their log density but for a constant, (draw,)."""
+        family, y, n_ticks = rates
+        seen, drift = ~np.isnan(y), self._drift(z) + effect
+        if family.observes_trust:
+            h, S = self._beta0, kalman.update(self._beta0, self._Q, var, 0.0, 0.0)
+            C = S
+        else:
+            h = self._h
+            S, C = kalman.innovation(self._beta0, h, self._Q, self._R, var)
+        left = log_density = np.zeros(mean.shape)
+        if family.integrates_out:  # all robots at once
+            e = np.where(seen, y - h * mean - drift, 0.0)
+            log_density = np.where(seen, -0.5 * (e**2 / S + np.log(S)), 0.0)
+        else:
+            e, left, log_density = (np.zeros(mean.shape) for _ in range(3))
+            predicted, sd = h * mean + drift, np.broadcast_to(np.sqrt(self._R), mean.shape)
+            at, left[:, seen], log_density[:, seen] = family.observe(
+                predicted[:, seen], S[:, seen], y[seen], n_ticks[seen], sd[:, seen]
+            )
+            e[:, seen] = at - predicted[:, seen]
         gain = np.where(seen, C / S, 0.0)
-        log_density = np.where(seen, -0.5 * (e**2 / S + np.log(S)), 0.0).sum(1)
         mean = self._beta0 * mean + drift + gain * e
-        return mean, kalman.update(self._beta0, self._Q, var, gain, S), log_density
+        ahead = kalman.update(self._beta0, self._Q, var, gain, S - left)
+        return mean, ahead, log_density.sum(1)
+
+    def draw(self, rng: np.random.Generator, mean: np.ndarray, var: np.ndarray) -> np.ndarray:
+        """Trust drawn from its moments, (draw, robot)."""
+        return mean + np.sqrt(var) * rng.standard_normal(mean.shape)
+
+    def roll(
+        self, rng: np.random.Generator, family: Family, x: np.ndarray, z: np.ndarray, effect: Effect
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Trust (draw, robot) after a bound, drawn given that before it, and rates of it."""
+        drift = self._drift(z) + effect
+        w, v = rng.standard_normal((2, *x.shape))
+        now, sd = self._beta0 * x + drift + np.sqrt(self._Q) * w, np.sqrt(self._R)
+        y = self._h * x + drift + np.sqrt(self._Q) * w + sd * v
+        return now, family.draw_rates(rng, now, y, sd, _TICKS)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
         if self._beta.shape[1] == 1:
@@ -92,10 +131,10 @@ class CoupledFilter:
         return moved, F @ var @ F_T + self._p.Delta_w
 
     def update(
-        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, y: np.ndarray, effect: Effect = 0.0
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, rates: Rates, effect: Effect = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `ApartFilter.update`."""
-        n = self._n_robots
+        n, (family, y, n_ticks) = self._n_robots, rates
         drift = self._drift(z) + effect
         joint = (self._F @ mean[..., None])[..., 0]
         joint[:, :n] += drift
@@ -103,12 +142,34 @@ class CoupledFilter:
         J = self._F @ var @ self._F_T + self._noise
         log_density = np.zeros(len(mean))
         for i in np.flatnonzero(~np.isnan(y)):
-            S, row = J[:, n + i, n + i].copy(), J[:, n + i].copy()
-            gain, e = row / S[:, None], y[i] - joint[:, n + i]
-            log_density -= 0.5 * (e**2 / S + np.log(S))
+            k = i if family.observes_trust else n + i
+            S, row = J[:, k, k].copy(), J[:, k].copy()
+            at, left, increment = family.observe(
+                joint[:, k], S, y[i], n_ticks[i], np.sqrt(self._p.Delta_v[:, i, i])
+            )
+            gain, e = row / S[:, None], at - joint[:, k]
+            log_density += increment
             joint += gain * e[:, None]
-            J -= gain[:, :, None] * row[:, None, :]
+            J -= gain[:, :, None] * (row * (1.0 - left / S)[:, None])[:, None, :]
         return joint[:, :n], J[:, :n, :n], log_density
+
+    def draw(self, rng: np.random.Generator, mean: np.ndarray, var: np.ndarray) -> np.ndarray:
+        """See `ApartFilter.draw`."""
+        factor = np.linalg.cholesky(var + 1e-12 * np.eye(self._n_robots))
+        return mean + (factor @ rng.standard_normal((*mean.shape, 1)))[..., 0]
+
+    def roll(
+        self, rng: np.random.Generator, family: Family, x: np.ndarray, z: np.ndarray, effect: Effect
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `ApartFilter.roll`."""
+        n, Delta_v = self._n_robots, np.asarray(self._p.Delta_v)
+        factors = np.linalg.cholesky(self._p.Delta_w), np.linalg.cholesky(Delta_v)
+        w, v = ((L @ rng.standard_normal((*x.shape, 1)))[..., 0] for L in factors)
+        joint = (self._F @ x[..., None])[..., 0]
+        drift = self._drift(z) + effect
+        now, y = joint[:, :n] + drift + w, joint[:, n:] + drift + w + v
+        sd = np.sqrt(np.diagonal(Delta_v, axis1=1, axis2=2))
+        return now, family.draw_rates(rng, now, y, sd, _TICKS)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
         return self._B @ z.ravel() + self._p.b

@@ -198,6 +198,44 @@ def match(kind, delta_v, row, m, v, lam, eta):
 
 
 @njit(**OPTIONS)
+def count_moments(mean, var, y, n_ticks, delta_v):
+    """Mean and variance of trust N(mean, var) given counts, and their log probability.
+
+    Newton's search for the mode takes the beta-binomial's slope and curvature by differences; its
+    Gaussian fit carries the nodes. All arguments are (value,).
+    """
+    found = np.empty((3, len(mean)))
+    for t in range(len(mean)):
+        N, m, v, phi = n_ticks[t], mean[t], var[t], concentration(delta_v[t])
+        n, d = np.round(y[t] * n_ticks[t]), 0.05
+        x, precision = m, 1.0 / v
+        for _ in range(4):
+            middle = log_count(n, N, phi, x)
+            low, high = log_count(n, N, phi, x - d), log_count(n, N, phi, x + d)
+            curvature = min((high - 2.0 * middle + low) / (d * d), 0.0)
+            slope = (high - low) / (2.0 * d) - (x - m) / v
+            precision = 1.0 / v - curvature
+            step = slope / precision
+            x += min(max(step, -2.0), 2.0)
+            if abs(step) < 0.05 / np.sqrt(precision):
+                break
+        sd = 1.1 / np.sqrt(precision)
+        off = log_count(n, N, phi, x) - 0.5 * (x - m) ** 2 / v
+        f0 = f1 = f2 = 0.0
+        for j in range(len(_NODES)):
+            at = x + sd * _NODES[j]
+            value = log_count(n, N, phi, at) - 0.5 * (at - m) ** 2 / v + 0.5 * _NODES[j] ** 2
+            f = _WEIGHTS[j] * math.exp(min(value - off, 300.0))
+            f0, f1, f2 = f0 + f, f1 + f * _NODES[j], f2 + f * _NODES[j] ** 2
+        a = f1 / f0
+        found[0, t], found[1, t] = x + sd * a, sd * sd * max(f2 / f0 - a * a, 0.05)
+        constant = math.lgamma(N + 1.0) - math.lgamma(n + 1.0) - math.lgamma(N - n + 1.0)
+        constant -= math.lgamma(N + phi) - math.lgamma(phi)
+        found[2, t] = off + math.log(f0) + math.log(sd / np.sqrt(v)) + constant
+    return found
+
+
+@njit(**OPTIONS)
 def log_overlap(m, v, lam, eta):
     """Log of the integral of N(x; m, v) exp(-lam x^2 / 2 + eta x)."""
     D = 1.0 + lam * v

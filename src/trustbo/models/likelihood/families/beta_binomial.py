@@ -16,7 +16,7 @@ from jax.scipy.special import gammaln
 from scipy.special import expit
 
 from trustbo.models.backend import own_settings
-from trustbo.models.likelihood.ep.terms import COUNT, NONE, Terms
+from trustbo.models.likelihood.ep.terms import COUNT, NONE, Terms, count_moments
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.linearised import Data, Linearised
 
@@ -32,6 +32,7 @@ class BetaBinomial(Linearised):
     allows_change: ClassVar[bool] = False
     rounds: ClassVar[bool] = False
     correlates: ClassVar[bool] = False
+    observes_trust: ClassVar[bool] = True
     expected_rate: ClassVar[str] = "logistic"
 
     @property
@@ -124,6 +125,21 @@ class BetaBinomial(Linearised):
         p = rng.beta(phi * expit(trust), phi * expit(-trust))
         N = np.where(n_ticks > 0.0, n_ticks, np.nan)
         return rng.binomial(np.where(np.isnan(N), 0.0, N).astype(int), p) / N
+
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.observe`; by Gauss-Hermite nodes around the mode."""
+        args = np.broadcast_arrays(mean, var, y, n_ticks, noise_sd)
+        shape = args[0].shape
+        flat = (np.ascontiguousarray(a, dtype=float).ravel() for a in args)
+        found = count_moments(*flat)
+        return found[0].reshape(shape), found[1].reshape(shape), found[2].reshape(shape)
 
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`; each distinct count is a case."""

@@ -10,6 +10,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from scipy import special
 from scipy.stats import norm
 
 from trustbo.models.likelihood.ep.terms import AT_ONE, AT_ZERO, Terms
@@ -63,6 +64,30 @@ class Censored(Gaussian):
     ) -> np.ndarray:
         """See `Family.draw_rates`."""
         return np.clip(y, 0.0, 1.0)
+
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.observe`: of a normal cut at a limit (Tobin 1958)."""
+        value, zero, density = super().observe(mean, var, y, n_ticks, noise_sd)
+        at_one, cut, S = y >= 1.0, (y >= 1.0) | (y <= 0.0), np.sqrt(var)
+        side, limit = np.where(at_one, 1.0, -1.0), np.where(at_one, 1.0, 0.0)
+        h = side * (mean - limit) / S
+        log_p = special.log_ndtr(h)
+        ratio = np.exp(-0.5 * h**2 - 0.5 * np.log(2.0 * np.pi) - log_p)
+        left = np.clip(1.0 - ratio * (ratio + h), 0.0, 1.0)
+        # On the scale of the densities of the others, which lack their constant.
+        log_p = log_p + 0.5 * np.log(2.0 * np.pi)
+        return (
+            np.where(cut, mean + side * S * ratio, value),
+            np.where(cut, var * left, zero),
+            np.where(cut, log_p, density),
+        )
 
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`."""

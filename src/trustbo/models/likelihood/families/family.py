@@ -58,6 +58,8 @@ class Family(ABC):
     """Rates may measure the change of trust (`response="change"`)."""
     rounds: ClassVar[bool] = True
     """delta_v is the sd of a rate, which is known to the resolution of its ticks."""
+    observes_trust: ClassVar[bool] = False
+    """`observe` takes and gives moments of trust, not of the rate before it is cut."""
     correlates: ClassVar[bool] = True
     """Observation noise may be correlated between robots."""
 
@@ -104,6 +106,21 @@ class Family(ABC):
         n_ticks: np.ndarray,
     ) -> np.ndarray:
         """`measure` in NumPy; `noise_sd` is delta_v, all arrays broadcast to trust."""
+
+    @abstractmethod
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Moments given a rate that was predicted N(mean, var), and its log probability or density.
+
+        They are those of the rate before it is cut, noise included, or of trust where
+        `observes_trust`. Arrays broadcast; `y` is not NaN.
+        """
 
     @abstractmethod
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:

@@ -56,6 +56,18 @@ class Gaussian(Family):
         """See `Family.draw_rates`."""
         return y
 
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.observe`; the density without its constant."""
+        value = np.broadcast_to(y, mean.shape)
+        return value, np.zeros(mean.shape), -0.5 * ((y - mean) ** 2 / var + np.log(var))
+
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`."""
         return Terms.of(np.where(np.isnan(y), NONE, GAUSSIAN))
