@@ -52,8 +52,8 @@ def draw_map(scene: Scene) -> Any:
     """Make the figure of the map: cells under the hillshade, the path, posts, and what is chosen.
 
     Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
-    marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and `sight` (the same, colour); its
-    colours `colours` and `contact`.
+    marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
+    `sight` (the same, colour); its colours `colours` and `contact`.
     """
     models, figure = require_bokeh()
     grid = scene.workspace.grid
