@@ -124,7 +124,7 @@ def test_robots_and_teams_are_checked():
         Robot(max_slope=30.0)
     with pytest.raises(TrustboError, match="n_robots must be a whole number from 1 on; got 0"):
         Team(n_robots=0)
-    with pytest.raises(TrustboError, match="must be a sequence of robots"):
+    with pytest.raises(TrustboError, match="must be a sequence of Robot"):
         Team(robots=Robot())
     with pytest.raises(TrustboError, match="3 distinct names"):
         Team(n_robots=3, names=("a", "b", "c", "a"))

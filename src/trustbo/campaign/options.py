@@ -177,7 +177,8 @@ class CampaignOptions:
     def to_record(self) -> dict[str, Any]:
         """Options as JSON can hold them, callbacks left out."""
         record = {o.name: getattr(self, o.name) for o in fields(self) if o.name != "callbacks"}
-        record["hazard"] = asdict(self.prior_hazard)
+        priors = asdict(self.prior_hazard).items()
+        record["hazard"] = {n: list(v) if isinstance(v, tuple) else v for n, v in priors}
         return record | ({"awareness": "belief"} if self.own_awareness else {})
 
     @classmethod

@@ -49,7 +49,7 @@ class Hazard:
 
     intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
-    tilt: tuple[float, float] = (8.0, 6.0)
+    tilt: tuple[float, float] = (4.0, 4.0)
     log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
 

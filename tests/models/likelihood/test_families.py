@@ -10,7 +10,14 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import CoupledParams, CoupledTrust, PooledTrust, TrustParams, fit
+from trustbo.models import (
+    CoupledParams,
+    CoupledTrust,
+    HierarchicalTrust,
+    PooledTrust,
+    TrustParams,
+    fit,
+)
 from trustbo.models.likelihood.families import FAMILIES, Observed
 
 N = 20
@@ -186,7 +193,7 @@ def test_families_that_do_not_suit_are_refused():
     with pytest.raises(TrustboError, match="unknown observation 'poisson'"):
         PooledTrust(observation="poisson")
     with pytest.raises(TrustboError, match=r'observation="censored".*not Gaussian'):
-        fit(missions, PooledTrust(observation="censored"), sampler="exact")
+        fit(missions, HierarchicalTrust(observation="censored"), sampler="exact")
     with pytest.raises(TrustboError, match='sampler "joint" is for observations'):
         fit(missions, sampler="joint")
     with pytest.raises(TrustboError, match="fractional mission"):
