@@ -33,6 +33,7 @@ from trustbo.parallel import one_blas_thread
 _MAX_ROUNDS, _MAX_FINAL = 4, 3
 _FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
 _RIDGE = 1e-3
+_MORE = 3  # times that uneven draws are added to
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
 
@@ -123,14 +124,13 @@ def sample_scores(
         points, proposal = _weigh(target, seed, start)
         rng = np.random.default_rng(seed)
         n = min(n_draws, target.n_corrected or n_draws)
-        chosen = np.sort(systematic(np.exp(points.log_w), n, rng))
-        params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
+        chosen, params, found = _draw(target, points, n, rng)
     khat, kish, log_evidence = points.khat, points.kish, points.log_evidence
     at = np.arange(n)
-    if log_weight is not None:
-        smoothed, worst, log_mean = smoothed_weights(log_weight)
+    if found is not None:
+        smoothed, worst, log_mean = found
         inner, log_evidence = _kish(smoothed), log_evidence + log_mean
-        khat = max(khat, worst) if inner < _EVEN * n else khat
+        khat = max(khat, worst) if inner < _EVEN * len(chosen) else khat
         kish = 1.0 / (1.0 / kish + 1.0 / inner)
         at = systematic(np.exp(smoothed), n_draws, rng)
     order = at[rng.permutation(n_draws)]
@@ -145,6 +145,29 @@ def sample_scores(
         ),
         proposal,
     )
+
+
+def _draw(
+    target: ScoreTarget, points: _Points, n: int, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[np.ndarray, float, float] | None]:
+    """Indices of resampled points, parameters there, and what `smoothed_weights` makes of theirs.
+
+    Where n weights are uneven more are drawn: the k-hat of a few is one of chance.
+    """
+    chosen = np.sort(systematic(np.exp(points.log_w), n, rng))
+    params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
+    if log_weight is None:
+        return chosen, params, None
+    found = smoothed_weights(log_weight)
+    for _ in range(_MORE):
+        if found[1] < GOOD_KHAT or _kish(found[0]) > _EVEN * len(chosen):
+            break
+        more = np.sort(systematic(np.exp(points.log_w), n, rng))
+        others, added = target.draw(points.z, points.log_p, more, rng)
+        chosen, log_weight = np.append(chosen, more), np.append(log_weight, added)  # pyright: ignore
+        params = {name: np.concatenate([of, others[name]]) for name, of in params.items()}
+        found = smoothed_weights(log_weight)
+    return chosen, params, found
 
 
 def _kish(log_w: np.ndarray) -> float:
