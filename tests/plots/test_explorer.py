@@ -133,7 +133,7 @@ def test_layers_that_do_not_fit_are_left_out_and_named(result, monkeypatch):
     grid = result.workspace.passable.shape
     some = [Layer(name, name.upper(), "", np.zeros((n, *grid)), (0.0, 1.0)) for name, n in
             (("a", 1), ("b", 3), ("c", 1))]  # fmt: skip
-    monkeypatch.setattr(scene, "MOST_VALUES", 2 * grid[0] * grid[1])
+    monkeypatch.setattr(scene, "MOST_BYTES", 2 * 11 * grid[0] * grid[1] + len("[]"))
     content = Scene("", result.workspace, some, ()).record()
     assert [layer["name"] for layer in content["layers"]] == ["a", "c"]
     assert content["left_out"] == ["B"]

@@ -12,7 +12,7 @@ from PIL import Image, features
 from trustbo.errors import TrustboError
 from trustbo.planning import QUANTILES
 from trustbo.plots.explorer.scene import Scene
-from trustbo.plots.layout import extent_of, tallness
+from trustbo.plots.layout import extent_of
 from trustbo.plots.maps import CLOSED, COLOURS, hillshade
 from trustbo.plots.mission import INNER
 from trustbo.plots.plan import COLOURS as ROBOTS
@@ -22,8 +22,6 @@ MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "star
 CONTACT = LinearSegmentedColormap.from_list("contact", ["#d55e00", "#ffffff"])
 """Colours of contact rates, from vermilion for the least to white for full contact."""
 SHADES = 64
-_WIDTH, _TALLEST = 640, 1.35  # px; height over width
-_BESIDE, _BELOW = 62, 128  # px of axes, tools and the colour bar
 _TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
 
 
@@ -51,28 +49,26 @@ def robot_marks(n: int) -> list[tuple[str, str]]:
 def draw_map(scene: Scene) -> Any:
     """Make the figure of the map: cells under the hillshade, the path, posts, and what is chosen.
 
+    The page's script sets its height, so that the map has its proportions at any width.
     Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
+<<<<<<< HEAD
     marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
+=======
+    marker, size), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
+>>>>>>> h-explore
     `sight` (the same, colour); its colours `colours` and `contact`.
     """
     models, figure = require_bokeh()
     grid = scene.workspace.grid
     size = {"width": grid.cell_width, "height": grid.cell_height}
-    height = round((_WIDTH - _BESIDE) * min(tallness(grid), _TALLEST)) + _BELOW
     plot = figure(
-        name="map", width=_WIDTH, height=height, sizing_mode="scale_width", tools=_TOOLS,
+        name="map", sizing_mode="stretch_width", tools=_TOOLS,
         active_drag=None, active_scroll=None, toolbar_location="above", match_aspect=True,
         x_range=models.DataRange1d(range_padding=0.0),
         y_range=models.DataRange1d(range_padding=0.0),
         x_axis_label="east (m)", y_axis_label="north (m)",
     )  # fmt: skip
-    col, row = np.meshgrid(np.arange(grid.shape[1]), np.arange(grid.shape[0]))
-    cells = _source(
-        "cells",
-        x=((col + 0.5) * grid.cell_width).ravel().tolist(),
-        y=((grid.shape[0] - row - 0.5) * grid.cell_height).ravel().tolist(),
-        value=[0.0] * col.size,
-    )
+    cells = _source("cells", x=[], y=[], value=[])
     mapper = models.LinearColorMapper(name="colours", palette=palette(COLOURS), low=0.0, high=1.0)
     mapper.nan_color = to_hex(CLOSED)
     field = {"field": "value", "transform": mapper}

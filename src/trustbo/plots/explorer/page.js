@@ -2,6 +2,10 @@
 const scene = JSON.parse(document.getElementById("scene").textContent)
 const [rows, cols] = scene.shape
 const [cellHeight, cellWidth] = scene.cell
+const every = Array.from({length: rows * cols}, (_, i) => [Math.floor(i / cols), i % cols])
+const centres = {
+  x: every.map(([, c]) => (c + 0.5) * cellWidth), y: every.map(([r]) => (rows - r - 0.5) * cellHeight),
+}
 const at = (id) => document.getElementById(id)
 const MINUS = "\u2212"
 const text = (x) => (x === null ? "\u2013" : Number(x.toPrecision(3)).toString().replace("-", MINUS))
@@ -58,8 +62,7 @@ async function start() {
     const one = layer()
     const colours = part("colours")
     colours.setv({palette: scene.palettes[one.colours], low: one.low, high: one.high})
-    const cells = part("cells")
-    cells.data = {...cells.data, value: unknown(values(one))}
+    fill("cells", {...centres, value: unknown(values(one))})
     at("map-title").textContent = one.label
     showNumbers()
   }
@@ -220,6 +223,13 @@ async function start() {
   toggle("posts", "post marks")
   if (part("hillshade") === null) at("shade").parentElement.remove()
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint)
+  const shape = Math.min((rows * cellHeight) / (cols * cellWidth), 1.35)
+  const fitMap = () => { // 62 and 128 pixels are of axes, tools and the colour bar
+    const height = Math.round(Math.max((at("map").clientWidth - 62) * shape, 70) + 128)
+    if (height !== map.height) map.height = height
+  }
+  new ResizeObserver(fitMap).observe(at("map"))
+  fitMap()
   paint()
   showLayer()
   showStep()

@@ -1,5 +1,6 @@
 """Content of the interactive page: layers of the map, and paths that its slider goes through."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,8 +12,9 @@ from trustbo.data import Cell
 from trustbo.plots.maps import COLOURS
 from trustbo.workspace import Workspace
 
-MOST_VALUES = 350_000
-"""Number of values of cells on a page, some 2.5 MB; layers beyond it are left out."""
+MOST_BYTES = 3_200_000
+"""Size of steps and layers, so that a page stays below 5 MB; layers beyond it are left out."""
+_PER_VALUE = 11  # bytes, at most, of a cell's value
 _DIGITS = 6
 
 
@@ -108,26 +110,22 @@ class Scene:
     layers: Sequence[Layer]
     steps: Sequence[Step]
 
-    def shown(self) -> list[Layer]:
-        """Layers that the page has room for."""
-        kept, room = [], MOST_VALUES
-        for layer in self.layers:
-            if layer.values.size <= room:
-                kept.append(layer)
-                room -= layer.values.size
-        return kept
-
     def record(self) -> dict[str, Any]:
-        """Content as JSON can hold it."""
+        """Content as JSON can hold it, with the layers that there is room for."""
         grid, passable = self.workspace.grid, self.workspace.passable.values
-        shown = self.shown()
+        steps = [step.record() for step in self.steps]
+        room, shown = MOST_BYTES - len(json.dumps(steps)), []
+        for layer in self.layers:
+            if layer.values.size * _PER_VALUE <= room:
+                shown.append(layer)
+                room -= layer.values.size * _PER_VALUE
         return {
             "shape": list(grid.shape),
             "cell": [grid.cell_height, grid.cell_width],
             "robots": list(self.workspace.team.names),
             "layers": [layer.record(passable) for layer in shown],
             "left_out": [layer.label for layer in self.layers if layer not in shown],
-            "steps": [step.record() for step in self.steps],
+            "steps": steps,
         }
 
 
