@@ -51,11 +51,7 @@ def draw_map(scene: Scene) -> Any:
 
     The page's script sets its height, so that the map has its proportions at any width.
     Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
-<<<<<<< HEAD
-    marker), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
-=======
     marker, size), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
->>>>>>> h-explore
     `sight` (the same, colour); its colours `colours` and `contact`.
     """
     models, figure = require_bokeh()
