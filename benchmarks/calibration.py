@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, sbc
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, sbc
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
 
@@ -18,6 +18,8 @@ def cases():
     """Model, sampler, data sets, shape."""
     yield PooledTrust(), "exact", 1000, (4, 8, 3, 2)
     yield CoupledTrust(inter_robot="none"), "exact", 200, SMALL
+    for sampler, n in (("exact", 300), ("nuts", 50)):
+        yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
     for observation in ("gaussian", "censored", "beta_binomial"):
         sampler = "nuts" if observation == "gaussian" else "joint"
         for model in (PooledTrust, HierarchicalTrust):
@@ -35,6 +37,7 @@ def main(folder="out/calibration", share="1"):
         n = max(2, round(n * float(share)))
         name = type(model).__name__
         detail = getattr(model, "inter_robot", model.response)
+        detail = "places" if model.place is not None else detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
         file = Path(folder) / f"{name}-{detail}-{model.observation}-{sampler}-{n}.json"
         started = time.perf_counter()

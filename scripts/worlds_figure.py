@@ -1,22 +1,23 @@
 """Draws docs/figures/worlds.png: regret of what contenders recommend, by kind of world.
 
-    python scripts/worlds_figure.py FOLDER ...
+    python scripts/worlds_figure.py FILE.png default=FOLDER:optimistic paper=FOLDER:paper ...
 
-Folders are those of `benchmarks/worlds.py` and `trustbo worlds`; their runs are drawn together.
+Each curve is named, default, neither, botorch, paper or shortest, with the folder of
+`benchmarks/worlds.py` or `trustbo worlds` and the contender in it that it is of. Kinds of worlds
+that only some of the runs have are drawn in one panel.
 """
 
 import sys
-from pathlib import Path
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
+from matplotlib.axes import Axes
 
 from trustbo.study import load_study
 
 mpl.use("Agg")
-FILE = Path(__file__).resolve().parents[1] / "docs" / "figures" / "worlds.png"
 KINDS = {
     "right": "sight as assumed",
     "bare": "only the ground is opaque",
@@ -26,57 +27,62 @@ KINDS = {
     "slopes": "robots that climb less",
 }
 STYLES = {
-    "optimistic": ("trustbo: bounds, places, optimistic", "#0072B2", "-"),
-    "greedy": ("bounds without places, greedy", "#56B4E9", (0, (6, 1.5, 1, 1.5))),
-    "BoTorch": ("BoTorch over path averages", "#D55E00", "--"),
+    "default": ("trustbo", "#0072B2", "-"),
+    "neither": ("trustbo without places and failures", "#56B4E9", (0, (6, 1.5, 1, 1.5))),
+    "botorch": ("BoTorch over path averages", "#D55E00", "--"),
     "paper": ("the paper's method", "#009E73", (0, (1, 1))),
-    "shortest path": ("a shortest path", "0.45", (0, (3, 1, 1, 1))),
+    "shortest": ("a shortest path", "0.45", (0, (3, 1, 1, 1))),
 }
 
 
 def main() -> None:
     """Draw the panels."""
-    results = [load_study(folder) for folder in sys.argv[1:]]
+    file, *given = sys.argv[1:]
+    results = {}
+    for one in given:
+        name, _, source = one.partition("=")
+        folder, _, contender = source.rpartition(":")
+        runs = load_study(folder)
+        results[name] = runs.isel(run=runs["contender"].values == contender)
+    whole = all(set(KINDS) <= set(runs["kind"].values) for runs in results.values())
+    kinds = {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): ""}
+    shape, size = ((2, 3), (9, 5.4)) if whole else ((1, 1), (5, 3.4))
     figure, axes = plt.subplots(
-        2, 3, figsize=(9, 5.4), sharex=True, sharey=True, layout="constrained"
+        *shape, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
-    for ax, (kind, title) in zip(axes.flat, KINDS.items(), strict=True):
-        n_courses = 0
-        for name, (label, color, line) in STYLES.items():
-            regret = curves(results, kind, name)
-            if not len(regret):
-                continue
-            mission = np.arange(regret.shape[1])
-            low, middle, high = np.quantile(np.maximum(regret, 0.0), [0.25, 0.5, 0.75], axis=0)
-            ax.fill_between(mission, low, high, color=color, alpha=0.18, linewidth=0)
-            ax.plot(mission, middle, linestyle=line, color=color, label=label, linewidth=1.8)
-            n_courses = max(n_courses, len(regret))
-        ax.set_yscale("symlog", linthresh=1.0, linscale=0.7)
-        ax.set_yticks([0, 0.5, 1, 3, 10, 30], ["0", "0.5", "1", "3", "10", "30"])
-        ax.set_ylim(-0.05, 100)
-        ax.set_title(f"{title} ({n_courses})", fontsize=9, loc="left")
-        ax.spines[["top", "right"]].set_visible(False)
+    for ax, (chosen, title) in zip(axes.flat, kinds.items(), strict=True):
+        n = draw(ax, {name: curves(runs, chosen) for name, runs in results.items()})
+        ax.set_title(f"{title} ({n})".strip(), fontsize=9, loc="left")
     for ax in axes[-1]:
         ax.set_xlabel("missions learned from", fontsize=9)
     for ax in axes[:, 0]:
         ax.set_ylabel("regret, % of the best contact", fontsize=9)
+    handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(
-        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False,
-        fontsize=9,
-    )  # fmt: skip
-    figure.savefig(FILE, dpi=85)
+        *handles, loc="outside lower center", ncols=3 if whole else 2, frameon=False, fontsize=9
+    )
+    figure.savefig(file, dpi=85)
 
 
-def curves(results: list[xr.Dataset], kind: str, contender: str) -> np.ndarray:
+def draw(ax: Axes, regrets: dict[str, np.ndarray]) -> int:
+    """Draw the median and the middle half of each, (run, mission); return the number of runs."""
+    for name, regret in regrets.items():
+        label, color, line = STYLES[name]
+        mission = np.arange(regret.shape[1])
+        low, middle, high = np.quantile(np.maximum(regret, 0.0), [0.25, 0.5, 0.75], axis=0)
+        ax.fill_between(mission, low, high, color=color, alpha=0.18, linewidth=0)
+        ax.plot(mission, middle, linestyle=line, color=color, label=label, linewidth=1.8)
+    ax.set_yscale("symlog", linthresh=1.0, linscale=0.7)
+    ax.set_yticks([0, 0.5, 1, 3, 10, 30], ["0", "0.5", "1", "3", "10", "30"])
+    ax.set_ylim(-0.05, 100)
+    ax.spines[["top", "right"]].set_visible(False)
+    return max(map(len, regrets.values()))
+
+
+def curves(runs: xr.Dataset, kinds: tuple[str, ...]) -> np.ndarray:
     """Regret of the recommendation before the first mission and after each, (run, mission)."""
-    found = []
-    for result in results:
-        chosen = (result["kind"].values == kind) & (result["contender"].values == contender)
-        one = result.isel(run=chosen)
-        found.append(
-            np.concatenate([one["regret_before"].values[:, None], one["regret"].values], axis=1)
-        )
-    return np.concatenate(found)
+    one = runs.isel(run=np.isin(runs["kind"].values, kinds))
+    return np.concatenate([one["regret_before"].values[:, None], one["regret"].values], axis=1)
 
 
 if __name__ == "__main__":
