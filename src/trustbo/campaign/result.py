@@ -170,7 +170,7 @@ class Result(Displayed):
             the mean over robots.
         """
         if n_draws is None and seed == 0:
-            return self._maps.copy()
+            return self._maps.copy(deep=True)  # the caller may write into it
         return self._compute_maps(n_draws, seed)
 
     @cached_property
