@@ -206,7 +206,7 @@ def test_the_mode_has_no_slope(name):
 # One test a model, not a fixture for two: two workers would compile and sample it twice.
 @pytest.mark.slow  # it compiles for long
 def test_hierarchical_robots_lie_between_pooled_and_separate_ones(missions):
-    hierarchical = fit(missions, HierarchicalTrust())
+    hierarchical = fit(missions, HierarchicalTrust(), sampler="nuts")
     found = diagnostics(hierarchical)
     assert found["r_hat"] <= 1.01
     assert found["divergences"] == 0
