@@ -47,7 +47,7 @@ def walk(rng, shape, ends):
     cells = [(row, col)]
     while (row, col) != goal:
         step = np.sign([goal[0] - row, goal[1] - col])
-        if rng.random() < 0.3:
+        if rng.random() < 0.1:
             step = rng.integers(-1, 2, 2)
         other = row + int(step[0]), col + int(step[1])
         if other != (row, col) and 0 <= other[0] < shape[0] and 0 <= other[1] < shape[1]:
@@ -113,7 +113,7 @@ def times(_):
         )
         posterior = tb.models.fit(missions, PLACES, earlier=earlier, **given)
         drawn = median_time(lambda p=posterior: params_of(p), 3)
-        n_bounds = posterior["places"].sizes.get("visited_bound", 0)
+        n_bounds = posterior["places"].sizes["bound"]
         print(f"| {name} | {n_bounds} | {cold:.3f} | {warm:.3f} | {drawn:.3f} |", flush=True)
     workspace, missions = driven(10, 8, False)
     started = time.perf_counter()
