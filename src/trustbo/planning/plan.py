@@ -9,7 +9,7 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
-from trustbo.display.svg import curve_picture, map_picture
+from trustbo.display.svg import curve_picture
 from trustbo.planning.risk import PathRisk
 from trustbo.workspace import Workspace
 
@@ -75,12 +75,9 @@ class Plan(Displayed):
             between = "" if band is None else f" ({band[0]:.3f} to {band[1]:.3f}, 90 %)"
             rows.append(("chance to arrive", f"{self.p_arrive:.3f}{between}"))
         rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
-        where, grid = self.workspace, self.workspace.grid
 
         def area() -> str:
-            shown = where.awareness.isel(feature=-1).mean("robot").where(where.passable)
-            label, aspect = where.features[-1], grid.cell_height / grid.cell_width
-            return map_picture(shown.values, self.path, aspect=aspect, label=label)
+            return self.workspace.picture(self.path)
 
         def along() -> str:
             curves = np.vstack([self.trust.mean(1), self.trust.T])

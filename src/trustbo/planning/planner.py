@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
-from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
@@ -126,7 +125,6 @@ class Planner(Displayed):
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
     def _card(self) -> Card:
-        where, grid = self.workspace, self.workspace.grid
         rows = [
             ("from", f"{self.start} to {self.goal}, {self.connectivity} directions"),
             ("objective", f"{self.objective}, {self.team} of the robots"),
@@ -137,11 +135,7 @@ class Planner(Displayed):
         ]
 
         def area() -> str:
-            shown = where.awareness.isel(feature=-1).mean("robot").where(where.passable)
-            return map_picture(
-                shown.values, [self.start, self.goal], aspect=grid.cell_height / grid.cell_width,
-                label=where.features[-1], line=False,
-            )  # fmt: skip
+            return self.workspace.picture([self.start, self.goal], line=False)
 
         return Card(f"Planner: {self.start} to {self.goal}", rows, [area])
 

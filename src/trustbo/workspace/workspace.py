@@ -256,10 +256,15 @@ class Workspace(Displayed):
             ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
             ("terrain", "none" if self.terrain is None else _sizes(self.terrain)),
         ]
-        aspect, last = grid.cell_height / grid.cell_width, self.features[-1]
-        pictures = [lambda: map_picture(shown.sel(feature=last).values, aspect=aspect, label=last)]
         sections = {"grid": grid._card().rows, "team": team._card().rows}
-        return Card(f"Workspace: {grid.shape[0]} x {grid.shape[1]} cells", rows, pictures, sections)
+        title = f"Workspace: {grid.shape[0]} x {grid.shape[1]} cells"
+        return Card(title, rows, [self.picture], sections)
+
+    def picture(self, path: Sequence[Cell] = (), *, line: bool = True) -> str:
+        """Draw the last feature, mean over robots, as a small SVG with a path, or its ends."""
+        shown = self.awareness.isel(feature=-1).mean("robot").where(self.passable)
+        aspect = self.grid.cell_height / self.grid.cell_width
+        return map_picture(shown.values, path, aspect=aspect, label=self.features[-1], line=line)
 
     def _with_line_of_sight(self) -> Self:
         ways, pixels = self.ground, self.pixels
