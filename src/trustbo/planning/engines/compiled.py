@@ -14,11 +14,11 @@ from trustbo.planning.engines.compiled_risk import (
     plan_stationary,
     require_complete,
 )
-from trustbo.planning.engines.constrained import Best
 from trustbo.planning.engines.constrained_stationary import least_to_goal
 from trustbo.planning.engines.contact_loss import LAWS, TINY_SD, least_loss
 from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
 from trustbo.planning.engines.labels import TERMINAL, LabelRisk, LabelSearch, mode_of, search
+from trustbo.planning.engines.lagrangian import Best
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths

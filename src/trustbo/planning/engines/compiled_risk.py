@@ -8,19 +8,19 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.engines.constrained import (
-    LEAST,
-    NONE,
-    SOFTPLUS,
-    Best,
-    Bounds,
-    EdgeRisk,
-    best_within,
-    safest_to_go,
-)
+from trustbo.planning.engines.constrained import best_within
 from trustbo.planning.engines.constrained_stationary import Network, least_to_goal
 from trustbo.planning.engines.constrained_stationary import best_within as best_free_within
 from trustbo.planning.engines.contact_loss import LAWS, TINY_SD
+from trustbo.planning.engines.costs_to_go import (
+    LEAST,
+    NONE,
+    SOFTPLUS,
+    Bounds,
+    EdgeRisk,
+    safest_to_go,
+)
+from trustbo.planning.engines.lagrangian import Best
 from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
 from trustbo.planning.engines.reference import best_stationary
 from trustbo.planning.objectives import Objective

@@ -1,7 +1,7 @@
 """Best path within a limit on risk where costs are free of history: the objective `stationary`.
 
 Method: label setting for the resource-constrained shortest path (Martins 1984), best first, with
-the Lagrangian bound of `constrained`.
+the bound of `lagrangian`.
 
 State of a label: cell, cost so far, sums of risks, parent. Costs are positive and risks not
 negative, so the best feasible walk is a simple path. Estimate of the cost of its completions: the
@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.engines.constrained import PRICES, Best, next_price
+from trustbo.planning.engines.lagrangian import PRICES, Best, next_price
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
