@@ -10,23 +10,14 @@ from typing import Any, Self
 
 import jax
 import numpy as np
-import pandas as pd
 import xarray as xr
 from jax import random
 
 from trustbo.campaign.card import campaign_card
-from trustbo.campaign.failures import Failure, learn_hazard, to_avoid, under_risk
+from trustbo.campaign.failures import Failure, to_avoid, under_risk
 from trustbo.campaign.folder import CampaignFolder
-from trustbo.campaign.history import (
-    LEARNED,
-    SET_ASIDE,
-    TOLD,
-    Entry,
-    History,
-    Posterior,
-    whole_posterior,
-)
-from trustbo.campaign.learning import CannotLearnError
+from trustbo.campaign.history import SET_ASIDE, TOLD, Entry, History
+from trustbo.campaign.learned import LearnedMissions
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, again
 from trustbo.campaign.result import Result
 from trustbo.campaign.told import never_to_be_learned, require_extra, require_mission, require_new
@@ -34,16 +25,7 @@ from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath
-from trustbo.models import (
-    CAUSES,
-    BoundRisk,
-    TrustModel,
-    diagnostics,
-    fit_hazard,
-    params_of,
-)
-from trustbo.models.params import Params
-from trustbo.models.posterior_groups import parameters_alone
+from trustbo.models import CAUSES, TrustModel, params_of
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -52,13 +34,12 @@ from trustbo.stacking import fill_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along
 
-_STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
 _N_MAPS = 500
 """Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
 _N_KEPT = 200
 
 
-class Campaign(Displayed):
+class Campaign(LearnedMissions, Displayed):
     """Learns from missions and proposes the next path.
 
     A mission is planned by `ask`, then told, then learned from. One that cannot be learned from yet
@@ -111,25 +92,15 @@ class Campaign(Displayed):
                 the model; or a model that cannot be updated so.
             NoPathError: The goal cannot be reached.
         """
-        self.options = CampaignOptions.of(options, Campaign.__init__)
+        chosen = CampaignOptions.of(options, Campaign.__init__)
         self.policy = resolve_policy(policy)
-        self._learning = self.options.learning(model, sampler)
-        self.model, self.log = self._learning.model, History()
+        super().__init__(workspace, chosen, model, sampler, seed)
         law = self.model.observation, self.model.response
-        self.planner = self.options.planner(workspace, start, goal, objective, *law)
-        self.workspace, self.seed = workspace, require_whole("seed", seed, 0)
-        self.awareness = self.options.belief(workspace)
+        self.planner = chosen.planner(workspace, start, goal, objective, *law)
+        self.awareness = chosen.belief(workspace)
         self._plan: Plan | None = None
         self._believed: Planner | None = None
-        self._hazard: xr.Dataset | None = None
-        self._risk: BoundRisk | None = None
-        self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
-        n_robots, seed_of_prior = len(workspace.team.robots), self.seed_of("prior")
-        self._prior: Params = self._learning.prior_belief(
-            self.options.initial, n_robots, workspace.features, seed_of_prior
-        )
-        self.belief = self._prior
         own_policy = not isinstance(policy, str)
         named = {
             "start": list(self.planner.start),
@@ -167,60 +138,6 @@ class Campaign(Displayed):
             f"Campaign: {told} missions", rows, self.workspace, settings, self.history,
             self.trust_map if told else None, lambda: self.recommend().path,
         )  # fmt: skip
-
-    @property
-    def missions(self) -> list[Mission]:
-        """Missions told so far, their awareness filled in."""
-        return self.log.missions
-
-    @property
-    def waiting(self) -> list[Mission]:
-        """Missions that were told, and are to be learned from with a later one."""
-        return [self.log.entries[j].measured for j in self.log.numbers(TOLD)]
-
-    @property
-    def posteriors(self) -> Sequence[xr.DataTree]:
-        """Posterior of the parameters after each mission; None where nothing was learned yet."""
-        return self.log.posteriors
-
-    @property
-    def plans(self) -> list[Plan]:
-        """Plan of each mission."""
-        return [entry.plan for entry in self.log.entries]
-
-    @property
-    def posterior(self) -> xr.DataTree | None:
-        """Posterior after the last mission, with all groups; None before anything is learned."""
-        last = self.log.last
-        if last is None:
-            return None
-        if self._whole is None or self._whole[0] is not last:
-            self._whole = last, whole_posterior(last(), self.missions, self.model)
-        whole = self._whole[1]
-        whole["hazard"] = xr.DataTree(self.hazard)
-        return whole
-
-    @property
-    def hazard(self) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `models.fit_hazard`; of the prior at first."""
-        if self._hazard is None:
-            log, last = self.log, self.log.last_tree
-            self._hazard = learn_hazard(
-                log.entries, log.failures, self.workspace, self.options.prior_hazard,
-                self.options.forgetting, self.seed_of("hazard"),
-            )  # fmt: skip
-            if self._hazard is None and last is not None and "hazard" in last.children:
-                self._hazard = last["hazard"].to_dataset()
-            if self._hazard is None:
-                self._hazard = fit_hazard([], self.workspace, self.options.prior_hazard)
-        return self._hazard
-
-    @property
-    def risk(self) -> BoundRisk:
-        """Chances of the bounds to fail, of all missions so far."""
-        if self._risk is None:
-            self._risk = BoundRisk.of(self.hazard, self.workspace)
-        return self._risk
 
     # --- ask and tell ---
 
@@ -352,45 +269,6 @@ class Campaign(Displayed):
         self._plan = self._believed = None
         self._write()
 
-    def _learn(self, seed: int) -> None:
-        """Fit the posterior of all missions that are not set aside; if it is refused, go on."""
-        self._forget_risk()
-        entries, waiting = self.log.entries, self.log.numbers(TOLD)
-        numbers, last = self.log.numbers(TOLD, LEARNED), self.log.last
-        if not numbers:
-            entries[-1].posterior, self.belief = None, self._prior
-            return
-        try:
-            tree = self._learning.learn(
-                [entries[j].mission for j in numbers],
-                len(waiting),
-                self.log.last_tree,
-                seed,
-                self.workspace,
-            )
-        except CannotLearnError as error:
-            for j in waiting:
-                entries[j].become(TOLD, str(error))
-            known = "the prior" if last is None else "the posterior before"
-            warnings.warn(
-                f"mission {len(entries)} is kept, but cannot be learned from yet: {error} "
-                f"The campaign goes on with {known}, and tries again with the next mission.",
-                stacklevel=4,
-            )
-            return
-        alone = self.options.update == "moment_matched"  # the prior stands for those before
-        tree.attrs["missions"] = waiting if alone else numbers
-        tree["hazard"] = xr.DataTree(self.hazard)
-        if "latent" not in tree.children:
-            tree = parameters_alone(tree)
-        if last is not None:
-            last.shrink()
-        for j in waiting:
-            entries[j].become(LEARNED)
-        entries[-1].row |= diagnostics(tree)
-        entries[-1].posterior = Posterior(len(entries), tree)
-        self.belief = params_of(tree)
-
     def fail(
         self,
         reason: str,
@@ -428,9 +306,6 @@ class Campaign(Displayed):
         self._forget_risk()
         return posterior
 
-    def _forget_risk(self) -> None:
-        self._hazard = self._risk = None
-
     def recommend(self) -> Plan:
         """Plan the best path under the mean of the belief, whatever the policy would try next."""
         return self.planner_now().plan(self.belief.mean())
@@ -440,15 +315,6 @@ class Campaign(Displayed):
         return self.planner_now().trust_map(self.belief.mean())
 
     # --- results ---
-
-    @property
-    def history(self) -> xr.Dataset:
-        """Dataset as `Result.history`; empty before the first mission."""
-        return self.log.to_dataset()
-
-    def summary(self) -> pd.DataFrame:
-        """Table with one row for each mission: its plan, status and diagnostics."""
-        return self.log.summary()
 
     def result(self) -> Result:
         """Collect everything learned so far, as `iterate` returns it.
@@ -653,10 +519,3 @@ class Campaign(Displayed):
         maps = problem.cells[:_N_KEPT].astype(np.float32)
         draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
         return xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
-
-    def seed_of(self, stream: str) -> int:
-        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
-        entropy = [self.seed, _STREAMS.index(stream), len(self.log.entries)]
-        if n_failures := sum(f.after == len(self.log.entries) for f in self.log.failures):
-            entropy.append(n_failures)  # another try may choose another path
-        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
