@@ -76,7 +76,10 @@ def shorter(words, page):
 
 
 @pytest.mark.usefixtures("blank_figures")  # a run on real terrain, in cli/, draws them
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize(
+    "page",  # every command is on that of the command line, and most on another
+    [pytest.param(p, marks=pytest.mark.slow if p == "docs/cli.md" else ()) for p in PAGES],
+)
 def test_the_commands_of_a_page_run_from_top_to_bottom(
     page, terrain, campaign, tmp_path, monkeypatch
 ):

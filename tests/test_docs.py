@@ -55,7 +55,15 @@ def page_of(namespace):
     return ROOT / "docs" / "api" / f"{namespace.split('.')[-1]}.md"
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=name_of)
+SLOW = {"docs/howto/use-arviz.md"}  # all of ArviZ's figures
+EXAMPLES = [
+    pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
+    for page in PAGES
+    if BLOCK.search(page.read_text())
+]
+
+
+@pytest.mark.parametrize("page", EXAMPLES)
 def test_the_examples_of_a_page_run_and_print_what_it_says(page, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
     if page == page_of("report"):  # whose figures its own tests draw

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
+import numpy as np
 from threadpoolctl import ThreadpoolController
 
 _BLOCK = 64  # rows per call: few enough for the caches
@@ -19,6 +20,14 @@ PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 They are not kept on disk either, where those that call them are.
 """
+
+
+def plain(values: np.ndarray) -> np.ndarray:
+    """Contiguous array that may be written to, a copy if need be.
+
+    Kernels are compiled for each layout of their arguments, which takes seconds: one suffices.
+    """
+    return np.require(values, requirements=["C", "W"])
 
 
 def over_rows(work: Callable[[int, int], None], n_rows: int) -> None:

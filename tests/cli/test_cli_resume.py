@@ -47,6 +47,7 @@ def struck(words, out, n_posteriors, strike):
     return process.returncode, said
 
 
+@pytest.mark.slow  # processes start for long; in one, test_resume dies at every write
 @pytest.mark.usefixtures("blank_figures")
 def test_what_is_done_is_kept_and_resume_goes_on(invoke, flags, tmp_path):
     """To the same result as without the interruptions: Ctrl-C, SIGTERM and a full disk."""

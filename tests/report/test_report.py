@@ -258,6 +258,7 @@ def test_the_coupled_model_s_parameters_are_listed_with_their_diagnostics(result
     assert 100 < read(b[-2]) < 800
 
 
+@pytest.mark.slow  # every figure is drawn again
 def test_the_same_result_gives_the_same_bytes(result, text, tmp_path):
     result.save(tmp_path / "kept")
     assert write(tb.load_result(tmp_path / "kept"), tmp_path) == text

@@ -412,6 +412,7 @@ def test_gaps_edges_and_other_pixels_are_no_obstacle():
         assert np.isfinite(mission.bounds[-1].poses).all()
 
 
+@pytest.mark.slow  # each tick is many steps of its solver
 def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
     terrain = tb.terrain.read_terrain(*real_terrain("wellington"))
     workspace = Workspace.from_terrain(terrain, (6, 8))

@@ -147,6 +147,7 @@ def test_a_file_s_content_decides_and_not_its_name(tmp_path):
 # --- where they run ---
 
 
+@pytest.mark.slow  # processes start for long; dask's tests are of the same code
 def test_loky_gives_the_same_numbers_though_a_worker_dies(serial, tmp_path):
     with killing_a_worker(tmp_path):
         assert_same(run(tmp_path, "loky"), serial)

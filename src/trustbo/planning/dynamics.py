@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.errors import ShapeError
 from trustbo.models.params import CoupledParams, Params, RobotParams, check_params
+from trustbo.parallel import plain
 from trustbo.workspace.moves import move_indices, moves_along
 
 TEAMS = ("mean", "min")
@@ -208,7 +209,7 @@ def roll(along: Dynamics) -> np.ndarray:
     _roll(
         np.broadcast_to(transition, (*leading, n_states, n_states)).reshape(-1, n_states, n_states),
         np.ascontiguousarray(drift).reshape(-1, n_states, n_bounds),
-        np.broadcast_to(start, (*leading, n_states)).reshape(-1, n_states),
+        plain(np.broadcast_to(start, (*leading, n_states)).reshape(-1, n_states)),
         trust.reshape(-1, n_bounds, n_states),
     )
     return trust

@@ -11,6 +11,7 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_pair, require_whole
+from trustbo.parallel import plain
 from trustbo.planning.engines.layers import Layers, build_layers
 from trustbo.planning.graph import (
     NoPathError,
@@ -100,8 +101,8 @@ class AdmissiblePaths:
     def layers(self) -> Layers:
         """Layered DAG: the grid unrolled over the bounds that are left."""
         layers = build_layers(
-            self.bounds_to_goal,
-            self.bounds_from_start,
+            plain(self.bounds_to_goal),
+            plain(self.bounds_from_start),
             self.steps,
             self.longest,
             u_turns=self.u_turns,

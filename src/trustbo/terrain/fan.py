@@ -101,7 +101,8 @@ def openness(
     known = np.isfinite(ground)
     # From the middle of the heights: float32 is then good to a millimetre on any terrain.
     middle = 0.5 * (ground[known].min() + ground[known].max()) if known.any() else 0.0
-    g, s = (np.where(known, a - middle, _NO_DATA).astype(np.float32) for a in (ground, surface))
+    heights = (np.where(known, a - middle, _NO_DATA) for a in (ground, surface))
+    g, s = (np.ascontiguousarray(a, np.float32) for a in heights)
     fan = Fan.around(n_rays, reach, pixel)
     numbers = np.array([eye, target, reach, extinction, crown_base], np.float32)
     result = np.full(g.shape, np.nan, ground.dtype)

@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
+from trustbo.parallel import plain
+
 Window = tuple[int, int, int, int]
 """First and end row, then first and end column, of pixels."""
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
@@ -41,7 +43,7 @@ def are_linked(
     """Whether two pixels of a raster (row, col) are in one region within a window."""
     top, bottom, left, right = window
     ends = (start[0] - top, start[1] - left), (goal[0] - top, goal[1] - left)
-    return bool(_flood(passable[top:bottom, left:right], *ends))
+    return bool(_flood(plain(passable[top:bottom, left:right]), *ends))
 
 
 @_compiled

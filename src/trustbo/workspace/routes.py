@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 
 from trustbo.data import Robot
+from trustbo.parallel import plain
 from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
@@ -62,7 +63,7 @@ class Routes:
             self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
         top, bottom, left, right = window
         cells = _a_star(
-            self._paces[max_slope][top:bottom, left:right],
+            plain(self._paces[max_slope][top:bottom, left:right]),
             surface.pixel,
             (start[0] - top, start[1] - left),
             (goal[0] - top, goal[1] - left),

@@ -8,7 +8,7 @@ from numba import njit
 
 from trustbo.data import Robot
 from trustbo.errors import TrustboError, require_choice
-from trustbo.parallel import PART
+from trustbo.parallel import PART, plain
 from trustbo.terrain import rays
 from trustbo.workspace.surface import Surface
 
@@ -87,8 +87,8 @@ def detection_probability(
         surface.pixel,
         surface.origin,
         sensor,
-        target,
-        np.broadcast_to(optics, (len(sensor), 4)),
+        plain(target),
+        plain(np.broadcast_to(optics, (len(sensor), 4))),
     )
     return _transmittances(
         surface.ground,

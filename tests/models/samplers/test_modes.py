@@ -48,6 +48,7 @@ LEFT_OUT = (136, 235)
 """Data sets, constant but once, of which all draws of NUTS were on one mode, R-hat below 1.01."""
 
 
+@pytest.mark.slow  # its program compiles for this alone
 def test_nuts_starts_at_both_modes_and_knows_their_mass():
     missions = modes.odd_missions("constant", np.random.default_rng(LEFT_OUT[1]))
     truth = modes.marginal(missions, "real")

@@ -145,7 +145,8 @@ class LatentTarget:
         if self._place is not None:
             for t in range(n):
                 log_det[t] = -_fill_places(P[t, k:, k:], self._place[1], theta[t, 3:])
-        args = theta[:, :1], theta[:, 1], theta[:, 2], self._x0, P, mean
+        beta0, delta_w, delta_v = np.ascontiguousarray(theta[:, :3].T)
+        args = beta0[:, None], delta_w, delta_v, self._x0, P, mean
         return args, log_det + np.log(precision).sum(1)
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.errors import TrustboError
-from trustbo.parallel import over_rows
+from trustbo.parallel import over_rows, plain
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.engines.buckets import best_stationary
 from trustbo.planning.engines.compiled_risk import (
@@ -236,9 +236,9 @@ def _label_search(
     at_goal = objective.name == "terminal"
     return LabelSearch(
         mode_of(objective),
-        np.ascontiguousarray(dynamics.transition),
-        dynamics.drift.reshape(*dynamics.drift.shape[:2], -1),
-        np.ascontiguousarray(dynamics.start),
+        plain(dynamics.transition),
+        plain(dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)),
+        plain(dynamics.start),
         dynamics.views,
         dominance_tests(dynamics, n_bounds),
         build_heuristic(dynamics, n_bounds, admissible.neighbours, goal, at_goal=at_goal),

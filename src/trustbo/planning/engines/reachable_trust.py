@@ -21,7 +21,7 @@ without it the path would be shorter than the fewest possible.
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import over_rows
+from trustbo.parallel import over_rows, plain
 
 _NO_MOVE, _NO_WAY = -1, 1 << 30
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
@@ -53,8 +53,7 @@ def best_trust(
     cells = order, (order // fewest.shape[1] + 1) * width + order % fewest.shape[1] + 1
     grid = bordered.ravel(), steps @ (width, 1), *cells, first
 
-    # One memory layout, so that the kernel is compiled once.
-    drift, beta0, x0 = (np.ascontiguousarray(v) for v in (u.reshape(*u.shape[:2], -1), beta0, x0))
+    drift, beta0, x0 = plain(u.reshape(*u.shape[:2], -1)), plain(beta0), plain(x0)
 
     def work(begin: int, end: int) -> None:
         some = slice(begin, end)

@@ -6,6 +6,7 @@ from trustbo.models.likelihood.ep.joint import Chains
 from trustbo.models.likelihood.ep.terms import AT_ONE, GAUSSIAN, count_tables
 from trustbo.models.likelihood.families import Family
 from trustbo.models.place import Visited
+from trustbo.parallel import plain
 from trustbo.stacking import MissionBatch
 
 
@@ -36,7 +37,7 @@ def gather_chains(
     u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
     seen = ~np.isnan(y)
     kept = np.flatnonzero(seen.any(1)) if whole is None else np.arange(len(y))
-    column = np.broadcast_to(np.arange(u.shape[-1]), (len(kept), u.shape[-1]))
+    column = plain(np.broadcast_to(np.arange(u.shape[-1]), (len(kept), u.shape[-1])))
     drift = u[kept]
     if places is not None:  # each bound has the effect of its unit, one column for each bound
         own = np.minimum(kept % n_robots, places.unit.shape[2] - 1)

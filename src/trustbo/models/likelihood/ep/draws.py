@@ -94,7 +94,7 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
     mean, L = np.empty(D), np.zeros((D, D))
     propagate(
         b0, delta_w, delta_v, x0, P, g, chains, table, sites[0], sites[1], n_sweeps, 1.0, mean, L,
-        False,
+        np.bool_(False),
     )  # fmt: skip
     constant = constants(chains.counts, concentration(delta_v))
     norm = math.lgamma(0.5 * (nu + D)) - math.lgamma(0.5 * nu) - 0.5 * D * np.log(0.5 * nu)

@@ -294,7 +294,7 @@ def log_evidence(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps):
         start_sites(chains, delta_v[t], kept, lam, eta)
         out[t] = propagate(
             b0[t], delta_w[t], delta_v[t], x0, P[t], g[t], chains, table, lam, eta, n_sweeps, 1.0,
-            mean, L, True,
+            mean, L, np.bool_(True),
         )  # fmt: skip
     return out
 
@@ -308,6 +308,6 @@ def settle(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps):
     start_sites(chains, delta_v, kept, sites[0], sites[1])
     propagate(
         b0, delta_w, delta_v, x0, P, g, chains, table, sites[0], sites[1], n_sweeps + 1, 0.8,
-        np.empty(len(g)), np.zeros(P.shape), False,
+        np.empty(len(g)), np.zeros(P.shape), np.bool_(False),
     )  # fmt: skip
     return sites

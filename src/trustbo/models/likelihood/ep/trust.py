@@ -161,8 +161,8 @@ def _trajectories(theta, drift, chains, kept, x, log_weight, rng):
         start_sites(chains, delta_v, kept, sites[0], sites[1])
         chains.drift[:] = drift[t]
         propagate(
-            b0, delta_w, delta_v, x0, empty, nothing, chains, table, sites[0], sites[1], _SWEEPS,
-            1.0, nothing, empty, False,
+            b0, delta_w, delta_v, x0, empty, nothing, chains, table, sites[0], sites[1],
+            np.int64(_SWEEPS), 1.0, nothing, empty, np.bool_(False),
         )  # fmt: skip
         constant = constants(chains.counts, concentration(delta_v))
         for i in range(x.shape[1]):
