@@ -1,7 +1,7 @@
 # make demo       install into .venv and run the main job on a real hillside
 # make test       install what the tests need too, and run them
 # make notebooks  run the notebooks, with fewer missions than they show
-# make slow       run the tests of models that compile for long, which make test leaves out
+# make slow       run the tests that take long, which make test leaves out
 # make lint       format, style, types and the direction of imports
 # make docs       build the documentation site, and say where to open it
 # make bench      install the peers, and print the figures we claim beside theirs

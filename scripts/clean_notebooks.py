@@ -1,0 +1,37 @@
+"""Clean executed notebooks before they are committed: no run times, figures of 256 colours.
+
+python scripts/clean_notebooks.py notebooks/*.ipynb
+"""
+
+import base64
+import io
+import json
+import sys
+from pathlib import Path
+
+from PIL import Image
+
+
+def smaller(png: str) -> str:
+    """The same figure with a palette, if that is smaller; both in base64."""
+    image = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
+    kept = io.BytesIO()
+    image.quantize(256, kmeans=1).save(kept, "PNG", optimize=True)
+    found = base64.b64encode(kept.getvalue()).decode()
+    return found if len(found) < len(png) else png
+
+
+def clean(path: Path) -> None:
+    """Rewrite a notebook in place."""
+    notebook = json.loads(path.read_text())
+    for cell in notebook["cells"]:
+        cell["metadata"].pop("execution", None)
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if "image/png" in data:
+                data["image/png"] = smaller("".join(data["image/png"]).strip())
+    path.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n")
+
+
+for name in sys.argv[1:]:
+    clean(Path(name))
