@@ -1,9 +1,10 @@
-"""Draws the figures of the documentation from what `make demo` left in out/demo.
+"""Draw the figures of the documentation: those of docs/gallery.md by its own code, and two more.
 
 The figure of long campaigns is of the tables that `benchmarks/campaigns.py --csv` wrote.
 """
 
 import io
+import re
 from pathlib import Path
 
 import matplotlib as mpl
@@ -12,38 +13,26 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-import trustbo as tb
 from trustbo import plots
 
 mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 RESULTS = FIGURES.parents[1] / "benchmarks" / "results"
+STEP = re.compile(r"^```python\n(.*?)^```|^!\[[^]]*\]\(figures/(\w+)\.png\)", flags=re.S | re.M)
 
 
 def main() -> None:
     """Draw them all."""
-    result = tb.load_result("out/demo")
-    workspace, mean = result.workspace, tb.models.params_of(result.posterior).mean()
-    cost = result.planner.cost_map(mean, per_robot=True)
-    drawn = {
-        "maps": result.plot_maps(),
-        "terrain": plots.terrain_maps(workspace),
-        "path_posterior": [
-            plots.path_posterior(result.maps()["path_probability"], workspace, result.path)
-        ],
-        "robot_maps": plots.robot_maps(cost, workspace, result.path, n_columns=3),
-        "mission_trust": plots.mission_trust(result.posterior),
-        "plan_map": plots.plan_map(result.plan, bounds=[1, 2]),
-        "plan_trust": plots.plan_trust(result.plan, workspace.team.names),
-        "parameter_history": plots.parameter_history(result.posteriors),
-        "campaign_history": plots.campaign_history(result.history),
-        "loadings": plots.loadings(workspace.composites),
-        "calibration": plots.calibration(tb.models.sbc(n_datasets=100)),
-    }
-    for name, axes in drawn.items():
-        save(axes[0].figure, name)
+    names: dict = {}
+    for code, name in STEP.findall((FIGURES.parent / "gallery.md").read_text()):
+        if code:
+            exec(code, names)
+        elif plt.get_fignums():
+            save(plt.gcf(), name)
+            plt.close("all")
     save(long_campaigns(), "long_campaigns")
-    film = plots.animate_mission(result.missions[-1], workspace)
+    result = names["result"]
+    film = plots.animate_mission(result.missions[-1], result.workspace)
     contact = np.concatenate([bound.contact for bound in result.missions[-1].bounds])
     divided = np.flatnonzero(contact.any(1) & ~contact.all(1))
     film._draw_frame(divided[len(divided) // 2])  # matplotlib has no public way to one frame

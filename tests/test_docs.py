@@ -55,7 +55,7 @@ def page_of(namespace):
     return ROOT / "docs" / "api" / f"{namespace.split('.')[-1]}.md"
 
 
-SLOW = {"docs/howto/use-arviz.md"}  # all of ArviZ's figures
+SLOW = {"docs/howto/use-arviz.md", "docs/gallery.md"}  # all figures
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
     for page in PAGES

@@ -1,5 +1,6 @@
 """Layout of figures: small multiples, maps in metres, colour bars."""
 
+import textwrap
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -9,6 +10,9 @@ from matplotlib.figure import Figure
 
 from trustbo.errors import require_whole
 from trustbo.workspace import Grid
+
+_LETTERS = 12
+"""Letters of a colour bar's label for each inch of the figure's height."""
 
 MARKERS = "osD^vPX*<>"
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
@@ -56,9 +60,10 @@ def map_panels(
 
 
 def colour_bar(figure, image, axes, label: str, **options) -> None:
-    """Add a colour bar with small numbers."""
+    """Add a colour bar with small numbers; a label longer than the figure is high is broken."""
     bar = figure.colorbar(image, ax=axes, pad=0.02, **{"aspect": 18, "shrink": 0.9} | options)
-    bar.set_label(label, fontsize=8)
+    n_letters = max(16, int(_LETTERS * figure.get_figheight()))
+    bar.set_label(textwrap.fill(label, n_letters), fontsize=8)
     bar.ax.tick_params(labelsize=7)
 
 

@@ -152,10 +152,11 @@ def hazard_map(
     worst = np.where(np.isnan(p_fail), -np.inf, p_fail).max(0)
     hazard = workspace.passable.copy(data=np.where(worst >= 0.0, worst, np.nan))
     figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
-    cell_map(ax, hazard, workspace, low=0.0, high=1.0)
+    high = max(0.2, float(np.nanmax(hazard, initial=0.0)))
+    cell_map(ax, hazard, workspace, low=0.0, high=high)
     if path is not None:
         draw_path(ax, path, workspace.grid)
-    _finish(figure, axes, workspace, "P(a bound into the cell fails), at most", (0.0, 1.0))
+    _finish(figure, axes, workspace, "chance to fail on entering, at most", (0.0, high))
     return ax
 
 
