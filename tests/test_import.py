@@ -41,15 +41,9 @@ def test_every_public_name_is_there():
 
 
 # Nothing before it is how all other processes of these tests import it.
+@pytest.mark.slow  # processes start for long
 @pytest.mark.parametrize(
-    "before",
-    [
-        "import arviz",
-        *(
-            pytest.param(before, marks=pytest.mark.slow)
-            for before in ("import arviz, numpyro.distributions", "import numpyro, arviz")
-        ),
-    ],
+    "before", ["import arviz", "import arviz, numpyro.distributions", "import numpyro, arviz"]
 )
 def test_numpyro_works_whatever_was_imported_first(before):
     """arviz_base leaves it half loaded; and JAX's configuration is as it was."""

@@ -121,6 +121,7 @@ resume_or_begin(make_workspace(), Path({folder!r}), 8)
 """
 
 
+@pytest.mark.slow  # processes start for long; in one, it dies at every write
 def test_killed_twice_it_comes_to_the_same(workspace, tmp_path):
     whole = run(workspace, tmp_path / "whole", 8)
     assert {"places", "hazard"} <= set(whole.posterior.children)  # effects and failures, too

@@ -59,6 +59,7 @@ def test_arviz_reads_it(posterior, missions):
     plt.close("all")
 
 
+@pytest.mark.slow  # NUTS compiles for this alone
 def test_the_posterior_is_the_one_plain_numpyro_samples(posterior, missions):
     """The change of variables, the mass matrix and the padding leave the target as it is."""
     batch = stack_missions(missions)
@@ -122,6 +123,7 @@ def with_a_gap(missions):
     return fit([gap, *missions[1:]], PooledTrust(HEAVY))
 
 
+@pytest.mark.slow  # NUTS compiles for this alone
 def test_missing_rates_are_predicted_through(with_a_gap):
     posterior = with_a_gap
     sd = posterior["latent"]["trust_sd"].sel(mission=0, robot="r2")
@@ -216,6 +218,7 @@ def test_a_prior_must_be_a_scalar_distribution(name):
             Priors(**{name: value})
 
 
+@pytest.mark.slow  # NUTS compiles for this alone
 def test_priors_without_a_mean_can_be_fitted(with_a_gap):
     assert diagnostics(with_a_gap)["r_hat"] <= 1.01
     assert HEAVY.mean(2)["b"] == 0.0

@@ -15,7 +15,7 @@ from trustbo.models.sbc import _uniformity
 
 
 def test_the_exact_sampler_is_calibrated():
-    ranks = sbc(n_datasets=200, shape=(2, 6, 2, 2), progress=False)
+    ranks = sbc(n_datasets=200, shape=(2, 4, 2, 2), progress=False)
     assert list(ranks["parameter"].values) == [
         "beta0",
         "beta[0]",

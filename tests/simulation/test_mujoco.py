@@ -364,6 +364,7 @@ def test_contact_is_lost_beyond_the_lidar_s_range():
     assert 0.0 < bound.contact_rate[0] < 1.0
 
 
+@pytest.mark.slow  # a process starts for long
 def test_the_same_seed_gives_the_same_mission_even_in_a_fresh_process(wooded):
     simulator = MujocoSimulator(wooded)
     first, again, other = (simulator.run(PATH[:2], seed=s) for s in (7, 7, 8))

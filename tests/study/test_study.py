@@ -84,6 +84,7 @@ def counted(monkeypatch):
 # --- the table of runs ---
 
 
+@pytest.mark.slow  # processes start for long
 def test_a_key_is_the_same_in_another_process(client):
     table = f"__import__('trustbo').study.Study.of({CONFIG!r}).runs()"
     assert client.submit(eval, f"[run.key for run in {table}]").result() == keys()
@@ -153,6 +154,7 @@ def test_loky_gives_the_same_numbers_though_a_worker_dies(serial, tmp_path):
         assert_same(run(tmp_path, "loky"), serial)
 
 
+@pytest.mark.slow  # processes start for long
 def test_dask_gives_the_same_numbers_on_a_core_for_each_worker(serial, client, tmp_path):
     assert_same(run(tmp_path, client), serial)
     pinned = [tuple(cores) for cores in client.run(os.sched_getaffinity, 0).values()]
@@ -161,6 +163,7 @@ def test_dask_gives_the_same_numbers_on_a_core_for_each_worker(serial, client, t
         assert {len(cores) for cores in pinned} == {1}
 
 
+@pytest.mark.slow  # processes start for long
 def test_dask_gives_the_same_numbers_though_a_worker_dies(client, tmp_path_factory):
     calm, hurt = (tmp_path_factory.mktemp(name) for name in ("calm", "hurt"))
     more = {"models": ["places"], "seeds": 5, "n_iterations": 3}

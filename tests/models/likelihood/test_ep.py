@@ -178,6 +178,7 @@ def test_gaussian_terms_give_the_smoother_s_moments():
     np.testing.assert_allclose(found.sd, exact.sd, rtol=5 / np.sqrt(4 * n))
 
 
+@pytest.mark.slow  # JAX's sampler of counts compiles for long
 def test_rates_drawn_by_numpy_are_those_drawn_by_jax():
     for family in ("censored", "beta_binomial"):
         p, z = PARAMS[family], np.random.default_rng(0).uniform(size=(1, 4, 2, 2))

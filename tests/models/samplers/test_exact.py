@@ -122,6 +122,7 @@ def test_the_evidence_is_the_prior_mean_of_the_likelihood():
     assert abs(exact.log_evidence - np.log(likelihood.mean())) < 5 * se + 0.02
 
 
+@pytest.mark.slow  # NUTS compiles for this alone
 def test_fit_lays_exact_draws_out_as_it_does_nuts_s(missions, posterior):
     exact = fit(missions, sampler="exact", seed=1)
     assert set(exact.children) == set(posterior.children)

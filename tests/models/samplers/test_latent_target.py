@@ -191,6 +191,7 @@ def test_trust_can_be_added_later_and_is_the_same():
     assert (whole["posterior_predictive"]["contact_rate"] <= 1.0).all()
 
 
+@pytest.mark.slow  # NUTS compiles for this alone
 def test_priors_of_ones_own_move_the_posterior_and_those_without_quantiles_go_to_nuts():
     missions = counted("censored", 4, 5)
     own = Priors(beta=dist.Normal(0.1, 0.01), delta_v=dist.LogNormal(-3.0, 0.2))
