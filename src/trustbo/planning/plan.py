@@ -64,10 +64,13 @@ class Plan(Displayed):
 
     def _card(self) -> Card:
         cells = " ".join(f"{row},{col}" for row, col in self.path)
+        best = "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"
+        if np.isnan(self.bound):
+            best = "not searched for"
         rows = [
             ("path", f"{len(self.path) - 1} bounds, {self.length:.4g} m"),
             ("value", f"{self.value:.4g} ({self.objective})"),
-            ("best", "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"),
+            ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
         if self.p_arrive is not None:
