@@ -4,7 +4,7 @@ import contextlib
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any, Self
 
 import jax
@@ -21,6 +21,7 @@ from trustbo.models.drift_form import Drift, DriftForm, name_of
 from trustbo.models.model import TrustModel, sample
 from trustbo.models.params import DriftParams
 from trustbo.models.priors import as_text
+from trustbo.models.samplers.priors_numpy import draw, quantile_at
 
 Axes = dict[str, tuple[str, ...]]
 _SIZES = {5: "robot", 7: "feature"}  # by which axes of a function's parameters are known
@@ -68,7 +69,7 @@ class DriftTrust(TrustModel):
         if not callable(drift):
             raise TrustboError(f"drift must be a function drift(z, ...); got {drift!r}.")
         _require_names(drift, *self._axes)
-        self._form.keep()
+        self.form.keep()
 
     @cached_property
     def _axes(self) -> tuple[Axes, Axes]:
@@ -77,7 +78,8 @@ class DriftTrust(TrustModel):
         return _traced_axes(own) if callable(own) else _listed_axes(own)
 
     @cached_property
-    def _form(self) -> DriftForm:
+    def form(self) -> DriftForm:
+        """The function and the axes of its arguments."""
         return DriftForm(self.drift, tuple(self._axes[0].items()))
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -85,7 +87,7 @@ class DriftTrust(TrustModel):
         listed, how = {}, self.parameters
         if not callable(how):
             listed = {name: _split(name, given)[0] for name, given in how.items()}
-            how = self._form.axes
+            how = self.form.axes
         return (self.priors, listed), (
             self.observation, self.response, self.place, self.drift, how,
         )  # fmt: skip
@@ -109,7 +111,7 @@ class DriftTrust(TrustModel):
         priors = self.priors
         return DriftParams(
             beta0=sample("beta0", priors.beta0),
-            drift=Drift(self._form, self._sample_theta(n_robots, n_features), n_features),
+            drift=Drift(self.form, self._sample_theta(n_robots, n_features), n_features),
             delta_w=sample("delta_w", priors.delta_w),
             delta_v=sample("delta_v", priors.delta_v),
             x0_mean=priors.x0_mean,
@@ -134,13 +136,13 @@ class DriftTrust(TrustModel):
         """See `TrustModel.params`."""
         own = dict(sites)
         try:
-            theta = {name: np.asarray(own[name], float) for name, _ in self._form.axes}
+            theta = {name: np.asarray(own[name], float) for name, _ in self.form.axes}
             beta0, delta_w, delta_v = (own[name] for name in ("beta0", "delta_w", "delta_v"))
         except KeyError as error:
             raise TrustboError(
                 f"parameter {error} is missing; {self.describe()} needs {', '.join(self.dims)}."
             ) from None
-        drift = Drift(self._form, theta, n_features)
+        drift = Drift(self.form, theta, n_features)
         return DriftParams(beta0, drift, delta_w, delta_v, **self.x0)
 
     # --- what the library asks a model ---
@@ -156,10 +158,73 @@ class DriftTrust(TrustModel):
         own = sites | arguments
         return {"beta0": (), **own, "delta_w": (), "delta_v": (), **self.place_dims}
 
-    @property
-    def why_not_exact(self) -> str:
-        """The drift's parameters do not integrate out."""
-        return "its drift is a function of your own, whose parameters do not integrate out"
+    @cached_property
+    def why_not_exact(self) -> str | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Reason why scores of priors do not do: other rates than Gaussian, places, or a prior."""
+        if not self.family.integrates_out:
+            return "its drift is a function of your own, and its observations are not Gaussian"
+        if self.place is not None:
+            return "its drift is a function of your own, and it has effects of places"
+        return self._why_no_scores
+
+    @cached_property
+    def _why_no_scores(self) -> str | None:
+        try:
+            with own_settings():
+                n = self.n_scores(5, 7)
+                jax.eval_shape(lambda z: self.at_scores(z, 5, 7), jnp.zeros(n))
+        except (NotImplementedError, ImportError, TypeError, ValueError):
+            return "a prior of its drift's parameters has no quantiles, or is no scalar"
+        return None
+
+    def require_statistics(self) -> None:
+        """See `TrustModel.require_statistics`: there are none."""
+        raise TrustboError(
+            f"{self.describe()} has no sufficient statistics: its drift is a function of your own."
+        )
+
+    def n_scores(self, n_robots: int, n_features: int) -> int:
+        """Number of scores of the drift's parameters, see `at_scores`."""
+        size = {"robot": n_robots, "feature": n_features}
+        return sum(int(np.prod([size[a] for a in axes])) for axes in self._axes[1].values())
+
+    def at_scores(
+        self, z: Array, n_robots: int, n_features: int
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Arguments of the drift, and all its parameters, by name, at normal scores (score,).
+
+        Each parameter is the quantile of its prior, given those before it, at Phi(score).
+        """
+        rest = z
+
+        def quantile(site: dict[str, Any]) -> Array | None:
+            nonlocal rest
+            if site["type"] != "sample":
+                return None
+            n = int(np.prod(site["fn"].shape()))
+            own, rest = rest[:n].reshape(site["fn"].shape()), rest[n:]
+            return quantile_at(site["fn"], own)
+
+        with handlers.trace() as trace, handlers.substitute(substitute_fn=quantile):
+            theta = self._sample_theta(n_robots, n_features)
+        names = self._axes[1] | self._axes[0]
+        return theta, {name: trace[name]["value"] for name in names}
+
+    def parameters_at(self, z: np.ndarray, shape: tuple[int, int]) -> dict[str, np.ndarray]:
+        """The drift's parameters at scores (point, score), by name, see `at_scores`."""
+        with own_settings():
+            found = _parameters_at(self, z, shape)
+        return {name: np.asarray(value) for name, value in found.items()}
+
+    def draw_prior(
+        self, shape: tuple[int, int], n: int, rng: np.random.Generator
+    ) -> dict[str, np.ndarray] | None:
+        """See `TrustModel.draw_prior`: from scores, which compile faster than random numbers."""
+        if self._why_no_scores is not None:
+            return None
+        names = ("beta0", "delta_w", "delta_v")
+        own = self.parameters_at(rng.standard_normal((n, self.n_scores(*shape))), shape)
+        return {name: draw(getattr(self.priors, name), (n,), rng) for name in names} | own
 
     def for_features(self, features: Any) -> Self:
         """The model itself: no prior goes by the name of a feature."""
@@ -172,7 +237,7 @@ class DriftTrust(TrustModel):
         return {
             "observation": self.observation,
             "response": self.response,
-            "drift": self._form.name,
+            "drift": self.form.name,
             "parameters": text,
         }
 
@@ -189,7 +254,7 @@ class DriftTrust(TrustModel):
             raise
         except Exception as error:
             raise TrustboError(
-                f"the drift {self._form.name} fails for awareness (robot, feature) = {shape}: "
+                f"the drift {self.form.name} fails for awareness (robot, feature) = {shape}: "
                 f"{type(error).__name__}: {error}"
             ) from error
         bad = ~np.isfinite(found)
@@ -197,14 +262,14 @@ class DriftTrust(TrustModel):
             draw, k, robot = np.argwhere(bad)[0]
             theta = ", ".join(f"{n} = {np.asarray(v[draw])}" for n, v in some.theta.items())
             raise TrustboError(
-                f"the drift {self._form.name} is {found[draw, k, robot]} at awareness "
+                f"the drift {self.form.name} is {found[draw, k, robot]} at awareness "
                 f"{z[k, robot].round(3).tolist()} with {theta}; it must be finite for all "
                 "awareness in [0, 1] and all parameters that their priors give."
             )
 
     def marks(self, shape: tuple[int, int]) -> dict[str, Any]:
         """See `TrustModel.marks`: `find_drift` knows the function by them."""
-        return {"drift_shape": list(shape), "drift_mark": self._form.mark(shape)}
+        return {"drift_shape": list(shape), "drift_mark": self.form.mark(shape)}
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`: the drift's parameters are in `own_log_prior`."""
@@ -226,6 +291,11 @@ class DriftTrust(TrustModel):
             found = jax.jit(jax.vmap(one))(flat)
         shape = sites["beta0"].shape
         return {name: np.asarray(value).reshape(shape) for name, value in found.items()}
+
+
+@partial(jax.jit, static_argnames="shape")
+def _parameters_at(model: DriftTrust, z: Array, shape: tuple[int, int]) -> dict[str, Array]:
+    return jax.vmap(lambda one: model.at_scores(one, *shape)[1])(z)
 
 
 def _require_indices(drift: Drift, z: np.ndarray) -> None:

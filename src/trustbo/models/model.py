@@ -28,6 +28,7 @@ from trustbo.models.likelihood.gram import Statistics, require_forgetting, suffi
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import PlaceEffect, bounds_of
 from trustbo.models.priors import Priors
+from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution
 from trustbo.stacking import MissionBatch, stack_missions
 
@@ -133,6 +134,22 @@ class TrustModel(Displayed, ABC):
     def own_log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Log prior density (chain, draw), by label, of parameters that `Priors` does not know."""
         return {}
+
+    def draw_prior(
+        self, shape: tuple[int, int], n: int, rng: np.random.Generator
+    ) -> dict[str, np.ndarray] | None:
+        """Draws of the parameters but those of places, (draw, ...), by name.
+
+        None where the model's own sample statements have to be run.
+        """
+        if not self.priors_are_independent:
+            return None
+        priors = self.priors
+        drawn = {
+            name: draw(getattr(priors, name), (n, *size), rng)
+            for name, size in self.sizes(*shape).items()
+        }
+        return priors.of_stationary(drawn)
 
     def check(self, sites: Mapping[str, np.ndarray], shape: tuple[int, int]) -> None:
         """Refuse a model that draws from its prior show to be none: TrustboError.

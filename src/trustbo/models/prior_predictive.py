@@ -16,7 +16,6 @@ from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.posterior_groups import Law, predict
-from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
 
@@ -116,21 +115,23 @@ def draw_sites(
 
     TrustboError: they show the model to be none, see `TrustModel.check`.
     """
-    if model.priors_are_independent:
-        rng, priors = np.random.default_rng(seed), model.priors
-        drawn = {
-            name: draw(getattr(priors, name), (n_draws, *size), rng)
-            for name, size in model.sizes(*shape).items()
-        }
-        return priors.of_stationary(drawn) | _place_draws(model, n_draws, seed)
+    found = model.draw_prior(shape, n_draws, np.random.default_rng(seed))
+    if found is None:
+        found = _compiled_draws(model, shape, n_draws, seed)
+    model.check(found, shape)
+    return found | _place_draws(model, n_draws, seed)
+
+
+def _compiled_draws(
+    model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
+) -> dict[str, np.ndarray]:
+    """The same by the model's sample statements, those of places apart."""
     # Whole batches: any number of draws meets one compiled program.
     rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
         drawn = [_parameter_draws(model, shape, keys[row]) for row in rows]
-    found = {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in drawn[0]}
-    model.check(found, shape)
-    return found | _place_draws(model, n_draws, seed)
+    return {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in drawn[0]}
 
 
 def _place_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:

@@ -33,6 +33,23 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
 
 
+def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
+    """Quantile of a prior of independent numbers at Phi(score), in JAX; shape of the scores.
+
+    NotImplementedError: it has no quantiles.
+    """
+    while isinstance(prior, dist.Independent | dist.ExpandedDistribution):
+        prior = prior.base_dist
+    if prior.event_shape:
+        raise NotImplementedError
+    if isinstance(prior, dist.Normal):  # to the far tails
+        return prior.loc + prior.scale * score
+    if isinstance(prior, dist.LogNormal):
+        return jax.numpy.exp(prior.loc + prior.scale * score)
+    share = jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16)
+    return prior.icdf(share)
+
+
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:
     return -0.5 * ((x - loc) / scale) ** 2 - np.log(scale * np.sqrt(2.0 * np.pi))
 
