@@ -1,5 +1,7 @@
 """Prior densities, draws and floors in NumPy: compiling them would take longer than using them."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import numpyro.distributions as dist
@@ -38,16 +40,16 @@ def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
 
     NotImplementedError: it has no quantiles.
     """
-    while isinstance(prior, dist.Independent | dist.ExpandedDistribution):
-        prior = prior.base_dist
-    if prior.event_shape:
+    one: Any = prior
+    while isinstance(one, dist.Independent | dist.ExpandedDistribution):
+        one = one.base_dist
+    if one.event_shape:
         raise NotImplementedError
-    if isinstance(prior, dist.Normal):  # to the far tails
-        return prior.loc + prior.scale * score
-    if isinstance(prior, dist.LogNormal):
-        return jax.numpy.exp(prior.loc + prior.scale * score)
-    share = jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16)
-    return prior.icdf(share)
+    if isinstance(one, dist.Normal):  # to the far tails
+        return one.loc + one.scale * score
+    if isinstance(one, dist.LogNormal):
+        return jax.numpy.exp(one.loc + one.scale * score)
+    return one.icdf(jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16))
 
 
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:
