@@ -19,7 +19,7 @@ from trustbo.models import (
     sample_prior,
 )
 from trustbo.models.model import require_model
-from trustbo.models.params import Params, assemble_params
+from trustbo.models.params import Params
 from trustbo.models.samplers.run import resolve_sampler
 from trustbo.workspace import Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
@@ -132,7 +132,7 @@ class Learning:
             values = model.priors.mean(n_features)
             sizes = model.sizes(n_robots, n_features)
             means = {name: np.broadcast_to(values[name], (1, *sizes[name])) for name in sizes}
-            return assemble_params(means, model.x0).flat()
+            return model.params(means, n_features).flat()
         # The mean of parameters that robots are drawn around has no closed form.
         n_draws = 1 if initial == "prior_draw" else 1000
         mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()

@@ -5,6 +5,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 # isort: split
 from trustbo.models.by_rate import by_rate
 from trustbo.models.coupled import CoupledTrust
+from trustbo.models.drift import DriftTrust
 from trustbo.models.exposures import CAUSES, LostMission
 from trustbo.models.filter import TrustFilter, TrustForecast, TrustState
 from trustbo.models.fit import fit
@@ -13,7 +14,13 @@ from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
 from trustbo.models.loo import loo
 from trustbo.models.model import TrustModel
-from trustbo.models.params import CoupledParams, RobotParams, TrustParams, params_of
+from trustbo.models.params import (
+    CoupledParams,
+    DriftParams,
+    RobotParams,
+    TrustParams,
+    params_of,
+)
 from trustbo.models.place import PlaceEffect
 from trustbo.models.place_maps import place_maps
 from trustbo.models.pooled import PooledTrust
@@ -32,6 +39,8 @@ __all__ = [
     "ContactRate",
     "CoupledParams",
     "CoupledTrust",
+    "DriftParams",
+    "DriftTrust",
     "ExactPosterior",
     "Hazard",
     "HierarchicalTrust",

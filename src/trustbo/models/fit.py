@@ -101,10 +101,10 @@ def fit(
     floored = model.at_resolution(ticks)
     settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
+    prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
     draws, complaints = draw_posterior(
         floored, chosen, settings, seed, batch, weight, places, _proposal(earlier), check=check
     )
-    prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
     groups = {
         "posterior": {name: draws.params[name] for name in model.dims},
         "sample_stats": draws.stats,
@@ -123,6 +123,7 @@ def fit(
         "sampler": draws.sampler,
         "sampler_reason": reason if draws.sampler == chosen else "weights were too uneven",
         "seed": seed,
+        **model.marks(batch.awareness.shape[2:]),
         **draws.summary,
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),

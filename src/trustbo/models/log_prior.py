@@ -39,6 +39,7 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
             found[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
     if model.place is not None:
         found |= model.place.log_prior(sites)
+    found |= model.own_log_prior(sites)
     return {label: each.reshape(*each.shape[:2], -1).sum(-1) for label, each in found.items()}
 
 
@@ -49,7 +50,8 @@ def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> 
     except (KeyError, TrustboError):  # of an older version, or with priors of the user's own
         return None
     draws = posterior["posterior"].to_dataset()
-    recorded = recorded.for_features([str(name) for name in draws["feature"].values])
+    if "feature" in draws:
+        recorded = recorded.for_features([str(name) for name in draws["feature"].values])
     sites = {str(n): a.transpose("chain", "draw", ...).values for n, a in draws.items()}
     densities = log_prior(recorded, sites)
     index = {"chain": draws["chain"], "draw": draws["draw"]}

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,10 @@ from trustbo.models.likelihood.contact_rate import (
 )
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
-from trustbo.models.params import Params, check_params
+from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import PlaceEffect, bounds_of
 from trustbo.models.priors import Priors
+from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution
 from trustbo.stacking import MissionBatch, stack_missions
 
@@ -130,6 +131,38 @@ class TrustModel(Displayed, ABC):
         """
         return {name: (name, sites[name]) for name in self.dims if name not in self.place_dims}
 
+    def own_log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Log prior density (chain, draw), by label, of parameters that `Priors` does not know."""
+        return {}
+
+    def draw_prior(
+        self, shape: tuple[int, int], n: int, rng: np.random.Generator
+    ) -> dict[str, np.ndarray] | None:
+        """Draws of the parameters but those of places, (draw, ...), by name.
+
+        None where the model's own sample statements have to be run.
+        """
+        if not self.priors_are_independent:
+            return None
+        priors = self.priors
+        drawn = {
+            name: draw(getattr(priors, name), (n, *size), rng)
+            for name, size in self.sizes(*shape).items()
+        }
+        return priors.of_stationary(drawn)
+
+    def check(self, sites: Mapping[str, np.ndarray], shape: tuple[int, int]) -> None:
+        """Refuse a model that draws from its prior show to be none: TrustboError.
+
+        Args:
+            sites: Draws by name, leading axis (draw,).
+            shape: Number of robots and of features.
+        """
+
+    def marks(self, shape: tuple[int, int]) -> dict[str, Any]:
+        """Attributes that a posterior of so many robots and features knows the model by."""
+        return {}
+
     @property
     def partial_pooling(self) -> "HierarchicalTrust | None":
         """The model, if its robots' coefficients are drawn from a common distribution."""
@@ -171,6 +204,15 @@ class TrustModel(Displayed, ABC):
         """Options by name, without the priors and the effects of places."""
         others = ("priors", "place")
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
+
+    def params(self, sites: Mapping[str, Any], n_features: int) -> Params:
+        """Parameters from their values by name, leading axes (draw,) or none.
+
+        Args:
+            sites: Values with the axes of `dims`.
+            n_features: Number of features.
+        """
+        return assemble_params(sites, self.x0)
 
     # --- shared by all models ---
 
@@ -338,7 +380,7 @@ class TrustModel(Displayed, ABC):
         reason = self.why_not_exact or (self.place and "places have effects")
         if not self.family.integrates_out:
             reason = "its observations are not Gaussian"
-        elif self.robot_sets is None:
+        elif self.robot_sets is None and not reason:
             reason = "its robots share some parameters only, or influence each other"
         if reason:
             raise TrustboError(f"{self.describe()} has no sufficient statistics: {reason}.")

@@ -11,7 +11,8 @@ from jax import Array
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models.likelihood.live import ApartFilter, CoupledFilter
+from trustbo.models.drift_form import Drift, find_drift
+from trustbo.models.likelihood.live import ApartFilter, CoupledFilter, DriftFilter
 from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.likelihood.vector import VectorSSM
 from trustbo.models.place_maps import place_maps_of
@@ -46,11 +47,22 @@ class _Draws(Displayed):
         def add(value: Numbers, n_own: int) -> Numbers:
             numbers = np.asarray(value, dtype=float)
             flat = numbers.reshape(-1, *numbers.shape[numbers.ndim - n_own :])
-            rows.append((self._fields[len(rows)], _written(flat)))
+            rows.append((names[len(rows)], _written(flat)))
             return value
+
+        names = list(self.by_name)
 
         self.map(add)
         return Card(f"{type(self).__name__}: {many}", rows)
+
+    @property
+    def by_name(self) -> dict[str, Numbers]:
+        """Values by name, those of a drift among them; fields that are None left out."""
+        found: dict[str, Numbers] = {}
+        for name in self._fields:
+            value = getattr(self, name)
+            found |= dict(value.theta) if isinstance(value, Drift) else {name: value}
+        return {name: value for name, value in found.items() if value is not None}
 
     @property
     def leading(self) -> tuple[int, ...]:
@@ -132,6 +144,13 @@ class _Draws(Displayed):
         b = b[..., None, None, None] if self.n_robots is None else b[..., None, None, :]
         return self._replace(b=b + effect, place=None, place_bound=None)  # pyright: ignore
 
+    def with_drift(self, awareness: np.ndarray) -> "Params":
+        """Parameters of given missions whose drift is linear in awareness, or an intercept.
+
+        Awareness is (mission, bound, robot, feature), leading axes of the parameters (draw,).
+        """
+        return self  # pyright: ignore[reportReturnType]
+
     def draw(self, index: int) -> Self:
         """One draw out of many, with its leading axis dropped."""
         return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
@@ -165,7 +184,7 @@ class _Draws(Displayed):
         """The same with a function of each field and the number of its own axes in its place."""
         core = {name: len(self.AXES.get(name, ())) for name in self._fields}
         values = {
-            name: function(value, n)
+            name: value.map(function) if isinstance(value, Drift) else function(value, n)
             for name, n in core.items()
             if (value := getattr(self, name)) is not None
         }
@@ -292,7 +311,58 @@ class CoupledParams(_Draws, _Coupled):
         return CoupledFilter(self, lag, n_robots)
 
 
-Params = TrustParams | RobotParams | CoupledParams
+class _OwnDrift(NamedTuple):
+    beta0: Numbers
+    drift: Drift
+    delta_w: Numbers
+    delta_v: Numbers
+    x0_mean: Numbers = 0.5
+    x0_sd: Numbers = 0.5
+    b: Numbers = 0.0
+    place: Numbers | None = None
+    place_bound: Numbers | None = None
+
+
+class DriftParams(_Draws, _OwnDrift):
+    """Parameters of `DriftTrust`; made by its `params`.
+
+    Fields: beta0 (...,), the drift with its own parameters, delta_w and delta_v (...,), x0_mean,
+    x0_sd, place and place_bound as in `TrustParams`; b is 0, for effects of places to enter by.
+    """
+
+    __slots__ = ()
+    AXES: ClassVar = {"beta0": (), **_PLACES}
+
+    @property
+    def n_features(self) -> int:
+        """Number of features."""
+        return self.drift.n_features
+
+    def ssm(self, awareness: Array, lag: float = 0.0) -> ScalarSSM:
+        """The state space of missions with awareness (mission, bound, robot, feature)."""
+        drift = jnp.swapaxes(self.drift.at(awareness) + self.b, 0, 1)
+        p = self
+        return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
+
+    def live(self, lag: float, n_robots: int) -> ApartFilter:
+        """One bound of the Kalman filter; the leading axis is (draw,)."""
+        return DriftFilter(self, lag, n_robots)
+
+    def with_drift(self, awareness: np.ndarray) -> "TrustParams":
+        """See `_Draws.with_drift`: the drift of each bound is its intercept."""
+        n_draws, n_features = len(self.beta0), awareness.shape[-1]
+        u = self.drift.values(awareness.reshape(-1, *awareness.shape[2:]), many=True)
+        u = u.reshape(n_draws, *awareness.shape[:3])
+        b = np.asarray(self.b)
+        known = {
+            name: getattr(self, name)
+            for name in ("beta0", "delta_w", "delta_v", "x0_mean", "x0_sd")
+        }
+        zero = np.zeros((n_draws, n_features))
+        return TrustParams(beta=zero, b=u + (b if b.ndim == 4 else b[:, None, None, None]), **known)
+
+
+Params = TrustParams | RobotParams | CoupledParams | DriftParams
 
 
 def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Numbers) -> CoupledParams:
@@ -330,7 +400,10 @@ def params_of(posterior: xr.DataTree) -> Params:
         posterior: DataTree from `fit`.
 
     Returns:
-        `TrustParams`, `RobotParams` or `CoupledParams`, according to the model.
+        `TrustParams`, `RobotParams`, `CoupledParams` or `DriftParams`, according to the model.
+
+    Raises:
+        TrustboError: This process has made no `DriftTrust` with the drift of the posterior.
     """
     draws = posterior["posterior"].to_dataset().stack(sample=("chain", "draw"))
     # In one layout, whether they were just sampled or read from a file: sums over draws then round
@@ -339,11 +412,22 @@ def params_of(posterior: xr.DataTree) -> Params:
         str(n): np.ascontiguousarray(draws[n].transpose("sample", ...).values)
         for n in draws.data_vars
     }
-    x0 = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
-    params = assemble_params(sites, x0)
+    params = params_from(sites, posterior.attrs)
     if "places" not in posterior.children:
         return params
     return params._replace(**place_maps_of(posterior["places"].to_dataset(), sites))  # pyright: ignore
+
+
+def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Params:
+    """Parameters from draws by name, leading axis (draw,), and the attributes of a posterior.
+
+    TrustboError: they are of a drift that is not known here.
+    """
+    x0 = {name: about[name] for name in ("x0_mean", "x0_sd")}
+    if "drift" not in about:
+        return assemble_params(sites, x0)
+    shared = {name: sites[name] for name in ("beta0", "delta_w", "delta_v")}
+    return DriftParams(drift=find_drift(about, sites), **shared, **x0)
 
 
 def assemble_params(sites: Mapping[str, np.ndarray], x0: Mapping[str, float]) -> Params:
@@ -367,6 +451,10 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     ShapeError: another number of robots or features. TrustboError: a covariance that is not
     symmetric and positive definite.
     """
+    _check_places(params, n_robots)
+    if isinstance(params, DriftParams):
+        params.drift.require(n_robots, n_features)
+        return
     name = params.WEIGHTS
     axes, shape = params.AXES[name], np.shape(getattr(params, name))
     if len(shape) < len(axes):
@@ -377,9 +465,6 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
             f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} "
             "features."
         )
-    for field, value in params.places.items():
-        if (n := value.shape[-len(_PLACES[field])]) not in (1, n_robots or n):
-            raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
     if "robot" not in sizes:
         return
     if n_robots is not None and sizes["robot"] != n_robots:
@@ -396,6 +481,12 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
             )
         if field.startswith("Delta"):
             _require_covariance(f"params.{field}", value)
+
+
+def _check_places(params: Params, n_robots: int | None) -> None:
+    for field, value in params.places.items():
+        if (n := value.shape[-len(_PLACES[field])]) not in (1, n_robots or n):
+            raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
 
 
 def _require_covariance(name: str, value: np.ndarray) -> None:

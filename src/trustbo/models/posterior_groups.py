@@ -16,7 +16,7 @@ from trustbo.models.likelihood.ep import trust
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.log_prior import log_prior_group
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params, assemble_params, params_of
+from trustbo.models.params import Params, params_from, params_of
 from trustbo.models.place import bounds_of
 from trustbo.models.place_maps import prior_maps
 from trustbo.models.posterior_tree import missions_of, to_datatree
@@ -168,8 +168,7 @@ def _likelihood_name(posterior: xr.DataTree) -> str:
 
 def _prior_of(posterior: xr.DataTree) -> Params:
     sites = {str(n): a.values[0] for n, a in posterior["prior"].data_vars.items()}
-    x0 = {n: posterior.attrs[n] for n in ("x0_mean", "x0_sd")}
-    params = assemble_params(sites, x0).flat()
+    params = params_from(sites, posterior.attrs).flat()
     if "places" not in posterior.children:
         return params
     return params._replace(**prior_maps(posterior["places"].to_dataset(), sites))  # pyright: ignore

@@ -14,9 +14,8 @@ from trustbo.data import default_features
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params, assemble_params
+from trustbo.models.params import Params
 from trustbo.models.posterior_groups import Law, predict
-from trustbo.models.samplers.priors_numpy import draw
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
 
@@ -69,7 +68,8 @@ def prior_predictive(
     )
     drawn = draw_sites(model, z.shape[2:], n_draws, seed)
     law = Law(model.family, model.lag, model.family.integrates_out and model.robots_are_apart)
-    params, batch = assemble_params(drawn, model.x0).flat(), MissionBatch(z, z[..., 0], ticks)
+    params = model.params(drawn, z.shape[3]).flat()
+    batch = MissionBatch(z, z[..., 0], ticks)
     drawn["contact_rate"] = predict(law, params, batch, seed + 1)
     dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
     robots = [f"r{i + 1}" for i in range(z.shape[2])]
@@ -104,27 +104,34 @@ def sample_prior(
         n_robots: Number of robots, for models whose robots have parameters of their own.
     """
     model = model.at_resolution({})
-    return assemble_params(draw_sites(model, (n_robots, n_features), n_draws, seed), model.x0)
+    drawn = draw_sites(model, (n_robots, n_features), n_draws, seed)
+    return model.params(drawn, n_features)
 
 
 def draw_sites(
     model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
 ) -> dict[str, np.ndarray]:
-    """Draws of the parameters from the prior for (robots, features), by name."""
-    if model.priors_are_independent:
-        rng, priors = np.random.default_rng(seed), model.priors
-        drawn = {
-            name: draw(getattr(priors, name), (n_draws, *size), rng)
-            for name, size in model.sizes(*shape).items()
-        }
-        return priors.of_stationary(drawn) | _place_draws(model, n_draws, seed)
+    """Draws of the parameters from the prior for (robots, features), by name.
+
+    TrustboError: they show the model to be none, see `TrustModel.check`.
+    """
+    found = model.draw_prior(shape, n_draws, np.random.default_rng(seed))
+    if found is None:
+        found = _compiled_draws(model, shape, n_draws, seed)
+    model.check(found, shape)
+    return found | _place_draws(model, n_draws, seed)
+
+
+def _compiled_draws(
+    model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
+) -> dict[str, np.ndarray]:
+    """The same by the model's sample statements, those of places apart."""
     # Whole batches: any number of draws meets one compiled program.
     rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
         drawn = [_parameter_draws(model, shape, keys[row]) for row in rows]
-    found = {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in drawn[0]}
-    return found | _place_draws(model, n_draws, seed)
+    return {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in drawn[0]}
 
 
 def _place_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:

@@ -68,7 +68,7 @@ class Priors(Displayed):
     stationary: bool = False
 
     def _card(self) -> Card:
-        rows = [(one.name, _as_text(getattr(self, one.name))) for one in fields(self)]
+        rows = [(one.name, as_text(getattr(self, one.name))) for one in fields(self)]
         return Card("Priors", rows)
 
     def __post_init__(self) -> None:
@@ -91,12 +91,12 @@ class Priors(Displayed):
             if not scalar or len(prior.batch_shape) > (name == "beta"):
                 raise TrustboError(
                     f"Priors.{name} must be a scalar numpyro distribution, e.g. "
-                    f"numpyro.distributions.{_as_text(default)}; got {prior!r}."
+                    f"numpyro.distributions.{as_text(default)}; got {prior!r}."
                 )
             if name in _SCALES and not _is_positive(prior):
                 raise TrustboError(
                     f"Priors.{name} is a standard deviation: its prior must live on (0, inf) or "
-                    f"part of it, e.g. numpyro.distributions.{_as_text(default)}; got {prior!r}."
+                    f"part of it, e.g. numpyro.distributions.{as_text(default)}; got {prior!r}."
                 )
         require_positive("Priors.concentration", self.concentration)
         if not np.isfinite(self.x0_mean):
@@ -204,8 +204,8 @@ class Priors(Displayed):
         """Each prior as text, for the record kept with a result."""
         named = {f.name: getattr(self, f.name) for f in fields(self)}
         if not named.pop("stationary"):
-            return {name: _as_text(value) for name, value in named.items()}
-        return {name: _as_text(value) for name, value in named.items()} | {"stationary": "True"}
+            return {name: as_text(value) for name, value in named.items()}
+        return {name: as_text(value) for name, value in named.items()} | {"stationary": "True"}
 
 
 @cache
@@ -232,13 +232,14 @@ def _unflatten(stationary: bool, children: Iterable[object]) -> Priors:
 jax.tree_util.register_pytree_node(Priors, _flatten, _unflatten)
 
 
-def _as_text(prior: Distribution | float) -> str:
+def as_text(prior: Distribution | float) -> str:
+    """Distribution or number as text."""
     if isinstance(prior, bool):
         return "yes" if prior else "no"
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
     if isinstance(prior, Floored):  # the floor is no prior of the user's, but the data's
-        return _as_text(prior.base)
+        return as_text(prior.base)
     numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
     return f"{type(prior).__name__}({numbers})"
 

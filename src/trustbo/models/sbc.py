@@ -90,6 +90,7 @@ def sbc(
                 keys = random.fold_in(random.key(seed), j)[None]
                 drawn = prior_draws(model, awareness, ticks, keys)
                 simulated = {name: np.asarray(values)[0] for name, values in drawn.items()}
+        model.check({name: value[None] for name, value in simulated.items()}, shape[2:])
         batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
         places = None if walks is None else walks.places(model)
         draws, _ = draw_posterior(

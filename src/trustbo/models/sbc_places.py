@@ -7,7 +7,6 @@ from jax import random
 
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
-from trustbo.models.params import assemble_params
 from trustbo.models.place import PlaceEffect, Visited, visited
 from trustbo.models.place_maps import draw_maps, nowhere, scales_of
 from trustbo.models.prior_predictive import draw_sites
@@ -53,7 +52,7 @@ class Walks(NamedTuple):
         no = np.zeros((1, 0))
         known = (no if place.cells else None, no if place.bounds else None)
         maps = draw_maps(scales_of(sites), empty, known[0], known[1], seed + 1)
-        params = assemble_params(sites, model.x0).draw(0)
+        params = model.params(sites, awareness.shape[3]).draw(0)
         params = params._replace(  # pyright: ignore
             **{n: m if m is None else m[0] for n, m in zip(_EFFECTS, maps, strict=True)}
         )

@@ -9,7 +9,7 @@ from trustbo.errors import require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.gram import Statistics
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params, TrustParams, assemble_params
+from trustbo.models.params import Params, TrustParams
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.exact import sample_exact
 from trustbo.models.ticks import add_ticks
@@ -53,7 +53,7 @@ def sample_statistics(
         for name in each[0].params
     }
     return ExactPosterior(
-        assemble_params(sites, model.x0),
+        model.params(sites, statistics[0].n_features),
         max(e.khat for e in each),
         min(e.kish for e in each),
         sum(e.log_evidence for e in each),

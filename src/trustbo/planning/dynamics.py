@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.errors import ShapeError
-from trustbo.models.params import CoupledParams, Params, RobotParams, check_params
+from trustbo.models.params import CoupledParams, DriftParams, Params, RobotParams, check_params
 from trustbo.parallel import plain
 from trustbo.workspace.moves import move_indices, moves_along
 
@@ -103,7 +103,8 @@ def trust_dynamics(
         return Dynamics(transition(params, n_robots), drift(params, z, moves), start, views, sd)
     beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
     # The mean over robots obeys the same equation.
-    z = z.mean(-5, keepdims=True) if n_robots > 1 else z
+    linear = not isinstance(params, DriftParams)
+    z = z.mean(-5, keepdims=True) if n_robots > 1 and linear else z
     u = drift(params, z, moves).mean(-4, keepdims=True)  # robots may differ in effects of places
     start = start.mean(-1, keepdims=True)
     return Dynamics(np.broadcast_to(beta0, (*leading, 1, 1)), u, start, np.eye(1), sd)
@@ -129,6 +130,8 @@ def transition(params: Params, n_robots: int) -> np.ndarray:
 def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None) -> np.ndarray:
     """Increment of trust by one bound, u = sum_m beta_m z_m + b, (..., robot, move, row, col).
 
+    Of `DriftParams`, the values of their drift instead.
+
     Awareness (robot, move, row, col, feature), or with a leading axis (draw,) like the parameters'.
     Effects of places are added, those of bounds for the given `moves`, by default all; or those of
     the bounds of a path, see `Params.along`. ShapeError: other numbers of robots, features, cells
@@ -146,6 +149,9 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
         u = np.einsum("...mai,...idrcm->...adrc", np.asarray(params.B, dtype=float), z)
     elif isinstance(params, RobotParams):
         u = np.einsum("...im,...idrcm->...idrc", np.asarray(params.beta, dtype=float), z)
+    elif isinstance(params, DriftParams):
+        u = _own_drift(params, z)
+        b = np.broadcast_to(b, params.leading)[..., None] if not b.ndim else b[..., None]
     else:
         beta = np.asarray(params.beta, dtype=float)
         u = (
@@ -158,6 +164,15 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
         return u + np.swapaxes(b[..., 0, :, :], -1, -2)[..., None, None, :]
     u += b[..., None, None, None]  # in place: over many draws and cells this is large
     return _with_places(u, params, moves)
+
+
+def _own_drift(params: DriftParams, z: np.ndarray) -> np.ndarray:
+    """Drift by a function of the user's own, (..., robot, move, row, col)."""
+    many, shape = bool(params.leading), z.shape[-4:-1]
+    bounds = np.moveaxis(z, -5, -2)  # (..., move, row, col, robot, feature)
+    bounds = bounds.reshape(*z.shape[:-5], -1, *bounds.shape[-2:])
+    u = np.swapaxes((params.flat() if many else params).drift.values(bounds, many=many), -1, -2)
+    return u.reshape(*params.leading, -1, *shape)
 
 
 def _with_places(u: np.ndarray, params: Params, moves: np.ndarray | None) -> np.ndarray:

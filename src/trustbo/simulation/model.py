@@ -110,8 +110,7 @@ class ModelSimulator(DescribedSimulator):
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""
-        fields = self.params._asdict().items()
-        truth = {n: np.asarray(value).tolist() for n, value in fields if value is not None}
+        truth = {n: np.asarray(value).tolist() for n, value in self.params.by_name.items()}
         about: dict[str, object] = {
             "simulator": type(self).__name__,
             "simulator_model": self.model.describe(),

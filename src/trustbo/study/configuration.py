@@ -34,7 +34,7 @@ class Study:
         terrains: Terrains of the kinds `synthetic`, `files`, `random`.
         policies: Names in `planning.POLICIES`.
         objectives: Names in `planning.OBJECTIVES`.
-        models: Models of the kinds `pooled`, `places`, `hierarchical`, `coupled`.
+        models: Models of the kinds `pooled`, `places`, `hierarchical`, `coupled`, `own`.
         samplers: `"nuts"`, `"exact"`, `"joint"`.
         simulators: Simulators of the kinds `kinematic`, `model`.
         seeds: Seeds, or their number: 0, 1, ...

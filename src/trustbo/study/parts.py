@@ -1,5 +1,6 @@
 """Parts of a study as plain settings: their base, trust models and simulators."""
 
+import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -9,6 +10,7 @@ import numpy as np
 
 from trustbo import models, simulation
 from trustbo.errors import TrustboError, require_choice
+from trustbo.models.model import require_model
 from trustbo.workspace import Workspace
 
 
@@ -142,7 +144,31 @@ class Coupled(Model):
     inter_robot: str = "full"
 
 
-MODELS = (Pooled, Places, Hierarchical, Coupled)
+@dataclass(frozen=True, kw_only=True)
+class Own(Part):
+    """Settings of a trust model of your own: where it is, `"module:name"`."""
+
+    kind, REQUIRED = "own", ("source",)
+    source: str
+
+    def __post_init__(self) -> None:
+        self.model()
+
+    def model(self) -> models.TrustModel:
+        """Import the model."""
+        module, _, name = self.source.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise TrustboError(
+                f"there is no model at {self.source!r}: {error}. Give source as module:name of a "
+                "TrustModel that Python can import."
+            ) from None
+        require_model(found)
+        return found
+
+
+MODELS = (Pooled, Places, Hierarchical, Coupled, Own)
 
 
 class Place(Protocol):

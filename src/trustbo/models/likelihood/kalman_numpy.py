@@ -171,6 +171,7 @@ def _groups(
 ) -> Iterator[_Group]:
     n_missions, longest, n_robots = batch.contact_rate.shape
     n_bounds = np.full(n_missions, longest) if n_bounds is None else n_bounds
+    params = params.with_drift(batch.awareness)
     b, n_draws = np.asarray(params.b), len(params.b)
     of_bounds = b.ndim == 4  # (draw, mission, bound, robot), see `Params.on`
     for members in params.alike(n_robots):

@@ -1,6 +1,6 @@
 """One bound of the Kalman filter under many parameter draws, in NumPy, for `TrustFilter`."""
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from trustbo.models.likelihood import kalman
 from trustbo.models.likelihood.families import Family
 
 if TYPE_CHECKING:
-    from trustbo.models.params import CoupledParams, RobotParams, TrustParams
+    from trustbo.models.params import CoupledParams, DriftParams, RobotParams, TrustParams
 
 Moments = tuple[np.ndarray, np.ndarray]
 Effect = np.ndarray | float
@@ -27,13 +27,14 @@ class Rates(NamedTuple):
 class ApartFilter:
     """Robots that do not influence each other; arrays are (draw, robot)."""
 
-    def __init__(self, params: "TrustParams | RobotParams", lag: float, n_robots: int) -> None:
+    def __init__(
+        self, params: "TrustParams | RobotParams | DriftParams", lag: float, n_robots: int
+    ) -> None:
+        self._p: Any = params
         self._n_robots = n_robots
         columns = (params.beta0, params.b, params.delta_w**2, params.delta_v**2)
         self._beta0, self._b, self._Q, self._R = (p.reshape(len(p), -1) for p in columns)
         self._h = self._beta0 - lag
-        # (draw, robot or 1, feature)
-        self._beta = params.beta.reshape(len(params.b), -1, params.beta.shape[-1])
         self._x0 = params.x0_mean, params.x0_sd
 
     def start(self) -> Moments:
@@ -95,9 +96,16 @@ class ApartFilter:
         return now, family.draw_rates(rng, now, y, sd, _TICKS)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
-        if self._beta.shape[1] == 1:
-            return self._beta[:, 0] @ z.T + self._b
-        return np.einsum("nim,im->ni", self._beta, z) + self._b
+        if self._p.beta.ndim == 2:
+            return self._p.beta @ z.T + self._b
+        return np.einsum("nim,im->ni", self._p.beta, z) + self._b
+
+
+class DriftFilter(ApartFilter):
+    """Robots whose drift is a function of the user's own."""
+
+    def _drift(self, z: np.ndarray) -> np.ndarray:
+        return self._p.drift.values(z[None], many=True)[:, 0] + self._b
 
 
 class CoupledFilter:

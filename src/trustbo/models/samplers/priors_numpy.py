@@ -1,5 +1,7 @@
 """Prior densities, draws and floors in NumPy: compiling them would take longer than using them."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import numpyro.distributions as dist
@@ -31,6 +33,23 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         return _normal(log_x, number(prior, "loc"), number(prior, "scale")) - log_x
     with own_settings():
         return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
+
+
+def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
+    """Quantile of a prior of independent numbers at Phi(score), in JAX; shape of the scores.
+
+    NotImplementedError: it has no quantiles.
+    """
+    one: Any = prior
+    while isinstance(one, dist.Independent | dist.ExpandedDistribution):
+        one = one.base_dist
+    if one.event_shape:
+        raise NotImplementedError
+    if isinstance(one, dist.Normal):  # to the far tails
+        return one.loc + one.scale * score
+    if isinstance(one, dist.LogNormal):
+        return jax.numpy.exp(one.loc + one.scale * score)
+    return one.icdf(jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16))
 
 
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:

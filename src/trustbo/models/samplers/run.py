@@ -11,6 +11,7 @@ from jax import Array, random
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import own_settings
+from trustbo.models.drift import DriftTrust
 from trustbo.models.likelihood.ep.chains import gather_chains
 from trustbo.models.likelihood.gram_jax import spectrum
 from trustbo.models.likelihood.latent import Latents
@@ -19,6 +20,7 @@ from trustbo.models.likelihood.place_rows import gather_rows
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
+from trustbo.models.samplers.drift_target import DriftTarget
 from trustbo.models.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
 from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.models.samplers.importance import ScoreTarget, sample_scores
@@ -144,14 +146,16 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     if sampler != "auto":
         return sampler, "asked for"
     pooling = model.partial_pooling is not None
-    by_scores = model.place or pooling or not model.family.integrates_out
-    reason = model.why_not_exact or why_not_conjugate(model.priors)
+    own = isinstance(model, DriftTrust)
+    by_scores = model.place or pooling or own or not model.family.integrates_out
+    reason = model.why_not_exact or (None if own else why_not_conjugate(model.priors))
     reason = reason or (
         why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
     )
     if reason is None:
         by = "" if model.family.integrates_out else " by expectation propagation, and weights"
-        return "exact", f"trust and coefficients integrate out{by}"
+        what = "trust integrates out" if own else "trust and coefficients integrate out"
+        return "exact", f"{what}{by}"
     return ("nuts" if model.family.integrates_out else "joint"), reason
 
 
@@ -190,6 +194,13 @@ def _sample_scores(
     each = [one.draws for one in found]
     if not _is_even(max(drawn.khat for drawn in each)):
         return None
+    if any(getattr(target, "has_modes", False) for target in targets):
+        warnings.warn(
+            "the posterior has more than one mode, which the exact sampler cannot weigh for a "
+            "drift of your own: NUTS is used instead.",
+            stacklevel=4,
+        )
+        return None
     params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
     summary = _summarize(each)
@@ -213,6 +224,8 @@ def _targets(
         rates = batch.awareness, batch.contact_rate
         rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
         return [PlaceTarget(rows, places, priors, place)]
+    if isinstance(model, DriftTrust):
+        return [DriftTarget(model, batch, weight)]
     if model.partial_pooling is not None:
         return [HierarchicalTarget(model.gather(batch, weight), priors)]
     return [LatentTarget(*gather_chains(family, one), priors) for one in model.robots_of(batch)]

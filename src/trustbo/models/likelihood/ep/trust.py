@@ -119,6 +119,7 @@ class _Group(NamedTuple):
 def _groups(
     family: Family, params: Params, batch: MissionBatch, n_bounds: np.ndarray
 ) -> Iterator[_Group]:
+    params = params.with_drift(batch.awareness)
     n_robots, b = batch.contact_rate.shape[2], np.asarray(params.b)
     of_bounds = b.ndim == 4  # (draw, mission, bound, robot), see `Params.on`
     for members in params.alike(n_robots):
