@@ -95,7 +95,7 @@ class Campaign(LearnedMissions, Displayed):
         chosen = CampaignOptions.of(options, Campaign.__init__)
         self.policy = resolve_policy(policy)
         super().__init__(workspace, chosen, model, sampler, seed)
-        law = self.model.observation, self.model.response
+        law = self.observation, self.model.response
         self.planner = chosen.planner(workspace, start, goal, objective, *law)
         self.awareness = chosen.belief(workspace)
         self._plan: Plan | None = None
@@ -495,7 +495,7 @@ class Campaign(LearnedMissions, Displayed):
         to fail fell below 0.2.
         """
         if self._believed is None:
-            planner = self.planner
+            planner = self.planner.with_observation(self.observation)
             if self.awareness is not None:
                 n_maps = min(_N_MAPS, self.belief.leading[0])
                 maps = self.awareness.draw(n_maps, self.seed_of("awareness"))

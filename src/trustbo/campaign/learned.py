@@ -111,6 +111,12 @@ class LearnedMissions:
         return self._risk
 
     @property
+    def observation(self) -> str:
+        """Family of observations of the belief: the posterior's, or that of the prior at first."""
+        last = self.log.last_tree
+        return self.model.family.name if last is None else last.attrs["observation"]
+
+    @property
     def history(self) -> xr.Dataset:
         """Dataset as `Result.history`; empty before the first mission."""
         return self.log.to_dataset()

@@ -18,6 +18,7 @@ from trustbo.models import (
     params_of,
     sample_prior,
 )
+from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import require_model
 from trustbo.models.params import Params
 from trustbo.models.samplers.run import resolve_sampler
@@ -48,17 +49,17 @@ class Learning:
     def __post_init__(self) -> None:
         require_model(self.model)
         resolve_sampler(self.model, self.sampler)
-        if self.forgetting < 1.0 and (
-            self.update != "refit" or not self.model.family.integrates_out
-        ):
+        gaussian = self.model.family.integrates_out and self.model.observation != AUTO
+        if self.forgetting < 1.0 and not (self.update == "refit" and gaussian):
             raise TrustboError(
                 f'forgetting = {self.forgetting:g} needs update "refit" and Gaussian observations; '
                 f'got "{self.update}" and "{self.model.observation}".'
             )
         if self.update == "moment_matched":
-            if self.model.robot_sets != "all":
+            if self.model.robot_sets != "all" or not gaussian:
                 raise TrustboError(
-                    f'update="moment_matched" is for PooledTrust; got {type(self.model).__name__}.'
+                    f'update="moment_matched" is for PooledTrust of Gaussian rates; got '
+                    f"{self.model.describe()}."
                 )
             warnings.warn(MOMENT_MATCHED_WARNING, stacklevel=5)
 
@@ -85,9 +86,9 @@ class Learning:
         Raises:
             CannotLearnError: Every attempt failed.
         """
-        model, weights = self.model.for_features(missions[0].features), None
+        model, weights = self.model, None
         if self.update == "moment_matched":
-            priors = model.priors
+            priors = model.for_features(missions[0].features).priors
             if last is not None:
                 priors = moment_matched(cast(TrustParams, params_of(last)), priors)
             model, missions = replace(model, priors=priors), missions[-new:]
@@ -127,7 +128,8 @@ class Learning:
         self, initial: str, n_robots: int, features: Sequence[str], seed: int
     ) -> Params:
         """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
-        model, n_features = self.model.for_features(features), len(features)
+        model = self.model.observing("gaussian").for_features(features)
+        n_features = len(features)
         if initial == "prior_mean" and model.priors_are_independent:
             values = model.priors.mean(n_features)
             sizes = model.sizes(n_robots, n_features)

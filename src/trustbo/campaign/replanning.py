@@ -85,7 +85,7 @@ def _live(campaign: Campaign) -> TrustFilter | None:
         return None
     model = campaign.model
     return TrustFilter(
-        params_of(last), n_robots, response=model.response, observation=model.observation
+        params_of(last), n_robots, response=model.response, observation=campaign.observation
     )
 
 

@@ -129,9 +129,10 @@ class Result(Displayed):
             )
         options = CampaignOptions(**{name: self.settings[name] for name in names})
         start, goal = (_cell(self.settings[name]) for name in ("start", "goal"))
-        law = [
-            self.settings.get(n, d) for n, d in (("observation", "gaussian"), ("response", "level"))
-        ]
+        law = (
+            self.posterior.attrs.get("observation", "gaussian"),
+            self.settings.get("response", "level"),
+        )
         objective = self.settings["objective"]
         planner = options.planner(self.workspace, start, goal, objective, *law)
         if "hazard" in self.posterior.children:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
+from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.place import Visited, bounds_of, visited
 from trustbo.models.place_maps import place_group
@@ -92,6 +93,7 @@ def fit(
     model = PooledTrust() if model is None else model
     require_model(model)
     batch = stack_missions(missions)
+    model, family_reason = _of_rates(model, batch, weighted=weights is not None)
     model = model.for_features(missions[0].features)
     chosen, reason = resolve_sampler(model, sampler)
     places = _places(model, missions, batch, workspace)
@@ -120,6 +122,7 @@ def fit(
         **model.options(),
         "place": "none" if model.place is None else json.dumps(model.place.to_record()),
         "model_record": json.dumps(model_to_record(model)),
+        "observation_reason": family_reason,
         "sampler": draws.sampler,
         "sampler_reason": reason if draws.sampler == chosen else "weights were too uneven",
         "seed": seed,
@@ -147,6 +150,13 @@ def fit(
             "Give more missions or firmer priors, or pass check=False to have it as it is.",
         )
     return posterior
+
+
+def _of_rates(model: TrustModel, batch: MissionBatch, *, weighted: bool) -> tuple[TrustModel, str]:
+    """Model of the family that suits the rates, and why; weights are for Gaussian ones."""
+    if weighted and model.observation == AUTO:
+        return model.observing("gaussian"), "missions have weights"
+    return model.for_rates(batch)
 
 
 def _places(

@@ -49,6 +49,7 @@ def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> 
         recorded = model or model_from_record(json.loads(posterior.attrs["model_record"]))
     except (KeyError, TrustboError):  # of an older version, or with priors of the user's own
         return None
+    recorded = recorded.observing(posterior.attrs["observation"])
     draws = posterior["posterior"].to_dataset()
     if "feature" in draws:
         recorded = recorded.for_features([str(name) for name in draws["feature"].values])

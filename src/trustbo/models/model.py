@@ -23,7 +23,7 @@ from trustbo.models.likelihood.contact_rate import (
     mission_log_likelihood,
     simulate_missions,
 )
-from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.likelihood.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import PlaceEffect, bounds_of
@@ -47,7 +47,7 @@ class TrustModel(Displayed, ABC):
             names of the features, see `Priors.of`.
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
-            trust being a logit.
+            trust being a logit; `"auto"`: that which suits the rates of a fit, see `for_rates`.
         response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
         place: Effects of places beyond what awareness says of them; None is the paper's model.
 
@@ -62,7 +62,7 @@ class TrustModel(Displayed, ABC):
     place: PlaceEffect | None = None
 
     def __post_init__(self) -> None:
-        require_choice("observation", self.observation, FAMILIES)
+        require_choice("observation", self.observation, (AUTO, *FAMILIES))
         require_choice("response", self.response, RESPONSES)
         if self.lag and not self.family.allows_change:
             raise TrustboError(
@@ -175,7 +175,31 @@ class TrustModel(Displayed, ABC):
         """
         if self.priors is not Priors.default(self.observation) or self.lag:
             return self
+        if self.observation == AUTO:  # of the fit's family, which is not known yet
+            return self
         return replace(self, priors=Priors.of(tuple(features), self.observation))
+
+    def for_rates(self, batch: MissionBatch) -> tuple[Self, str]:
+        """The model with the family of observations that suits measured rates, and the reason.
+
+        With `observation="auto"`: counts of ticks, or censored rates where ticks are not known, if
+        5 % of the rates are 0 or 1; else Gaussian ones, and too where the exact sampler treats the
+        model with these alone. Any other model as it is.
+        """
+        if self.observation != AUTO:
+            return self, "asked for"
+        name, reason = choose(batch.contact_rate, batch.n_ticks, change=self.lag > 0.0)
+        chosen = self.observing(name)
+        if chosen.why_not_exact and not self.why_not_exact:
+            return self.observing("gaussian"), f"{reason}, but {chosen.why_not_exact}"
+        return chosen, reason
+
+    def observing(self, observation: str) -> Self:
+        """The model of rates of that family, if its own is `"auto"`, else as it is."""
+        if self.observation != AUTO:
+            return self
+        own = self.priors is not Priors.default(AUTO)
+        return replace(self, observation=observation, priors=self.priors if own else None)
 
     def at_resolution(self, ticks: Mapping[float, float]) -> Self:
         """The model whose delta_v is no less than the resolution of rates of so many ticks.
@@ -219,7 +243,7 @@ class TrustModel(Displayed, ABC):
     @property
     def family(self) -> Family:
         """The family of observations."""
-        return FAMILIES[self.observation]
+        return family_of(self.observation)
 
     @property
     def x0(self) -> dict[str, float]:

@@ -17,7 +17,7 @@ from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.floored import Floored
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.likelihood.families import family_of
 from trustbo.models.samplers.priors_numpy import floored, log_prob
 
 _SCALES = ("delta_w", "delta_v", "tau")
@@ -134,7 +134,7 @@ class Priors(Displayed):
         default, n = cls.default(observation), max(int(is_sight.sum()), 1)
         if not is_sight.any():
             return default
-        unit, centre = FAMILIES[observation].line_of_sight
+        unit, centre = family_of(observation).line_of_sight
         with own_settings():
             sd = np.where(is_sight, 0.3 / np.sqrt(n), 0.25)
             return replace(
@@ -210,7 +210,7 @@ class Priors(Displayed):
 
 @cache
 def _default(observation: str) -> Priors:
-    return Priors(**FAMILIES[observation].priors())
+    return Priors(**family_of(observation).priors())
 
 
 def _flatten(priors: Priors) -> tuple[tuple[object, ...], bool]:

@@ -179,6 +179,14 @@ class Planner(Displayed):
         """Return the planner with other awareness of cells; see `PlanningProblem`."""
         return self._with(self.problem.with_awareness(awareness, mean))
 
+    def with_observation(self, observation: str) -> Self:
+        """Return the planner for contact rates of another family, see `Planner`."""
+        family = FAMILIES[require_choice("observation", observation, FAMILIES)]
+        objective = self.problem.objective._replace(family=family)
+        other = self._with(replace(self.problem, objective=objective))
+        other.family = family
+        return other
+
     def with_risk(
         self,
         p_fail: ArrayLike | None,

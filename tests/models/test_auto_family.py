@@ -1,0 +1,101 @@
+"""Families of observations chosen by the rates."""
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, fit
+from trustbo.simulation import KinematicSimulator
+
+PATH = [(2, 0), (1, 1), (0, 2)]
+
+
+def missions(share, *, ticks=True, n=10):
+    """Missions of which a share of the rates is exactly 1."""
+    rng = np.random.default_rng(0)
+    rates = np.round(rng.uniform(0.3, 0.9, n * 4), 2)
+    rates[: round(share * len(rates))] = 1.0
+    z = rng.uniform(size=(n, 2, 2, 1))
+    more = {"n_ticks": np.full((2, 2), 100)} if ticks else {}
+    return [
+        tb.Mission.from_arrays(PATH, z[j], of, **more)
+        for j, of in enumerate(rates.reshape(n, 2, 2))
+    ]
+
+
+@pytest.mark.parametrize(
+    ("share", "ticks", "family", "reason"),
+    [
+        (0.0, True, "gaussian", "0% of the rates are 0 or 1"),
+        (0.025, True, "gaussian", "2% of the rates are 0 or 1"),
+        (0.1, True, "beta_binomial", "10% of the rates are 0 or 1, and ticks are known"),
+        (0.1, False, "censored", "10% of the rates are 0 or 1"),
+    ],
+)
+def test_the_rates_choose_the_family_and_the_posterior_says_why(share, ticks, family, reason):
+    some = missions(share, ticks=ticks)
+    posterior = fit(some, PooledTrust(observation="auto"), n_draws=50)
+    assert posterior.attrs["observation"] == family
+    assert posterior.attrs["observation_reason"] == reason
+    asked = fit(some, PooledTrust(observation=family), n_draws=50)
+    assert asked.attrs["observation_reason"] == "asked for"
+    for group in ("posterior", "log_prior", "log_likelihood", "prior"):
+        assert (
+            posterior[group]
+            .to_dataset()
+            .drop_attrs()
+            .identical(asked[group].to_dataset().drop_attrs())
+        )
+
+
+def test_the_exact_sampler_and_weights_come_first():
+    some = missions(0.5)
+    posterior = fit(some, HierarchicalTrust(observation="auto"), n_draws=50)
+    assert posterior.attrs["sampler"] == "exact"
+    assert posterior.attrs["observation"] == "gaussian"
+    assert "but its robots are partially pooled" in posterior.attrs["observation_reason"]
+    weighted = fit(some, PooledTrust(observation="auto"), weights=np.full(10, 0.5), n_draws=50)
+    assert weighted.attrs["observation_reason"] == "missions have weights"
+    change = PooledTrust(observation="auto", response="change")
+    assert fit(missions(0.0), change, n_draws=50).attrs["observation"] == "gaussian"
+
+
+def test_priors_of_one_s_own_are_kept():
+    own = Priors(x0_sd=0.1)
+    model = PooledTrust(own, observation="auto").observing("censored")
+    assert model.priors is own
+    assert PooledTrust(observation="auto").observing("censored").priors is Priors.default(
+        "censored"
+    )
+
+
+def test_a_campaign_plans_for_the_family_of_its_posterior(tmp_path):
+    """Over bare ground, many bounds are in sight all the time."""
+    terrain = tb.terrain.synthetic_terrain((120.0, 120.0), seed=5)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3), sight="bare")
+    model = PooledTrust(observation="auto")
+    with tb.Campaign(workspace, (2, 0), (0, 2), model=model, directory=tmp_path / "c") as campaign:
+        assert campaign.planner_now().family.name == "gaussian"
+        mission = KinematicSimulator(workspace).run(campaign.ask().path, seed=0)
+        assert (mission.contact_rate == 1.0).mean() > 0.05
+        campaign.tell(mission)
+        assert campaign.posterior.attrs["observation"] == "beta_binomial"
+        assert campaign.planner_now().family.name == "beta_binomial"
+        plan = campaign.ask()
+        result = campaign.result()
+        assert result.planner.family.name == "beta_binomial"
+    with tb.Campaign.load(tmp_path / "c") as again:
+        assert again.model == model
+        assert again.ask().path == plan.path
+        assert again.planner_now().family.name == "beta_binomial"
+
+
+def test_what_is_for_gaussian_rates_refuses_it():
+    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.5))
+    model = PooledTrust(observation="auto")
+    with pytest.raises(tb.TrustboError, match='needs update "refit" and Gaussian observations'):
+        tb.Campaign(workspace, (2, 0), (0, 2), model=model, forgetting=0.9)
+    with pytest.raises(tb.TrustboError, match="is for PooledTrust of Gaussian rates; got Pooled"):
+        tb.Campaign(workspace, (2, 0), (0, 2), model=model, update="moment_matched")
+    with pytest.raises(tb.TrustboError, match="unknown observation 'normal'; choose one of auto"):
+        CoupledTrust(observation="normal")
