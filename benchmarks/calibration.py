@@ -9,15 +9,38 @@ import sys
 import time
 from pathlib import Path
 
-from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, sbc
+import jax.numpy as jnp
+from numpyro.distributions import HalfNormal, LogNormal, Normal
+
+from trustbo.models import (
+    CoupledTrust,
+    DriftTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    sbc,
+)
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
+
+
+OWN = {
+    "top": HalfNormal(1.0),
+    "slope": LogNormal(1.0, 0.7),
+    "own": (Normal(0.0, 0.3), "robot"),
+}
+
+
+def saturating(z, top, slope, own):
+    """A drift of the user's own: sight that saturates, and a weight of each robot."""
+    return top * (1.0 - jnp.exp(-slope * z[:, 0])) + own * z[:, 1]
 
 
 def cases():
     """Model, sampler, data sets, shape."""
     yield PooledTrust(), "exact", 1000, (4, 8, 3, 2)
     yield CoupledTrust(inter_robot="none"), "exact", 200, SMALL
+    yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     for sampler, n in (("exact", 300), ("nuts", 50)):
         yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
     for observation in ("gaussian", "censored", "beta_binomial"):

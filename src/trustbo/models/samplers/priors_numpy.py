@@ -45,11 +45,11 @@ def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
         one = one.base_dist
     if one.event_shape:
         raise NotImplementedError
-    if isinstance(one, dist.Normal):  # to the far tails
-        return one.loc + one.scale * score
-    if isinstance(one, dist.LogNormal):
-        return jax.numpy.exp(one.loc + one.scale * score)
-    return one.icdf(jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16))
+    if isinstance(prior := one, dist.Normal | dist.LogNormal):  # to the far tails
+        line = jax.numpy.asarray(prior.loc) + jax.numpy.asarray(prior.scale) * score
+        return line if isinstance(prior, dist.Normal) else jax.numpy.exp(line)
+    share = jax.numpy.clip(jax.scipy.special.ndtr(score), 1e-300, 1.0 - 1e-16)
+    return jax.numpy.asarray(one.icdf(share))
 
 
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:
