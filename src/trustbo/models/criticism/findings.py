@@ -112,14 +112,15 @@ def _shift(found: Innovations, column: np.ndarray) -> str:
 
 def verdict_of(fault: str, table: pd.DataFrame) -> str:
     """Verdict in words from the rows of the checks."""
-    tested = table[table["p_adjusted"].notna()]
+    checks = [str(name) for name in table.index]
+    adjusted, after = (table[name].to_numpy(dtype=float) for name in ("p_adjusted", "p_after"))
+    n = int(np.isfinite(adjusted).sum())
     if fault == "none":
-        return f"no fault is found by {len(tested)} checks, at a level of 5 % for all together."
-    others = tested[(tested["p_adjusted"] <= _LEVEL) & (tested.index != fault)]
-    verdict = f"{fault}: {table.loc[fault, 'finding']}"
-    known = others[others["p_after"].notna()]
-    gone = [str(name) for name in known.index[known["p_after"] * len(known) > _LEVEL]]
-    left = [str(name) for name in others.index if name not in gone]
+        return f"no fault is found by {n} checks, at a level of 5 % for all together."
+    verdict = f"{fault}: {table['finding'].to_numpy()[checks.index(fault)]}"
+    others = [i for i, p in enumerate(adjusted) if p <= _LEVEL and checks[i] != fault]
+    gone = [checks[i] for i in others if after[i] * len(others) > _LEVEL]
+    left = [checks[i] for i in others if not after[i] * len(others) > _LEVEL]
     if gone:
         verdict += f" It explains what is found under {_listed(gone)}."
     if left:

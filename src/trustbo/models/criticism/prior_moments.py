@@ -1,5 +1,6 @@
 """Test of the prior of coefficients against what the rates alone say of them."""
 
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +44,7 @@ def coefficients_of(
         field, _, rest = name.partition("[")
         if field not in fields:
             continue
-        where = tuple(int(i) for i in rest.rstrip("]").split("][")) if rest else ()
+        where: tuple[int, ...] = tuple(map(int, re.findall(r"\d+", rest)))
         own = field != "b" and (not coupled or where[1] == where[2])
         label = name
         if field != "b":

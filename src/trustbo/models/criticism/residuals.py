@@ -48,19 +48,24 @@ def groups_of(
 
     `band` is the half-width of the simultaneous 95 % band of all groups of a kind.
     """
-    edges = np.quantile(rates["expected"], np.linspace(0.0, 1.0, _N_CLASSES + 1)[1:-1])
+    expected = rates["expected"].to_numpy()
+    edges = np.quantile(expected, np.linspace(0.0, 1.0, _N_CLASSES + 1)[1:-1])
     names, columns = cell_columns(missions, data)
-    classes = np.searchsorted(edges, rates["expected"])
-    levels = rates["expected"].groupby(classes).mean()
-    kinds = {name: pd.factorize(rates[name], sort=True) for name in ("mission", "bound", "robot")}
-    kinds["cell"] = columns[data.seen].argmax(1), pd.Index(names, tupleize_cols=False)
-    kinds["contact"] = np.searchsorted(levels.index, classes), levels.round(2).to_numpy()
+    classes, of_class = np.unique(np.searchsorted(edges, expected), return_inverse=True)
+    levels = [round(float(expected[of_class == c].mean()), 2) for c in range(len(classes))]
+    kinds: dict[str, tuple[np.ndarray, list]] = {}
+    for name in ("mission", "bound", "robot"):
+        labels, index = np.unique(rates[name].to_numpy(), return_inverse=True)
+        kinds[name] = index, labels.tolist()
+    kinds["cell"] = columns[data.seen].argmax(1), names
+    kinds["contact"] = of_class, levels
     rows = []
     for kind, (index, labels) in kinds.items():
         member = index == np.arange(len(labels))[:, None]
         n = member.sum(1)
         means = member @ found.e / np.maximum(n, 1)[:, None]
-        sd = np.maximum(means[:, 1:].std(1), 1e-12)
+        # Where parameters leave next to no residual, as at first bounds, it does not stand out.
+        sd = np.maximum(means[:, 1:].std(1), 0.2 / np.sqrt(np.maximum(n, 1)))
         reach = np.quantile(np.abs(means[:, 1:] / sd[:, None]).max(0), PROBABILITY)
         rows += [
             (kind, label, int(n[g]), means[g, 0], reach * sd[g])
@@ -68,7 +73,8 @@ def groups_of(
             if n[g]
         ]
     groups = pd.DataFrame(rows, columns=["kind", "group", "n", "mean", "band"])
-    return groups.assign(stands_out=groups["mean"].abs() > groups["band"])
+    outside = np.abs(groups["mean"].to_numpy()) > groups["band"].to_numpy()
+    return groups.assign(stands_out=outside)
 
 
 def curves_of(
@@ -98,7 +104,7 @@ def curves_of(
     curves["autocorrelation"] = ("lag", np.array(products))
     levels = full.sum((1, 2)) / np.sqrt(np.maximum(there.sum((1, 2)), 1.0))
     apart = range(1, min(_N_LAGS, shape[0] - 1) + 1)
-    between = [(levels[lag:] * levels[:-lag]).mean(0) for lag in apart]
+    between = [(levels[lag:] * levels[:-lag]).mean(0) / (levels**2).mean(0) for lag in apart]
     curves["autocorrelation_missions"] = ("mission_lag", np.array(between))
     ahead = _one_mission_ahead(data, found, coefficients, draws)
     later = mission > 0

@@ -23,6 +23,8 @@ from trustbo.models.criticism.departures import Departure
 from trustbo.models.criticism.joint_normal import Data, Normal, Point, joint_normal, varied
 
 _LEVEL = 0.05
+_LEAST = -700.0  # logarithm of the least p
+_NORMAL = 0.02  # skewness below which a quadratic form is taken as normal
 _RANK = 1e-6  # of a column's norm, below which nuisances explain it
 
 
@@ -118,7 +120,7 @@ class Innovations:
         if not Q.shape[1]:
             return np.zeros((2, self.e.shape[1]))
         statistic = ((Q.T @ self.e) ** 2).sum(0)
-        return np.array([statistic, stats.chi2.logsf(statistic, Q.shape[1])])
+        return np.array([statistic, np.maximum(stats.chi2.logsf(statistic, Q.shape[1]), _LEAST)])
 
     def _source(self, U: np.ndarray) -> np.ndarray:
         of = self.noises
@@ -131,8 +133,9 @@ class Innovations:
         square = W @ W
         var = 2.0 * np.trace(square) + 4.0 * v @ v
         third = 8.0 * (square * W).sum() + 24.0 * v @ W @ v
-        z = forms / np.sqrt(var)
-        return np.array([z, stats.pearson3.logsf(z, max(third / var**1.5, 1e-3))])
+        z, skewness = forms / np.sqrt(var), third / var**1.5
+        law = stats.pearson3(skewness) if skewness > _NORMAL else stats.norm()
+        return np.array([z, np.maximum(law.logsf(z), _LEAST)])
 
 
 class Noises(NamedTuple):

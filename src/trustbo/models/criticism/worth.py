@@ -1,6 +1,7 @@
 """Worth of the parts of a model: LOO with and without each, and the sensitivity to priors."""
 
 import json
+import logging
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import xarray as xr
-from arviz_stats import psense_summary
+from arviz_stats.psense import psense_summary
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
@@ -68,10 +69,10 @@ def _rows(
     if len(missions[0].robots) > 1:
         shared = {"priors": model.priors, "response": model.response, "place": model.place}
         if isinstance(model, PooledTrust):
-            wider = HierarchicalTrust(**shared), "with coefficients of their own"
+            wider, how = HierarchicalTrust(**shared), "with coefficients of their own"
         else:
-            wider = PooledTrust(**shared), "with shared coefficients"
-        others["robots"] = missions, *wider
+            wider, how = PooledTrust(**shared), "with shared coefficients"
+        others["robots"] = missions, wider, how
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of single influential missions, by k-hat
         own = loo(posterior)
@@ -99,7 +100,13 @@ def _sensitivity(posterior: xr.DataTree) -> tuple[float, float, str]:
         return np.nan, np.nan, "its sensitivity is not known: no log_prior of this model."
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        found = psense_summary(posterior)
+        logger = logging.getLogger("arviz_stats")
+        level = logger.level
+        logger.setLevel(logging.ERROR)  # it says at length that it found something
+        try:
+            found = psense_summary(posterior)
+        finally:
+            logger.setLevel(level)
     names = [str(name) for name in found.index]
     by_prior, by_rates = (found[name].to_numpy(dtype=float) for name in ("prior", "likelihood"))
     sensitive = [name for name, d in zip(names, by_prior, strict=True) if d > _SENSITIVE]
