@@ -42,6 +42,7 @@ def main() -> None:
     }
     for name, axes in drawn.items():
         save(axes[0].figure, name)
+    save(criticism(), "criticism")
     save(long_campaigns(), "long_campaigns")
     film = plots.animate_mission(result.missions[-1], workspace)
     contact = np.concatenate([bound.contact for bound in result.missions[-1].bounds])
@@ -49,6 +50,14 @@ def main() -> None:
     film._draw_frame(divided[len(divided) // 2])  # matplotlib has no public way to one frame
     film._draw_was_started = True
     save(film._fig, "animate_mission")
+
+
+def criticism() -> Figure:
+    """Criticism of the first example of docs/howto/criticise.md."""
+    page = (FIGURES.parent / "howto" / "criticise.md").read_text()
+    namespace: dict = {}
+    exec(page.split("```python\n")[1].split("```")[0], namespace)
+    return plots.criticism(namespace["found"])[0].figure
 
 
 def long_campaigns() -> Figure:

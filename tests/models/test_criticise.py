@@ -214,7 +214,7 @@ def test_what_cannot_be_criticised_says_why(with_places, planted):
         criticise(alone)
     first = planted("none")[0]
     short = replace(first, path=first.path[:5], bounds=first.bounds[:4])
-    with pytest.raises(TrustboError, match="12 rates are too few to criticise 8 parameters"):
+    with pytest.raises(TrustboError, match="12 rates are too few to criticise 9 parameters"):
         criticise(posterior, [short])
     with pytest.raises(TrustboError, match="2475 rates are more than the 2000"):
         criticise(posterior, planted("none") * 5)

@@ -115,8 +115,11 @@ def curves_of(
     for name, (axis, values) in curves.items():
         if not len(values):
             continue
-        centre, sd = values[:, 1:].mean(1), np.maximum(values[:, 1:].std(1), 1e-12)
-        reach = np.quantile((np.abs(values[:, 1:] - centre[:, None]) / sd[:, None]).max(0), 0.95)
+        # beta0 and the noises leave next to no autocorrelation at the first lags.
+        least = 0.5 / np.sqrt(len(e)) if name == "autocorrelation" else 1e-12
+        centre, sd = values[:, 1:].mean(1), np.maximum(values[:, 1:].std(1), least)
+        far = np.abs(values[:, 1:] - centre[:, None]) / sd[:, None]
+        reach = np.quantile(far.max(0), PROBABILITY)
         variables[name] = (axis, values[:, 0])
         variables[f"{name}_low"] = (axis, centre - reach * sd)
         variables[f"{name}_high"] = (axis, centre + reach * sd)
