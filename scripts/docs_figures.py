@@ -30,6 +30,7 @@ def main() -> None:
         elif plt.get_fignums():
             save(plt.gcf(), name)
             plt.close("all")
+    save(criticism(), "criticism")
     save(long_campaigns(), "long_campaigns")
     result = names["result"]
     film = plots.animate_mission(result.missions[-1], result.workspace)
@@ -38,6 +39,14 @@ def main() -> None:
     film._draw_frame(divided[len(divided) // 2])  # matplotlib has no public way to one frame
     film._draw_was_started = True
     save(film._fig, "animate_mission")
+
+
+def criticism() -> Figure:
+    """Criticism of the first example of docs/howto/criticise.md."""
+    page = (FIGURES.parent / "howto" / "criticise.md").read_text()
+    namespace: dict = {}
+    exec(page.split("```python\n")[1].split("```")[0], namespace)
+    return plots.criticism(namespace["found"])[0].figure
 
 
 def long_campaigns() -> Figure:

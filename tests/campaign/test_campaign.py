@@ -164,7 +164,9 @@ def test_the_later_code_s_updating_is_offered_with_a_warning(workspace):
 
 
 def test_what_cannot_be_planned_or_updated_with_is_refused_at_once(workspace):
-    with pytest.raises(TrustboError, match='"moment_matched" is for PooledTrust of Gaussian rates; got Coupled'):
+    with pytest.raises(
+        TrustboError, match='"moment_matched" is for PooledTrust of Gaussian rates; got Coupled'
+    ):
         Campaign(workspace, *ENDS, model=CoupledTrust(), update="moment_matched")
     with pytest.raises(TrustboError, match="unknown awareness 'guess'; choose one of map, belief"):
         Campaign(workspace, *ENDS, awareness="guess")

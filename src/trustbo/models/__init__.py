@@ -5,6 +5,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 # isort: split
 from trustbo.models.by_rate import by_rate
 from trustbo.models.coupled import CoupledTrust
+from trustbo.models.criticise import Criticism, criticise
 from trustbo.models.drift import DriftTrust
 from trustbo.models.exposures import CAUSES, LostMission
 from trustbo.models.filter import TrustFilter, TrustForecast, TrustState
@@ -39,6 +40,7 @@ __all__ = [
     "ContactRate",
     "CoupledParams",
     "CoupledTrust",
+    "Criticism",
     "DriftParams",
     "DriftTrust",
     "ExactPosterior",
@@ -57,6 +59,7 @@ __all__ = [
     "TrustState",
     "by_rate",
     "complete",
+    "criticise",
     "diagnostics",
     "fit",
     "fit_hazard",

@@ -45,14 +45,14 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
 
 def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> xr.Dataset | None:
     """Group `log_prior` of a posterior; None where its model is not given and not on record."""
+    draws = posterior["posterior"].to_dataset()
+    features = [str(name) for name in draws["feature"].values]
     try:
-        recorded = model or model_from_record(json.loads(posterior.attrs["model_record"]))
+        record = json.loads(posterior.attrs["model_record"])
+        recorded = model or model_from_record(record, features=features)
     except (KeyError, TrustboError):  # of an older version, or with priors of the user's own
         return None
-    recorded = recorded.observing(posterior.attrs["observation"])
-    draws = posterior["posterior"].to_dataset()
-    if "feature" in draws:
-        recorded = recorded.for_features([str(name) for name in draws["feature"].values])
+    recorded = recorded.observing(posterior.attrs["observation"]).for_features(features)
     sites = {str(n): a.transpose("chain", "draw", ...).values for n, a in draws.items()}
     densities = log_prior(recorded, sites)
     index = {"chain": draws["chain"], "draw": draws["draw"]}

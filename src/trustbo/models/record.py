@@ -1,5 +1,6 @@
 """A model's settings as a record that JSON can hold, and the model again."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,9 +27,12 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
     return own | ({"by_feature": True} if by_feature else {})
 
 
-def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -> TrustModel:
+def model_from_record(
+    record: dict[str, Any], given: TrustModel | None = None, features: Sequence[str] = ()
+) -> TrustModel:
     """Model of a record; one with priors or a class of the user's own has to be given again.
 
+    `features` are those that a posterior has, whose default priors its model may have.
     TrustboError: it has to be given and was not, or another was given.
     """
     record = {"place": None, **record}  # version 0.1 had none
@@ -44,7 +48,8 @@ def model_from_record(record: dict[str, Any], given: TrustModel | None = None) -
     place = None if record["place"] is None else PlaceEffect(**record["place"])
     if kind is not None:
         fixed = replace(Priors.default(record["observation"]))
-        for priors in (None, fixed, Priors.zheng2023()):
+        of_features = Priors.of(features, record["observation"])
+        for priors in (None, fixed, of_features, Priors.zheng2023()):
             model = kind(priors=priors, place=place, **options)  # pyright: ignore
             if model_to_record(model) == record:
                 return model

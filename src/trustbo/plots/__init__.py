@@ -3,6 +3,7 @@
 from trustbo.plots.animation import animate_mission
 from trustbo.plots.calibration import calibration
 from trustbo.plots.campaign import campaign_history, parameter_history
+from trustbo.plots.criticism import criticism
 from trustbo.plots.explorer import Explorer
 from trustbo.plots.maps import (
     cell_map,
@@ -20,8 +21,8 @@ from trustbo.plots.regret import regret_curves
 from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
-    "Explorer", "animate_mission", "calibration", "campaign_history", "cell_map", "draw_path",
-    "draw_scale", "hazard_map", "loadings", "mission_trust", "parameter_history", "path_posterior",
-    "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps", "terrain_maps",
-    "trust_maps",
+    "Explorer", "animate_mission", "calibration", "campaign_history", "cell_map", "criticism",
+    "draw_path", "draw_scale", "hazard_map", "loadings", "mission_trust", "parameter_history",
+    "path_posterior", "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps",
+    "terrain_maps", "trust_maps",
 ]  # fmt: skip

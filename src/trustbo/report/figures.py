@@ -6,7 +6,7 @@ import numpy as np
 
 from trustbo import plots
 from trustbo.campaign.result import Result
-from trustbo.models import params_of, place_maps
+from trustbo.models import Criticism, params_of, place_maps
 from trustbo.models.posterior_tree import labelled_draws
 from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
@@ -188,6 +188,21 @@ def parameters(result: Result) -> Picture | None:
         f"{counted(len(result.posteriors), 'mission')}. The table has the numbers.",
         caption,
         phone_columns=2,
+    )
+
+
+def criticism(found: Criticism) -> Picture:
+    """Draw what the criticism of the model looked at."""
+    odd = found.groups.loc[found.groups["stands_out"].to_numpy(), :]
+    said = f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
+    return picture(
+        lambda n_columns: plots.criticism(found, n_columns=n_columns),
+        "Nine panels: adjusted p of each test, PIT, coverage, autocorrelation, and mean residuals "
+        f"by mission, bound, robot, expected contact and cell; {said}. The table has the tests.",
+        "Tests (hollow: once the named fault is accounted for), predictions and mean residuals. "
+        "Grey bands hold a whole panel with 95 % where the model is right; red is outside.",
+        phone_columns=1,
+        shrink=True,
     )
 
 

@@ -10,6 +10,7 @@ import jinja2
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_file, write_text
+from trustbo.models import criticise
 from trustbo.report import figures, tables
 from trustbo.report.blocks import Picture, Section, Table
 from trustbo.report.numbers import counted
@@ -98,6 +99,7 @@ def _sections(result: Result) -> Iterator[Section]:
         _meaning_of_parameters(result),
         [block for block in _learned(result) if block is not None],
     )
+    yield _criticism(result)
     yield Section(
         "last",
         "Trust along the last mission",
@@ -112,6 +114,17 @@ def _sections(result: Result) -> Iterator[Section]:
 
 def _learned(result: Result) -> tuple[Picture | None, Table]:
     return figures.parameters(result), tables.parameter_table(result)
+
+
+def _criticism(result: Result) -> Section:
+    """Section of the model's criticism, or of the reason why there is none."""
+    try:
+        found = criticise(result.posterior, result.missions, compare=False)
+    except TrustboError as error:
+        return Section("criticism", "Criticism of the model", f"Not made: {error}", [])
+    said = found.verdict[0].upper() + found.verdict[1:]
+    blocks = [figures.criticism(found), tables.criticism_table(found)]
+    return Section("criticism", "Criticism of the model", said, blocks)
 
 
 def _meaning_of_parameters(result: Result) -> str:

@@ -6,6 +6,7 @@ from arviz_stats import sampling_diagnostics
 
 from trustbo.campaign.result import Result
 from trustbo.files import to_json
+from trustbo.models import Criticism
 from trustbo.models.posterior_tree import labelled_draws
 from trustbo.report.blocks import Table
 from trustbo.report.numbers import NONE, cell_text, decimals_for, number
@@ -90,6 +91,28 @@ def history_table(result: Result) -> Table:
         rows,
         text_columns=(1, 4),
     )
+
+
+def criticism_table(found: Criticism) -> Table:
+    """Tabulate the tests of a criticism."""
+    table = found.table
+    p, after = (map(_p, table[name].to_numpy(dtype=float)) for name in ("p_adjusted", "p_after"))
+    words = (map(str, each) for each in (table.index, table["label"], table["finding"]))
+    names, labels, findings = words
+    rows = list(zip(names, labels, p, after, findings, strict=True))
+    return Table(
+        "Tests of what may be wrong with the model: the label with the strongest evidence, p "
+        "adjusted for the number of tests, and p once the fault that is named is accounted for.",
+        ("check", "label", "adjusted p", "p after", "finding"),
+        rows,
+        text_columns=(1, 4),
+    )
+
+
+def _p(value: float) -> str:
+    if np.isnan(value):
+        return NONE
+    return "< .001" if value < 0.001 else number(value, 3)
 
 
 def settings_table(result: Result) -> Table:

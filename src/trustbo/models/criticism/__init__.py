@@ -1,0 +1,1 @@
+"""Tests of a fitted trust model against what may be wrong with it."""

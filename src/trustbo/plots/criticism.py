@@ -1,0 +1,148 @@
+"""Figure of a criticism: tests, residuals and coverage of a fitted model."""
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
+
+from trustbo.models import Criticism
+from trustbo.plots.layout import as_text, colour_bar, plain, small_multiples
+from trustbo.plots.places import BETTER_WORSE
+
+_LEVEL = 0.05
+_LEAST_P = 1e-6
+"""Smallest p that is told from others."""
+_BAND, _ODD = "0.88", "#c1272d"
+_KINDS = ("mission", "bound", "robot", "contact")
+
+
+def criticism(found: Criticism, *, n_columns: int | None = None) -> np.ndarray:
+    """Draw what a criticism looked at.
+
+    Tests with their adjusted p, and once the fault that is named is accounted for (hollow); the
+    distribution of PIT values less the uniform one; coverage one mission ahead; autocorrelation;
+    and mean standardised residuals by mission, bound, robot, class of expected contact rate and
+    cell, there in units of the band. Grey bands hold a whole panel with a probability of 95 % where
+    the model is right; what lies outside is red, and framed on the map of cells.
+
+    Args:
+        found: Criticism of `models.criticise`.
+        n_columns: Panels per row, by default three.
+
+    Returns:
+        Axes, shape (9,).
+    """
+    _, _, panels = small_multiples(9, n_columns, (2.9, 2.4))
+    tests, pit, cover, correlation, *groups, cells = panels
+    _draw_tests(tests, found)
+    _draw_curves(pit, cover, correlation, found.curves)
+    for ax, kind in zip(groups, _KINDS, strict=True):
+        _draw_groups(ax, found, kind)
+    _draw_cells(cells, found)
+    for ax in panels:
+        plain(ax)
+    return panels
+
+
+def _draw_tests(ax: Axes, found: Criticism) -> None:
+    table = found.table.loc[np.isfinite(found.table["p_adjusted"].to_numpy(dtype=float)), :]
+    p, after = (
+        np.maximum(table[name].to_numpy(dtype=float), _LEAST_P)
+        for name in ("p_adjusted", "p_after")
+    )
+    y = np.arange(len(table))[::-1]
+    names = [str(name) for name in table.index]
+    ax.axvspan(_LEAST_P / 2.0, _LEVEL, color=_BAND, linewidth=0.0)
+    ax.hlines(y, p, np.where(np.isfinite(after), after, p), color="0.6", linewidth=0.8)
+    ax.scatter(after, y, s=18, facecolor="white", edgecolor="0.3", zorder=3)
+    ax.scatter(p, y, s=22, color=np.where(p <= _LEVEL, _ODD, "0.2"), zorder=4)
+    ax.set(xscale="log", xlim=(_LEAST_P / 2.0, 1.6), ylim=(-0.7, len(table) - 0.3))
+    bold = ["bold" if name == found.fault else "normal" for name in names]
+    ax.set_yticks(y, names)
+    for label, weight in zip(ax.get_yticklabels(), bold, strict=True):
+        label.set_fontweight(weight)
+    ax.set_xlabel("adjusted p (grey: found at 5 %)", fontsize=8)
+
+
+def _draw_curves(pit: Axes, cover: Axes, correlation: Axes, curves: xr.Dataset) -> None:
+    u = curves["u"].values
+    pit.fill_between(u, curves["pit_low"], curves["pit_high"], color=_BAND, linewidth=0.0)
+    pit.plot(u, curves["pit"], color="0.2", linewidth=1.2)
+    _mark(pit, u, curves, "pit")
+    pit.set_xlabel("PIT of rates one bound ahead", fontsize=8)
+    pit.set_ylabel("share below, less uniform", fontsize=8)
+    if "coverage" in curves:
+        level, low, high = (curves[n].values for n in ("level", "coverage_low", "coverage_high"))
+        x = np.arange(len(level))
+        cover.bar(x, high - low, 0.7, bottom=low - level, color=_BAND)
+        cover.axhline(0.0, color="0.6", linewidth=0.8)
+        cover.plot(x, curves["coverage"] - level, "o", color="0.2", markersize=4.5)
+        outside = (curves["coverage"].values < low) | (curves["coverage"].values > high)
+        cover.plot(x[outside], (curves["coverage"] - level)[outside], "o", color=_ODD, markersize=5)
+        cover.set_xticks(x, [f"{p:.0%}" for p in level])
+    cover.set_xlabel("interval one mission ahead", fontsize=8)
+    cover.set_ylabel("share inside, less nominal", fontsize=8)
+    offset = 0
+    for name, axis in (("autocorrelation", "lag"), ("autocorrelation_missions", "mission_lag")):
+        if name not in curves:
+            continue
+        x = offset + curves[axis].values
+        low, high = curves[f"{name}_low"].values, curves[f"{name}_high"].values
+        correlation.bar(x, high - low, 0.8, bottom=low, color=_BAND)
+        correlation.vlines(x, 0.0, curves[name], color="0.2", linewidth=1.5)
+        _mark(correlation, x, curves, name)
+        offset = int(x[-1]) + 1
+    lags = curves.sizes.get("lag", 0)
+    correlation.axhline(0.0, color="0.6", linewidth=0.8)
+    ticks = [*curves["lag"].values, *(lags + 1 + curves["mission_lag"].values)]
+    correlation.set_xticks(ticks, [*curves["lag"].values, *curves["mission_lag"].values])
+    correlation.set_xlabel("lag in bounds | lag in missions", fontsize=8)
+    correlation.set_ylabel("autocorrelation", fontsize=8)
+
+
+def _mark(ax: Axes, x: np.ndarray, curves: xr.Dataset, name: str) -> None:
+    """Points of a curve outside its band."""
+    y = curves[name].values
+    outside = (y < curves[f"{name}_low"].values) | (y > curves[f"{name}_high"].values)
+    ax.plot(x[outside], y[outside], "o", color=_ODD, markersize=4, zorder=4)
+
+
+def _draw_groups(ax: Axes, found: Criticism, kind: str) -> None:
+    groups = _groups_of(found, kind)
+    mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
+    odd, labels = groups["stands_out"].to_numpy(dtype=bool), list(groups["group"])
+    x = np.arange(len(mean)) if kind in ("robot", "contact") else np.array(labels, dtype=float)
+    ax.bar(x, 2.0 * band, 0.8, bottom=-band, color=_BAND)
+    ax.axhline(0.0, color="0.6", linewidth=0.8)
+    ax.plot(x[~odd], mean[~odd], "o", color="0.2", markersize=4)
+    ax.plot(x[odd], mean[odd], "o", color=_ODD, markersize=5)
+    if kind in ("robot", "contact"):
+        ax.set_xticks(x, [as_text(str(label)) for label in labels])
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("expected contact rate" if kind == "contact" else kind, fontsize=8)
+    ax.set_ylabel("mean residual (sd)", fontsize=8)
+
+
+def _draw_cells(ax: Axes, found: Criticism) -> None:
+    groups = _groups_of(found, "cell")
+    cells = np.array(list(groups["group"]))
+    values = np.full(tuple(cells.max(0) + 1), np.nan)
+    mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
+    values[*cells.T] = mean / band
+    far = max(float(np.nanmax(np.abs(values))), 1.0)
+    image = ax.imshow(values, cmap=BETTER_WORSE, vmin=-far, vmax=far)
+    for row, col in cells[groups["stands_out"].to_numpy(dtype=bool)]:
+        corner = col - 0.5, row - 0.5
+        ax.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, edgecolor="black", linewidth=1.6))
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("column of the cell entered", fontsize=8)
+    ax.set_ylabel("row", fontsize=8)
+    colour_bar(ax.figure, image, ax, "mean residual / band")
+
+
+def _groups_of(found: Criticism, kind: str) -> pd.DataFrame:
+    return found.groups.loc[found.groups["kind"].to_numpy() == kind, :]

@@ -1,0 +1,226 @@
+"""Criticism of a fitted model: residuals, calibrated tests, and the names of planted faults."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from references import dense_coupled, dense_log_likelihood
+from scipy import stats
+
+import trustbo as tb
+from trustbo import Mission, TrustboError
+from trustbo.models import (
+    CoupledParams,
+    CoupledTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    TrustParams,
+    criticise,
+    fit,
+)
+from trustbo.models.criticism import joint_normal as dense
+from trustbo.models.criticism.departures import departures
+from trustbo.models.criticism.score import Innovations, derivatives, holm
+from trustbo.models.likelihood import kalman_numpy
+
+_SOURCE = Path(__file__).resolve().parents[2] / "benchmarks" / "criticism.py"
+
+
+@pytest.fixture(scope="module")
+def planted():
+    """Missions with a fault, as the benchmark draws them."""
+    spec = importlib.util.spec_from_file_location("criticism_benchmark", _SOURCE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return lambda fault, seed=11: module.draw_missions(fault, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def with_places(planted):
+    """Posterior and criticism of missions whose places matter, by a model without places."""
+    posterior = fit(planted("place"), PooledTrust(), "exact", whole=False)
+    return posterior, criticise(posterior, compare=False)
+
+
+def missions_of_shape(n_missions, n_bounds, n_robots=2, n_features=2, seed=0):
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(n_missions):
+        path = [(0, k) for k in range(n_bounds + 1)]
+        z = rng.uniform(size=(n_bounds, n_robots, n_features))
+        found.append(Mission.from_arrays(path, z, rng.uniform(size=z.shape[:2])))
+    return found
+
+
+def log_normal(normal, y):
+    return stats.multivariate_normal(normal.mean, normal.cov).logpdf(y)
+
+
+def test_the_joint_normal_is_the_product_of_the_robots_densities():
+    missions = missions_of_shape(2, 4)
+    rates = missions[1].contact_rate.copy()
+    rates[2, 1] = np.nan  # a gap
+    missions[1] = Mission.from_arrays(missions[1].path, missions[1].awareness, rates)
+    params = TrustParams(0.6, np.array([0.3, -0.2]), 0.1, 0.05, 0.08, 0.4, 0.3)
+    data = dense.gather(missions, None)
+    normal = dense.joint_normal(dense.Point(params, {}, 0.0), data)
+    expected = sum(
+        dense_log_likelihood(*params[:7], mission.awareness[:, i], mission.contact_rate[:, i])
+        for mission in missions
+        for i in range(2)
+    )
+    np.testing.assert_allclose(log_normal(normal, data.y), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("lag", [0.0, 1.0])
+def test_the_joint_normal_of_robots_that_influence_each_other(lag):
+    missions = missions_of_shape(2, 3)
+    Q, R = np.array([[0.04, 0.01], [0.01, 0.03]]), np.array([[0.02, -0.01], [-0.01, 0.05]])
+    B0, B = np.array([[0.5, 0.1], [-0.2, 0.4]]), np.array([0.3 * np.eye(2), 0.2 * np.ones((2, 2))])
+    params = CoupledParams(B0, B, np.array([0.1, 0.0]), Q, R, 0.4, 0.3)
+    data = dense.gather(missions, None)
+    normal = dense.joint_normal(dense.Point(params, {}, lag), data)
+    expected = 0.0
+    for mission in missions:
+        drift = np.einsum("kim,mai->ka", mission.awareness, B) + params.b
+        expected += dense_coupled(B0, drift, Q, R, 0.4, 0.3, mission.contact_rate, lag)[0]
+    np.testing.assert_allclose(log_normal(normal, data.y), expected, rtol=1e-10)
+
+
+def test_effects_of_places_tie_missions_together():
+    """Two missions of one bound each: both rates have the variance of s and e in common."""
+    missions = missions_of_shape(2, 1)
+    place = PlaceEffect()
+    params = TrustParams(0.6, np.array([0.3, -0.2]), 0.1, 0.05, 0.08, 0.4, 0.3)
+    data = dense.gather(missions, place)
+    scales = {"tau_s": 0.3, "length_scale": 2.0, "tau_e": 0.4}
+    normal = dense.joint_normal(dense.Point(params, scales, 0.0), data)
+    own = 0.6**2 * 0.3**2 + 0.05**2 + 0.08**2
+    np.testing.assert_allclose(normal.cov, 0.25 + own * np.eye(4), rtol=1e-12)
+
+
+def test_residuals_are_those_of_the_kalman_filter(planted):
+    posterior = fit(planted("none"), PooledTrust(), "exact", whole=False)
+    found = criticise(posterior, compare=False, n_replicates=100)
+    point, _ = dense.posterior_point(posterior)
+    data = dense.gather(planted("none"), None)
+    point = dense.with_start(point, data)
+    one = point.params.map(lambda value, _: np.asarray(value)[None])
+    mean, sd = (a[0] for a in kalman_numpy.one_step(one, 0.0, data.batch))
+    np.testing.assert_allclose(found.rates["expected"], mean.ravel(), rtol=1e-9)
+    np.testing.assert_allclose(found.rates["sd"], sd.ravel(), rtol=1e-9)
+    # The projection takes away what 7 parameters explain, of 495 rates.
+    plain = (data.y - mean.ravel()) / sd.ravel()
+    assert np.corrcoef(plain, found.rates["residual"])[0, 1] > 0.97
+
+
+def test_p_values_of_the_right_model_are_uniform():
+    """Rates drawn from one point; parameters are estimated by the step of scoring alone."""
+    missions = missions_of_shape(8, 6)
+    params = TrustParams(0.5, np.array([0.3, 0.2]), 0.1, 0.06, 0.06, 0.5, 0.2)
+    point, data = dense.Point(params, {}, 0.0), dense.gather(missions, None)
+    normal, by_parameter = dense.joint_normal(point, data), derivatives(point, data)
+    tests, left_out = departures(missions, data, normal, point, None)
+    assert left_out == {}
+    rng, L, p = np.random.default_rng(0), np.linalg.cholesky(normal.cov), []
+    for _ in range(100):
+        y = normal.mean + L @ rng.standard_normal(len(data.y))
+        found = Innovations.of(normal, y, by_parameter, rng.standard_normal((len(y), 200)))
+        p.append([found.test(each).p for each in tests])
+    for name, each in zip((test.name for test in tests), np.transpose(p), strict=True):
+        # Six departures: a KS p-value below 1e-3 would come by chance in one of 200 seeds.
+        assert stats.kstest(each, "uniform").pvalue > 1e-3, name
+
+
+@pytest.mark.parametrize(
+    ("fault", "name", "words"),
+    [
+        ("robot", "robot", "differs from the other robots"),
+        ("change", "change", "from mission 10 on"),
+        ("saturation", "curvature", "the response to line_of_sight bends: it flattens"),
+        ("wrong sign", "prior", "line_of_sight has the wrong sign"),
+        ("correlated robots", "correlation", "robots in one bound go together"),
+        ("none", "none", "no fault is found by 7 checks"),
+    ],
+)
+def test_a_planted_fault_is_named(planted, fault, name, words):
+    posterior = fit(planted(fault), PooledTrust(), "exact", whole=False)
+    found = criticise(posterior, compare=False, n_replicates=300)
+    assert found.fault == name
+    assert words in found.verdict
+
+
+def test_a_place_is_named_and_explains_what_it_makes_go_together(with_places):
+    found = with_places[1]
+    assert found.fault == "place"
+    assert "cells that stand out: (" in found.verdict
+    assert "It explains what is found under" in found.verdict
+    correlation = found.table.loc["correlation"]
+    assert correlation["p_adjusted"] < 0.05 < correlation["p_after"]
+    odd = found.groups[found.groups["stands_out"]]
+    assert "cell" in set(odd["kind"])
+    assert len(repr(found).splitlines()) <= 12
+
+
+def test_other_models_are_criticised_for_what_they_lack(planted):
+    missions = planted("place")
+    with_place = fit(missions, PooledTrust(place=PlaceEffect()), "exact", whole=False)
+    found = criticise(with_place, compare=False, n_replicates=200)
+    assert "the model has effects of cells and bounds" in found.table.loc["place", "finding"]
+    assert found.fault == "none"
+    odd = planted("robot")
+    for model in (HierarchicalTrust(), CoupledTrust(inter_robot="none")):
+        posterior = fit(odd, model, "exact", whole=False, check=False)
+        found = criticise(posterior, compare=False, n_replicates=200)
+        assert found.fault == "none"
+        assert "coefficients of its own" in found.table.loc["robot", "finding"]
+
+
+def test_the_worth_of_the_parts_of_a_model(with_places, planted):
+    posterior, _ = with_places
+    worth = criticise(posterior, n_replicates=100).worth
+    assert list(worth.index) == [
+        "prior", "traversability", "visibility", "line_of_sight", "places", "robots",
+    ]  # fmt: skip
+    assert worth.loc["line_of_sight", "value"] > 2.0 * worth.loc["line_of_sight", "se"]
+    assert worth.loc["places", "value"] < -2.0 * worth.loc["places", "se"]
+    own = replace(tb.models.Priors(), x0_sd=0.2)
+    mine = fit(planted("place")[:3], PooledTrust(own), "exact")
+    said = criticise(mine, n_replicates=100).worth.loc["comparison", "finding"]
+    assert "give it again with model=" in said
+
+
+def test_what_cannot_be_criticised_says_why(with_places, planted):
+    posterior, _ = with_places
+    with pytest.raises(TrustboError, match=r"takes a posterior of trustbo.models.fit; got dict"):
+        criticise({})
+    bare = posterior.copy()
+    bare.attrs = {}
+    with pytest.raises(TrustboError, match="lacks the attribute 'observation'"):
+        criticise(bare)
+    other = posterior.copy()
+    other["posterior"] = other["posterior"].to_dataset().drop_vars("beta0")
+    with pytest.raises(TrustboError, match="of a linear drift"):
+        criticise(other)
+    alone = posterior.copy()
+    del alone["constant_data"]
+    with pytest.raises(TrustboError, match="give the missions it was fitted to"):
+        criticise(alone)
+    alone = posterior.copy()
+    alone.attrs = posterior.attrs | {"observation": "censored"}
+    with pytest.raises(TrustboError, match='has observation "censored"'):
+        criticise(alone)
+    first = planted("none")[0]
+    short = replace(first, path=first.path[:5], bounds=first.bounds[:4])
+    with pytest.raises(TrustboError, match="12 rates are too few to criticise 9 parameters"):
+        criticise(posterior, [short])
+    with pytest.raises(TrustboError, match="2475 rates are more than the 2000"):
+        criticise(posterior, planted("none") * 5)
+    with pytest.raises(TrustboError, match="n_replicates must be a whole number from 100 on"):
+        criticise(posterior, n_replicates=10)
+
+
+def test_holm_adjusts_for_the_number_of_tests():
+    np.testing.assert_allclose(holm(np.array([0.04, 0.01, 0.03])), [0.06, 0.03, 0.06])
