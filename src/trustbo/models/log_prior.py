@@ -46,7 +46,7 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
 def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> xr.Dataset | None:
     """Group `log_prior` of a posterior; None where its model is not given and not on record."""
     draws = posterior["posterior"].to_dataset()
-    features = [str(name) for name in draws["feature"].values]
+    features = [str(n) for n in draws["feature"].values] if "feature" in draws else []
     try:
         record = json.loads(posterior.attrs["model_record"])
         recorded = model or model_from_record(record, features=features)
