@@ -276,6 +276,39 @@ def test_policies_plan_with_it(policy, posterior):
     assert plan.path[-1] == (0, 3)
 
 
+def test_places_are_added_to_it_in_every_room():
+    """A linear drift with effects of places equals the pooled model with them."""
+    rng, workspace = np.random.default_rng(3), make_workspace()
+    n = 4
+    maps = {
+        "place": rng.normal(0.0, 0.3, (n, 1, 4, 4)),
+        "place_bound": rng.normal(0.0, 0.3, (n, 3, 8, 4, 4)),
+    }
+    beta0, weight, level = rng.uniform(0.2, 0.7, n), rng.normal(size=(n, 2)), rng.normal(size=n)
+    noises = {name: np.full(n, 0.05) for name in NOISES}
+    pooled = tb.models.TrustParams(beta0, weight, level, **noises, **maps)
+    own = LINEAR.params({"beta0": beta0, "weight": weight, "level": level, **noises}, 2)
+    own = own._replace(**maps)
+    planner = tb.planning.Planner(workspace, (3, 0), (0, 3))
+    path = [(3, 0), (2, 1), (1, 2), (0, 3)]
+    z = np.swapaxes(workspace.along(path), 0, 1)
+    mission = tb.Mission.from_arrays(path, z, rng.uniform(size=(3, 3)))
+    by_hand = PooledTrust().log_likelihood(pooled, [mission])
+    np.testing.assert_allclose(LINEAR.log_likelihood(own, [mission]), by_hand, rtol=1e-10)
+    for i in range(n):
+        one, other = planner.plan(own.draw(i)), planner.plan(pooled.draw(i))
+        assert one.path == other.path
+        np.testing.assert_allclose(one.trust, other.trust, rtol=1e-10)
+    found, expected = (planner.evaluate(path, p) for p in (own, pooled))
+    np.testing.assert_allclose(found.value, expected.value, rtol=1e-10)
+    np.testing.assert_allclose(found.bands, expected.bands, rtol=1e-10)
+    live = [
+        TrustFilter(p, 3).update(z[0], [0.5, 0.4, np.nan], (path[0], path[1]))
+        for p in (own, pooled)
+    ]
+    np.testing.assert_allclose(live[0].mean, live[1].mean, rtol=1e-10)
+
+
 # --- functions and files ---
 
 

@@ -73,7 +73,8 @@ def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
     if not posteriors:
         raise TrustboError("there are no posteriors to learn priors from; give one at least.")
     names = [
-        tuple(str(name) for name in np.asarray(each["posterior"]["feature"])) for each in posteriors
+        tuple(str(name) for name in each["posterior"].coords.get("feature", ()))
+        for each in posteriors
     ]
     for j, (each, own) in enumerate(zip(posteriors, names, strict=True)):
         if each.attrs["model"] != "PooledTrust" or own != names[0]:

@@ -151,7 +151,8 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
         u = np.einsum("...im,...idrcm->...idrc", np.asarray(params.beta, dtype=float), z)
     elif isinstance(params, DriftParams):
         u = _own_drift(params, z)
-        b = np.broadcast_to(b, params.leading)[..., None] if not b.ndim else b[..., None]
+        b = b if b.ndim else np.broadcast_to(b, params.leading)
+        b = b[..., None] if b.ndim == len(params.leading) else b
     else:
         beta = np.asarray(params.beta, dtype=float)
         u = (
@@ -168,10 +169,16 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
 
 def _own_drift(params: DriftParams, z: np.ndarray) -> np.ndarray:
     """Drift by a function of the user's own, (..., robot, move, row, col)."""
-    many, shape = bool(params.leading), z.shape[-4:-1]
+    leading, shape = params.leading, z.shape[-4:-1]
+
+    def flat(value: np.ndarray, n: int) -> np.ndarray:
+        core = np.shape(value)[np.ndim(value) - n :]
+        return np.broadcast_to(value, leading + core).reshape(-1, *core)
+
+    drift = params.drift.map(flat) if leading else params.drift
     bounds = np.moveaxis(z, -5, -2)  # (..., move, row, col, robot, feature)
     bounds = bounds.reshape(*z.shape[:-5], -1, *bounds.shape[-2:])
-    u = np.swapaxes((params.flat() if many else params).drift.values(bounds, many=many), -1, -2)
+    u = np.swapaxes(drift.values(bounds, many=bool(leading)), -1, -2)
     return u.reshape(*params.leading, -1, *shape)
 
 
