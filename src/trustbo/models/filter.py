@@ -14,6 +14,7 @@ from trustbo.models.likelihood.live import Effect, Rates
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
 from trustbo.models.ticks import broadcast_ticks
+from trustbo.workspace.belief import AwarenessBelief
 from trustbo.workspace.moves import bounds_along
 
 
@@ -67,6 +68,7 @@ class TrustFilter:
         response: str = "level",
         observation: str = "gaussian",
         max_draws: int = 1000,
+        belief: AwarenessBelief | None = None,
     ) -> None:
         """Start before the first bound of a mission.
 
@@ -76,6 +78,8 @@ class TrustFilter:
             response: `"level"` or `"change"`; needed with draws, a posterior knows its own.
             observation: Family of observations; needed with draws, a posterior knows its own.
             max_draws: Largest number of draws to follow; they are evenly spaced.
+            belief: Belief about awareness: a map drawn from it goes with each draw, and gives what
+                was not measured in a bound.
 
         Raises:
             ShapeError: Draws of another number of robots.
@@ -99,6 +103,7 @@ class TrustFilter:
         self._family = FAMILIES[require_choice("observation", observation, FAMILIES)]
         lag = float(require_choice("response", response, RESPONSES) == "change")
         self._core = self.params.live(lag, n_robots)
+        self._maps = None if belief is None else belief.draw(len(kept))
         self.reset()
 
     def reset(self) -> None:
@@ -125,9 +130,10 @@ class TrustFilter:
         """Take in one bound.
 
         Args:
-            awareness: Shape (robot, feature).
+            awareness: Shape (robot, feature); NaN, where there is a `belief`, if not measured.
             contact_rate: Shape (robot,); NaN where not measured.
-            bound: Cell left and cell entered; needed where places have effects.
+            bound: Cell left and cell entered; needed where places have effects, or awareness is
+                NaN.
             n_ticks: Ticks of the bound, () or (robot,); the beta-binomial family needs them.
 
         Returns:
@@ -139,7 +145,7 @@ class TrustFilter:
                 bound that is missing or none, or one that is running.
         """
         self._require_running(running=False)
-        z, y = self._checked(awareness, 2), np.asarray(contact_rate, dtype=float)
+        z, y = self._awareness(awareness, bound), np.asarray(contact_rate, dtype=float)
         effect = self._effects(bound, 1)[0]
         if y.shape != (self._n_robots,):
             raise ShapeError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
@@ -152,7 +158,7 @@ class TrustFilter:
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
         """Begin a bound whose ticks `update_tick` takes in; arguments as those of `update`."""
         self._require_running(running=False)
-        z, effect = self._checked(awareness, 2), self._effects(bound, 1)[0]
+        z, effect = self._awareness(awareness, bound), self._effects(bound, 1)[0]
         self._running = _Running(z, effect, *np.zeros((2, self._n_robots)))
 
     def update_tick(self, in_contact: ArrayLike) -> TrustState:
@@ -196,9 +202,9 @@ class TrustFilter:
         Rates are drawn, one for each parameter draw, in bounds of 200 ticks where these count.
 
         Args:
-            awareness: Shape (bound, robot, feature).
+            awareness: Shape (bound, robot, feature); NaN as for `update`.
             path: The cell where the team is and the cells to be entered; needed where places have
-                effects.
+                effects, or awareness is NaN.
 
         Returns:
             Shapes (bound, robot).
@@ -208,7 +214,8 @@ class TrustFilter:
             TrustboError: Awareness that is NaN.
         """
         mean, var, ahead = self._mean, self._var, []
-        zs, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
+        given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
+        zs = [self._filled(z, None if path is None else path[k + 1]) for k, z in enumerate(given)]
         x = self._core.draw(rng, mean, var)
         for z, effect in zip(zs, self._effects(path, len(zs)), strict=True):
             mean, var = self._core.predict(mean, var, z, effect)
@@ -266,9 +273,25 @@ class TrustFilter:
                 f"awareness must be {'(bound, ' if n_axes == 3 else '('}{expected[0]} robots, "
                 f"{expected[1]} features); got shape {z.shape}."
             )
-        if np.isnan(z).any():
-            raise TrustboError("awareness must not be NaN; take unmeasured values from the map.")
+        if np.isnan(z).any() and self._maps is None:
+            raise TrustboError(
+                "awareness must not be NaN without a belief=; take unmeasured values from the map."
+            )
         return z
+
+    def _awareness(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> np.ndarray:
+        """Awareness of one bound, (robot, feature) or, filled in, (draw, robot, feature)."""
+        z = self._checked(awareness, 2)
+        return self._filled(z, None if bound is None else bound[1])
+
+    def _filled(self, z: np.ndarray, cell: Cell | None) -> np.ndarray:
+        """Awareness with that of each draw's map in the place of NaN."""
+        missing = np.isnan(z)
+        if self._maps is None or not missing.any():
+            return z
+        if cell is None:
+            raise TrustboError("awareness is NaN: say which cells the bounds lead over.")
+        return np.where(missing, self._maps[:, :, *cell], z)
 
 
 class _Running(NamedTuple):

@@ -46,9 +46,10 @@ class ApartFilter:
     def predict(
         self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, effect: Effect = 0.0
     ) -> Moments:
-        """Mean and variance after a bound with awareness z (robot, feature), nothing measured.
+        """Mean and variance after a bound, nothing measured.
 
-        `effect` is that of its place.
+        Awareness z (robot, feature), or of each draw (draw, robot, feature); `effect` is that of
+        the bound's place.
         """
         ahead = kalman.update(self._beta0, self._Q, var, 0.0, 0.0)
         return self._beta0 * mean + self._drift(z) + effect, ahead
@@ -96,16 +97,19 @@ class ApartFilter:
         return now, family.draw_rates(rng, now, y, sd, _TICKS)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
-        if self._p.beta.ndim == 2:
-            return self._p.beta @ z.T + self._b
-        return np.einsum("nim,im->ni", self._p.beta, z) + self._b
+        beta = self._p.beta
+        if beta.ndim == z.ndim == 2:
+            return beta @ z.T + self._b
+        of_robots = beta if beta.ndim == 3 else beta[:, None]
+        return (of_robots * z).sum(-1) + self._b
 
 
 class DriftFilter(ApartFilter):
     """Robots whose drift is a function of the user's own."""
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
-        return self._p.drift.values(z[None], many=True)[:, 0] + self._b
+        own = z[:, None] if z.ndim == 3 else z[None]
+        return self._p.drift.values(own, many=True)[:, 0] + self._b
 
 
 class CoupledFilter:
@@ -180,4 +184,5 @@ class CoupledFilter:
         return now, family.draw_rates(rng, now, y, sd, _TICKS)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
-        return self._B @ z.ravel() + self._p.b
+        flat = z.reshape(*z.shape[:-2], -1)
+        return (self._B @ flat[..., None])[..., 0] + self._p.b
