@@ -66,7 +66,7 @@ def short(yaml):
 def shorter(words, page):
     """Flags that win over those of a command: two missions, and one more when it is resumed.
 
-    README's commands sample by NUTS, as printed; those of other pages need not compile it too.
+    README's commands run as printed; those of other pages sample exactly, whatever they say.
     """
     if words[0] == "resume":
         return ["--iterations", "3"] if "--iterations" in words else []
