@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from trustbo.data import Bound, Mission, Robot, Team
+from trustbo.data import Bound, Mission
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.stacking import fill_awareness
+from trustbo.team import Robot, Team
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 

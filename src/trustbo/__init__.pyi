@@ -10,9 +10,10 @@ from .campaign import (
     missions,
     resume,
 )
-from .data import Bound, Mission, Robot, Team
+from .data import Bound, Mission
 from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
 from .planning import NoPathError
+from .team import Robot, Team
 from .workspace import Workspace
 
 __all__ = [

@@ -1,7 +1,7 @@
-"""Robots, teams, and the missions they run, bound by bound."""
+"""Missions of a team of robots, bound by bound."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Self, get_args
 
@@ -15,8 +15,6 @@ from trustbo.errors import (
     TrustboError,
     require_choice,
     require_pair,
-    require_positive,
-    require_whole,
 )
 
 Cell = tuple[int, int]
@@ -26,125 +24,6 @@ FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
 """Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
-
-
-@dataclass(frozen=True, repr=False)
-class Robot(Displayed):
-    """One ground robot with a lidar. The defaults describe a Husky-sized skid-steer vehicle.
-
-    Attributes:
-        speed: Speed on level ground, m/s.
-        turn_rate: Largest yaw rate, rad/s.
-        lidar_range: Distance up to which the lidar tracks another robot, m.
-        vertical_fov: Half the vertical field of view, rad, measured from the plane of the body.
-        sensor_height: Height of the lidar above ground, m.
-        target_height: Height of the point others aim at, m above ground; by default the lidar.
-        max_slope: Steepest pitch or roll that the robot withstands, rad.
-        detection: Quality of the lidar: share of clear looks that find their target, in (0, 1].
-        acquire: Number of successive looks that must find a target before contact begins.
-        drop: Number of successive looks that must miss it before contact ends.
-
-    Raises:
-        TrustboError: A value is not positive, an angle exceeds a quarter turn, a share exceeds 1,
-            or a number of looks is not whole.
-    """
-
-    speed: float = 2.0
-    turn_rate: float = 1.0
-    lidar_range: float = 100.0
-    vertical_fov: float = np.pi / 8
-    sensor_height: float = 1.0
-    target_height: float = 1.0
-    max_slope: float = np.pi / 4
-    detection: float = 1.0
-    acquire: int = 1
-    drop: int = 1
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            require_positive(f"Robot.{name}", value)
-        for name in ("acquire", "drop"):
-            require_whole(f"Robot.{name}", getattr(self, name), 1)
-        if self.detection > 1.0:
-            raise TrustboError(f"Robot.detection must be in (0, 1]; got {self.detection:g}.")
-        for name in ("vertical_fov", "max_slope"):
-            if getattr(self, name) >= np.pi / 2:
-                raise TrustboError(
-                    f"Robot.{name} is an angle in radians below pi/2; got {getattr(self, name):g} "
-                    "(degrees? use numpy.deg2rad)."
-                )
-
-    def _card(self) -> Card:
-        field_of_view, max_slope = (
-            number(float(np.rad2deg(angle)), "degrees")
-            for angle in (2.0 * self.vertical_fov, self.max_slope)
-        )
-        rows = [
-            ("speed", f"{number(self.speed, 'm/s')}, turns {number(self.turn_rate, 'rad/s')}"),
-            ("slope limit", max_slope),
-            ("lidar", f"range {number(self.lidar_range, 'm')}, {field_of_view} vertically"),
-            ("sensor", f"{number(self.sensor_height, 'm')} high, aims {self.target_height:g} m"),
-            (
-                "looks",
-                f"{self.detection:.0%} found; {self.acquire} to acquire, {self.drop} to drop",
-            ),
-        ]
-        return Card("Robot", rows)
-
-
-@dataclass(frozen=True, repr=False)
-class Team(Displayed):
-    """The lead T1 and the overwatching subteam T2.
-
-    Attributes:
-        n_robots: Number of robots in T2; taken from `robots` where these are given.
-        robots: Members of T2; by default `n_robots` equal ones.
-        lead: Lead robot T1.
-        names: Names of the members of T2; by default r1, r2, ...
-
-    Raises:
-        TrustboError: There are no robots, or not one distinct name per robot.
-    """
-
-    n_robots: int = 3
-    robots: tuple[Robot, ...] = ()
-    lead: Robot = field(default_factory=Robot)
-    names: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.robots, Sequence) or not all(
-            isinstance(robot, Robot) for robot in self.robots
-        ):
-            raise TrustboError(
-                "Team.robots must be a sequence of Robot; for a number of equal ones give "
-                f"n_robots=; got {type(self.robots).__name__}."
-            )
-        robots = tuple(self.robots) or (Robot(),) * require_whole("n_robots", self.n_robots, 1)
-        names = tuple(self.names) or tuple(f"r{i + 1}" for i in range(len(robots)))
-        if not len(set(names)) == len(names) == len(robots):
-            raise TrustboError(f"names must be {len(robots)} distinct names; got {names}.")
-        for name, value in (("n_robots", len(robots)), ("robots", robots), ("names", names)):
-            object.__setattr__(self, name, value)
-
-    @property
-    def max_slope(self) -> float:
-        """Steepest slope that every member withstands, rad."""
-        return min(robot.max_slope for robot in (self.lead, *self.robots))
-
-    @classmethod
-    def of(cls, team: Self | None, n_robots: int = 3) -> Self:
-        """Team as it is, or one of equal robots for None; TrustboError: it is no team."""
-        if team is not None and not isinstance(team, Team):
-            raise TrustboError(f"team must be a Team, e.g. Team(n_robots=3); got {team!r}.")
-        return cls(n_robots=n_robots) if team is None else team
-
-    def _card(self) -> Card:
-        members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
-        limit = number(float(np.rad2deg(self.max_slope)), "degrees")
-        alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
-        rows = [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]
-        sections = {name: robot._card().rows for name, robot in members.items()}
-        return Card(f"Team: a lead and {self.n_robots} overwatching robots", rows, (), sections)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from trustbo.data import Robot
 from trustbo.simulation.motion import drive
+from trustbo.team import Robot
 from trustbo.workspace.routes import Routes
 from trustbo.workspace.surface import Surface
 

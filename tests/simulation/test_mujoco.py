@@ -9,11 +9,11 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
-from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.mujoco import MujocoSimulator
 from trustbo.simulation.vehicle import WHEEL_RADIUS, Ground, Physics, center_of_mass, crop, grip_of
+from trustbo.team import Robot, Team
 from trustbo.terrain import assemble_terrain, synthetic_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import detection_probability, optics

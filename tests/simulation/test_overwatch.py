@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator
+from trustbo.team import Robot, Team
 from trustbo.terrain import assemble_terrain, synthetic_terrain
 from trustbo.workspace import Sight, Workspace
 

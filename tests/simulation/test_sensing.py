@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.data import Robot, Team
 from trustbo.errors import TrustboError
 from trustbo.logs import STATES
 from trustbo.simulation import Degradation, KinematicSimulator, Threat
 from trustbo.simulation.sensing import contact_of, new_tracks
+from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex, synthetic_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight, detection_probability

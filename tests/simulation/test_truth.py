@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from trustbo.data import Bound, Robot, Team
+from trustbo.data import Bound
 from trustbo.errors import TrustboError
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams
@@ -13,6 +13,7 @@ from trustbo.simulation import KinematicSimulator, ModelSimulator, Threat, Truth
 from trustbo.simulation.bound_table import BoundTable
 from trustbo.simulation.model_contact import ModelContact
 from trustbo.simulation.replicates import edges_of
+from trustbo.team import Robot, Team
 from trustbo.terrain import synthetic_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, existing_bounds

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from simulators import Steady
 
-from trustbo.data import Robot, Team
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.sensing import detections
+from trustbo.team import Robot, Team
 from trustbo.terrain import read_terrain, synthetic_terrain
 from trustbo.workspace import Sight, Workspace
 from trustbo.workspace.line_of_sight import N_SAMPLES, bound_features, geometry

@@ -4,7 +4,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from trustbo.data import Robot
+from trustbo.team import Robot
 from trustbo.workspace.regions import largest_region
 from trustbo.workspace.routes import Routes, _a_star
 from trustbo.workspace.surface import Surface

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from trustbo.data import Robot
+from trustbo.team import Robot
 from trustbo.terrain import rays
 from trustbo.workspace.sight import Sight, detection_probability, optics
 from trustbo.workspace.surface import Surface

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from trustbo.data import Robot, Team
 from trustbo.errors import ShapeError, TerrainError, TrustboError
+from trustbo.team import Robot, Team
 from trustbo.terrain import assemble_terrain, pixel_size, read_terrain, synthetic_terrain
 from trustbo.workspace import Grid, Workspace
 

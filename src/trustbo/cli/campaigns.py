@@ -11,8 +11,8 @@ from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
-    from trustbo.data import Team
     from trustbo.simulation import KinematicSimulator
+    from trustbo.team import Team
 
 _MOST_PIXELS = 9e6
 """Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
@@ -216,7 +216,7 @@ def _team(n_robots: int, max_slope: float, lidar_range: float) -> "Team":
     """Make a team of equal robots; the slope is in degrees."""
     from math import radians
 
-    from trustbo.data import Robot, Team
+    from trustbo.team import Robot, Team
 
     if not 0.0 < max_slope < 90.0:
         raise TrustboError(f"--max-slope must be between 0 and 90 degrees; got {max_slope:g}.")

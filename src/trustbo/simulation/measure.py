@@ -6,9 +6,10 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Bound, Robot, Team
+from trustbo.data import Bound
 from trustbo.errors import require_choice
 from trustbo.logs.netcdf import STATES
+from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex, fan
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from trustbo.data import Robot
 from trustbo.parallel import PART
+from trustbo.team import Robot
 from trustbo.workspace.routes import speed_share
 from trustbo.workspace.surface import Surface
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.data import Robot
 from trustbo.errors import require_positive
 from trustbo.simulation.motion import ARRIVED, LOOKAHEAD
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.vehicle import Physics, crop, grip_of, require_mujoco, wheel_speeds
+from trustbo.team import Robot
 from trustbo.workspace import Workspace
 from trustbo.workspace.routes import SLOWEST
 from trustbo.workspace.surface import Surface

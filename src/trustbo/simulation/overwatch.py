@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Bound, Cell, Mission, Robot, Team
+from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
 from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Threat
@@ -16,6 +16,7 @@ from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.simulation.sensing import contact_of, cut_at_lost_contact, detections, new_tracks
 from trustbo.simulation.world import Worlds, true_surface
+from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace

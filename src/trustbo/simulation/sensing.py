@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from trustbo.data import Robot, Team
 from trustbo.simulation.bounding import Drive
 from trustbo.simulation.world import World
+from trustbo.team import Robot, Team
 from trustbo.workspace.sight import Sight, detection_probability, optics
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trustbo.data import Robot
 from trustbo.errors import TrustboError
+from trustbo.team import Robot
 from trustbo.workspace.surface import Surface, filled
 
 # A Husky: 1.0 x 0.7 x 0.4 m over all, 50 kg.

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Team
 from trustbo.errors import TerrainError, TrustboError, require_choice
 from trustbo.simulation.events import Degradation, Threat, acts_in, require_events
+from trustbo.team import Team
 from trustbo.terrain.dataset import is_lazy, require_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight

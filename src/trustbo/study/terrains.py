@@ -11,10 +11,11 @@ import numpy as np
 
 from trustbo import terrain
 from trustbo.campaign.loop import path_class
-from trustbo.data import Cell, Team
+from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.planning import Planner
 from trustbo.study.parts import Part
+from trustbo.team import Team
 from trustbo.workspace import Workspace
 
 EACH_RUN = "run"

@@ -12,9 +12,10 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo import terrain
-from trustbo.data import Cell, Robot, Team
+from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.team import Robot, Team
 from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight

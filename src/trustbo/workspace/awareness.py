@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Team
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.parallel import in_order
+from trustbo.team import Team
 from trustbo.terrain import stencil
 from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
 from trustbo.terrain.dataset import is_lazy, pixel_size, warn_if_clipped

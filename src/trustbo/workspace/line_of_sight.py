@@ -23,7 +23,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.data import Cell, Robot, Team
+from trustbo.data import Cell
+from trustbo.team import Robot, Team
 from trustbo.workspace.routes import speed_share
 from trustbo.workspace.sight import Sight, detection_probability, optics
 from trustbo.workspace.surface import Surface

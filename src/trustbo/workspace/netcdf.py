@@ -5,8 +5,8 @@ from dataclasses import asdict
 
 import xarray as xr
 
-from trustbo.data import Robot, Team
 from trustbo.files import to_json
+from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.posts import FORMATION_RADIUS

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from trustbo.data import Cell, Team
+from trustbo.data import Cell
 from trustbo.errors import TerrainError, TrustboError, require_positive
+from trustbo.team import Team
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.regions import are_linked, largest_region, linked_to

@@ -6,8 +6,8 @@ import math
 import numpy as np
 from numba import njit
 
-from trustbo.data import Robot
 from trustbo.parallel import plain
+from trustbo.team import Robot
 from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1

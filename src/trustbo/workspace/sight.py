@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from trustbo.data import Robot
 from trustbo.errors import TrustboError, require_choice
 from trustbo.parallel import PART, plain
+from trustbo.team import Robot
 from trustbo.terrain import rays
 from trustbo.workspace.surface import Surface
 

@@ -10,11 +10,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, Mission, Team, default_features, is_line_of_sight
+from trustbo.data import Cell, Mission, default_features, is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
 from trustbo.stacking import fill_awareness
+from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.dataset import is_lazy, require_terrain
 from trustbo.terrain.features import (
