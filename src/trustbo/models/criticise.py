@@ -1,4 +1,4 @@
-"""What is wrong with a fitted trust model: tests, residuals and comparisons, with a verdict."""
+"""Criticism of a fitted trust model: tests, residuals and comparisons, with a verdict."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from trustbo.models.criticism.joint_normal import (
     posterior_point,
     with_start,
 )
-from trustbo.models.criticism.prior_moments import coefficients_of, estimate, test_prior
+from trustbo.models.criticism.prior_moments import Coefficients, coefficients_of, test_prior
 from trustbo.models.criticism.residuals import curves_of, groups_of, table_of_rates
-from trustbo.models.criticism.score import Derivatives, Innovations, derivatives, holm
+from trustbo.models.criticism.score import Derivatives, Innovations, Outcome, derivatives, holm
 from trustbo.models.criticism.worth import worth_of
 from trustbo.models.model import TrustModel
 from trustbo.models.posterior_tree import missions_of
@@ -117,37 +117,39 @@ def criticise(
     draws = rng.standard_normal((len(data.y), n_replicates))
     found = Innovations.of(normal, data.y, by_parameter, draws)
     tests, left_out = departures(missions, data, normal, point, place)
-    outcomes = {each.name: found.test(each) for each in tests}
     of = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
-    alone = estimate(found, of)
-    outcomes["prior"] = test_prior(alone, of, rng, n_replicates)
-    outcomes["family"] = family_test(found)
-    names = list(outcomes)
-    adjusted = dict(zip(names, holm(np.array([outcomes[n].p for n in names])), strict=True))
-    first = min(names, key=lambda name: outcomes[name].log_p)
-    fault = first if adjusted[first] <= _LEVEL else "none"
-    after = {}
+    outcomes = _test_all(found, tests, of, seed)
+    adjusted = holm(np.array([each.p for each in outcomes.values()]))
+    first = min(outcomes, key=lambda name: outcomes[name].log_p)
+    fault = first if adjusted.min() <= _LEVEL else "none"
+    after: dict[str, Outcome] = {}
     if chosen := [each for each in tests if each.name == fault]:
         wider = _account_for(chosen[0], outcomes[fault].label, found, data, by_parameter, draws)
-        after = {each.name: wider.test(each).p for each in tests if each.name != fault}
-        after["prior"] = test_prior(estimate(wider, of), of, rng, n_replicates).p
-        after["family"] = family_test(wider).p
+        after = _test_all(wider, [each for each in tests if each.name != fault], of, seed)
+    rows = {}
+    for (name, one), p in zip(outcomes.items(), adjusted, strict=True):
+        said = "nothing found."
+        if p <= _LEVEL:
+            said = finding(name, one, found, data, missions, tests, of)
+        p_after = after[name].p if name in after else np.nan
+        rows[name] = one.label, one.statistic, one.p, p, p_after, said
+    rows |= {name: ("", *[np.nan] * 4, f"not tested: {why}") for name, why in left_out.items()}
     rates = table_of_rates(missions, data, found)
     groups = groups_of(rates, missions, data, found)
     curves, rates["ahead"] = curves_of(data, found, of, draws)
-    rows = {}
-    for name, one in outcomes.items():
-        said = "nothing found."
-        if adjusted[name] <= _LEVEL:
-            said = finding(name, one, found, data, missions, tests, of, alone)
-        p_after = after.get(name, np.nan)
-        rows[name] = one.label, one.statistic, one.p, adjusted[name], p_after, said
-    rows |= {name: ("", *[np.nan] * 4, f"not tested: {why}") for name, why in left_out.items()}
     rows["coverage"] = coverage_row(curves)
     head = ["label", "statistic", "p", "p_adjusted", "p_after", "finding"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=head).rename_axis("check")
     worth = worth_of(posterior, missions, model) if compare else worth_of(None, missions, None)
     return Criticism(verdict_of(fault, table), fault, table, rates, groups, curves, worth)
+
+
+def _test_all(
+    found: Innovations, tests: Sequence[Departure], of: Coefficients, seed: int
+) -> dict[str, Outcome]:
+    """Outcome of each departure, of the prior and of the family."""
+    outcomes = {each.name: found.test(each) for each in tests}
+    return outcomes | {"prior": test_prior(found, of, seed), "family": family_test(found)}
 
 
 def _account_for(

@@ -22,7 +22,7 @@ _MEMORY = 0.7  # correlation of successive bounds, and of successive missions
 
 
 class Departure(NamedTuple):
-    """What may be wrong, by label."""
+    """A departure and its labels."""
 
     name: str
     effects: Mapping[str, np.ndarray] = {}

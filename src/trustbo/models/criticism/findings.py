@@ -10,7 +10,7 @@ from scipy import stats
 from trustbo.data import Mission
 from trustbo.models.criticism.departures import Departure, cell_columns
 from trustbo.models.criticism.joint_normal import Data
-from trustbo.models.criticism.prior_moments import Coefficients, Estimate
+from trustbo.models.criticism.prior_moments import Coefficients, estimate
 from trustbo.models.criticism.score import Innovations, Outcome, judge
 
 _MOST_CELLS = 3
@@ -48,7 +48,6 @@ def finding(
     missions: Sequence[Mission],
     tests: Sequence[Departure],
     of: Coefficients,
-    alone: Estimate,
 ) -> str:
     """Finding of a test in a sentence."""
     mission, _, robot = data.slots.T
@@ -71,6 +70,7 @@ def finding(
         bend = "flattens (saturates)" if effect < 0.0 else "steepens"
         return f"the response to {label} bends: it {bend} as {label} grows."
     if name == "prior":
+        alone = estimate(found, of)
         i = of.labels.index(label.removeprefix("sign of "))
         data_say = f"{alone.mean[i]:.2f} +- {np.sqrt(alone.cov[i, i]):.2f}"
         prior = f"{of.mean[i]:.2f} +- {np.sqrt(of.cov[i, i]):.2f}"

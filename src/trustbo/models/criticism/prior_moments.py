@@ -82,15 +82,15 @@ def estimate(found: Innovations, of: Coefficients) -> Estimate:
     return Estimate(of.fitted + step[of.columns], inverse[np.ix_(of.columns, of.columns)])
 
 
-def test_prior(
-    alone: Estimate, of: Coefficients, rng: np.random.Generator, n_replicates: int
-) -> Outcome:
+def test_prior(found: Innovations, of: Coefficients, seed: int) -> Outcome:
     """Test each coefficient for conflict with its prior, and each weight for a wrong sign.
 
     Conflict: the estimate is too far from the prior's mean for the spread of both (Evans and
     Moshonov 2006). Wrong sign: the estimate is beyond 0, on the side away from the prior's mean;
     where that is 0, awareness is taken to help.
     """
+    alone, n_replicates = estimate(found, of), found.e.shape[1] - 1
+    rng = np.random.default_rng([seed, 1])
     sign = np.where(np.abs(of.mean) < 0.1 * np.sqrt(np.diag(of.cov)), 1.0, np.sign(of.mean))
     both = alone.cov + of.cov
     sd, se = np.sqrt(np.diag(both)), np.sqrt(np.diag(alone.cov))
