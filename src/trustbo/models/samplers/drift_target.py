@@ -106,8 +106,8 @@ class DriftTarget:
         if self._visited is None:
             return params, None
         place = cast(PlaceEffect, self.model.place)
-        named = dict(zip(("tau_s", "length_scale", "tau_e"), theta.T[3:], strict=True))
-        hyper = {name: named[name] for name in place.names}
+        column = {"tau_s": 3, "length_scale": 4, "tau_e": 5}
+        hyper = {name: theta[:, column[name]] for name in place.names}
         with own_settings():
             keys = jax.random.split(jax.random.key(int(rng.integers(1 << 31))), len(theta))
             rows = np.minimum(np.arange(-(-len(theta) // _CHUNK) * _CHUNK), len(theta) - 1)
