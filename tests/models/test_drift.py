@@ -23,6 +23,7 @@ from trustbo.models import (
     diagnostics,
     fit,
     params_of,
+    place_maps,
     prior_predictive,
     sbc,
 )
@@ -172,6 +173,24 @@ def test_a_posterior_is_around_its_truth_and_read_by_arviz(posterior, missions):
     assert table.index[0] == "own"
 
 
+def test_with_places_a_linear_drift_has_the_pooled_posterior_too(missions):
+    """Dense factors in JAX against normal equations in numba; tolerances as above."""
+    own = fit(missions[:2], DriftTrust(linear, LINEAR.parameters, place=PlaceEffect()), seed=3)
+    exact = fit(missions[:2], PooledTrust(place=PlaceEffect()), seed=3)
+    assert own.attrs["sampler"] == "exact"
+    assert own.attrs["k_hat"] < 0.7
+    np.testing.assert_allclose(own.attrs["log_evidence"], exact.attrs["log_evidence"], atol=0.3)
+    for name in ("beta0", "delta_v", "tau_s", "length_scale", "tau_e"):
+        a, b = own["posterior"][name], exact["posterior"][name]
+        gap = abs(float(a.mean() - b.mean())) / float(b.std())
+        assert gap < 4.0 / np.sqrt(own.attrs["kish"]) + 4.0 / np.sqrt(exact.attrs["kish"]), name
+    one, other = (place_maps(each) for each in (own, exact))
+    sd = other["place_bound_sd"].max()
+    assert (np.abs(one["place_bound_mean"] - other["place_bound_mean"]) < 0.3 * sd).sum() == (
+        other["place_bound_mean"].notnull().sum()
+    )
+
+
 def test_the_next_mission_compiles_nothing(missions, posterior):
     before = drift_target._log_likelihood._cache_size()
     fit(missions[:5], OWN, seed=2, whole=False)
@@ -202,15 +221,8 @@ def test_nuts_finds_the_same_posterior(missions, posterior):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "model",
-    [
-        DriftTrust(saturating, OWN.parameters, observation="censored"),
-        DriftTrust(saturating, OWN.parameters, place=PlaceEffect()),
-    ],
-    ids=["censored", "places"],
-)
-def test_other_families_and_places_are_left_to_nuts(missions, model):
+def test_other_families_are_left_to_nuts(missions):
+    model = DriftTrust(saturating, OWN.parameters, observation="censored")
     posterior = fit(missions, model, seed=1, check=False)
     assert "drift is a function of your own" in posterior.attrs["sampler_reason"]
     assert np.isfinite(posterior["log_likelihood"]["contact_rate"]).all()

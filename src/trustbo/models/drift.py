@@ -160,11 +160,9 @@ class DriftTrust(TrustModel):
 
     @cached_property
     def why_not_exact(self) -> str | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Reason why scores of priors do not do: other rates than Gaussian, places, or a prior."""
+        """Reason why scores of priors do not do: other rates than Gaussian, or a prior."""
         if not self.family.integrates_out:
             return "its drift is a function of your own, and its observations are not Gaussian"
-        if self.place is not None:
-            return "its drift is a function of your own, and it has effects of places"
         return self._why_no_scores
 
     @cached_property

@@ -216,6 +216,8 @@ def _targets(
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
     priors, family = model.priors, model.family
+    if isinstance(model, DriftTrust):
+        return [DriftTarget(model, batch, weight, places)]
     if places is not None:
         place = cast(PlaceEffect, model.place)
         if not family.integrates_out:
@@ -224,8 +226,6 @@ def _targets(
         rates = batch.awareness, batch.contact_rate
         rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
         return [PlaceTarget(rows, places, priors, place)]
-    if isinstance(model, DriftTrust):
-        return [DriftTarget(model, batch, weight)]
     if model.partial_pooling is not None:
         return [HierarchicalTarget(model.gather(batch, weight), priors)]
     return [LatentTarget(*gather_chains(family, one), priors) for one in model.robots_of(batch)]
