@@ -45,7 +45,7 @@ def test_everything_is_shown_without_complaint(seen):
     loaded = seen.execute_script(
         "return [...document.images].map(i => i.complete && i.naturalWidth > 0)"
     )
-    assert loaded == [True] * 8
+    assert loaded == [True] * 9
 
 
 def test_nothing_overflows_the_page_and_text_can_be_read(seen):

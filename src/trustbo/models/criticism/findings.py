@@ -79,7 +79,7 @@ def finding(
     if name == "correlation":
         return f"noise is correlated: {label} go together beyond what the model says."
     limits = ((data.y <= 0.0) | (data.y >= 1.0)).mean()
-    end = f"; {limits:.0%} of the rates are 0 or 1, try observation='censored'" if limits else ""
+    end = f"; {limits:.0%} of the rates are 0 or 1, try observation='auto'" if limits else ""
     return f"residuals are not normal ({label}){end}."
 
 
