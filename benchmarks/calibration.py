@@ -60,6 +60,7 @@ def main(folder="out/calibration", share="1"):
         n = max(2, round(n * float(share)))
         name = type(model).__name__
         detail = getattr(model, "inter_robot", model.response)
+        detail = "saturating" if isinstance(model, DriftTrust) else detail
         detail = "places" if model.place is not None else detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
         file = Path(folder) / f"{name}-{detail}-{model.observation}-{sampler}-{n}.json"

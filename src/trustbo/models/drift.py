@@ -35,7 +35,7 @@ _RESERVED = (
 @jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True, repr=False, init=False)
 class DriftTrust(TrustModel):
-    """Trust x^k = beta0 x^{k-1} + u^k + eps_w with a drift u = drift(z, **theta) of your own.
+    """Trust x^k = beta0 x^{k-1} + u^k + eps_w, u = `drift(z, **theta)` a function of your own.
 
     Rates are as in (4), and trust integrates out as it does in `PooledTrust`, whose drift is
     z @ beta + b. All robots share beta0 and the noises, whose priors are those of `priors`.

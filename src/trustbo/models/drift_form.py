@@ -24,7 +24,7 @@ _KNOWN: dict[str, list["DriftForm"]] = {}
 
 @dataclass(frozen=True)
 class DriftForm:
-    """Function u = drift(z, **theta) of one bound, z (robot, feature), u (robot,).
+    """Function u = `drift(z, **theta)` of one bound, z (robot, feature), u (robot,).
 
     Attributes:
         function: JAX function.
