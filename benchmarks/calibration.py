@@ -22,8 +22,6 @@ from trustbo.models import (
 )
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
-
-
 OWN = {
     "top": HalfNormal(1.0),
     "slope": LogNormal(1.0, 0.7),
@@ -40,9 +38,15 @@ def cases():
     """Model, sampler, data sets, shape."""
     yield PooledTrust(), "exact", 1000, (4, 8, 3, 2)
     yield CoupledTrust(inter_robot="none"), "exact", 200, SMALL
+    for observation in ("censored", "beta_binomial"):
+        yield PooledTrust(observation=observation), "exact", 300, SMALL
+        yield CoupledTrust(observation=observation, inter_robot="none"), "exact", 200, SMALL
+        yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 100, SMALL
+    yield HierarchicalTrust(), "exact", 300, SMALL
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     for sampler, n in (("exact", 300), ("nuts", 50)):
         yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
+    yield PooledTrust(observation="student_t"), "joint", 100, SMALL
     for observation in ("gaussian", "censored", "beta_binomial"):
         sampler = "nuts" if observation == "gaussian" else "joint"
         for model in (PooledTrust, HierarchicalTrust):

@@ -38,8 +38,8 @@ Learning
   model NAME: Trust model: places (robots are alike, places differ), pooled (places do not, as in
     the paper), hierarchical (robots are similar), coupled (influence
     each other).
-  observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial, or
-    auto (the one that suits them).
+  observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial,
+    student_t, or auto (the one that suits them).
   sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
     (importance sampling, which need not compile); nuts;
     joint (nuts, for other than gaussian).

@@ -47,7 +47,8 @@ class TrustModel(Displayed, ABC):
             names of the features, see `Priors.of`.
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
-            trust being a logit; `"auto"`: that which suits the rates of a fit, see `for_rates`.
+            trust being a logit; `"student_t"`, rates with odd values, 4 degrees of freedom;
+            `"auto"`: that which suits the rates of a fit, see `for_rates`.
         response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
         place: Effects of places beyond what awareness says of them; None is the paper's model.
 
@@ -412,6 +413,8 @@ class TrustModel(Displayed, ABC):
     @property
     def why_not_exact(self) -> str | None:
         """Reason why the exact sampler cannot treat the model; None if it can."""
+        if not (self.family.integrates_out or self.family.propagates):
+            return "expectation propagation does not know its observations"
         if self.robot_sets is None and self.partial_pooling is None:
             return "its robots share some parameters only, or influence each other"
         if self.partial_pooling is not None:

@@ -52,7 +52,9 @@ class Law(NamedTuple):
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
-        return cls(family, lag, apart and (family.integrates_out or not lag))
+        return cls(
+            family, lag, apart and (family.integrates_out or (family.propagates and not lag))
+        )
 
     @property
     def keeps_trust(self) -> bool:

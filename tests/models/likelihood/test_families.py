@@ -25,6 +25,7 @@ PARAMS = {
     "gaussian": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
     "censored": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.15, 0.1),
     "beta_binomial": TrustParams(0.6, np.array([2.0, 1.0]), -0.6, 0.4, 0.25, 0.0, 1.5),
+    "student_t": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
 }
 
 
@@ -48,6 +49,8 @@ def on_a_grid(family, p, z, y, n_points=1201, *, last_trust=False):
             phi = p.delta_v**-2.0
             share = special.expit(x)
             likelihood = stats.betabinom.pmf(round(y[k] * N), N, phi * share, phi * (1 - share))
+        elif family == "student_t":
+            likelihood = stats.t.pdf(y[k], 4, x, p.delta_v)
         elif y[k] <= 0.0:
             likelihood = stats.norm.cdf(0.0, x, p.delta_v)
         elif y[k] >= 1.0:
@@ -76,10 +79,10 @@ def sequences(family, seed=0, n=6, low=0.0):
     return z, y, missions
 
 
-@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+@pytest.mark.parametrize("family", ["censored", "beta_binomial", "student_t"])
 def test_importance_sampling_finds_the_integral_over_trust(family):
     z, y, missions = sequences(family)
-    assert ((y == 0.0) | (y == 1.0)).any()
+    assert ((y == 0.0) | (y == 1.0)).any()  # odd ones, for Student-t rates
     model, p = PooledTrust(observation=family), PARAMS[family]
     expected = [on_a_grid(family, p, z[j, :, 0], y[j, :, 0]) for j in range(len(y))]
     found = np.array([model.log_likelihood(p, missions, seed=s) for s in range(60)])

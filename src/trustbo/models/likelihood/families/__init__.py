@@ -10,9 +10,10 @@ from trustbo.models.likelihood.families.beta_binomial import BetaBinomial
 from trustbo.models.likelihood.families.censored import Censored
 from trustbo.models.likelihood.families.family import Family, Observed
 from trustbo.models.likelihood.families.gaussian import Gaussian
+from trustbo.models.likelihood.families.student_t import StudentT
 
 FAMILIES: dict[str, Family] = {
-    family.name: family for family in (Gaussian(), Censored(), BetaBinomial())
+    family.name: family for family in (Gaussian(), Censored(), BetaBinomial(), StudentT())
 }
 
 AUTO = "auto"

@@ -63,6 +63,9 @@ class Family(ABC):
     correlates: ClassVar[bool] = True
     """Observation noise may be correlated between robots."""
 
+    propagates: ClassVar[bool] = True
+    """Expectation propagation knows its `terms`, and so the exact sampler treats it."""
+
     expected_rate: ClassVar[str] = "identity"
     """E[rate | trust] as compiled planning knows it: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (of a normal with sd delta_v, cut to [0, 1]); the mean of `rate_moments`."""
