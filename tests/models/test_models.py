@@ -229,8 +229,7 @@ def test_hierarchical_robots_lie_between_pooled_and_separate_ones(missions):
 @pytest.mark.slow  # it compiles for long
 def test_a_coupled_posterior_has_the_paper_s_matrices(missions):
     coupled = fit(missions, CoupledTrust(), n_trajectories=AS_MANY_AS_PRIOR_DRAWS)
-    assert diagnostics(coupled)["r_hat"] <= 1.01
-    assert diagnostics(coupled)["divergences"] == 0
+    assert diagnostics(coupled)["k_hat"] <= 0.7
     draws = coupled["posterior"]
     assert list(draws.data_vars) == ["B0", "B", "b", "Delta_w", "Delta_v"]
     assert draws["B"].dims == ("chain", "draw", "feature", "robot", "robot_")
@@ -406,5 +405,5 @@ def test_covariances_and_sizes_that_do_not_fit_are_named():
         PooledTrust(3)
     with pytest.raises(TrustboError, match="model must be a trust model"):
         fit(missions, "pooled")
-    with pytest.raises(TrustboError, match=r'"exact" cannot treat CoupledTrust.*share some'):
-        fit(missions, CoupledTrust(), sampler="exact")
+    with pytest.raises(TrustboError, match=r'"exact" cannot treat CoupledTrust.*influence'):
+        fit(missions, CoupledTrust(observation="censored"), sampler="exact")

@@ -139,6 +139,15 @@ class CoupledTrust(TrustModel):
         return self.robots_are_apart
 
     @property
+    def why_not_exact(self) -> str | None:
+        """See `TrustModel.why_not_exact`: coupled robots need Gaussian rates."""
+        if self.robots_are_apart:
+            return super().why_not_exact
+        if not self.family.integrates_out:
+            return "its robots influence each other, and its observations are not Gaussian"
+        return None
+
+    @property
     def robot_sets(self) -> str | None:
         """Each robot has its own, if nothing couples them."""
         return "each" if self.robots_are_apart else None

@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, HierarchicalTrust, Priors, complete, diagnostics, fit
+from trustbo.models import HierarchicalTrust, Priors, complete, diagnostics, fit
 from trustbo.models.model import TrustModel
 from trustbo.models.samplers import scores
 from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
@@ -189,8 +189,6 @@ def test_what_it_cannot_treat_is_refused():
         fit(missions, HierarchicalTrust(observation="censored"), "exact")
     with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
         HierarchicalTrust().update(None, missions)
-    with pytest.raises(TrustboError, match="share some parameters only, or influence each other"):
-        fit(missions, CoupledTrust(), "exact")
 
 
 def test_half_normal_quantiles_are_scipy_s():

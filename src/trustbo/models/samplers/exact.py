@@ -341,9 +341,10 @@ def backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
     return x
 
 
-def why_not_conjugate(priors: Priors) -> str | None:
-    """Reason why the sampler cannot treat these priors; None if it can."""
+def why_not_conjugate(priors: Priors, *, coupled: bool = False) -> str | None:
+    """Reason why the sampler cannot treat these priors, of coupled robots if so; None if it can."""
     for name, allowed, kind in (
+        ("coupling", lambda p: not coupled or isinstance(p, dist.Normal), "a Normal distribution"),
         ("beta", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),
         ("b", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),
         ("beta0", lambda p: p.support in _LINES, "on (0, 1) or the real line"),

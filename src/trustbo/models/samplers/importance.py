@@ -33,6 +33,7 @@ from trustbo.parallel import one_blas_thread
 _MAX_ROUNDS, _MAX_FINAL = 4, 3
 _FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
 _RIDGE = 1e-3
+_MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
 _MORE = 3  # times that uneven draws are added to
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
@@ -187,7 +188,7 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
         cloud.add(proposal.widened(target.widths[0]), target.n_pilot // 2, seed + k)
         cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)
         points = cloud.points()
-        proposal = Student.of(points.z, points.log_w, _RIDGE)
+        proposal = _fitted(points)
         if k == 1 and not warm:  # a curvature's proposal only serves to be replaced
             cloud = _Cloud(target)
         elif points.kish > _FAIR * target.n_pilot:
@@ -199,10 +200,24 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
     for k in range(1, _MAX_FINAL):
         if points.khat < GOOD_KHAT:
             break
-        proposal = Student.of(points.z, points.log_w, _RIDGE)
+        proposal = _fitted(points)
         cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77 + k)
         points = cloud.points()
     return points, Student.of(points.z, points.log_w, 1e-9)
+
+
+def _fitted(points: _Points) -> Student:
+    """Student-t with the moments of weighted points.
+
+    With many axes those of few effective points are far too narrow in some direction: weights are
+    then raised to a power below 1, which leaves the moments between the proposals' and the
+    posterior's.
+    """
+    log_w, n_axes = points.log_w, points.z.shape[1]
+    while n_axes > _MANY and _kish(log_w) < _PER_AXIS * n_axes:
+        log_w = 0.75 * log_w
+        log_w = log_w - np.logaddexp.reduce(log_w)
+    return Student.of(points.z, log_w, _RIDGE)
 
 
 class _Cloud:

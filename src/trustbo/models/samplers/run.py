@@ -11,6 +11,7 @@ from jax import Array, random
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import own_settings
+from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.likelihood.ep.chains import gather_chains
 from trustbo.models.likelihood.gram_jax import spectrum
@@ -20,6 +21,7 @@ from trustbo.models.likelihood.place_rows import gather_rows
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
+from trustbo.models.samplers.coupled_target import CoupledTarget
 from trustbo.models.samplers.drift_target import DriftTarget
 from trustbo.models.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
 from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
@@ -74,7 +76,8 @@ def draw_posterior(
         batch: Missions, padded.
         weight: Weight of each mission, shape (mission,); 1 by default.
         places: Visited places, where these have effects.
-        start: First proposal of the exact sampler with places, from an earlier posterior.
+        start: First proposal of the exact sampler with places or coupled robots, from an earlier
+            posterior.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
     """
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
@@ -121,9 +124,8 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
     """Refuse a sampler that cannot treat the model.
 
     Raises:
-        TrustboError: The sampler is `"exact"`, and robots share some parameters only or influence
-            each other, or what else `TrustModel.why_not_exact` says; or it is `"joint"`, and trust
-            integrates out.
+        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` says why it cannot
+            be; or it is `"joint"`, and trust integrates out.
     """
     if sampler == "exact" and (reason := model.why_not_exact):
         raise TrustboError(
@@ -146,9 +148,11 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     if sampler != "auto":
         return sampler, "asked for"
     pooling = model.partial_pooling is not None
-    own = isinstance(model, DriftTrust)
-    by_scores = model.place or pooling or own or not model.family.integrates_out
-    reason = model.why_not_exact or (None if own else why_not_conjugate(model.priors))
+    own, coupled = isinstance(model, DriftTrust), _is_coupled(model)
+    by_scores = model.place or pooling or own or coupled or not model.family.integrates_out
+    reason = model.why_not_exact or (
+        None if own else why_not_conjugate(model.priors, coupled=coupled)
+    )
     reason = reason or (
         why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
     )
@@ -187,9 +191,12 @@ def _sample_scores(
     places: Visited | None,
     start: Student | None,
 ) -> Draws | None:
-    """The same for effects of places, partial pooling, and rates that are not Gaussian."""
+    """The same for places, partial pooling, coupled robots, and rates that are not Gaussian."""
     shape = (settings.n_chains, settings.n_draws)
     targets = _targets(model, batch, weight, places)
+    coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
+    if start is not None and coupled and len(start.center) != coupled.n_scores:
+        start = None  # of another team
     found = [sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)]
     each = [one.draws for one in found]
     if not _is_even(max(drawn.khat for drawn in each)):
@@ -204,7 +211,7 @@ def _sample_scores(
     params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
     summary = _summarize(each)
-    if places is not None:
+    if places is not None or coupled is not None:
         proposal = found[0].proposal
         summary["proposal_center"] = proposal.center.tolist()
         summary["proposal_scale"] = proposal.scale.ravel().tolist()
@@ -228,7 +235,13 @@ def _targets(
         return [PlaceTarget(rows, places, priors, place)]
     if model.partial_pooling is not None:
         return [HierarchicalTarget(model.gather(batch, weight), priors)]
+    if _is_coupled(model):
+        return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
     return [LatentTarget(*gather_chains(family, one), priors) for one in model.robots_of(batch)]
+
+
+def _is_coupled(model: TrustModel) -> bool:
+    return isinstance(model, CoupledTrust) and not model.robots_are_apart
 
 
 def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
