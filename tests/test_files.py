@@ -9,8 +9,8 @@ import threading
 import pytest
 
 import trustbo.files
-from trustbo.errors import DamagedFileError
-from trustbo.files import read_checked, write_checked, write_file
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.files import read_checked, require_file, require_folder, write_checked, write_file
 
 
 @pytest.fixture(autouse=True)
@@ -121,3 +121,10 @@ def test_whenever_it_dies_a_file_and_its_sum_agree(tmp_path, monkeypatch):
     file.write_bytes(b"noise")
     with pytest.raises(DamagedFileError, match=r"a.bin' is damaged: its bytes are not those"):
         read_checked(file)
+
+
+@pytest.mark.parametrize("require", [require_file, require_folder])
+def test_what_is_no_path_is_named(require):
+    """Arguments in the wrong order, say."""
+    with pytest.raises(TrustboError, match="give the path of a file or folder; got a dict"):
+        require({})

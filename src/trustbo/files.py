@@ -183,7 +183,7 @@ def cache_folder(name: str) -> Path:
 
 def require_folder(directory: FilePath) -> Path:
     """Return a folder, which need not exist; TrustboError if it, or one above it, is a file."""
-    folder = Path(directory)
+    folder = _as_path(directory)
     for part in (folder, *folder.parents):
         if part.exists():
             if not part.is_dir():
@@ -198,13 +198,19 @@ def require_file(path: FilePath, *suffixes: str) -> Path:
     `suffixes` are in lower case with the dot; none allow any. TrustboError: another suffix, a
     folder of that name, or a file of that of its folder.
     """
-    file = Path(path)
+    file = _as_path(path)
     if suffixes and file.suffix.lower() not in suffixes:
         raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
     if file.is_dir():
         raise TrustboError(f"cannot write {str(file)!r}: it is a folder; name a file in it.")
     require_folder(file.parent)
     return file
+
+
+def _as_path(path: FilePath) -> Path:
+    if not isinstance(path, str | os.PathLike):
+        raise TrustboError(f"give the path of a file or folder; got a {type(path).__name__}.")
+    return Path(path)
 
 
 def read_yaml(file: Path) -> Any:
