@@ -18,6 +18,8 @@ def cases():
     """Model, sampler, data sets, shape."""
     yield PooledTrust(), "exact", 1000, (4, 8, 3, 2)
     yield CoupledTrust(inter_robot="none"), "exact", 200, SMALL
+    yield CoupledTrust(), "exact", 100, SMALL
+    yield CoupledTrust(inter_robot="ordered"), "exact", 100, SMALL
     for sampler, n in (("exact", 300), ("nuts", 50)):
         yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
     for observation in ("gaussian", "censored", "beta_binomial"):
