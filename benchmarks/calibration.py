@@ -44,6 +44,8 @@ def cases():
         yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 100, SMALL
     yield HierarchicalTrust(), "exact", 300, SMALL
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
+    yield CoupledTrust(), "exact", 100, SMALL
+    yield CoupledTrust(inter_robot="ordered"), "exact", 100, SMALL
     for sampler, n in (("exact", 300), ("nuts", 50)):
         yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
     yield PooledTrust(observation="student_t"), "joint", 100, SMALL

@@ -145,7 +145,10 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--replan", "tick"), "unknown replan 'tick'; choose one of mission, bound"),
         (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
         (("--stop-regret", "2"), "--stop-regret must be in (0, 1); got 2.0"),
-        (("--model", "coupled"), 'sampler "exact" cannot treat Coupled'),
+        (
+            ("--model", "hierarchical", "--observation", "censored"),
+            'sampler "exact" cannot treat Hier',
+        ),
         (("--iterations", "0"), "--iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),
         (("--seed", "-1"), "seed must be a whole number from 0 on; got -1"),
@@ -186,7 +189,10 @@ def test_errors_speak_of_the_flags_that_mend_them(invoke, flags, tmp_path):
     for remedy, said in (
         ([], "pass both --crs and --resolution (metres).\n"),
         (["--crs", "EPSG:32633", "--resolution", 1], "Pass --nodata 12345.0, or set the tag"),
-        (["--nodata", "12345.0", "--model", "coupled"], "Use --sampler auto.\n"),
+        (
+            ["--nodata", "12345.0", "--model", "hierarchical", "--observation", "censored"],
+            "Use --sampler auto.\n",
+        ),
     ):
         words += remedy
         done = invoke(*words)

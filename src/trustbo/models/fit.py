@@ -53,14 +53,15 @@ def fit(
         model: Trust model; by default `PooledTrust()`.
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
             attributes say which, and why. `"exact"`: near-independent draws by importance sampling,
-            without compiling, for robots that share their parameters, have nothing in common, or
-            are partially pooled; it falls back on NUTS, with a warning, where its weights are too
-            uneven. `"nuts"`. Or `"joint"`: NUTS on parameters and latent trust together, which
-            `"nuts"` is too where trust does not integrate out.
+            without compiling, for robots that share their parameters, have nothing in common, are
+            partially pooled or influence each other; it falls back on NUTS, with a warning, where
+            its weights are too uneven. `"nuts"`. Or `"joint"`: NUTS on
+            parameters and latent trust together, which `"nuts"` is too where trust does not
+            integrate out.
         workspace: Workspace of the missions. A model with effects of places then knows them over
             the whole grid, else up to the last row and column that was visited.
-        earlier: Posterior of earlier missions, to begin the exact sampler of effects of places
-            from; the posterior is the same but for Monte Carlo error.
+        earlier: Posterior of earlier missions, to begin the exact sampler of effects of places or
+            coupled robots from; the posterior is the same but for Monte Carlo error.
         weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
             observations.
         seed: Seed; the same seed gives the same posterior.

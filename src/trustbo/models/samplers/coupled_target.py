@@ -32,8 +32,8 @@ from trustbo.stacking import MissionBatch
 class CoupledTarget:
     """Log posterior density of the scores."""
 
-    n_pilot, widths = 4096, (1.05, 1.0)
-    n_final = 4096
+    n_pilot, widths = 2048, (1.05, 1.1)
+    n_final = 8192
     """Points of the last proposal."""
     n_corrected = None
 
@@ -86,7 +86,8 @@ class CoupledTarget:
         def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
             values = -self.log_density(np.vstack([z, z + steps]))
             up, down = np.split(values[1:], 2)
-            return values[0], np.nan_to_num((up - down) / 2e-4)
+            with np.errstate(invalid="ignore"):  # beside a point without density
+                return values[0], np.nan_to_num((up - down) / 2e-4)
 
         mode = optimize.minimize(cost, start, jac=True, method="BFGS", options={"maxiter": 60}).x
         return Student(mode, laplace(self.log_density, mode[None], 0)[2][0])
