@@ -25,12 +25,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from trustbo.models.samplers.convergence import GOOD_KHAT
+from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT
 from trustbo.models.samplers.exact import ExactDraws, smoothed_weights, systematic
 from trustbo.models.samplers.student import Proposal, Student, log_mixture
 from trustbo.parallel import one_blas_thread
 
 _MAX_ROUNDS, _MAX_FINAL = 4, 3
+_MAX_LAST = 8  # rounds of the last proposal where weights would be refused after fewer
 _FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
 _RIDGE = 1e-3
 _MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
@@ -197,8 +198,8 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
             cloud, proposal, warm = _Cloud(target), target.first(), False
     cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77)
     points = cloud.points()
-    for k in range(1, _MAX_FINAL):
-        if points.khat < GOOD_KHAT:
+    for k in range(1, _MAX_LAST):
+        if points.khat < (GOOD_KHAT if k < _MAX_FINAL else MAX_KHAT):
             break
         proposal = _fitted(points)
         cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77 + k)
