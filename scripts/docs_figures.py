@@ -1,6 +1,7 @@
 """Draw the figures of the documentation: those of docs/gallery.md by its own code, and two more.
 
-The figure of long campaigns is of the tables that `benchmarks/campaigns.py --csv` wrote.
+The figures of long campaigns and of reliability are of the tables that `benchmarks/campaigns.py
+--csv` and `benchmarks/failures.py --csv` wrote.
 """
 
 import io
@@ -32,6 +33,7 @@ def main() -> None:
             plt.close("all")
     save(criticism(), "criticism")
     save(long_campaigns(), "long_campaigns")
+    save(reliability(), "reliability")
     result = names["result"]
     film = plots.animate_mission(result.missions[-1], result.workspace)
     contact = np.concatenate([bound.contact for bound in result.missions[-1].bounds])
@@ -63,6 +65,35 @@ def long_campaigns() -> Figure:
     for ax, name in zip(axes, ("seconds a mission", "memory gained, GB", "disk, GB"), strict=True):
         ax.set(xlabel="mission", ylabel=name, ylim=(0, None), xlim=(0, 200))
         ax.spines[["top", "right"]].set_visible(False)
+    axes[0].legend(frameon=False)
+    return figure
+
+
+def reliability() -> Figure:
+    """Share of missions that arrived, by the chance predicted, after 15 and 60 missions."""
+    table = np.genfromtxt(
+        RESULTS / "failures_reliability.csv", delimiter=",", names=True, dtype=None, encoding=None
+    )
+    figure, axes = plt.subplots(1, 2, figsize=(7, 3.3), layout="constrained", sharey=True)
+    styles = {
+        "topography": ("#0072B2", "o"),
+        "tahoe": ("#D55E00", "s"),
+        "synthetic-0": ("#009E73", "^"),
+    }
+    for ax, missions in zip(axes, (15, 60), strict=True):
+        ax.fill_between([0, 1], [-0.05, 0.95], [0.05, 1.05], color="0.9", label="off by .05")
+        ax.plot([0, 1], [0, 1], color="0.5", linewidth=0.8)
+        for name, (color, marker) in styles.items():
+            of = table[np.char.startswith(table["world"], name) & (table["missions"] == missions)]
+            many, few = of[of["n"] >= 100], of[(of["n"] < 100) & (of["n"] > 0)]
+            ax.plot(many["predicted"], many["arrived"], marker, color=color, label=name)
+            ax.plot(
+                few["predicted"], few["arrived"], marker, color=color, fillstyle="none", alpha=0.6
+            )
+        ax.set(xlabel="predicted chance to arrive", title=f"after {missions} missions")
+        ax.set(xlim=(0, 1), ylim=(0, 1.02))
+        ax.spines[["top", "right"]].set_visible(False)
+    axes[0].set_ylabel("share that arrived")
     axes[0].legend(frameon=False)
     return figure
 
