@@ -11,10 +11,10 @@ import typer
 
 from trustbo.cli import app, main
 from trustbo.export import FORMATS
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.likelihood.families import AUTO, FAMILIES
 from trustbo.models.samplers.run import SAMPLERS
 from trustbo.planning import OBJECTIVES, POLICIES
-from trustbo.study.parts import MODELS
+from trustbo.study.parts import NAMED_MODELS
 from trustbo.workspace import SIGHT_MODES
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
@@ -178,7 +178,7 @@ def test_shells_complete_commands_flags_and_names():
     ("option", "names"),
     [
         ("policy", POLICIES), ("objective", OBJECTIVES), ("sampler", SAMPLERS),
-        ("model", [model.kind for model in MODELS]), ("observation", FAMILIES),
+        ("model", [model.kind for model in NAMED_MODELS]), ("observation", [AUTO, *FAMILIES]),
         ("sight", SIGHT_MODES),
     ],
 )  # fmt: skip

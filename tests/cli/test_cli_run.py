@@ -140,7 +140,10 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
             "unknown model 'own'; choose one of pooled, places, hierarchical, coupled",
         ),
         (("--sampler", "gibbs"), "unknown sampler 'gibbs'; choose one of auto, exact, nuts, joint"),
-        (("--observation", "odd"), "unknown observation 'odd'; choose one of gaussian, censored"),
+        (
+            ("--observation", "odd"),
+            "unknown observation 'odd'; choose one of auto, gaussian, censored",
+        ),
         (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
         (("--replan", "tick"), "unknown replan 'tick'; choose one of mission, bound"),
         (("--team", "max"), "unknown team 'max'; choose one of mean, min"),

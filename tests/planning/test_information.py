@@ -136,7 +136,8 @@ def test_moments_of_a_rate_are_those_of_simulated_ones(name, trust):
         p, phi = expit(trust), 1.0 / (sd**2 + 1e-6)
         y = rng.binomial(200, rng.beta(phi * p, phi * (1.0 - p), n)) / 200
     else:
-        y = trust + sd * rng.standard_normal(n)
+        t = rng.standard_t(4, n) if name == "student_t" else rng.standard_normal(n)
+        y = trust + sd * t
         y = np.clip(y, 0.0, 1.0) if name == "censored" else y
     assert abs(y.mean() - mean) <= 5.0 * y.std() / np.sqrt(n) + 1e-15
     fourth = ((y - y.mean()) ** 4).mean() - y.var() ** 2

@@ -454,7 +454,10 @@ def test_regret_curves_show_each_policy_s_median(serial):
             {"models": {"pooled": {"priors": "mine"}}},
             "unknown priors 'mine'; choose one of default",
         ),
-        ({"models": ["coupled"]}, "model 'coupled': sampler \"exact\" cannot treat"),
+        (
+            {"models": {"coupled": {"observation": "censored"}}},
+            "model 'coupled': sampler \"exact\" cannot treat",
+        ),
         ({"options": {"seed": 3}}, "unknown option 'seed'; choose one of .*initial"),
         ({"options": {"forgetting": float("nan")}}, "option 'forgetting' must be a number, a name"),
         ({"options": {"forgetting": 7}}, "the run seed=0.*forgetting"),

@@ -207,9 +207,9 @@ def _require_names(
 
 
 def _models() -> dict[str, Any]:
-    from trustbo.study.parts import MODELS
+    from trustbo.study.parts import NAMED_MODELS
 
-    return {model.kind: model for model in MODELS}
+    return {model.kind: model for model in NAMED_MODELS}
 
 
 def _team(n_robots: int, max_slope: float, lidar_range: float) -> "Team":

@@ -39,7 +39,7 @@ Learning
     the paper), hierarchical (robots are similar), coupled (influence
     each other).
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial,
-    student_t, or auto (the one that suits them).
+    student_t, auto (the one that suits them).
   sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
     (importance sampling, which need not compile); nuts;
     joint (nuts, for other than gaussian).

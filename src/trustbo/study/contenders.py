@@ -21,7 +21,7 @@ from trustbo.planning import POLICIES, Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.policies import random, seed_of
-from trustbo.study.parts import MODELS, Part, Pooled, parts_of
+from trustbo.study.parts import NAMED_MODELS, Part, Pooled, parts_of
 
 BASELINES = ("random", "shortest", "paper", "botorch")
 """Baselines: a random path, a random one of the shortest, the paper's method, and BoTorch."""
@@ -161,10 +161,10 @@ def _baseline(name: str) -> Any:
 
 def _models_of(models: Any) -> dict[str, Any]:
     """Parts of models by name."""
-    kinds, parts = {kind.kind for kind in MODELS}, {}
+    kinds, parts = {kind.kind for kind in NAMED_MODELS}, {}
     for given in _listed(models):
         if isinstance(given, str) and ":" not in given:
-            parts |= parts_of("model", (require_choice("model", given, kinds),), MODELS)
+            parts |= parts_of("model", (require_choice("model", given, kinds),), NAMED_MODELS)
         else:
             part = OwnModel(given=given)
             part.model()

@@ -168,7 +168,9 @@ class Own(Part):
         return found
 
 
-MODELS = (Pooled, Places, Hierarchical, Coupled, Own)
+NAMED_MODELS = (Pooled, Places, Hierarchical, Coupled)
+"""Models that a name alone tells."""
+MODELS = (*NAMED_MODELS, Own)
 
 
 class Place(Protocol):

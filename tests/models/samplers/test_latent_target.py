@@ -208,7 +208,7 @@ def test_priors_of_ones_own_move_the_posterior_and_those_without_quantiles_go_to
     ("model", "reason"),
     [
         (PooledTrust(observation="censored", response="change"), "it measures changes of trust"),
-        (CoupledTrust(observation="censored"), "its robots share some parameters only, or influ"),
+        (CoupledTrust(observation="censored"), "its robots influence each other, and its observ"),
     ],
 )
 def test_models_it_cannot_treat_are_refused(model, reason):
