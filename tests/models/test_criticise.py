@@ -4,6 +4,7 @@ import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from references import dense_coupled, dense_log_likelihood
@@ -224,3 +225,29 @@ def test_what_cannot_be_criticised_says_why(with_places, planted):
 
 def test_holm_adjusts_for_the_number_of_tests():
     np.testing.assert_allclose(holm(np.array([0.04, 0.01, 0.03])), [0.06, 0.03, 0.06])
+
+
+def few(n, n_bounds):
+    """Missions along a row, of random rates."""
+    rng, path = np.random.default_rng(0), [(0, k) for k in range(n_bounds + 1)]
+    shape = (n_bounds, 3)
+    return [
+        Mission.from_arrays(path, rng.uniform(size=(*shape, 2)), rng.uniform(0.3, 0.9, shape))
+        for _ in range(n)
+    ]
+
+
+@pytest.mark.parametrize("missions", [few(1, 11), few(8, 1)], ids=["one mission", "one bound"])
+def test_one_mission_and_missions_of_one_bound_have_figures_too(missions):
+    found = tb.models.criticise(tb.models.fit(missions), compare=False, n_replicates=200)
+    assert found.fault == "none"
+    tb.plots.criticism(found)
+    plt.close("all")
+
+
+def test_rates_that_are_all_alike_are_refused():
+    model = tb.models.PooledTrust(place=tb.models.PlaceEffect())
+    path = [(0, k) for k in range(6)]
+    same = [Mission.from_arrays(path, np.full((5, 3, 2), 0.5), np.ones((5, 3))) for _ in range(3)]
+    with pytest.raises(tb.TrustboError, match="the rates are all but equal"):
+        tb.models.criticise(tb.models.fit(same, model), compare=False)

@@ -100,10 +100,29 @@ def criticise(
 
     Raises:
         TrustboError: The posterior is not of a linear model with Gaussian observations, or holds no
-            data and no missions are given; there are too few rates, or more than 2000.
+            data and no missions are given; there are too few rates, or more than 2000; or they
+            are all but equal.
     """
     require_whole("n_replicates", n_replicates, 100)
     missions = _checked(posterior, missions)
+    try:
+        return _criticise(posterior, missions, model, compare, n_replicates, seed)
+    except np.linalg.LinAlgError:
+        raise TrustboError(
+            "the rates are all but equal, so that residuals say nothing of the model; criticise "
+            "missions that differ."
+        ) from None
+
+
+def _criticise(
+    posterior: xr.DataTree,
+    missions: list[Mission],
+    model: TrustModel | None,
+    compare: bool,
+    n_replicates: int,
+    seed: int,
+) -> Criticism:
+    """See `criticise`; LinAlgError: rates are all but equal."""
     point, place = posterior_point(posterior)
     data = gather(missions, place)
     point = with_start(point, data)

@@ -84,20 +84,18 @@ def _draw_curves(pit: Axes, cover: Axes, correlation: Axes, curves: xr.Dataset) 
         cover.set_xticks(x, [f"{p:.0%}" for p in level])
     cover.set_xlabel("interval one mission ahead", fontsize=8)
     cover.set_ylabel("share inside, less nominal", fontsize=8)
-    offset = 0
+    ticks, lags = [], []
     for name, axis in (("autocorrelation", "lag"), ("autocorrelation_missions", "mission_lag")):
-        if name not in curves:
+        if name not in curves:  # missions of one bound, or only one mission
             continue
-        x = offset + curves[axis].values
+        x = curves[axis].values + (ticks[-1] + 1 if ticks else 0)
         low, high = curves[f"{name}_low"].values, curves[f"{name}_high"].values
         correlation.bar(x, high - low, 0.8, bottom=low, color=_BAND)
         correlation.vlines(x, 0.0, curves[name], color="0.2", linewidth=1.5)
         _mark(correlation, x, curves, name)
-        offset = int(x[-1]) + 1
-    lags = curves.sizes.get("lag", 0)
+        ticks, lags = [*ticks, *x], [*lags, *curves[axis].values]
     correlation.axhline(0.0, color="0.6", linewidth=0.8)
-    ticks = [*curves["lag"].values, *(lags + 1 + curves["mission_lag"].values)]
-    correlation.set_xticks(ticks, [*curves["lag"].values, *curves["mission_lag"].values])
+    correlation.set_xticks(ticks, lags)
     correlation.set_xlabel("lag in bounds | lag in missions", fontsize=8)
     correlation.set_ylabel("autocorrelation", fontsize=8)
 
