@@ -21,6 +21,8 @@ _PIXELS = 96
 _DOTS, _QUALITY = 160, 75
 """Resolution of rasters such as hillshades, dots per inch, and their quality in WebP."""
 _PNG = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
+_DIGITS = re.compile(r"(?<![\d.])([1-9]\d*\.\d\d)\d+")  # beyond a hundredth of a point
+_BETWEEN = re.compile(r">\s+<")
 _STYLE: dict[Any, Any] = {
     "svg.fonttype": "path",
     "svg.hashsalt": "trustbo",
@@ -59,6 +61,7 @@ def _image(figure: Figure) -> Image:
     plt.close(figure)
     width, height = (round(_PIXELS * inches) for inches in figure.get_size_inches())
     svg = _PNG.sub(_smaller, file.getvalue().decode("utf-8"))
+    svg = _BETWEEN.sub("><", _DIGITS.sub(r"\1", svg))
     text = base64.b64encode(svg.encode("utf-8")).decode("ascii")
     return Image(f"data:image/svg+xml;base64,{text}", width, height)
 
