@@ -182,6 +182,8 @@ class Planner(Displayed):
     def with_observation(self, observation: str) -> Self:
         """Return the planner for contact rates of another family, see `Planner`."""
         family = FAMILIES[require_choice("observation", observation, FAMILIES)]
+        if family is self.family:  # what the problem has computed stays
+            return self
         objective = self.problem.objective._replace(family=family)
         other = self._with(replace(self.problem, objective=objective))
         other.family = family

@@ -137,7 +137,7 @@ class BetaBinomial(Linearised):
         """See `Family.observe`; by Gauss-Hermite nodes around the mode."""
         args = np.broadcast_arrays(mean, var, y, n_ticks, noise_sd)
         shape = args[0].shape
-        flat = (np.ascontiguousarray(a, dtype=float).ravel() for a in args)
+        flat = (np.array(a, dtype=float).ravel() for a in args)  # a broadcast one cannot be written
         found = count_moments(*flat)
         return found[0].reshape(shape), found[1].reshape(shape), found[2].reshape(shape)
 

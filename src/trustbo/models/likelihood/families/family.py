@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, random
 
+from trustbo.errors import TrustboError
 from trustbo.models.likelihood.ep.terms import Terms
 from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.likelihood.vector import VectorSSM
@@ -125,9 +126,12 @@ class Family(ABC):
         `observes_trust`. Arrays broadcast; `y` is not NaN.
         """
 
-    @abstractmethod
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
-        """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`."""
+        """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`.
+
+        TrustboError: the family has none, as its `propagates` says.
+        """
+        raise TrustboError(f'expectation propagation does not know observation "{self.name}".')
 
     @abstractmethod
     def is_density(self, y: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ import numpy as np
 from jax import Array, random
 from scipy import special
 
-from trustbo.models.likelihood.ep.terms import Terms
 from trustbo.models.likelihood.families.family import SSM, Observed
 from trustbo.models.likelihood.families.linearised import Data, Linearised
 
@@ -96,10 +95,6 @@ class StudentT(Linearised):
             mean[..., None] + gain * e - center[..., None]
         ) ** 2
         return center, (share * spread).sum(-1), total
-
-    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
-        """See `Family.terms`: it has none, as `propagates` says."""
-        raise NotImplementedError
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
         """See `Family.is_density`: all have."""
