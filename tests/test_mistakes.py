@@ -19,11 +19,12 @@ def made(*shape):
 class Case:
     """A mission that is as it should be, and its parts."""
 
-    workspace = made(3, 6, 6, 2)
-    simulator = ModelSimulator(workspace, TRUTH)
-    path = tb.Campaign(workspace, *ENDS).ask().path
-    mission = simulator.run(path, seed=0)
-    z, y = mission.awareness, mission.contact_rate
+    def __init__(self):
+        self.workspace = made(3, 6, 6, 2)
+        self.simulator = ModelSimulator(self.workspace, TRUTH)
+        self.path = tb.Campaign(self.workspace, *ENDS).ask().path
+        self.mission = self.simulator.run(self.path, seed=0)
+        self.z, self.y = self.mission.awareness, self.mission.contact_rate
 
     def tell(self, path=None, z=None, y=None):
         z, y = (self.z if z is None else z), (self.y if y is None else y)

@@ -1,0 +1,91 @@
+"""Regret and leave-one-out density by family of observations, over the worlds.
+
+    python benchmarks/families.py regret --data ../shared/data --out out/families
+    python benchmarks/families.py loo --data ../shared/data
+
+`regret`: campaigns of 15 missions with effects of places under each family, and the seconds of
+their fits; `auto` looks at the rates of each fit. `loo`: every family on the missions of one
+campaign of each terrain, along random paths; the log density of a mission left out, in nats of
+counts of ticks, less that of the best family. Both go on where they stopped.
+"""
+
+import argparse
+import warnings
+
+import numpy as np
+
+import trustbo as tb
+from trustbo.models import PlaceEffect, PooledTrust, fit
+from trustbo.study import run_worlds, worlds, worlds_table
+from trustbo.study.benchmark import as_text
+
+REGRET = ("gaussian", "auto", "censored")
+LOO = ("gaussian", "censored", "beta_binomial", "student_t")
+TERRAINS = ("synthetic-0", "synthetic-1", "synthetic-2", "wellington", "tahoe", "bcts",
+            "topography", "synthetic-0-wall", "tahoe-wall")  # fmt: skip
+HARDER = ("wellington", "tahoe-aged", "synthetic-0-aged", "bcts-low", "tahoe-wall",
+          "synthetic-1")  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("regret", "loo"))
+    parser.add_argument("--data")
+    parser.add_argument("--out", default="out/families")
+    parser.add_argument("--families", nargs="*")
+    parser.add_argument("--worlds", nargs="*")
+    parser.add_argument("--courses", nargs="*", default=["sw-ne", "n-s"])
+    parser.add_argument("--executor", default="loky")
+    given = parser.parse_args()
+    (regret if given.what == "regret" else loo)(given)
+
+
+def regret(given):
+    models = [
+        PooledTrust(observation=family, place=PlaceEffect()) for family in given.families or REGRET
+    ]
+    results = run_worlds(
+        given.out, data=given.data, only=given.worlds or HARDER, courses=given.courses,
+        models=models, baselines=(), sampler="auto", executor=given.executor,
+    )  # fmt: skip
+    print(as_text(worlds_table(results)))
+    seconds = results["seconds_fit"].groupby("contender").median(...)
+    print("\nmedian seconds of a fit\n")
+    for name, value in zip(seconds["contender"].values, seconds.values, strict=True):
+        print(f"{name}: {value:.2f}")
+
+
+def loo(given):
+    families = given.families or LOO
+    total = dict.fromkeys(families, 0.0)
+    print("| world | 0 or 1 | " + " | ".join(families) + " |\n|---|" + "---|" * (len(families) + 1))
+    for name in given.worlds or TERRAINS:
+        missions = driven(worlds(given.data)[name])
+        rates = np.concatenate([m.contact_rate.ravel() for m in missions])
+        piled = np.mean((rates[~np.isnan(rates)] % 1.0) == 0.0)
+        found = {family: density(missions, family) for family in families}
+        best = max(found.values())
+        total = {family: total[family] + found[family] - best for family in families}
+        row = " | ".join(f"{found[family] - best:.0f}" for family in families)
+        print(f"| {name} | {piled:.0%} | {row} |", flush=True)
+    print("| all | | " + " | ".join(f"{total[family]:.0f}" for family in families) + " |")
+
+
+def driven(world, n=15):
+    """Missions along random paths through a world."""
+    workspace = world.workspace()
+    options = {"policy": "random", "max_bounds": "shortest+4", "sampler": "exact"}
+    campaign = tb.Campaign(workspace, *world.ends("sw-ne"), **options)
+    run = tb.missions(campaign, world.simulator(workspace), n_iterations=n)
+    return [workspace.fill(mission) for _, mission in run]
+
+
+def density(missions, family):
+    """Log density of missions left out one by one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Pareto k: 15 missions are few
+        return float(tb.models.loo(fit(missions, PooledTrust(observation=family))).elpd)
+
+
+if __name__ == "__main__":
+    main()
