@@ -28,7 +28,7 @@ def missions(share, *, ticks=True, n=10):
     [
         (0.0, True, "gaussian", "0% of the rates are 0 or 1"),
         (0.025, True, "gaussian", "2% of the rates are 0 or 1"),
-        (0.1, True, "beta_binomial", "10% of the rates are 0 or 1, and ticks are known"),
+        (0.1, True, "censored", "10% of the rates are 0 or 1"),
         (0.1, False, "censored", "10% of the rates are 0 or 1"),
     ],
 )
@@ -79,15 +79,15 @@ def test_a_campaign_plans_for_the_family_of_its_posterior(tmp_path):
         mission = KinematicSimulator(workspace).run(campaign.ask().path, seed=0)
         assert (mission.contact_rate == 1.0).mean() > 0.05
         campaign.tell(mission)
-        assert campaign.posterior.attrs["observation"] == "beta_binomial"
-        assert campaign.planner_now().family.name == "beta_binomial"
+        assert campaign.posterior.attrs["observation"] == "censored"
+        assert campaign.planner_now().family.name == "censored"
         plan = campaign.ask()
         result = campaign.result()
-        assert result.planner.family.name == "beta_binomial"
+        assert result.planner.family.name == "censored"
     with tb.Campaign.load(tmp_path / "c") as again:
         assert again.model == model
         assert again.ask().path == plan.path
-        assert again.planner_now().family.name == "beta_binomial"
+        assert again.planner_now().family.name == "censored"
 
 
 def test_what_is_for_gaussian_rates_refuses_it():

@@ -183,13 +183,12 @@ class TrustModel(Displayed, ABC):
     def for_rates(self, batch: MissionBatch) -> tuple[Self, str]:
         """The model with the family of observations that suits measured rates, and the reason.
 
-        With `observation="auto"`: counts of ticks, or censored rates where ticks are not known, if
-        5 % of the rates are 0 or 1; else Gaussian ones, and too where the exact sampler treats the
-        model with these alone. Any other model as it is.
+        With `observation="auto"`: censored rates if 5 % of them are 0 or 1; else Gaussian ones, and
+        too where the exact sampler treats the model with these alone. Any other model as it is.
         """
         if self.observation != AUTO:
             return self, "asked for"
-        name, reason = choose(batch.contact_rate, batch.n_ticks, change=self.lag > 0.0)
+        name, reason = choose(batch.contact_rate)
         chosen = self.observing(name)
         if chosen.why_not_exact and not self.why_not_exact:
             return self.observing("gaussian"), f"{reason}, but {chosen.why_not_exact}"
