@@ -35,7 +35,7 @@ from trustbo.models.likelihood.gram import SufficientStatistics
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.convergence import GOOD_KHAT
 from trustbo.models.samplers.laplace import laplace
-from trustbo.models.samplers.priors_numpy import log_prob, number, numbers
+from trustbo.models.samplers.priors_numpy import log_prob, number, of_coefficients
 from trustbo.models.samplers.proposal import Mixture
 from trustbo.parallel import one_blas_thread
 
@@ -181,14 +181,9 @@ def sample_exact(
 
 
 def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
-    n_features = statistics.n_features
-
-    def each(name: str) -> np.ndarray:
-        return np.append(np.broadcast_to(numbers(priors.beta, name), n_features),
-                         numbers(priors.b, name))  # fmt: skip
-
+    mean, precision = of_coefficients(priors.beta, priors.b, statistics.n_features)
     floor = number(priors.delta_v, "low") if isinstance(priors.delta_v, Floored) else 0.0
-    return _Target(statistics, priors, each("loc"), each("scale") ** -2.0, floor)
+    return _Target(statistics, priors, mean, precision, floor)
 
 
 def _modes(target: _Target) -> Mixture:
