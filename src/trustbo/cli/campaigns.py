@@ -190,7 +190,7 @@ def _require_names(
     seed: int,
 ) -> None:
     """Refuse unknown names and numbers out of range (TrustboError) before a raster is read."""
-    from trustbo.models.samplers.run import SAMPLERS
+    from trustbo.models.samplers.choice import SAMPLERS
     from trustbo.planning import OBJECTIVES, POLICIES
     from trustbo.workspace import SIGHT_MODES
 

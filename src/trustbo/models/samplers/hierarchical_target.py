@@ -20,9 +20,9 @@ from scipy import special
 from trustbo.models.likelihood.gram import Statistics
 from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
-from trustbo.models.samplers.exact import backward, forward, small_cholesky
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.priors_numpy import log_prob, of_coefficients
+from trustbo.models.samplers.small_matrices import backward, forward, small_cholesky
 from trustbo.models.samplers.student import Spanning, Student
 
 _WIDE = 0.01  # variance added to what a grid says of a robot's beta0

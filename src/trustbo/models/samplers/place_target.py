@@ -19,10 +19,10 @@ from trustbo.models.likelihood.place_rows import Rows, filter_rows
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
-from trustbo.models.samplers.exact import small_cholesky
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.place_draws import split_units
 from trustbo.models.samplers.priors_numpy import of_coefficients
+from trustbo.models.samplers.small_matrices import small_cholesky
 from trustbo.models.samplers.student import Student
 
 _MEMORY = 8e6  # numbers per chunk of parameter values
