@@ -155,7 +155,8 @@ def resume(
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
     The result is the same as without the interruption. The folder keeps all flags.
-    A campaign that --stop-regret has ended goes on with more --iterations only.
+    A campaign that --stop-regret has ended goes on with more --iterations, or another
+    --stop-regret.
     """
     with one_line_errors(debug, campaign=folder):
         if iterations is not None:
