@@ -1,6 +1,6 @@
 """Missions of a team of robots, bound by bound."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Self, get_args
@@ -179,11 +179,11 @@ class Mission(Displayed):
         rates = self.contact_rate
         measured = np.isfinite(rates)
         mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
-        cells = [f"{row},{col}" for row, col in self.path]
+        first, last = path_text(self.path[:1]), path_text(self.path[-1:])
         with np.errstate(all="ignore"):
             each = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
         rows = [
-            ("path", f"{cells[0]} to {cells[-1]}, {len(self.path) - 1} bounds planned"),
+            ("path", f"{first} to {last}, {len(self.path) - 1} bounds planned"),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
             ("contact rate", f"{mean} on average; {(~measured).sum()} of {rates.size} missing"),
             *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, each, strict=True)),
@@ -198,7 +198,7 @@ class Mission(Displayed):
             )
 
         sections = {
-            "cells": [("path", " ".join(cells))],
+            "cells": [("path", path_text(self.path))],
             "features": [("", ", ".join(self.features))],
         }
         return Card(f"Mission: {self.status}, contact {mean}", rows, [picture], sections)
@@ -331,6 +331,11 @@ class Mission(Displayed):
         array = np.stack([getattr(bound, name) for bound in self.bounds])
         array.flags.writeable = False
         return array
+
+
+def path_text(path: Iterable[Cell]) -> str:
+    """Write cells as on the command line: "9,0 8,1"."""
+    return " ".join(f"{row},{col}" for row, col in path)
 
 
 def is_line_of_sight(feature: str) -> bool:

@@ -12,7 +12,7 @@ from numpyro.infer import MCMC, NUTS
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.models import PooledTrust, Priors, diagnostics, fit, params_of
-from trustbo.models.samplers import run
+from trustbo.models.samplers import complaints, run
 from trustbo.models.samplers.nuts import NutsSettings, run_nuts
 from trustbo.stacking import stack_missions
 
@@ -134,7 +134,7 @@ def test_missing_rates_are_predicted_through(with_a_gap):
 
 def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypatch):
     """A limit that no run meets; the longer run takes the short one's length, and its program."""
-    assert (run.MAX_RHAT, run.MIN_ESS) == (1.01, 400.0)
+    assert (complaints.MAX_RHAT, complaints.MIN_ESS) == (1.01, 400.0)
     tried = []
 
     def short(settings, *args, **options):
@@ -142,7 +142,7 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
         return run_nuts(NutsSettings(), *args, **options)
 
     monkeypatch.setattr(run, "run_nuts", short)
-    monkeypatch.setattr(run, "MIN_ESS", 1e6)
+    monkeypatch.setattr(complaints, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
         fit(missions, sampler="nuts")
@@ -153,7 +153,7 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
 
 @pytest.mark.slow  # its program compiles for this alone
 def test_the_longer_run_samples_the_same_posterior(missions, posterior, monkeypatch):
-    monkeypatch.setattr(run, "MIN_ESS", 1e6)
+    monkeypatch.setattr(complaints, "MIN_ESS", 1e6)
     with pytest.raises(PosteriorError) as error:
         fit(missions, sampler="nuts")
     longer = error.value.posterior["posterior"]

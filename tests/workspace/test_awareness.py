@@ -1,4 +1,4 @@
-"""From pixels to cells: in strips, with one's own features, by mean or quantile."""
+"""From pixels to cells: in strips, with one's own features."""
 
 from functools import partial
 
@@ -81,18 +81,6 @@ def test_a_lazily_read_terrain_gives_what_one_in_memory_gives(terrain, tmp_path,
     np.testing.assert_array_equal(lazy.passable, eager.passable)
 
 
-@pytest.mark.parametrize("q", [0.0, 0.25, 1.0])
-def test_a_quantile_of_a_cell_is_numpy_s(terrain, q, monkeypatch):
-    monkeypatch.setattr("trustbo.terrain.strips._PIXELS", 90 * 7)
-    workspace = Workspace.from_terrain(terrain, (4, 3), aggregate=q)
-    pixels, edges = workspace.pixels["visibility"].values, [0, 32, 65, 97, 130]
-    for i in range(4):
-        for j in range(3):
-            cell = pixels[edges[i] : edges[i + 1], 30 * j : 30 * (j + 1)]
-            ours = workspace.awareness.sel(robot="r1", feature="visibility").values[i, j]
-            assert ours == pytest.approx(np.nanquantile(cell, q), abs=1e-9)
-
-
 def test_features_of_one_s_own_and_one_used_as_it_is(terrain):
     gentle = PixelFeature(lambda t: np.cos(slope(t)), +1)
     workspace = Workspace.from_terrain(
@@ -140,12 +128,6 @@ def test_observers_become_a_third_feature(terrain, thin):
 def test_features_that_are_none_are_refused(terrain, features, message):
     with pytest.raises(TrustboError, match=message):
         Workspace.from_terrain(terrain, (4, 3), features=features)
-
-
-@pytest.mark.parametrize("aggregate", ["median", 1.5, True])
-def test_an_unknown_aggregate_is_refused(terrain, aggregate):
-    with pytest.raises(TrustboError, match=r'aggregate must be "mean" or a quantile in \[0, 1\]'):
-        Workspace.from_terrain(terrain, (4, 3), aggregate=aggregate)
 
 
 def test_clipping_is_reported_for_lazy_terrains_too(tmp_path):

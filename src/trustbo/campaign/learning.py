@@ -21,7 +21,7 @@ from trustbo.models import (
 from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import require_model
 from trustbo.models.params import Params
-from trustbo.models.samplers.run import resolve_sampler
+from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.workspace import Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
 

@@ -7,7 +7,7 @@ from typing import Any
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.progress import Progress
-from trustbo.campaign.replanning import require_bounds, run_replanning
+from trustbo.campaign.replanning import run_replanning
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import (
     Stop,
@@ -22,7 +22,7 @@ from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.simulation import KinematicSimulator, Simulator, Truth
-from trustbo.simulation.protocol import takes
+from trustbo.simulation.protocol import require_bounds, takes
 from trustbo.workspace import Workspace
 
 
@@ -187,7 +187,7 @@ def missions(
             f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}{made}."
         )
     if campaign.options.replan == "bound":
-        require_bounds(runner)
+        require_bounds(runner, 'replan="bound"')
     if truth is not None:
         truth.require_workspace(campaign.workspace)
     rules = require_stops(stop)

@@ -7,7 +7,6 @@ import numpy as np
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError
 from trustbo.models import TrustFilter, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
@@ -16,20 +15,6 @@ from trustbo.stacking import fill_awareness
 
 THRESHOLD = 0.01
 """Least gain in the objective's value for which another continuation is taken."""
-
-
-def require_bounds(simulator: Any) -> None:
-    """Refuse a simulator that cannot run one bound after the other.
-
-    Raises:
-        TrustboError: It has no `reset` or `run_bound`.
-    """
-    missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
-    if missing:
-        raise TrustboError(
-            f'replan="bound" needs a simulator with reset(start, seed) and run_bound(k, cell); '
-            f"{type(simulator).__name__} has no {' and no '.join(missing)}."
-        )
 
 
 def run_replanning(

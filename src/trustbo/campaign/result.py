@@ -14,7 +14,7 @@ from trustbo.campaign.damage import naming_what_is_left, read_json
 from trustbo.campaign.failures import under_risk
 from trustbo.campaign.history import Kept, Posterior, Posteriors, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, path_text
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
@@ -278,7 +278,7 @@ class Result(Displayed):
             write_tree(folder / _BELIEVED, xr.DataTree(self.believed))
         scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
         table = self.history[scalars].to_dataframe()[scalars]
-        table["path"] = [_path_text(path) for path in self.history["path"].values]
+        table["path"] = [path_text(path[path[:, 0] >= 0]) for path in self.history["path"].values]
         write_text(folder / "history.csv", table.to_csv())
         record = {
             "n_missions": len(self.missions),
@@ -359,7 +359,3 @@ def _cell(pair: Any) -> Cell:
 
 def _posterior_file(folder: Path, after: int) -> Path:
     return folder / "posteriors" / f"{after:04d}.nc"
-
-
-def _path_text(path: np.ndarray) -> str:
-    return " ".join(f"{row},{col}" for row, col in path if row >= 0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, path_text
 from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
 
@@ -106,8 +106,8 @@ def _require_path(
     if maybe == "." and path[0] != asked[0]:
         maybe = f": it starts at {path[0]}, not at {asked[0]}."
     raise TrustboError(
-        f"the mission followed {_text(path)}, but {_text(asked)} was asked for{maybe} If it really "
-        "went there, tell(mission, other_path=True)."
+        f"the mission followed {path_text(path)}, but {path_text(asked)} was asked for{maybe} If "
+        "it really went there, tell(mission, other_path=True)."
     )
 
 
@@ -127,7 +127,3 @@ def _is_same(one: Mission, other: Mission) -> bool:
         return all(np.array_equal(a.poses, b.poses) for a, b in pairs)  # pyright: ignore
     # Perfect contact of the same durations is common; rates in between, to the last bit, are not.
     return bool(((one.contact_rate > 0.0) & (one.contact_rate < 1.0)).any())
-
-
-def _text(path: Sequence[Cell]) -> str:
-    return " ".join(f"{row},{col}" for row, col in path)

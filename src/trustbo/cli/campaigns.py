@@ -155,7 +155,8 @@ def resume(
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
     The result is the same as without the interruption. The folder keeps all flags.
-    A campaign that --stop-regret has ended goes on with more --iterations only.
+    A campaign that --stop-regret has ended goes on with more --iterations, or another
+    --stop-regret.
     """
     with one_line_errors(debug, campaign=folder):
         if iterations is not None:
@@ -190,7 +191,7 @@ def _require_names(
     seed: int,
 ) -> None:
     """Refuse unknown names and numbers out of range (TrustboError) before a raster is read."""
-    from trustbo.models.samplers.run import SAMPLERS
+    from trustbo.models.samplers.choice import SAMPLERS
     from trustbo.planning import OBJECTIVES, POLICIES
     from trustbo.workspace import SIGHT_MODES
 

@@ -29,7 +29,8 @@ def study(
     with one_line_errors(debug):
         from trustbo import plots
         from trustbo.files import require_file, write_text
-        from trustbo.study import axes_of, run_study, summary
+        from trustbo.study import run_study, summary
+        from trustbo.study.table import axes_of
 
         for name in ("summary.csv", "regret.png"):
             require_file(out / name)

@@ -1,35 +1,32 @@
 """A trust model whose drift is the user's own function of awareness and sampled parameters."""
 
 import contextlib
-import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-import numpyro.distributions as dist
-from jax import Array, random
+from jax import Array
 from numpyro import handlers
 
 from trustbo.errors import TrustboError
 from trustbo.models.backend import own_settings
 from trustbo.models.drift_form import Drift, DriftForm, name_of
+from trustbo.models.drift_parameters import (
+    Axes,
+    listed_axes,
+    prior_text,
+    require_names,
+    split_prior,
+    traced_axes,
+)
 from trustbo.models.model import TrustModel, sample
 from trustbo.models.params import DriftParams
-from trustbo.models.priors import as_text
 from trustbo.models.samplers.priors_numpy import draw, quantile_at
-
-Axes = dict[str, tuple[str, ...]]
-_SIZES = {5: "robot", 7: "feature"}  # by which axes of a function's parameters are known
-_RESERVED = (
-    *("beta0", "delta_w", "delta_v", "x0_mean", "x0_sd", "b", "contact_rate", "innovations"),
-    *("tau_s", "length_scale", "tau_e", "place", "place_bound", "place_white", "place_unit"),
-    *("chain", "draw", "mission", "bound", "robot", "feature", "z"),
-)
 
 
 @jax.tree_util.register_pytree_node_class
@@ -68,14 +65,14 @@ class DriftTrust(TrustModel):
         object.__setattr__(self, "parameters", parameters)
         if not callable(drift):
             raise TrustboError(f"drift must be a function drift(z, ...); got {drift!r}.")
-        _require_names(drift, *self._axes)
+        require_names(drift, *self._axes)
         self.form.keep()
 
     @cached_property
     def _axes(self) -> tuple[Axes, Axes]:
         """Axes of the drift's arguments, and of the sample sites, by name."""
         own = self.parameters
-        return _traced_axes(own) if callable(own) else _listed_axes(own)
+        return traced_axes(own) if callable(own) else listed_axes(own)
 
     @cached_property
     def form(self) -> DriftForm:
@@ -86,7 +83,7 @@ class DriftTrust(TrustModel):
         """Priors as data of compiled code, all else static."""
         listed, how = {}, self.parameters
         if not callable(how):
-            listed = {name: _split(name, given)[0] for name, given in how.items()}
+            listed = {name: split_prior(name, given)[0] for name, given in how.items()}
             how = self.form.axes
         return (self.priors, listed), (
             self.observation, self.response, self.place, self.drift, how,
@@ -122,7 +119,7 @@ class DriftTrust(TrustModel):
         """Sample statements of the drift's parameters."""
         size = {"robot": n_robots, "feature": n_features}
         if not callable(self.parameters):
-            split = {name: _split(name, given) for name, given in self.parameters.items()}
+            split = {name: split_prior(name, given) for name, given in self.parameters.items()}
             return {
                 name: sample(name, prior, tuple(size[axis] for axis in axes))
                 for name, (prior, axes) in split.items()
@@ -231,7 +228,7 @@ class DriftTrust(TrustModel):
     def options(self) -> dict[str, str]:
         """Options by name, function and parameters as text."""
         own = self.parameters
-        text = name_of(own) if callable(own) else "; ".join(map(_as_text, own, own.values()))
+        text = name_of(own) if callable(own) else "; ".join(map(prior_text, own, own.values()))
         return {
             "observation": self.observation,
             "response": self.response,
@@ -302,86 +299,3 @@ def _require_indices(drift: Drift, z: np.ndarray) -> None:
     with contextlib.suppress(AttributeError, TypeError, ValueError), np.errstate(all="ignore"):
         with own_settings():
             drift.form(z, theta)
-
-
-def _listed_axes(parameters: object) -> tuple[Axes, Axes]:
-    """Axes of arguments of the drift, and of sample sites, of priors by name."""
-    if not isinstance(parameters, Mapping):
-        raise TrustboError(
-            "parameters must be priors by name, or a function (n_robots, n_features) with "
-            f"numpyro.sample statements; got {parameters!r}."
-        )
-    axes = {str(name): _split(name, given)[1] for name, given in parameters.items()}
-    return axes, axes
-
-
-def _split(name: str, given: Any) -> tuple[dist.Distribution, tuple[str, ...]]:
-    """Prior and axes of a parameter."""
-    prior, *axes = given if isinstance(given, tuple) else (given,)
-    scalar = isinstance(prior, dist.Distribution) and not prior.batch_shape + prior.event_shape
-    if not scalar or not set(axes) <= {"robot", "feature"} or len(set(axes)) < len(axes):
-        raise TrustboError(
-            f"parameter {name} must be a scalar numpyro distribution, such as Normal(0.0, 1.0), or "
-            f'a pair of it and "robot" or "feature"; got {given!r}.'
-        )
-    return prior, tuple(axes)
-
-
-def _as_text(name: str, given: Any) -> str:
-    prior, axes = _split(name, given)
-    return f"{name} ~ {as_text(prior)}" + "".join(f" by {axis}" for axis in axes)
-
-
-@lru_cache(maxsize=64)
-def _traced_axes(parameters: Callable[[int, int], Mapping[str, Any]]) -> tuple[Axes, Axes]:
-    """The same of a function, from its shapes for sizes that tell robots and features apart."""
-    try:
-        inspect.signature(parameters).bind(5, 7)
-    except TypeError:
-        raise TrustboError(
-            f"the function of parameters {name_of(parameters)} must take (n_robots, n_features)."
-        ) from None
-
-    def program() -> tuple[Any, dict[str, Array]]:
-        with handlers.trace() as trace:
-            returned = handlers.seed(parameters, random.key(0))(5, 7)
-        return returned, {n: s["value"] for n, s in trace.items() if s["type"] == "sample"}
-
-    with own_settings():
-        returned, sites = jax.eval_shape(program)
-    if not isinstance(returned, Mapping):
-        raise TrustboError(
-            f"the function of parameters {name_of(parameters)} must return them by name, such as "
-            f'{{"slope": slope}}; it returns {returned!r}.'
-        )
-
-    def named(values: Mapping[str, Any]) -> Axes:
-        for name, value in values.items():
-            if not set(value.shape) <= set(_SIZES) or len(set(value.shape)) < len(value.shape):
-                raise TrustboError(
-                    f"parameter {name} must be (), (robot,), (feature,) or (robot, feature); for 5 "
-                    f"robots and 7 features it is {value.shape}."
-                )
-        return {n: tuple(_SIZES[size] for size in value.shape) for n, value in values.items()}
-
-    return named(returned), named(sites)
-
-
-def _require_names(drift: Callable[..., Any], arguments: Axes, sites: Axes) -> None:
-    """Refuse names that the drift and its parameters do not have in common, or that are taken."""
-    for name in arguments | sites:
-        if name in _RESERVED:
-            raise TrustboError(f"parameter {name!r} is the model's own; give yours another name.")
-    first, *others = inspect.signature(drift).parameters.values()
-    takes = {p.name: p for p in others if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
-    anything = any(p.kind == p.VAR_KEYWORD for p in others)
-    if missing := [n for n, p in takes.items() if p.default is p.empty and n not in arguments]:
-        raise TrustboError(
-            f"the drift {name_of(drift)} takes {missing[0]!r}, which is no parameter; there are "
-            f"{', '.join(arguments) or 'none'}. Add its prior to parameters."
-        )
-    if unused := [name for name in arguments if name not in takes and not anything]:
-        raise TrustboError(
-            f"parameter {unused[0]!r} is none of the drift {name_of(drift)}, which takes "
-            f"{', '.join(takes) or 'none'} besides {first.name}."
-        )

@@ -20,8 +20,9 @@ from trustbo.models.posterior_groups import Law, complete
 from trustbo.models.posterior_tree import to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.record import model_to_record
+from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.nuts import NutsSettings
-from trustbo.models.samplers.run import draw_posterior, resolve_sampler
+from trustbo.models.samplers.run import draw_posterior
 from trustbo.models.samplers.student import Student
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions

@@ -23,8 +23,8 @@ import numpy as np
 from scipy import special, stats
 
 from trustbo.models.exposures import Exposures
-from trustbo.models.samplers.exact import smoothed_weights
 from trustbo.models.samplers.laplace import laplace
+from trustbo.models.samplers.weights import smoothed_weights
 
 LIMIT = 0.7
 """Largest k-hat of a posterior that is not refused."""

@@ -15,8 +15,9 @@ from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.prior_predictive import prior_draws
+from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.nuts import NutsSettings
-from trustbo.models.samplers.run import draw_posterior, resolve_sampler
+from trustbo.models.samplers.run import draw_posterior
 from trustbo.models.sbc_places import Walks
 from trustbo.stacking import MissionBatch
 

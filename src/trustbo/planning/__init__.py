@@ -8,9 +8,9 @@ from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES, Policy
 from trustbo.planning.posterior import DrawnPaths
-from trustbo.planning.risk import InfeasibleError, PathRisk, Risk
+from trustbo.planning.risk import InfeasibleError, PathRisk
 
 __all__ = [
     "OBJECTIVES", "POLICIES", "QUANTILES", "DrawnPaths", "Dynamics", "InfeasibleError",
-    "NoPathError", "PathRisk", "Plan", "Planner", "Policy", "Risk", "policies", "roll_trust",
+    "NoPathError", "PathRisk", "Plan", "Planner", "Policy", "policies", "roll_trust",
 ]  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.data import Cell
+from trustbo.data import Cell, path_text
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import curve_picture
 from trustbo.planning.risk import PathRisk
@@ -63,7 +63,6 @@ class Plan(Displayed):
     risk: PathRisk | None = None
 
     def _card(self) -> Card:
-        cells = " ".join(f"{row},{col}" for row, col in self.path)
         best = "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"
         if np.isnan(self.bound):
             best = "not searched for"
@@ -89,7 +88,7 @@ class Plan(Displayed):
 
         return Card(
             f"Plan: {self.path[0]} to {self.path[-1]}", rows, [area, along],
-            {"cells (row, col)": [("path", cells)]},
+            {"cells (row, col)": [("path", path_text(self.path))]},
         )  # fmt: skip
 
     @property

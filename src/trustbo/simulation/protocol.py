@@ -6,6 +6,7 @@ from typing import Protocol
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.display.card import Card, Displayed
+from trustbo.errors import TrustboError
 
 
 class Simulator(Protocol):
@@ -52,6 +53,16 @@ class DescribedSimulator(Displayed):
         settings = {name: value for name, value in self.describe().items() if name != "simulator"}
         rows = [(name, str(value)) for name, value in settings.items() if value not in (None, [])]
         return Card(type(self).__name__, [(name, text) for name, text in rows if len(text) < 200])
+
+
+def require_bounds(simulator: object, what: str) -> None:
+    """Refuse a simulator that cannot run bound by bound, as `what` needs: TrustboError."""
+    missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
+    if missing:
+        raise TrustboError(
+            f"{what} needs a simulator with reset(start, seed) and run_bound(k, cell); "
+            f"{type(simulator).__name__} has no {' and no '.join(missing)}."
+        )
 
 
 def takes(function: Callable[..., object], name: str) -> bool:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from trustbo.data import Bound, Cell, Mission
+from trustbo.data import Bound, Cell, Mission, path_text
 from trustbo.errors import TrustboError, require_choice, require_pair
 from trustbo.files import FilePath
 from trustbo.logs.netcdf import read_missions
@@ -176,7 +176,7 @@ class ReplaySimulator(DescribedSimulator):
         if recorded:
             which = ", ".join(map(str, recorded))
             return (
-                f"path {_text(path)} was recorded, but as mission {which}, replayed by now; "
+                f"path {path_text(path)} was recorded, but as mission {which}, replayed by now; "
                 "rewind() starts over."
             )
 
@@ -187,14 +187,10 @@ class ReplaySimulator(DescribedSimulator):
         nearest = sorted(self._left, key=lambda j: (-agreeing(j), j))[:_NEAREST]
         lines = [
             f"mission {j}, {agreeing(j)} of {len(path) - 1} bounds agree: "
-            f"{_text(self.missions[j].path)}"
+            f"{path_text(self.missions[j].path)}"
             for j in nearest
         ]
         return (
-            f"path {_text(path)} was never recorded. Nearest of {len(self._left)} left: "
+            f"path {path_text(path)} was never recorded. Nearest of {len(self._left)} left: "
             f'{"; ".join(lines)}. Or take the next mission on any path: on_missing="next".'
         )
-
-
-def _text(path: Sequence[Cell]) -> str:
-    return " ".join(f"{row},{col}" for row, col in path)

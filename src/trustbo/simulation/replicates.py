@@ -11,7 +11,7 @@ from trustbo.errors import TrustboError
 from trustbo.parallel import in_order
 from trustbo.simulation.bounding import State
 from trustbo.simulation.overwatch import KinematicSimulator
-from trustbo.simulation.protocol import takes
+from trustbo.simulation.protocol import require_bounds, takes
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
@@ -111,12 +111,7 @@ class PlainReplicates:
 
     def __init__(self, simulator: Any, mission: int, seed: int) -> None:
         """Take a simulator; TrustboError: it lacks `reset` or `run_bound`."""
-        missing = [name for name in ("reset", "run_bound") if not hasattr(simulator, name)]
-        if missing:
-            raise TrustboError(
-                "truth needs a simulator with reset(start, seed) and run_bound(k, cell); "
-                f"{type(simulator).__name__} has no {' and no '.join(missing)}."
-            )
+        require_bounds(simulator, "truth")
         self._simulator, self._seed, self.most = simulator, seed, 1000
         self._numbered = {"mission": mission} if takes(simulator.reset, "mission") else {}
 

@@ -3,11 +3,11 @@
 from trustbo.study.benchmark import run_worlds, worlds_table
 from trustbo.study.conduct import failures, load_study, run_study
 from trustbo.study.configuration import Study, read_study
-from trustbo.study.table import axes_of, summary
+from trustbo.study.table import summary
 from trustbo.study.world import World
 from trustbo.study.world_set import worlds
 
 __all__ = [
-    "Study", "World", "axes_of", "failures", "load_study", "read_study", "run_study", "run_worlds",
+    "Study", "World", "failures", "load_study", "read_study", "run_study", "run_worlds",
     "summary", "worlds", "worlds_table",
 ]  # fmt: skip

@@ -1,9 +1,6 @@
 """Contenders of the benchmark: a model and a policy, or a baseline; the user's own among them."""
 
 import hashlib
-import importlib
-import os
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,37 +11,15 @@ from jax import Array
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
-from trustbo.models import TrustModel
 from trustbo.models.params import Params
-from trustbo.models.record import model_to_record
 from trustbo.planning import POLICIES, Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.policies import random, seed_of
-from trustbo.study.parts import NAMED_MODELS, Part, Pooled, parts_of
+from trustbo.study.parts import NAMED_MODELS, Own, Pooled, imported, parts_of
 
 BASELINES = ("random", "shortest", "paper", "botorch")
 """Baselines: a random path, a random one of the shortest, the paper's method, and BoTorch."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OwnModel(Part):
-    """Trust model of the user's own: itself, or the `"module:name"` of it or of what makes it."""
-
-    kind = "own"
-    given: Any
-
-    def model(self) -> TrustModel:
-        """Give the model."""
-        found = resolved("model", self.given)
-        made = found() if callable(found) and not isinstance(found, TrustModel) else found
-        if not isinstance(made, TrustModel):
-            raise TrustboError(f"model {self.given!r} must be a TrustModel; got {made!r}.")
-        return made
-
-    def identity(self) -> dict[str, Any]:
-        """Settings that the numbers depend on."""
-        return {"kind": self.kind, "model": model_to_record(self.model())}
 
 
 @dataclass(frozen=True)
@@ -131,12 +106,7 @@ def resolved(what: str, given: Any, known: Mapping[str, Any] | None = None) -> A
         return _baseline(name)
     if not colon:
         require_choice(f'{what} (or give "module:name")', given, known or ())
-    if os.getcwd() not in sys.path:  # where a program runs, there are the user's modules
-        sys.path.append(os.getcwd())
-    try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise TrustboError(f"{what} {given!r} cannot be imported: {error}.") from None
+    return imported(what, given)
 
 
 def identity_of(given: Any) -> Any:
@@ -166,9 +136,7 @@ def _models_of(models: Any) -> dict[str, Any]:
         if isinstance(given, str) and ":" not in given:
             parts |= parts_of("model", (require_choice("model", given, kinds),), NAMED_MODELS)
         else:
-            part = OwnModel(given=given)
-            part.model()
-            parts[_name(given)] = part
+            parts[_name(given)] = Own(source=given)
     return parts
 
 

@@ -1,6 +1,8 @@
 """Parts of a study as plain settings: their base, trust models and simulators."""
 
 import importlib
+import os
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -11,6 +13,7 @@ import numpy as np
 from trustbo import models, simulation
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.model import require_model
+from trustbo.models.record import model_to_record
 from trustbo.workspace import Workspace
 
 
@@ -80,6 +83,17 @@ def parts_of[P: Part](what: str, given: object, kinds: Iterable[type[P]]) -> dic
     return parts
 
 
+def imported(what: str, source: str) -> Any:
+    """Object of a `"module:name"`; TrustboError: there is no such module or name."""
+    module, _, name = source.partition(":")
+    if os.getcwd() not in sys.path:  # where a program runs, there are the user's modules
+        sys.path.append(os.getcwd())
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise TrustboError(f"{what} {source!r} cannot be imported: {error}.") from None
+
+
 def _frozen(value: Any) -> Any:
     """Lists as tuples, so that parts can be hashed."""
     if isinstance(value, np.ndarray):
@@ -146,26 +160,27 @@ class Coupled(Model):
 
 @dataclass(frozen=True, kw_only=True)
 class Own(Part):
-    """Settings of a trust model of your own: where it is, `"module:name"`."""
+    """Trust model of your own: itself, or the `"module:name"` of it or of what makes it."""
 
     kind, REQUIRED = "own", ("source",)
-    source: str
+    source: Any
 
     def __post_init__(self) -> None:
         self.model()
 
     def model(self) -> models.TrustModel:
-        """Import the model."""
-        module, _, name = self.source.partition(":")
-        try:
-            found = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise TrustboError(
-                f"there is no model at {self.source!r}: {error}. Give source as module:name of a "
-                "TrustModel that Python can import."
-            ) from None
-        require_model(found)
-        return found
+        """Give the model."""
+        given = self.source
+        found = imported("model", given) if isinstance(given, str) else given
+        made: Any = found
+        if callable(found) and not isinstance(found, models.TrustModel):
+            made = found()
+        require_model(made)
+        return made
+
+    def identity(self) -> dict[str, Any]:
+        """Settings that the numbers depend on."""
+        return {"kind": self.kind, "model": model_to_record(self.model())}
 
 
 NAMED_MODELS = (Pooled, Places, Hierarchical, Coupled)

@@ -17,7 +17,7 @@ from trustbo.terrain.dataset import is_lazy, pixel_size, warn_if_clipped
 from trustbo.terrain.features import openness
 from trustbo.terrain.pixel_feature import FEATURES, PixelFeature, feature_named
 from trustbo.terrain.strips import Strip, sample_strips, strips
-from trustbo.workspace.grid import CellMeans, CellQuantiles, Grid, Sums
+from trustbo.workspace.grid import CellMeans, Grid, Sums
 
 FeatureSpec = PixelFeature | Mapping[str, PixelFeature]
 """Definition of an awareness feature: a pixel feature in [0, 1], or those of a composite."""
@@ -70,55 +70,40 @@ def cell_maps(
     *,
     max_slope: float,
     scaling: str = "percentile",
-    aggregate: str | float = "mean",
-    composites: Mapping[str, CompositeIndex] | None = None,
     keep_pixels: bool = True,
 ) -> CellMaps:
     """Awareness and passability (slope up to `max_slope`, rad) of each cell.
 
     A composite is fitted on all pixels of a raster of up to a million, on rows spread evenly over a
-    larger one, unless it is given fitted, by feature; then each pixel's index is added to its cell,
-    strip by strip, so that no feature of the whole raster is in memory, unless `keep_pixels`.
-    `scaling` is `CompositeIndex`'s; `aggregate` the `"mean"` of a cell's pixels, or a quantile in
-    [0, 1].
+    larger one; then each pixel's index is added to its cell, strip by strip, so that no feature of
+    the whole raster is in memory, unless `keep_pixels`. `scaling` is `CompositeIndex`'s.
 
-    TrustboError: a quantile outside [0, 1], or a feature that is no composite outside [0, 1].
+    TrustboError: a feature that is no composite outside [0, 1].
     """
-    quantile = _require_aggregate(aggregate)
     parts = [p for f in features.values() for p in _parts(f)]
     halo = max(part.halo for part in parts)
     whole = list(strips(terrain, halo)) if terrain["dem"].size <= MAX_PIXELS else None
     known = _StripFeatures(whole)
-    fitted = dict(composites or {})
-    to_fit = {n: f for n, f in features.items() if isinstance(f, Mapping) and n not in fitted}
-    if to_fit:
-        fitted |= _fit(terrain, to_fit, scaling, known, whole)
+    to_fit = {n: f for n, f in features.items() if isinstance(f, Mapping)}
+    fitted = _fit(terrain, to_fit, scaling, known, whole)
     like = terrain["dem"]
-    cells: dict[str, CellMeans | CellQuantiles] = {
-        name: CellMeans(grid, like) if quantile is None else CellQuantiles(grid, like, quantile)
-        for name in features
-    }
-    cells["passable"] = CellMeans(grid, like)
+    cells = {name: CellMeans(grid, like) for name in (*features, "passable")}
     maps: dict[str, list[np.ndarray]] = {name: [] for name in cells}
-    means = {n: c for n, c in cells.items() if isinstance(c, CellMeans)}
 
     def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
         index = {"passable": known.passable(strip, max_slope)}
         for name, f in features.items():
             index[name] = known.index(strip, name, f, fitted)
-        sums = {name: of.sums(index[name], strip.rows.start) for name, of in means.items()}
-        wanted = index if keep_pixels else index.keys() - means.keys()
+        sums = {name: of.sums(index[name], strip.rows.start) for name, of in cells.items()}
+        wanted = index if keep_pixels else ()
         return strip, {name: index[name].copy() for name in wanted}, sums
 
     n_clipped = n_valid = 0.0
     for strip, index, sums in in_order(work, whole or strips(terrain, halo)):
         for name, of_strip in sums.items():
-            means[name].merge(of_strip)
+            cells[name].merge(of_strip)
         for name, values in index.items():
-            if name not in means:
-                cells[name].add(values, strip.rows.start)
-            if keep_pixels:
-                maps[name].append(values)
+            maps[name].append(values)
         own = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
         n_clipped, n_valid = n_clipped + own * strip.n_clipped, n_valid + own * strip.n_valid
     if is_lazy(terrain):
@@ -126,7 +111,7 @@ def cell_maps(
     return CellMaps(
         np.stack([cells[name].cells for name in features], axis=-1),
         cells["passable"].cells,
-        {name: fitted[name] for name in features if name in fitted},
+        fitted,
         _assemble(like, maps) if keep_pixels else None,
     )
 
@@ -255,16 +240,6 @@ def _assemble(like: xr.DataArray, maps: Mapping[str, list[np.ndarray]]) -> xr.Da
             for name, values in whole.items()
         }
     )
-
-
-def _require_aggregate(aggregate: str | float) -> float | None:
-    """Quantile to take, or None for the mean."""
-    if isinstance(aggregate, str):
-        if aggregate == "mean":
-            return None
-    elif not isinstance(aggregate, bool) and 0.0 <= aggregate <= 1.0:
-        return float(aggregate)
-    raise TrustboError(f'aggregate must be "mean" or a quantile in [0, 1]; got {aggregate!r}.')
 
 
 def within_reach(

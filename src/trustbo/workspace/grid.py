@@ -1,6 +1,5 @@
-"""Planning grid: cells of positions and of pixels, means and quantiles over cells."""
+"""Planning grid: cells of positions and of pixels, means over cells."""
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -140,9 +139,9 @@ class Grid(Displayed):
         Returns:
             Shape (row, col); NaN where a cell has no data.
         """
-        sums = CellMeans(self, values)
-        sums.add(values.transpose("y", "x").values)
-        return sums.cells
+        means = CellMeans(self, values)
+        means.merge(means.sums(values.transpose("y", "x").values, 0))
+        return means.cells
 
     def cell_share(self, condition: xr.DataArray) -> np.ndarray:
         """Share of each cell's pixels where a condition holds, shape (row, col)."""
@@ -169,15 +168,15 @@ class CellMeans:
 
     def __init__(self, grid: Grid, like: xr.DataArray) -> None:
         """Start without pixels, for a raster of the whole terrain, dims (y, x)."""
-        self._row, self._edges = _ownership(grid, like)
+        self._row, col = grid.cells_along(like["y"].values, like["x"].values)
+        self._edges = np.searchsorted(col, np.arange(grid.shape[1] + 1))
         self._total, self._count = np.zeros(grid.shape), np.zeros(grid.shape)
 
-    def add(self, values: np.ndarray, first: int = 0) -> None:
-        """Add rows of pixels, shape (row, col), the first of them row `first` of the raster."""
-        self.merge(self.sums(values, first))
+    def sums(self, values: np.ndarray, first: int) -> Sums:
+        """Sums for `merge` of rows of pixels, (row, col), from row `first` of the raster on.
 
-    def sums(self, values: np.ndarray, first: int = 0) -> Sums:
-        """Sums for `merge`, of the arguments of `add`; threads may compute them."""
+        Threads may compute them.
+        """
         row = self._row[first : first + len(values)]
         values = values.view(np.uint8) if values.dtype == bool else values
         total, count = np.zeros_like(self._total), np.zeros_like(self._count)
@@ -194,42 +193,6 @@ class CellMeans:
         """Means, shape (row, col); NaN where a cell has no data."""
         with np.errstate(invalid="ignore"):
             return self._total / self._count
-
-
-class CellQuantiles:
-    """Quantiles, like `CellMeans`; pixels of one row of cells are in memory."""
-
-    def __init__(self, grid: Grid, like: xr.DataArray, q: float) -> None:
-        """Start without pixels; `q` is in [0, 1]."""
-        self._row, self._edges = _ownership(grid, like)
-        self._q = q
-        self._pending: list[np.ndarray] = []
-        self.cells = np.full(grid.shape, np.nan)
-        """Quantiles, shape (row, col); NaN where a cell has no data, or lacks pixels yet."""
-
-    def add(self, values: np.ndarray, first: int = 0) -> None:
-        """Add rows of pixels, see `CellMeans.add`."""
-        row = self._row[first : first + len(values)]
-        for cell in np.unique(row):
-            self._pending.append(values[row == cell])
-            if first + np.searchsorted(row, cell, "right") == np.searchsorted(
-                self._row, cell, "right"
-            ):
-                self._finish(cell)
-
-    def _finish(self, row: int) -> None:
-        values = np.concatenate(self._pending)
-        self._pending = []
-        for col, (left, right) in enumerate(itertools.pairwise(self._edges)):
-            cell = values[:, left:right]
-            if np.isfinite(cell).any():
-                self.cells[row, col] = np.nanquantile(cell, self._q)
-
-
-def _ownership(grid: Grid, like: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
-    """Row of cells of each row of pixels; first column of pixels of each column of cells."""
-    row, col = grid.cells_along(like["y"].values, like["x"].values)
-    return row, np.searchsorted(col, np.arange(grid.shape[1] + 1))
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})

@@ -88,7 +88,6 @@ class Workspace(Displayed):
         scaling: str = "percentile",
         features: Mapping[str, object] | None = None,
         observers: ArrayLike | None = None,
-        aggregate: str | float = "mean",
         bounds: bool = True,
         sight: Sight | str | Sequence[Sight | str] = "transmittance",
         formation_radius: float = FORMATION_RADIUS,
@@ -118,7 +117,6 @@ class Workspace(Displayed):
                 visibility, of `terrain.TRAVERSABILITY` and `terrain.VISIBILITY`.
             observers: Positions of enemies, shape (observer, 2), x and y in CRS metres: the share
                 of them that see a pixel becomes one more feature, `exposure`.
-            aggregate: `"mean"` of a cell's pixels, or a quantile in [0, 1].
             bounds: False for awareness of cells alone, as in the paper: traversability, and the
                 visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
@@ -130,7 +128,7 @@ class Workspace(Displayed):
                 without standing room for the team, a DSM without the canopy that a sight needs, a
                 terrain that is read lazily, unless `bounds` is False, or a dataset that is no
                 terrain: without dem, dsm or a metric CRS, or with irregular coordinates.
-            TrustboError: No cell is passable, or an unknown scaling, feature, aggregate or sight.
+            TrustboError: No cell is passable, or an unknown scaling, feature or sight.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
         require_formation(formation_radius)
@@ -154,7 +152,6 @@ class Workspace(Displayed):
             chosen,
             max_slope=team.max_slope,
             scaling=scaling,
-            aggregate=aggregate,
             keep_pixels=not is_lazy(terrain),
         )
         passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING

@@ -9,9 +9,9 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.models import CoupledParams, CoupledTrust, Priors, fit, sample_prior
 from trustbo.models.params import ordered_params
+from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.coupled_target import CoupledTarget
 from trustbo.models.samplers.importance import sample_scores
-from trustbo.models.samplers.run import resolve_sampler
 from trustbo.stacking import stack_missions
 
 

@@ -20,9 +20,9 @@ from trustbo.models import (
     fit,
 )
 from trustbo.models.likelihood.ep.chains import gather_chains
+from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.importance import sample_scores
 from trustbo.models.samplers.latent_target import LatentTarget
-from trustbo.models.samplers.run import resolve_sampler
 from trustbo.stacking import stack_missions
 
 FAMILIES = ("censored", "beta_binomial")

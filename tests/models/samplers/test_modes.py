@@ -13,6 +13,7 @@ from trustbo.errors import PosteriorError
 from trustbo.models import PooledTrust, diagnostics, fit
 from trustbo.models.backend import own_settings
 from trustbo.models.samplers import run
+from trustbo.models.samplers.complaints import complaints_of_modes
 from trustbo.models.samplers.modes import Modes, find_modes
 from trustbo.models.samplers.nuts import NutsDraws
 from trustbo.models.samplers.reparam import reparametrise
@@ -134,7 +135,7 @@ def complaints(share_of_draws, *, sticky):
     found = Modes(CENTERS, np.array([SCALE, SCALE]), SHARES)
     params = {"beta0": x[..., 0], "beta": x[..., 1:]}
     at_modes = {"beta0": CENTERS[:, 0], "beta": CENTERS[:, 1:]}
-    return run._mode_complaints(NutsDraws(params, {}, None, None, x, found, at_modes))
+    return complaints_of_modes(NutsDraws(params, {}, None, None, x, found, at_modes))
 
 
 def test_a_mode_that_all_chains_left_is_a_complaint():

@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpyro.distributions as dist
-from arviz_stats.base.array import array_stats
 from numpyro.distributions import constraints
 from scipy import special
 from scipy.ndimage import maximum_filter
@@ -35,8 +34,10 @@ from trustbo.models.likelihood.gram import SufficientStatistics
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.convergence import GOOD_KHAT
 from trustbo.models.samplers.laplace import laplace
-from trustbo.models.samplers.priors_numpy import log_prob, number, numbers
+from trustbo.models.samplers.priors_numpy import log_prob, number, of_coefficients
 from trustbo.models.samplers.proposal import Mixture
+from trustbo.models.samplers.small_matrices import backward, forward, small_cholesky
+from trustbo.models.samplers.weights import smoothed_weights, systematic
 from trustbo.parallel import one_blas_thread
 
 _LOG2_POINTS, _LOG2_AROUND = 12, 10
@@ -181,14 +182,9 @@ def sample_exact(
 
 
 def _target(statistics: SufficientStatistics, priors: Priors) -> _Target:
-    n_features = statistics.n_features
-
-    def each(name: str) -> np.ndarray:
-        return np.append(np.broadcast_to(numbers(priors.beta, name), n_features),
-                         numbers(priors.b, name))  # fmt: skip
-
+    mean, precision = of_coefficients(priors.beta, priors.b, statistics.n_features)
     floor = number(priors.delta_v, "low") if isinstance(priors.delta_v, Floored) else 0.0
-    return _Target(statistics, priors, each("loc"), each("scale") ** -2.0, floor)
+    return _Target(statistics, priors, mean, precision, floor)
 
 
 def _modes(target: _Target) -> Mixture:
@@ -241,22 +237,6 @@ def _weigh(
     return _Weighted(z, log_p, log_w, mean, factor, khat, log_evidence)
 
 
-def smoothed_weights(raw: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Pareto-smooth log importance weights (point,), some of them finite.
-
-    Returns:
-        Normalised log weights, k-hat, and the log of the raw ones' mean, the evidence.
-    """
-    finite = np.isfinite(raw)
-    # Minus the log weights, points without density far below all others.
-    smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
-    log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
-    log_w = smoothed - np.logaddexp.reduce(smoothed)
-    # Of nearly equal weights none is in a tail, and the fit of one fails.
-    unknown = -np.inf if finite.all() and np.ptp(raw) < 1e-6 else np.inf
-    return log_w, float(np.nan_to_num(khat, nan=unknown)), log_evidence
-
-
 def _starts(target: _Target) -> np.ndarray:
     """Points to search a mode from: the local maxima of a grid around the scatter of the rates.
 
@@ -304,41 +284,6 @@ def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
     local = Mixture(np.vstack([z[drawn], mean]), np.array([*scales, 1.5 * whole]), shares)
     kept = first._replace(weights=_KEPT * first.weights)
     return Mixture(*(np.concatenate(both) for both in zip(local, kept, strict=True)))
-
-
-def systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices of n equally weighted draws, by systematic resampling."""
-    points = (rng.random() + np.arange(n)) / n
-    return np.searchsorted(np.cumsum(weights)[:-1] / weights.sum(), points)
-
-
-def small_cholesky(A: np.ndarray) -> np.ndarray:
-    """Lower factors of many small matrices, (row, column, point); NaN where one is not positive.
-
-    NumPy's takes the point first, one matrix at a time, and raises for all if one is not positive.
-    """
-    L = np.zeros_like(A)
-    for j in range(len(A)):
-        L[j, j] = np.sqrt(A[j, j] - (L[j, :j] ** 2).sum(0))
-        for i in range(j + 1, len(A)):
-            L[i, j] = (A[i, j] - (L[i, :j] * L[j, :j]).sum(0)) / L[j, j]
-    return L
-
-
-def forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """L^-1 b for factors (row, column, point) and vectors (row, point)."""
-    x = np.empty_like(b)
-    for i in range(len(b)):
-        x[i] = (b[i] - (L[i, :i] * x[:i]).sum(0)) / L[i, i]
-    return x
-
-
-def backward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """L'^-1 b for factors (row, column, point) and vectors (row, point)."""
-    x = np.empty_like(b)
-    for i in reversed(range(len(b))):
-        x[i] = (b[i] - (L[i + 1 :, i] * x[i + 1 :]).sum(0)) / L[i, i]
-    return x
 
 
 def why_not_conjugate(priors: Priors, *, coupled: bool = False) -> str | None:

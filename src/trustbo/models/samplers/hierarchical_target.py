@@ -20,9 +20,9 @@ from scipy import special
 from trustbo.models.likelihood.gram import Statistics
 from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
-from trustbo.models.samplers.exact import backward, forward, small_cholesky
 from trustbo.models.samplers.laplace import laplace
-from trustbo.models.samplers.priors_numpy import log_prob, numbers
+from trustbo.models.samplers.priors_numpy import log_prob, of_coefficients
+from trustbo.models.samplers.small_matrices import backward, forward, small_cholesky
 from trustbo.models.samplers.student import Spanning, Student
 
 _WIDE = 0.01  # variance added to what a grid says of a robot's beta0
@@ -42,12 +42,7 @@ class HierarchicalTarget:
         self.statistics, self.priors = statistics, priors
         self.n_robots, n_features = len(statistics), statistics[0].n_features
         self.n_coefficients = n_features + 1
-
-        def each(name: str) -> np.ndarray:
-            of_features = np.broadcast_to(numbers(priors.beta, name), n_features)
-            return np.append(of_features, numbers(priors.b, name))
-
-        self.mean, self.precision = each("loc"), each("scale") ** -2.0
+        self.mean, self.precision = of_coefficients(priors.beta, priors.b, n_features)
         self._unit = priors.beta0.support is constraints.unit_interval
         low, middle, high = self._to_line(scores.quantile(priors.beta0, np.array([-1.0, 0.0, 1.0])))
         self._prior = middle, (2.0 / (high - low)) ** 2

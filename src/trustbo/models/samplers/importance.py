@@ -26,8 +26,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT
-from trustbo.models.samplers.exact import ExactDraws, smoothed_weights, systematic
+from trustbo.models.samplers.exact import ExactDraws
 from trustbo.models.samplers.student import Proposal, Student, log_mixture
+from trustbo.models.samplers.weights import smoothed_weights, systematic
 from trustbo.parallel import one_blas_thread
 
 _MAX_ROUNDS, _MAX_FINAL = 4, 3

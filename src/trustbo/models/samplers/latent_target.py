@@ -20,7 +20,7 @@ from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.place_target import hyperparameters, name_draws, prior_of_places
-from trustbo.models.samplers.priors_numpy import numbers
+from trustbo.models.samplers.priors_numpy import of_coefficients
 from trustbo.models.samplers.student import Spanning, Student
 
 _ROUGH, _SWEEPS, _SETTLED = 4, 2, 8  # sweeps far from the sites' mode, near it, and to find it
@@ -45,12 +45,7 @@ class LatentTarget:
         self.chains, self.priors, self._sites, self._place = chains, priors, sites, place
         n_units = 0 if place is None else len(place[1].units)
         n_features = chains.u.shape[2] - 1 - (0 if place is None else chains.y.shape[1])
-
-        def each(name: str) -> np.ndarray:
-            of_features = np.broadcast_to(numbers(priors.beta, name), n_features)
-            return np.append(of_features, numbers(priors.b, name))
-
-        self.mean, self.precision = each("loc"), each("scale") ** -2.0
+        self.mean, self.precision = of_coefficients(priors.beta, priors.b, n_features)
         self.n_scores = 3 + (0 if place is None else len(place[0].names))
         self.n_final = 1024 if place is None else 512
         self.n_corrected = 1000 if place is None else 500

@@ -19,10 +19,10 @@ from trustbo.models.likelihood.place_rows import Rows, filter_rows
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.priors import Priors
 from trustbo.models.samplers import scores
-from trustbo.models.samplers.exact import small_cholesky
 from trustbo.models.samplers.laplace import laplace
 from trustbo.models.samplers.place_draws import split_units
-from trustbo.models.samplers.priors_numpy import numbers
+from trustbo.models.samplers.priors_numpy import of_coefficients
+from trustbo.models.samplers.small_matrices import small_cholesky
 from trustbo.models.samplers.student import Student
 
 _MEMORY = 8e6  # numbers per chunk of parameter values
@@ -75,13 +75,7 @@ class PlaceTarget:
         """Take the rows of all missions and the priors."""
         self.rows, self.places, self.priors, self.place = rows, places, priors, place
         self.n_scores = 3 + len(place.names)
-        n_features = rows.X.shape[2] - 2
-        beta, b = priors.beta, priors.b
-
-        def each(name: str) -> np.ndarray:
-            return np.append(np.broadcast_to(numbers(beta, name), n_features), numbers(b, name))
-
-        self.mean, self.precision = each("loc"), each("scale") ** -2.0
+        self.mean, self.precision = of_coefficients(priors.beta, priors.b, rows.X.shape[2] - 2)
         self.n_c = np.bincount(places.cell_of, minlength=len(places.cells)).astype(float)
         K, q, kinds = rows.y.shape[1], rows.X.shape[2], int(rows.kind[-1]) + 1
         self._chunk = max(4, int(_MEMORY / (K * (len(rows.y) * q + K * kinds))))

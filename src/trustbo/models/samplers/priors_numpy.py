@@ -99,6 +99,17 @@ def floored(prior: Distribution, low: float) -> Distribution:
     return Floored(prior, low, (1.0 - above, float(density @ x)))
 
 
+def of_coefficients(
+    beta: Distribution, b: Distribution, n_features: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and precision of normal priors of (beta, b), each (coefficient,)."""
+    mean, sd = (
+        np.append(np.broadcast_to(numbers(beta, name), n_features), numbers(b, name))
+        for name in ("loc", "scale")
+    )
+    return mean, sd**-2.0
+
+
 def number(prior: Distribution, name: str) -> float:
     """A scalar argument of a distribution."""
     return float(getattr(prior, name))

@@ -1,15 +1,12 @@
-"""Draws from a model's posterior by the chosen sampler, and the checks of their diagnostics."""
+"""Draws from a model's posterior by the chosen sampler."""
 
 import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
-import arviz_base
 import numpy as np
-from arviz_stats import sampling_diagnostics
 from jax import Array, random
 
-from trustbo.errors import TrustboError, require_choice
 from trustbo.models.backend import own_settings
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
@@ -20,25 +17,21 @@ from trustbo.models.likelihood.place_marginal import PlaceIndex
 from trustbo.models.likelihood.place_rows import gather_rows
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
-from trustbo.models.samplers.convergence import MAX_KHAT, MAX_RHAT, MIN_ESS, convergence
+from trustbo.models.samplers.choice import is_coupled
+from trustbo.models.samplers.complaints import complaints_of, complaints_of_modes
+from trustbo.models.samplers.convergence import MAX_KHAT
 from trustbo.models.samplers.coupled_target import CoupledTarget
 from trustbo.models.samplers.drift_target import DriftTarget
-from trustbo.models.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
+from trustbo.models.samplers.exact import ExactDraws, sample_exact
 from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.models.samplers.importance import ScoreTarget, sample_scores
 from trustbo.models.samplers.latent_target import LatentTarget
-from trustbo.models.samplers.modes import visits
-from trustbo.models.samplers.nuts import NutsDraws, NutsSettings, run_nuts
+from trustbo.models.samplers.nuts import NutsSettings, run_nuts
 from trustbo.models.samplers.place_draws import split_units
 from trustbo.models.samplers.place_target import PlaceTarget
-from trustbo.models.samplers.scores import why_no_quantiles
 from trustbo.models.samplers.student import Student
 from trustbo.models.samplers.target import NutsData
 from trustbo.stacking import MissionBatch
-
-SAMPLERS = ("auto", "exact", "nuts", "joint")
-_VISITED = 0.1  # of the draws that a mode's mass promises; Laplace's masses are rough
-_MAX_SHARE_ERROR = 0.015  # Monte Carlo error of a mode's share of the draws
 
 
 class Draws(NamedTuple):
@@ -120,49 +113,6 @@ def nuts_data(
     return NutsData(*batch, weight)
 
 
-def require_sampler(model: TrustModel, sampler: str) -> None:
-    """Refuse a sampler that cannot treat the model.
-
-    Raises:
-        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` says why it cannot
-            be; or it is `"joint"`, and trust integrates out.
-    """
-    if sampler == "exact" and (reason := model.why_not_exact):
-        raise TrustboError(
-            f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
-        )
-    if sampler == "joint" and model.family.integrates_out:
-        raise TrustboError(
-            'sampler "joint" is for observations that trust does not integrate out of; with '
-            'Gaussian ones use "nuts" or "exact".'
-        )
-
-
-def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
-    """The sampler to use, and why: for `"auto"` the exact one where it applies, else NUTS.
-
-    Raises:
-        TrustboError: See `require_sampler`.
-    """
-    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
-    if sampler != "auto":
-        return sampler, "asked for"
-    pooling = model.partial_pooling is not None
-    own, coupled = isinstance(model, DriftTrust), _is_coupled(model)
-    by_scores = model.place or pooling or own or coupled or not model.family.integrates_out
-    reason = model.why_not_exact or (
-        None if own else why_not_conjugate(model.priors, coupled=coupled)
-    )
-    reason = reason or (
-        why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
-    )
-    if reason is None:
-        by = "" if model.family.integrates_out else " by expectation propagation, and weights"
-        what = "trust integrates out" if own else "trust and coefficients integrate out"
-        return "exact", f"{what}{by}"
-    return ("nuts" if model.family.integrates_out else "joint"), reason
-
-
 def _sample_exact(
     model: TrustModel,
     settings: NutsSettings,
@@ -235,13 +185,9 @@ def _targets(
         return [PlaceTarget(rows, places, priors, place)]
     if model.partial_pooling is not None:
         return [HierarchicalTarget(model.gather(batch, weight), priors)]
-    if _is_coupled(model):
+    if is_coupled(model):
         return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
     return [LatentTarget(*gather_chains(family, one), priors) for one in model.robots_of(batch)]
-
-
-def _is_coupled(model: TrustModel) -> bool:
-    return isinstance(model, CoupledTrust) and not model.robots_are_apart
 
 
 def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
@@ -303,7 +249,7 @@ def _sample_nuts(
         innovations = None if raw.innovations is None else np.asarray(raw.innovations)
         latents = Latents(innovations, raw.linearisation)
         draws = Draws(params, stats, {"retries": retries}, name, latents)
-        return draws, [*_complaints(draws), *_mode_complaints(raw)] if check else []
+        return draws, [*complaints_of(params, stats), *complaints_of_modes(raw)] if check else []
 
     draws, complaints = attempt(settings, 0)
     return attempt(longer, 1) if complaints else (draws, complaints)
@@ -326,51 +272,3 @@ def _is_complete(contact_rate: np.ndarray) -> bool:
     seen = ~np.isnan(contact_rate)
     together = (seen.any(2) == seen.all(2)).all()
     return bool(together and (np.diff(seen.any(2).astype(int), axis=1) <= 0).all())
-
-
-def _complaints(draws: Draws) -> list[str]:
-    """Limits that the draws exceed, parameter by parameter; empty if none."""
-    sites = arviz_base.from_dict({"posterior": draws.params})["posterior"].to_dataset()
-    found = []
-    for name, (worst, fewest) in convergence(sites).items():
-        if not worst <= MAX_RHAT:  # NaN is a complaint too
-            found.append(f"R-hat of {name} is {worst:.3f} (limit {MAX_RHAT})")
-        if not fewest >= MIN_ESS:
-            found.append(f"bulk ESS of {name} is {fewest:.0f} (at least {MIN_ESS:.0f})")
-    n_divergences = int(draws.stats["diverging"].sum())
-    if n_divergences:
-        found.append(f"{n_divergences} divergences")
-    return found
-
-
-def _mode_complaints(raw: NutsDraws) -> list[str]:
-    """Modes that chains left out, or whose share of the draws is not settled; empty if none."""
-    found, around = [], visits(raw.modes, np.asarray(raw.theta))
-    if len(around) == 1:
-        return found
-    shares = arviz_base.from_dict({"posterior": {str(i): each * 1.0 for i, each in around.items()}})
-    error = sampling_diagnostics.mcse(shares["posterior"].to_dataset())
-    for i, each in around.items():
-        mass, share = float(raw.modes.share[i]), each.mean()
-        mode = f"the mode where {_telling(raw, i)}"
-        if share < _VISITED * mass:
-            found.append(f"{share:.1%} of the draws are around {mode}, of some {mass:.0%} mass")
-        elif not error[str(i)] <= _MAX_SHARE_ERROR:
-            found.append(
-                f"the share of {mode} is {share:.2f} +- {float(error[str(i)]):.3f} (limit "
-                f"{_MAX_SHARE_ERROR})"
-            )
-    return found
-
-
-def _telling(raw: NutsDraws, i: int) -> str:
-    """The parameter that tells a mode from the largest other best, and its value there."""
-    gaps, other = [], int(np.argmax(np.delete(raw.modes.share, i)))
-    other += other >= i
-    for name, values in raw.params.items():
-        at = np.asarray(raw.params_at_modes[name])
-        gap = np.abs(at[i] - at[other]) / np.maximum(np.std(values, (0, 1)), 1e-12)
-        place = np.unravel_index(gap.argmax(), gap.shape)
-        index = f"[{', '.join(map(str, place))}]" if place else ""
-        gaps.append((gap[place], f"{name}{index} is {at[i][place]:.3g}"))
-    return max(gaps)[1]

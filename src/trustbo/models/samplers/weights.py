@@ -1,0 +1,26 @@
+"""Importance weights: Pareto smoothing, and resampling to equal weights."""
+
+import numpy as np
+from arviz_stats.base.array import array_stats
+
+
+def smoothed_weights(raw: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Pareto-smooth log importance weights (point,), some of them finite.
+
+    Returns:
+        Normalised log weights, k-hat, and the log of the raw ones' mean, the evidence.
+    """
+    finite = np.isfinite(raw)
+    # Minus the log weights, points without density far below all others.
+    smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
+    log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
+    log_w = smoothed - np.logaddexp.reduce(smoothed)
+    # Of nearly equal weights none is in a tail, and the fit of one fails.
+    unknown = -np.inf if finite.all() and np.ptp(raw) < 1e-6 else np.inf
+    return log_w, float(np.nan_to_num(khat, nan=unknown)), log_evidence
+
+
+def systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices of n equally weighted draws, by systematic resampling."""
+    points = (rng.random() + np.arange(n)) / n
+    return np.searchsorted(np.cumsum(weights)[:-1] / weights.sum(), points)
