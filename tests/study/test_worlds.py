@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -11,9 +12,12 @@ from typer.testing import CliRunner
 
 import trustbo as tb
 from trustbo.cli import app
+from trustbo.errors import TrustboError
+from trustbo.models import PlaceEffect, PooledTrust
+from trustbo.planning.policies import ucb
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.study import World, run_worlds, worlds, worlds_table
-from trustbo.study.contenders import contenders_of
+from trustbo.study.contenders import contenders_of, identity_of
 from trustbo.study.world import COURSES, REAL, aged
 from trustbo.workspace.sight import Sight
 
@@ -145,6 +149,32 @@ def test_a_policy_may_be_named(tmp_path, monkeypatch):
     monkeypatch.setattr("sys.path", list(sys.path))
     (one,) = contenders_of("pooled", "my_policies:best", (), "mean", 9)
     assert (one.name, one.policy) == ("best", "my_policies:best")
+
+
+def test_every_model_and_policy_has_a_row_and_a_key_of_its_own():
+    """Of three models of one class, two would have been left out without a word."""
+    models = [PooledTrust(place=PlaceEffect()), PooledTrust(observation="censored"), PooledTrust()]
+    policies = [partial(ucb, kappa=1.0), partial(ucb, kappa=2.0)]
+    names = [one.name for one in contenders_of(models, policies, (), "mean", 9)]
+    assert names[:3] == [
+        "PooledTrust(places) ucb(kappa=1.0)",
+        "PooledTrust(places) ucb(kappa=2.0)",
+        "PooledTrust(censored) ucb(kappa=1.0)",
+    ]
+    assert len(set(names)) == 6
+    assert identity_of(policies[0]) != identity_of(policies[1])
+    assert identity_of(Lucky(1)) == identity_of(Lucky(1)) != identity_of(Lucky(2))
+    with pytest.raises(TrustboError, match="two policies have the name 'Lucky'"):
+        contenders_of("pooled", [Lucky(1), Lucky(2)], (), "mean", 9)
+
+
+class Lucky:
+    """A policy with a setting."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def __call__(self, key, posterior, planner): ...
 
 
 def test_the_command_prints_the_table(tiny, tmp_path):

@@ -2,7 +2,8 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from jax import Array
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.planning import POLICIES, Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
@@ -73,7 +75,7 @@ def contenders_of(
     """Every model with every policy, and baselines; TrustboError: an unknown name."""
     options = {"max_bounds": max_bounds}
     parts = _models_of(models)
-    named = {_name(policy): policy for policy in _listed(policies)}
+    named = _by_name("policies", _listed(policies))
     for policy in named.values():
         if not callable(resolved("policy", policy, POLICIES)):
             raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
@@ -110,11 +112,14 @@ def resolved(what: str, given: Any, known: Mapping[str, Any] | None = None) -> A
 
 
 def identity_of(given: Any) -> Any:
-    """Name of an object, with a hash of the code of a function, as JSON can hold it."""
+    """Name of an object, with a hash of a function's code or of an object's state, for JSON."""
     if given is None or isinstance(given, str):
         return given
+    if isinstance(given, partial):
+        return [identity_of(given.func), repr(given.args), repr(sorted(given.keywords.items()))]
     kind = given if hasattr(given, "__qualname__") else type(given)
-    code = getattr(getattr(given, "__code__", None), "co_code", b"")
+    code = getattr(getattr(given, "__code__", None), "co_code", None)
+    code = repr(sorted(getattr(given, "__dict__", {}).items())).encode() if code is None else code
     return f"{kind.__module__}:{kind.__qualname__} {hashlib.sha256(code).hexdigest()[:12]}"
 
 
@@ -132,11 +137,11 @@ def _baseline(name: str) -> Any:
 def _models_of(models: Any) -> dict[str, Any]:
     """Parts of models by name."""
     kinds, parts = {kind.kind for kind in NAMED_MODELS}, {}
-    for given in _listed(models):
+    for name, given in _by_name("models", _listed(models)).items():
         if isinstance(given, str) and ":" not in given:
             parts |= parts_of("model", (require_choice("model", given, kinds),), NAMED_MODELS)
         else:
-            parts[_name(given)] = Own(source=given)
+            parts[name] = Own(source=given)
     return parts
 
 
@@ -144,7 +149,28 @@ def _listed(given: Any) -> list[Any]:
     return list(given) if isinstance(given, list | tuple) else [given]
 
 
+def _by_name(what: str, given: Sequence[Any]) -> dict[str, Any]:
+    """Objects by the names of their rows; TrustboError: two have the same."""
+    names = [_name(one) for one in given]
+    for name in names:
+        if names.count(name) > 1:
+            raise TrustboError(
+                f"two {what} have the name {name!r}, and a row of the table needs one of its own: "
+                'give functions of other names, or "module:name" of each.'
+            )
+    return dict(zip(names, given, strict=True))
+
+
 def _name(given: Any) -> str:
     if isinstance(given, str):
         return given.rpartition(":")[2]
-    return getattr(given, "__name__", type(given).__name__)
+    if isinstance(given, partial):
+        return f"{_name(given.func)}({', '.join(f'{k}={v}' for k, v in given.keywords.items())})"
+    own = getattr(given, "__name__", type(given).__name__)
+    if not isinstance(given, TrustModel):
+        return own
+    usual = {f.name: f.default for f in fields(given)}
+    options = given.options().items()
+    chosen = [v for name, v in options if isinstance(v, str) and v != usual[name]]
+    chosen += [] if given.place is None else ["places"]
+    return f"{own}({', '.join(chosen)})" if chosen else own
