@@ -3,6 +3,7 @@
 import itertools
 import math
 import struct
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -47,13 +48,23 @@ def dense_posterior_of_trust(
     return mean + gain @ (contact_rate - mean)[seen], prior - gain @ prior[seen]
 
 
-def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate, lag=0.0):
-    """Log density of a mission's rates, and moments of its trust, from one joint normal.
+class Joint(NamedTuple):
+    """Joint normal of a mission's trust x and rates y, each flat over (bound, robot)."""
 
-    drift, contact_rate: (bound, robot), rates NaN where not measured. Trust as one vector of all
-    bounds and robots: A x = d + B0 x_0 e_1 + w; rates y = x - lag x_prev + v.
+    mean_x: np.ndarray
+    cov_x: np.ndarray
+    cov_xy: np.ndarray
+    mean_y: np.ndarray
+    cov_y: np.ndarray
+
+
+def dense_joint(B0, drift, Q, R, x0_mean, x0_sd, lag=0.0):
+    """Moments of a mission's trust and rates, drift (bound, robot).
+
+    Trust as one vector of all bounds and robots: A x = d + B0 x_0 e_1 + w; rates y = x - lag x_prev
+    + v.
     """
-    K, n = contact_rate.shape
+    K, n = drift.shape
     eye, first = np.eye(K), np.eye(K)[:, :1]
     inverse = np.linalg.inv(np.eye(K * n) - np.kron(np.eye(K, k=-1), B0))
     start = np.kron(first, B0)  # how x_0 enters
@@ -64,10 +75,17 @@ def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate, lag=0.0):
     # Rates are linear in (x, x_0).
     H = np.eye(K * n) - lag * np.kron(np.eye(K, k=-1), np.eye(n))
     G = -lag * np.kron(first, np.eye(n))
-    mean_y = H @ mean_x + G @ x0
-    cov_xy = cov_x @ H.T + cov_x_x0 @ G.T
     cross = H @ cov_x_x0 @ G.T
     cov_y = H @ cov_x @ H.T + cross + cross.T + G @ G.T * x0_sd**2 + np.kron(eye, R)
+    return Joint(mean_x, cov_x, cov_x @ H.T + cov_x_x0 @ G.T, H @ mean_x + G @ x0, cov_y)
+
+
+def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate, lag=0.0):
+    """Log density of a mission's rates, and moments of its trust, from one joint normal.
+
+    drift, contact_rate: (bound, robot), rates NaN where not measured.
+    """
+    mean_x, cov_x, cov_xy, mean_y, cov_y = dense_joint(B0, drift, Q, R, x0_mean, x0_sd, lag)
     y = contact_rate.ravel()
     seen = ~np.isnan(y)
     cov, residual = cov_y[np.ix_(seen, seen)], (y - mean_y)[seen]
@@ -76,7 +94,7 @@ def dense_coupled(B0, drift, Q, R, x0_mean, x0_sd, contact_rate, lag=0.0):
     log_density = -0.5 * (quadratic + log_det + seen.sum() * math.log(2.0 * math.pi))
     gain = cov_xy[:, seen] @ np.linalg.inv(cov)
     mean = mean_x + gain @ residual
-    return log_density, mean.reshape(K, n), cov_x - gain @ cov_xy[:, seen].T
+    return log_density, mean.reshape(drift.shape), cov_x - gain @ cov_xy[:, seen].T
 
 
 def walks(passable, start, goal, max_bounds, connectivity=8, *, u_turns=True, simple=False):

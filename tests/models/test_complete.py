@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import xarray as xr
 from models.conftest import simulate_missions
+from numpyro.distributions import HalfCauchy
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, PooledTrust, complete, fit
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, complete, fit
 from trustbo.models.prior_predictive import sample_prior
 
 
@@ -54,7 +55,7 @@ def test_trust_that_was_sampled_cannot_be_added_later(missions):
 
 def test_the_caller_s_jax_flags_do_not_matter(missions):
     plain = fit(missions, sampler="exact", n_draws=100)
-    shared = CoupledTrust()  # its prior is drawn by JAX
+    shared = HierarchicalTrust(Priors(tau=HalfCauchy(0.3)))  # whose draws are JAX's
     drawn = sample_prior(shared, 2, 5, seed=1, n_robots=3)
     with jax.enable_x64(True), jax.default_prng_impl("rbg"), jax.threefry_partitionable(False):
         same(fit(missions, sampler="exact", n_draws=100), plain)

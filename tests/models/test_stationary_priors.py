@@ -66,9 +66,7 @@ def test_draws_have_the_slopes_of_stationary_trust(model):
     assert level.std() == pytest.approx(0.15, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "observation", ["gaussian", "censored", pytest.param("beta_binomial", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("observation", ["gaussian", "censored", "beta_binomial"])
 def test_most_rates_of_the_prior_are_rates_and_follow_the_line_of_sight(observation):
     rng = np.random.default_rng(0)
     z = rng.uniform(0.4, 0.9, (40, 9, 1, 3))

@@ -12,7 +12,8 @@ from trustbo.models.filter import TrustFilter, TrustForecast, TrustState
 from trustbo.models.fit import fit
 from trustbo.models.hazard import Hazard, fit_hazard
 from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.likelihood.contact_rate import ContactRate, TrustSample
+from trustbo.models.likelihood.contact_rate import ContactRate
+from trustbo.models.likelihood.generate import TrustSample
 from trustbo.models.loo import loo
 from trustbo.models.model import TrustModel
 from trustbo.models.params import (

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from numpyro.distributions import Distribution, LKJCholesky
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import CoupledParams, Params, RobotParams, ordered_params
+from trustbo.models.samplers.priors_numpy import draw, draw_lkj_cholesky
 
 INTER_ROBOT = ("full", "none", "ordered")
 
@@ -78,12 +80,46 @@ class CoupledTrust(TrustModel):
     def _covariance(self, noise: str, sd_prior: Distribution, n_robots: int) -> Array:
         sd = sample(f"delta_{noise}", sd_prior, (n_robots,))
         factor = jnp.eye(n_robots)
-        # Rates that are independent given trust have noise without correlations.
-        if n_robots > 1 and (noise == "w" or self.family.correlates):
+        if n_robots > 1 and self._correlates(noise):
             lkj = LKJCholesky(n_robots, self.priors.concentration)
             factor = jnp.asarray(numpyro.sample(f"corr_{noise}", lkj))
         factor = sd[:, None] * factor
         return jnp.asarray(numpyro.deterministic(f"Delta_{noise}", factor @ factor.T))
+
+    def draw_prior(
+        self, shape: tuple[int, int], n: int, rng: np.random.Generator
+    ) -> dict[str, np.ndarray]:
+        """See `TrustModel.draw_prior`."""
+        (n_robots, n_features), priors = shape, self.priors
+        fields = {name: name for name in RobotParams._fields[:5]}
+        if self.inter_robot == "ordered":
+            fields["gamma"] = "coupling"
+        own = {"beta": (n_robots, n_features), "gamma": (n_robots - 1,)}
+        drawn = priors.of_stationary({
+            name: draw(getattr(priors, field), (n, *own.get(name, (n_robots,))), rng)
+            for name, field in fields.items()
+        })  # fmt: skip
+        if self.inter_robot != "full":
+            return drawn
+        off, diagonal = n_robots * (n_robots - 1), np.swapaxes(drawn["beta"], 1, 2)
+        return {
+            "B0": _matrix(drawn["beta0"], draw(priors.coupling, (n, off), rng)),
+            "B": _matrix(diagonal, draw(priors.coupling, (n, n_features, off), rng)),
+            "b": drawn["b"],
+            "Delta_w": self._draw_covariance("w", drawn["delta_w"], rng),
+            "Delta_v": self._draw_covariance("v", drawn["delta_v"], rng),
+        }
+
+    def _draw_covariance(self, noise: str, sd: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        factor = np.eye(sd.shape[-1])
+        if self._correlates(noise):
+            factor = draw_lkj_cholesky(self.priors.concentration, sd.shape, rng)
+        factor = sd[..., None] * factor
+        return factor @ np.swapaxes(factor, 1, 2)
+
+    def _correlates(self, noise: str) -> bool:
+        # Rates that are independent given trust have noise without correlations.
+        return noise == "w" or self.family.correlates
 
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
         """See `TrustModel.level`."""
@@ -153,11 +189,10 @@ class CoupledTrust(TrustModel):
         return "each" if self.robots_are_apart else None
 
 
-def _matrix(diagonal: Array, off_diagonal: Array) -> Array:
+def _matrix(diagonal: Any, off_diagonal: Any) -> Any:
     """Square matrices of a diagonal (..., robot) and the other entries, row by row."""
+    xp = np if isinstance(diagonal, np.ndarray) else jnp
     n = diagonal.shape[-1]
-    rows, cols = jnp.nonzero(~jnp.eye(n, dtype=bool), size=n * (n - 1))
-    matrix = jnp.zeros((*diagonal.shape, n), diagonal.dtype)
-    index = jnp.arange(n)
-    matrix = matrix.at[..., index, index].set(diagonal)
-    return matrix.at[..., rows, cols].set(off_diagonal)
+    place = np.diag(np.arange(n))
+    place[~np.eye(n, dtype=bool)] = np.arange(n, n * n)
+    return xp.concatenate([diagonal, off_diagonal], axis=-1)[..., place]

@@ -13,6 +13,7 @@ from numpyro.distributions.transforms import biject_to
 
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import RobotParams
+from trustbo.models.samplers.priors_numpy import bijection, draw
 
 
 @register
@@ -48,6 +49,32 @@ class HierarchicalTrust(TrustModel):
         for name in ("beta0", "beta", "b"):
             numpyro.deterministic(name, getattr(params, name))
         return params
+
+    def draw_prior(
+        self, shape: tuple[int, int], n: int, rng: np.random.Generator
+    ) -> dict[str, np.ndarray]:
+        """See `TrustModel.draw_prior`."""
+        (n_robots, n_features), priors = shape, self.priors
+        size = {"beta0": (), "beta": (n_features,), "b": ()}
+        mean = priors.of_stationary(
+            {name: draw(getattr(priors, name), (n, *size[name]), rng) for name in size}
+        )
+        tau = {name: draw(priors.tau, (n, *size[name]), rng) for name in size}
+        from_line, to_line = bijection(priors.beta0.support)
+        centre = mean | {"beta0": to_line(mean["beta0"])}
+        own = {
+            name: centre[name][:, None]
+            + tau[name][:, None] * rng.standard_normal((n, n_robots, *size[name]))
+            for name in size
+        }
+        return {
+            **own,
+            "beta0": from_line(own["beta0"]),
+            "delta_w": draw(priors.delta_w, (n,), rng),
+            "delta_v": draw(priors.delta_v, (n,), rng),
+            **{f"mean_{name}": mean[name] for name in size},
+            **{f"tau_{name}": tau[name] for name in size},
+        }
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`: means, spreads and noises."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
@@ -17,13 +16,9 @@ from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
-from trustbo.models.likelihood.contact_rate import (
-    ContactRate,
-    TrustSample,
-    mission_log_likelihood,
-    simulate_missions,
-)
+from trustbo.models.likelihood.contact_rate import ContactRate, mission_log_likelihood
 from trustbo.models.likelihood.families import AUTO, FAMILIES, Family, choose, family_of
+from trustbo.models.likelihood.generate import TrustSample, draw_missions
 from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import PlaceEffect, bounds_of
@@ -36,6 +31,7 @@ if TYPE_CHECKING:
     from trustbo.models.hierarchical import HierarchicalTrust
 
 RESPONSES = ("level", "change")
+_STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,7 +137,7 @@ class TrustModel(Displayed, ABC):
     ) -> dict[str, np.ndarray] | None:
         """Draws of the parameters but those of places, (draw, ...), by name.
 
-        None where the model's own sample statements have to be run.
+        None where the model's own sample statements have to be run, which takes long to compile.
         """
         if not self.priors_are_independent:
             return None
@@ -351,10 +347,12 @@ class TrustModel(Displayed, ABC):
             )
         check_params(params, z.shape[2], z.shape[3])
         ticks = broadcast_ticks(self.family, n_ticks, z.shape[:3])
-        with own_settings():
-            params64 = params.map(lambda value, _: jnp.asarray(value, dtype=float))
-            drawn = simulate_missions(self.family, self.lag, params64, z, ticks * 1.0, key)
-        return TrustSample(*(np.swapaxes(np.asarray(a), 0, 1) for a in drawn))
+        one = params.map(lambda value, _: np.asarray(value, dtype=float)[None])
+        # The last number: else key 0 would give the stream of `default_rng(0)`, which awareness
+        # may well have been drawn from.
+        rng = np.random.default_rng([*np.asarray(jax.random.key_data(key)).ravel(), _STREAM])
+        drawn = draw_missions(self.family, one, self.lag, z, ticks, rng)
+        return TrustSample(*(values[0] for values in drawn))
 
     def update(
         self,

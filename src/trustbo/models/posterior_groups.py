@@ -14,6 +14,7 @@ from trustbo.models.likelihood import kalman_numpy, latent
 from trustbo.models.likelihood.contact_rate import mission_log_likelihood
 from trustbo.models.likelihood.ep import trust
 from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.likelihood.generate import draw_missions
 from trustbo.models.log_prior import log_prior_group
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, params_from, params_of
@@ -146,6 +147,8 @@ def _groups(
         found = _trust_compiled(law, every, few, latents, kept, batch, seed)
     prior = _prior_of(posterior).on(bounds)
 
+    rng = np.random.default_rng(seed + 3)
+
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
 
@@ -159,7 +162,7 @@ def _groups(
             "draw": kept,
         },
         "posterior_predictive": {"contact_rate": by_chain(found["predicted"])},
-        "prior_predictive": {"contact_rate": predict(law, prior, batch, seed + 3)[None]},
+        "prior_predictive": {"contact_rate": _predict(law, prior, batch, rng)[None]},
     }, of
 
 
@@ -197,7 +200,7 @@ def _trust_by_numpy(
         "trust": trajectories,
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
-        "predicted": kalman_numpy.simulate(law.family, every, law.lag, batch, rng),
+        "predicted": _predict(law, every, batch, rng),
     }
 
 
@@ -217,25 +220,22 @@ def _trust_compiled(
         latents = latents._replace(innovations=innovations.reshape(shape))
         few_latents = latents._replace(innovations=innovations[:, kept].reshape(shape))
     with own_settings():
-        keys = random.split(random.fold_in(random.key(seed), 1), 3)
+        keys = random.split(random.fold_in(random.key(seed), 1))
         moments = latent.trust_moments(law.family, law.lag, every, latents, batch)
         found = {
             "log_likelihood": mission_log_likelihood(law.family, law.lag, every, *batch, keys[0]),
             "trust": latent.trust_draws(law.family, law.lag, few, few_latents, batch, keys[1]),
             "trust_mean": moments.mean,
             "trust_sd": moments.sd,
-            "predicted": latent.predictive(law.family, law.lag, every, batch, keys[2]),
+            "predicted": _predict(law, every, batch, np.random.default_rng([seed, 1])),
         }
         return {name: np.asarray(array) for name, array in found.items()}
 
 
-def predict(law: Law, params: Params, batch: MissionBatch, seed: int) -> np.ndarray:
+def _predict(law: Law, params: Params, batch: MissionBatch, rng: np.random.Generator) -> np.ndarray:
     """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
-    if law.by_numpy:
-        rng = np.random.default_rng(seed)
-        return kalman_numpy.simulate(law.family, params, law.lag, batch, rng)
-    with own_settings():
-        return np.asarray(latent.predictive(law.family, law.lag, params, batch, random.key(seed)))
+    drawn = draw_missions(law.family, params, law.lag, batch.awareness, batch.n_ticks, rng)
+    return drawn.contact_rate
 
 
 def _count_ticks(

@@ -1,6 +1,6 @@
 """Draws of parameters, and of contact rates, from the priors alone."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import jax
@@ -13,9 +13,9 @@ from numpyro import handlers
 from trustbo.data import default_features
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models.backend import own_settings
+from trustbo.models.likelihood.generate import draw_missions
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
-from trustbo.models.posterior_groups import Law, predict
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
 
@@ -67,10 +67,9 @@ def prior_predictive(
         weigh_ticks(MissionBatch(z, np.zeros(z.shape[:3]), ticks))
     )
     drawn = draw_sites(model, z.shape[2:], n_draws, seed)
-    law = Law(model.family, model.lag, model.family.integrates_out and model.robots_are_apart)
-    params = model.params(drawn, z.shape[3]).flat()
-    batch = MissionBatch(z, z[..., 0], ticks)
-    drawn["contact_rate"] = predict(law, params, batch, seed + 1)
+    params, rng = model.params(drawn, z.shape[3]).flat(), np.random.default_rng(seed + 1)
+    missions = draw_missions(model.family, params, model.lag, z, ticks, rng)
+    drawn["contact_rate"] = missions.contact_rate
     dims = {**model.dims, "contact_rate": ("mission", "bound", "robot")}
     robots = [f"r{i + 1}" for i in range(z.shape[2])]
     coords = {
@@ -141,30 +140,13 @@ def _place_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.nda
     return model.place.draw(n_draws, np.random.default_rng([seed, 1]))
 
 
-@jax.jit
-def prior_draws(
-    model: TrustModel, awareness: Array, n_ticks: Array, keys: Array
-) -> dict[str, Array]:
-    """Parameters and contact rates drawn from the prior, one set per key."""
-
-    def program() -> None:
-        params = model.sample_params(*awareness.shape[2:])
-        model.sample_rates(params, awareness, n_ticks=n_ticks)
-
-    return _traced(program, (*model.sizes(*awareness.shape[2:]), "contact_rate"), keys)
-
-
 @partial(jax.jit, static_argnames="shape")
 def _parameter_draws(model: TrustModel, shape: tuple[int, int], keys: Array) -> dict[str, Array]:
-    """The same parameters without the rates, whose part of the program takes long to compile."""
-    return _traced(partial(model.sample_params, *shape), tuple(model.sizes(*shape)), keys)
-
-
-def _traced(program: Callable[[], object], names: Sequence[str], keys: Array) -> dict[str, Array]:
-    """Values of a program's sites by name, one set per key."""
+    """Values of the sites of the model's program by name, one set per key."""
+    program = partial(model.sample_params, *shape)
 
     def one(key: Array) -> dict[str, Array]:
         trace = handlers.trace(handlers.seed(program, key)).get_trace()
-        return {name: trace[name]["value"] for name in names}
+        return {name: trace[name]["value"] for name in model.sizes(*shape)}
 
     return jax.vmap(one)(keys)

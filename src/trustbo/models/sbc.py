@@ -14,7 +14,7 @@ from trustbo.files import FilePath, write_text
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
-from trustbo.models.prior_predictive import prior_draws
+from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import draw_posterior
@@ -84,14 +84,12 @@ def sbc(
     for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
         if j < len(ranks):
             continue
-        if walks is not None:
-            simulated = walks.simulate(model, awareness, ticks, seed + j)
+        # Not seed + j, whose random numbers the sampler draws.
+        own = int(np.random.SeedSequence([seed, j]).generate_state(1)[0])
+        if walks is None:
+            simulated = _simulate(model, awareness, ticks, own)
         else:
-            with own_settings():
-                keys = random.fold_in(random.key(seed), j)[None]
-                drawn = prior_draws(model, awareness, ticks, keys)
-                simulated = {name: np.asarray(values)[0] for name, values in drawn.items()}
-        model.check({name: value[None] for name, value in simulated.items()}, shape[2:])
+            simulated = walks.simulate(model, awareness, ticks, own)
         batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
         places = None if walks is None else walks.places(model)
         draws, _ = draw_posterior(
@@ -109,6 +107,18 @@ def sbc(
         ranks.append(rank)
         _write(checkpoint, asked, ranks)
     return _summary(ranks[:n_datasets], kept * _CHAINS, sampler)
+
+
+def _simulate(
+    model: TrustModel, awareness: np.ndarray, ticks: np.ndarray, seed: int
+) -> dict[str, np.ndarray]:
+    """Parameters and contact rates drawn from the prior, by name."""
+    sites = draw_sites(model, awareness.shape[2:], 1, seed)
+    params = model.params(sites, awareness.shape[3]).draw(0)
+    with own_settings():
+        key = random.key(seed)
+    rates = model.simulate(key, params, awareness, ticks).contact_rate
+    return {name: value[0] for name, value in sites.items()} | {"contact_rate": rates}
 
 
 def _label(name: str, index: tuple[int, ...]) -> str:

@@ -13,9 +13,7 @@ from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, along, bounds_along, moves_along
-
-_BUCKET = 8  # bounds: missions of about the same length share compiled code
+from trustbo.workspace.moves import MOVES, along, moves_along
 
 
 class ModelSimulator(DescribedSimulator):
@@ -82,14 +80,11 @@ class ModelSimulator(DescribedSimulator):
         """Run a path; the same seed gives the same mission."""
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         z = np.swapaxes(along(self.awareness, cells), 0, 1)
-        n_bounds = len(z)
-        padded = np.concatenate([z, np.repeat(z[-1:], -n_bounds % _BUCKET, axis=0)])
         with own_settings():  # else the caller's flags decide what is drawn
             key = jax.random.key(seed)
-        bounds = np.full((1, len(padded), 3), -1)
-        bounds[0, :n_bounds] = bounds_along(cells)
-        sample = self.model.simulate(key, self.params.on(bounds), padded[None], self.n_ticks)
-        rates = np.clip(sample.contact_rate[0, :n_bounds], 0.0, 1.0)
+        params = self.params.along(cells)
+        sample = self.model.simulate(key, params, z[None], self.n_ticks)
+        rates = np.clip(sample.contact_rate[0], 0.0, 1.0)
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
         n, status = self._end(cells, seed)
         ticks = None if ticks is None else ticks[:n]

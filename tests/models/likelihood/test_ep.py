@@ -1,13 +1,12 @@
 """Expectation propagation and its weighted draws: integrals over trust and coefficients."""
 
-import jax
 import numpy as np
 import pytest
 from models.likelihood.test_families import PARAMS, N, on_a_grid, sequences
 from scipy import stats
 
 from trustbo.data import Mission
-from trustbo.models import PooledTrust, TrustParams
+from trustbo.models import TrustParams
 from trustbo.models.likelihood import kalman_numpy
 from trustbo.models.likelihood.ep import draws, joint, terms, trust
 from trustbo.models.likelihood.ep.chains import gather_chains
@@ -176,25 +175,6 @@ def test_gaussian_terms_give_the_smoother_s_moments():
     # Two trajectories of each draw: 5 standard errors of a mean of 1000, and of an sd.
     assert (np.abs(found.mean - exact.mean) < 5 * exact.sd / np.sqrt(2 * n)).all()
     np.testing.assert_allclose(found.sd, exact.sd, rtol=5 / np.sqrt(4 * n))
-
-
-@pytest.mark.slow  # JAX's sampler of counts compiles for long
-def test_rates_drawn_by_numpy_are_those_drawn_by_jax():
-    for family in ("censored", "beta_binomial"):
-        p, z = PARAMS[family], np.random.default_rng(0).uniform(size=(1, 4, 2, 2))
-        n, ticks = 3000, np.full((1, 4, 2), float(N))
-        many = TrustParams(*(np.broadcast_to(v, (n, *np.shape(v))).copy() for v in p[:7]))
-        batch = MissionBatch(z, np.zeros((1, 4, 2)), ticks)
-        rng = np.random.default_rng(1)
-        ours = kalman_numpy.simulate(FAMILIES[family], many, 0.0, batch, rng)[:, 0]
-        model = PooledTrust(observation=family)
-        theirs = model.simulate(jax.random.key(0), p, np.repeat(z, n, 0), np.repeat(ticks, n, 0))
-        error = theirs.contact_rate.std(0) * np.sqrt(2.0 / n)
-        assert (np.abs(ours.mean(0) - theirs.contact_rate.mean(0)) < 5 * error).all()
-        spread = np.log(ours.std(0) / theirs.contact_rate.std(0))
-        assert (np.abs(spread) < 0.1).all()
-        assert (ours >= 0.0).all()
-        assert (ours <= 1.0).all()
 
 
 def test_a_mission_without_a_rate_leaves_the_evidence_as_it_is():

@@ -192,7 +192,7 @@ def test_an_influence_of_one_robot_on_another_is_found():
     posterior = fit(missions, model, whole=False)
     assert posterior.attrs["sampler"] == "exact"
     assert posterior.attrs["k_hat"] <= 0.7
-    low, high = posterior["posterior"]["B0"].quantile([0.025, 0.975], ("chain", "draw")).values
+    low, high = posterior["posterior"]["B0"].quantile([0.005, 0.995], ("chain", "draw")).values
     assert ((low <= truth.B0) & (truth.B0 <= high)).all()
     assert low[0, 1] > 0.1
     others = fit(small(n_robots=3), CoupledTrust(), earlier=posterior, whole=False)

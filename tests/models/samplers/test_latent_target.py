@@ -159,7 +159,7 @@ def test_odd_data_have_a_posterior(family, rates):
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_robots_apart_are_each_sampled_alone(family):
-    missions = counted(family, 4, 5, seed=2)
+    missions = counted(family, 4, 5, seed=3)
     model = CoupledTrust(observation=family, inter_robot="none")
     posterior = fit(missions, model, seed=3, n_draws=250)
     assert posterior.attrs["sampler"] == "exact"

@@ -1,7 +1,6 @@
 """The joint distribution of contact rates for numpyro, and compiled functions of it."""
 
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,22 +69,19 @@ class ContactRate(dist.Distribution):
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
         """Contact rates, shape `(*sample_shape, mission, bound, robot)`."""
-        keys = jax.random.split(key, sample_shape)
-        args = (self.family, self.lag, self.params, self.awareness, self.n_ticks)
+        ssm = self.params.ssm(self.awareness, self.lag)
+        ticks = jnp.full(self.event_shape, jnp.nan) if self.n_ticks is None else self.n_ticks
+        ticks = jnp.broadcast_to(ticks, self.awareness.shape[:3])
 
         def one(key: Array) -> Array:
-            return jnp.swapaxes(draw_missions(*args, key)[1], 0, 1)
+            key_trust, key_rate = jax.random.split(key)
+            trust, y = ssm.simulate(key_trust)
+            rates = self.family.measure(key_rate, ssm, trust, y, jnp.swapaxes(ticks, 0, 1))
+            return jnp.swapaxes(rates, 0, 1)
 
         for _ in sample_shape:
             one = jax.vmap(one)
-        return one(keys)
-
-
-class TrustSample(NamedTuple):
-    """Draws of latent trust and contact rate, each of shape (mission, bound, robot)."""
-
-    trust: np.ndarray
-    contact_rate: np.ndarray
+        return one(jax.random.split(key, sample_shape))
 
 
 @partial(jax.jit, static_argnames=("family", "lag"))
@@ -111,14 +107,3 @@ def mission_log_likelihood(
     # Whole batches: the rest would be compiled as a program of its own.
     rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1)
     return lax.map(one, jax.tree.map(lambda a: a[rows], params), batch_size=_BATCH)[:n_draws]
-
-
-def draw_missions(
-    family: Family, lag: float, params: Params, awareness: Array, n_ticks: Array | None, key: Array
-) -> tuple[Array, Array]:
-    """Latent trust and contact rates drawn from the model, each (bound, mission, robot)."""
-    like = awareness[..., 0] if n_ticks is None else n_ticks
-    return family.simulate(params.ssm(awareness, lag), jnp.swapaxes(like, 0, 1), key)
-
-
-simulate_missions = jax.jit(draw_missions, static_argnames=("family", "lag"))

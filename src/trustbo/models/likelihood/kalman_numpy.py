@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trustbo.models.likelihood.families import Family
 from trustbo.models.likelihood.gram import lengths
 from trustbo.models.likelihood.kalman import innovation, look_back, update
 from trustbo.models.params import Params
@@ -98,36 +97,6 @@ def sample(
                 x = A * x + a + np.sqrt(V) * e[k]
             trust[:, group.mission, k, group.robot] = x.T
     return trust
-
-
-def simulate(
-    family: Family, params: Params, lag: float, batch: MissionBatch, rng: np.random.Generator
-) -> np.ndarray:
-    """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot).
-
-    Args:
-        family: Family of observations.
-        params: Draws with leading axis (draw,).
-        lag: 0 where rates measure trust, 1 where they measure its change.
-        batch: Awareness and numbers of ticks; its rates are not read.
-        rng: Random number generator.
-    """
-    n, shape = len(params.b), batch.awareness.shape[:3]
-    n_ticks = np.broadcast_to(batch.n_ticks, shape)
-    batch = batch._replace(contact_rate=np.zeros(shape))
-    rates = np.zeros((n, *shape))
-    for group in _groups(params, batch):
-        p = group.draws
-        w, v = rng.standard_normal((2, *group.y.shape, n))
-        x = p.x0_mean + p.x0_sd * rng.standard_normal((len(group.mission), n))
-        for k in range(len(group.y)):
-            before = x
-            x = p.beta0 * x + p.drift(group.z[k], k) + p.delta_w * w[k]
-            y = x - lag * before + p.delta_v * v[k]
-            ticks = n_ticks[group.mission, k, group.robot][:, None]
-            y = family.draw_rates(rng, x, y, p.delta_v, ticks)
-            rates[:, group.mission, k, group.robot] = y.T
-    return rates
 
 
 class _Draws(NamedTuple):

@@ -1,4 +1,4 @@
-"""Latent trust and predicted contact rates under posterior draws, compiled for all models."""
+"""Latent trust under posterior draws, compiled for all models."""
 
 from collections.abc import Callable
 from functools import partial
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax, random
 
-from trustbo.models.likelihood.contact_rate import draw_missions
 from trustbo.models.likelihood.families import Family, Observed
 from trustbo.models.params import Params
 from trustbo.stacking import MissionBatch
@@ -62,14 +61,6 @@ def trust_moments(
     return TrustMoments(jnp.swapaxes(mean, 0, 1), jnp.swapaxes(sd, 0, 1))
 
 
-def predictive(
-    family: Family, lag: float, params: Params, batch: MissionBatch, key: Array
-) -> np.ndarray:
-    """Contact rates of replicated missions, one set per draw: (draw, mission, bound, robot)."""
-    keys = random.split(key, len(params.b))
-    return _in_batches(partial(_predictive, family, lag, batch), (params, keys))
-
-
 @partial(jax.jit, static_argnames=("family", "lag"))
 def _trust_draws(
     family: Family, lag: float, batch: MissionBatch, linearisation: Array | None, inputs: Any
@@ -81,16 +72,6 @@ def _trust_draws(
         e = jnp.zeros_like(observed.y) if e is None else e
         ssm = p.ssm(batch.awareness, lag)
         return jnp.swapaxes(family.draw_trust(ssm, observed, e, key), 0, 1)
-
-    return jax.vmap(one)(inputs)
-
-
-@partial(jax.jit, static_argnames=("family", "lag"))
-def _predictive(family: Family, lag: float, batch: MissionBatch, inputs: Any) -> Array:
-    def one(inputs: Any) -> Array:
-        p, key = inputs
-        _, rates = draw_missions(family, lag, p, batch.awareness, batch.n_ticks, key)  # pyright: ignore
-        return jnp.swapaxes(rates, 0, 1)
 
     return jax.vmap(one)(inputs)
 

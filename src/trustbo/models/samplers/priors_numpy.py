@@ -1,11 +1,14 @@
 """Prior densities, draws and floors in NumPy: compiling them would take longer than using them."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 import numpyro.distributions as dist
-from numpyro.distributions import Distribution
+from numpyro.distributions import Distribution, constraints
+from numpyro.distributions.transforms import biject_to
 from scipy import special
 
 from trustbo.errors import TrustboError
@@ -72,6 +75,40 @@ def draw(prior: Distribution, shape: tuple[int, ...], rng: np.random.Generator) 
     with own_settings():
         key = jax.random.key(int(rng.integers(1 << 31)))
         return np.asarray(prior.expand(shape).sample(key), dtype=float)
+
+
+def draw_lkj_cholesky(
+    concentration: float, shape: tuple[int, int], rng: np.random.Generator
+) -> np.ndarray:
+    """Cholesky factors of correlation matrices, (draw, row, column), for a shape (draw, row).
+
+    The onion method (Lewandowski, Kurowicka and Joe 2009, section 3.2): row by row a direction,
+    uniform on the sphere, and a Beta squared length of what is left of the diagonal.
+    """
+    n_draws, n = shape
+    factor = np.zeros((n_draws, n, n))
+    factor[:, 0, 0] = 1.0
+    for i in range(1, n):
+        square = rng.beta(0.5 * i, concentration + 0.5 * (n - 1 - i), n_draws)
+        direction = rng.standard_normal((n_draws, i))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        factor[:, i, :i] = np.sqrt(square)[:, None] * direction
+        factor[:, i, i] = np.sqrt(1.0 - square)
+    return factor
+
+
+def bijection(support: Any) -> tuple[Callable[..., np.ndarray], Callable[..., np.ndarray]]:
+    """Map of the real line onto a support, as numpyro's, and its inverse."""
+    if support is constraints.unit_interval:
+        limits = np.finfo(float)
+        return lambda x: np.clip(special.expit(x), limits.tiny, 1.0 - limits.eps), special.logit
+    transform = biject_to(support)
+
+    def in_float64(function: Callable[..., Any], x: np.ndarray) -> np.ndarray:
+        with own_settings():
+            return np.asarray(function(x), dtype=float)
+
+    return partial(in_float64, transform), partial(in_float64, transform.inv)
 
 
 def floored(prior: Distribution, low: float) -> Distribution:

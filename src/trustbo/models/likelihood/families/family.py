@@ -164,12 +164,6 @@ class Family(ABC):
         """Find the linearisation point, if the family has one."""
         return observed
 
-    def simulate(self, ssm: SSM, n_ticks: Array, key: Array) -> tuple[Array, Array]:
-        """Latent trust and contact rates drawn from the model, each (bound, mission, robot)."""
-        key_trust, key_rate = random.split(key)
-        trust, y = ssm.simulate(key_trust)
-        return trust, self.measure(key_rate, ssm, trust, y, n_ticks)
-
     def marginal_log_likelihood(self, ssm: SSM, observed: Observed, key: Array) -> Array:
         """Log p(rates of each mission), latent trust integrated out, shape (mission,), nats.
 
