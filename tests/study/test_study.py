@@ -548,6 +548,8 @@ def test_the_model_s_simulator_measures_the_true_awareness_and_counts():
     mission = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
     assert (mission.awareness == 0.7).all()
     assert (mission.n_ticks == 20).all()
+    with pytest.raises(tb.TrustboError, match="n_ticks=20 is for counts, and gaussian rates are"):
+        tb.simulation.ModelSimulator(workspace, truth, n_ticks=20)
     with pytest.raises(tb.TrustboError, match="counts ticks: give n_ticks"):
         tb.simulation.ModelSimulator(workspace, truth, model)
     with pytest.raises(

@@ -71,6 +71,11 @@ class ModelSimulator(DescribedSimulator):
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if self.n_ticks is None and self.model.family.needs_ticks:
             raise TrustboError("the beta-binomial family counts ticks: give n_ticks.")
+        if self.n_ticks is not None and not self.model.family.needs_ticks:
+            raise TrustboError(
+                f"n_ticks={self.n_ticks} is for counts, and {self.model.family.name} rates are no "
+                'shares of ticks: leave it out, or give a model of observation="beta_binomial".'
+            )
         self.p_fail = (
             None if p_fail is None else _require_chances(p_fail, (len(MOVES[8]), *shape[1:3]))
         )
