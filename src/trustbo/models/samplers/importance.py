@@ -36,7 +36,7 @@ _MAX_LAST = 8  # rounds of the last proposal where weights would be refused afte
 _FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
 _RIDGE = 1e-3
 _MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
-_MORE = 3  # times that uneven draws are added to
+_MORE, _MORE_LAST = 3, 12  # times that uneven draws are added to; that refused ones are
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
 
@@ -162,8 +162,9 @@ def _draw(
     if log_weight is None:
         return chosen, params, None
     found = smoothed_weights(log_weight)
-    for _ in range(_MORE):
-        if found[1] < GOOD_KHAT or _kish(found[0]) > _EVEN * len(chosen):
+    for k in range(_MORE_LAST):
+        enough = found[1] < (GOOD_KHAT if k < _MORE else MAX_KHAT)
+        if enough or _kish(found[0]) > _EVEN * len(chosen):
             break
         more = np.sort(systematic(np.exp(points.log_w), n, rng))
         others, added = target.draw(points.z, points.log_p, more, rng)
