@@ -75,9 +75,9 @@ def test_exact_draws_are_those_of_a_quadrature(seed):
         below = stats.norm.cdf(at[:, None], mean[likely, m], sd[likely, m]) @ weight[likely]
         laws[f"c{m}"] = draws, centre, spread, lambda x, a=at, b=below: np.interp(x, a, b)
     for name, (ours, centre, spread, cdf) in laws.items():
-        # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %;
-        # of 18 such comparisons the largest may well be 3 of these.
-        assert abs(ours.mean() - centre) < 0.066 * spread, name
+        # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %.
+        # Pareto smoothing thins delta_v's tail to 0 in data set 2, which takes 3 % off its sd.
+        assert abs(ours.mean() - centre) < 0.05 * spread, name
         assert abs(np.log(ours.std() / spread)) < 0.048, name
         assert stats.kstest(ours, cdf).pvalue > 0.01, name
 
@@ -96,11 +96,10 @@ def test_exact_draws_and_a_long_nuts_run_agree(seed):
     for name, reference in nuts.items():
         for ours, theirs in zip(exact[name].reshape(4000, -1).T, reference.T, strict=True):
             sd = theirs.std()
-            # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %;
-            # of 18 such comparisons the largest may well be 3 of these.
-            # NUTS of ESS > 40 000 adds 0.005 sd and 0.4 %.
+            # Quasi-random points of Kish size > 2000: standard errors below 0.022 sd and 1.6 %.
+            # NUTS of ESS > 40 000 adds 0.005 sd and 0.4 %, smoothing of a tail 3 % as above.
             assert abs(ours.mean() - theirs.mean()) < 0.05 * sd, name
-            assert abs(np.log(ours.std() / sd)) < 0.03, name
+            assert abs(np.log(ours.std() / sd)) < 0.048, name
             assert stats.ks_2samp(ours, theirs[::4]).pvalue > 0.01, name
 
 
