@@ -74,15 +74,9 @@ def test_labels_have_as_many_digits_as_tell_them_apart(low, high, labels, tmp_pa
     assert [label for *_, label in read(tmp_path / "map.qml")[2]] == labels
 
 
-def test_another_band_may_be_shown(maps, tmp_path):
-    write_style(tmp_path / "maps.qml", maps, band="cost")
-    renderer, _, stops = read(tmp_path / "maps.qml")
-    assert renderer.get("band") == "3"
-    assert stops[-1][0] == float(maps["cost"].max())
-    with pytest.raises(TrustboError, match="unknown band 'trust'; choose one of trust_mean, trust"):
-        write_style(tmp_path / "other.qml", maps, band="trust")
+def test_no_maps_and_other_suffixes_are_refused(maps, tmp_path):
     with pytest.raises(ShapeError, match="there are no maps"):
         write_style(tmp_path / "other.qml", xr.Dataset())
     with pytest.raises(TrustboError, match=r"other\.xml' must end in \.qml"):
         write_style(tmp_path / "other.xml", maps)
-    assert [file.name for file in tmp_path.iterdir()] == ["maps.qml"]
+    assert not list(tmp_path.iterdir())

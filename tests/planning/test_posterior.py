@@ -118,7 +118,6 @@ def test_the_summary_is_over_the_trust_maps_of_draws(workspace, draws):
     np.testing.assert_allclose(summary["sd"].values, maps.std(0))
     np.testing.assert_allclose(summary["cost"].values, (1.0 / (1.0 + np.exp(maps))).mean(0))
     assert planner.trust_map(draws).dims == ("draw", "row", "col")
-    assert planner.trust_summary(draws, per_robot=True)["sd"].dims == ("robot", "row", "col")
 
 
 @pytest.mark.parametrize("team", ["mean", "min"])

@@ -5,7 +5,6 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from trustbo.errors import require_choice
 from trustbo.export.checks import Maps, as_dataset
 from trustbo.files import FilePath, require_file, write_text
 
@@ -17,25 +16,22 @@ _VIRIDIS = (
 _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 
 
-def write_style(path: FilePath, maps: Maps, *, band: str | None = None) -> None:
-    """Write the style of a raster of `write_geotiff`: viridis over the values of one band.
+def write_style(path: FilePath, maps: Maps) -> None:
+    """Write the style of a raster of `write_geotiff`: viridis over the values of its first band.
 
-    QGIS loads the style of the same name beside a raster. `band` is the map to show, by default the
-    first; NaN is left out of the limits of its colours. ShapeError: no maps. TrustboError: an
-    unknown band, or a file that cannot be written.
+    QGIS loads the style of the same name beside a raster. NaN is left out of the limits of the
+    colours. ShapeError: no maps. TrustboError: a file that cannot be written.
     """
     target = require_file(path, ".qml")
-    bands = as_dataset(maps)
-    names = [str(name) for name in bands.data_vars]
-    shown = names[0] if band is None else require_choice("band", band, names)
-    low, high = _limits(bands[shown].values)
+    shown, *_ = as_dataset(maps).data_vars.values()
+    low, high = _limits(shown.values)
     root = ET.Element("qgis", version="3.28.0-Firenze", styleCategories="Symbology")
     pipe = ET.SubElement(root, "pipe")
     nearest = {f"zoomed{way}ResamplingMethod": "nearestNeighbour" for way in ("In", "Out")}
     provider = ET.SubElement(pipe, "provider")
     ET.SubElement(provider, "resampling", nearest, enabled="false", maxOversampling="2")
     limits = {"classificationMin": repr(low), "classificationMax": repr(high)}
-    of_band = {"band": str(names.index(shown) + 1), "alphaBand": "-1", "opacity": "1"}
+    of_band = {"band": "1", "alphaBand": "-1", "opacity": "1"}
     kind = {"type": "singlebandpseudocolor", "nodataColor": ""}
     renderer = ET.SubElement(pipe, "rasterrenderer", kind | of_band | limits)
     ET.SubElement(renderer, "rasterTransparency")

@@ -15,9 +15,9 @@ from trustbo.workspace.grid import Grid
 KEYS = ("mission", "bound", "robot", "row", "col")
 NUMBERS = ("contact_rate", "contact_time", "duration", "n_ticks", "t0")
 COLUMNS = (*KEYS, *NUMBERS, "status", "mission_status")
+"""Columns with a meaning of their own; any other is an awareness feature."""
 POSITIONS = (("row", "col"), ("x", "y"), ("lon", "lat"))
 """Pairs of columns with the cell, or with a position in it."""
-"""Columns with a meaning of their own; any other is an awareness feature."""
 _TICKS_BEFORE = "exposure"
 """Name of the column `n_ticks` in version 0.1."""
 _RESERVED = (*COLUMNS, _TICKS_BEFORE)

@@ -22,6 +22,7 @@ from trustbo.errors import PosteriorError, TrustboError, require_positive, requi
 from trustbo.models.exposures import CAUSES, Exposures, LostMission
 from trustbo.models.hazard_sampler import LIMIT, Law, Points, sample
 from trustbo.models.risk import BoundRisk
+from trustbo.models.samplers.weights import systematic
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES
 
@@ -159,9 +160,7 @@ def _dataset(
 ) -> xr.Dataset:
     """The group without the maps of chances."""
     rng = np.random.default_rng([seed, 2])
-    # Systematic resampling: equally weighted draws, in random order.
-    grid = (rng.random() + np.arange(n_draws)) / n_draws
-    chosen = rng.permutation(np.searchsorted(np.cumsum(points.weights)[:-1], grid))
+    chosen = rng.permutation(systematic(points.weights, n_draws, rng))
     values = law.center + law.scale * points.z[chosen]
     shape = workspace.difficulty.shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)

@@ -364,20 +364,18 @@ class Planner(Displayed):
         self,
         posterior: Params | xr.DataTree,
         *,
-        per_robot: bool = False,
         n_draws: int = 200,
         seed: int = 0,
     ) -> xr.Dataset:
-        """Compute `mean` and `sd` of the trust map over draws, and the mean `cost`.
+        """Compute `mean` and `sd` of the trust map over draws, (row, col), and the mean `cost`.
 
         Args:
             posterior: Posterior of `fit`, or draws with leading axis (draw,).
-            per_robot: True for maps (robot, row, col) instead of the team's (row, col).
             n_draws: Number of draws, taken at random without replacement.
             seed: Seed of the choice of draws.
         """
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
-        return summary_of(trust_map(self.problem, params, per_robot=per_robot, draws=chosen))
+        return summary_of(trust_map(self.problem, params, draws=chosen))
 
     def path_posterior(
         self, posterior: Params | xr.DataTree, *, n_draws: int | None = 1000, seed: int = 0

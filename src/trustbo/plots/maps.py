@@ -127,12 +127,7 @@ def path_posterior(
     Returns:
         Axes of the map.
     """
-    figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
-    cell_map(ax, share, workspace, low=0.0, high=1.0)
-    if path is not None:
-        draw_path(ax, path, workspace.grid)
-    _finish(figure, axes, workspace, "P(cell on the best path)", (0.0, 1.0))
-    return ax
+    return _one_map(share, workspace, path, "P(cell on the best path)", 1.0)
 
 
 def hazard_map(
@@ -151,12 +146,19 @@ def hazard_map(
     """
     worst = np.where(np.isnan(p_fail), -np.inf, p_fail).max(0)
     hazard = workspace.passable.copy(data=np.where(worst >= 0.0, worst, np.nan))
-    figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
     high = max(0.2, float(np.nanmax(hazard, initial=0.0)))
-    cell_map(ax, hazard, workspace, low=0.0, high=high)
+    return _one_map(hazard, workspace, path, "chance to fail on entering, at most", high)
+
+
+def _one_map(
+    values: xr.DataArray, workspace: Workspace, path: Sequence[Cell] | None, label: str, high: float
+) -> Axes:
+    """Draw a single map in colours from 0 to `high`."""
+    figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
+    cell_map(ax, values, workspace, low=0.0, high=high)
     if path is not None:
         draw_path(ax, path, workspace.grid)
-    _finish(figure, axes, workspace, "chance to fail on entering, at most", (0.0, high))
+    _finish(figure, axes, workspace, label, (0.0, high))
     return ax
 
 

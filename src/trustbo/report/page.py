@@ -12,7 +12,7 @@ from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.models import criticise
 from trustbo.report import figures, tables
-from trustbo.report.blocks import Picture, Section, Table
+from trustbo.report.blocks import Section
 from trustbo.report.numbers import counted
 from trustbo.report.summary import facts_of
 
@@ -93,11 +93,12 @@ def _sections(result: Result) -> Iterator[Section]:
     yield Section("cost", "Cost per robot", "", [figures.robot_costs(result)])
     if on_terrain:
         yield Section("terrain", "Terrain", "", [figures.terrain(result)])
+    parameters = figures.parameters(result)
     yield Section(
         "learned",
         "Parameters",
         _meaning_of_parameters(result),
-        [block for block in _learned(result) if block is not None],
+        [*([] if parameters is None else [parameters]), tables.parameter_table(result)],
     )
     yield _criticism(result)
     yield Section(
@@ -110,10 +111,6 @@ def _sections(result: Result) -> Iterator[Section]:
         "history", "The campaign", "", [figures.history(result), tables.history_table(result)]
     )
     yield Section("settings", "Settings", "", [tables.settings_table(result)])
-
-
-def _learned(result: Result) -> tuple[Picture | None, Table]:
-    return figures.parameters(result), tables.parameter_table(result)
 
 
 def _criticism(result: Result) -> Section:
@@ -132,7 +129,7 @@ def _meaning_of_parameters(result: Result) -> str:
     awareness = result.posterior.attrs.get("drift", awareness)  # a function of the user's own
     return (
         f"The parameters of the model, {result.settings['model']}: trust follows itself by "
-        f"{itself}, and the awareness of the cell entered by {awareness}."
+        f"{itself}, and the awareness of the bound by {awareness}."
     )
 
 

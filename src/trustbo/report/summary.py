@@ -1,7 +1,6 @@
 """Summary of a result in sentences."""
 
 import numpy as np
-from scipy.special import expit
 
 from trustbo.campaign.result import Result
 from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
@@ -29,7 +28,6 @@ def facts_of(result: Result) -> list[Fact]:
         Fact("Recommended", _path(result, plan)),
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
-        Fact("Success", _success(plan)),
         _soundness(result),
         Fact("Why it ended", _end(result)),
     ]
@@ -93,16 +91,6 @@ def _arrival(risk: PathRisk) -> str:
         cause = max(causes, key=lambda name: causes[name])
         said += f" The likeliest cause is {cause.replace('_', ' ')}."
     return said
-
-
-def _success(plan: Plan) -> str:
-    n, sigma = len(plan.path) - 1, "\N{GREEK SMALL LETTER SIGMA}"
-    return (
-        f"Its success index is {number(plan.success_index)}, the product of {sigma}(trust) over "
-        f"its {counted(n, 'bound')}. That compares paths rather than predicts: as "
-        f"{sigma}(1) is 0.73, even {counted(n, 'bound')} of full contact come to "
-        f"{number(expit(1.0) ** n)}."
-    )
 
 
 def _soundness(result: Result) -> Fact:

@@ -35,7 +35,7 @@ class Study:
         policies: Names in `planning.POLICIES`.
         objectives: Names in `planning.OBJECTIVES`.
         models: Models of the kinds `pooled`, `places`, `hierarchical`, `coupled`, `own`.
-        samplers: `"nuts"`, `"exact"`, `"joint"`.
+        samplers: `"auto"`, `"exact"`, `"nuts"`, `"joint"`.
         simulators: Simulators of the kinds `kinematic`, `model`.
         seeds: Seeds, or their number: 0, 1, ...
         n_iterations: Missions of a run.

@@ -29,7 +29,7 @@ class PathBandit:
 
     __name__ = "botorch"
 
-    def __init__(self, n_candidates: int = _N_CANDIDATES) -> None:
+    def __init__(self) -> None:
         """Know nothing; TrustboError: BoTorch is not installed."""
         try:
             import botorch  # noqa: F401  # pyright: ignore[reportMissingImports]
@@ -37,7 +37,6 @@ class PathBandit:
             raise TrustboError(
                 'the baseline botorch needs BoTorch: pip install "trustbo[bench]", or leave it out.'
             ) from None
-        self._n_candidates = n_candidates
         self._paths: list[tuple[Cell, ...]] = []
         self._features = np.empty((0, 0))
         self._inputs: list[np.ndarray] = []
@@ -72,10 +71,10 @@ class PathBandit:
         chosen: list[int] = []
         for i in order:
             others = (len(bounds[i] & bounds[j]) / len(bounds[i]) for j in chosen)
-            if len(chosen) < self._n_candidates and max(others, default=0.0) <= _OVERLAP:
+            if len(chosen) < _N_CANDIDATES and max(others, default=0.0) <= _OVERLAP:
                 chosen.append(int(i))
         rest = [int(i) for i in order if i not in set(chosen)]
-        chosen += rest[: self._n_candidates - len(chosen)]
+        chosen += rest[: _N_CANDIDATES - len(chosen)]
         self._paths, self._features = [drawn[i] for i in chosen], features[chosen]
 
     def _best(self, *, improve: bool) -> int:

@@ -153,7 +153,7 @@ class PlaceTarget:
         factor = np.ascontiguousarray(small_cholesky(of_c.transpose(1, 2, 0)).transpose(2, 0, 1))
         bad = ~np.isfinite(factor).all((1, 2)) | ~(G[:, -1, -1] > 0.0)
         factor[bad] = np.eye(factor.shape[1])
-        half = _forward(factor, G[:, :-1, -1] + precision * mean)
+        half = np.linalg.solve(factor, (G[:, :-1, -1] + precision * mean)[..., None])[..., 0]
         misfit = G[:, -1, -1] + (precision * mean**2).sum(1) - (half**2).sum(1)
         log_det = log_det + 2.0 * np.log(np.einsum("tcc->tc", factor)).sum(1)
         log_det -= np.log(precision).sum(1)
@@ -188,11 +188,6 @@ class PlaceTarget:
             if keep:
                 kept[t] = A
         return of_units, kept
-
-
-def _forward(L: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """L^-1 b for factors (point, c, c) and vectors (point, c)."""
-    return np.linalg.solve(L, b[..., None])[..., 0]
 
 
 def name_draws(
