@@ -20,7 +20,7 @@ def page(tmp_path_factory):
         workspace,
         (3, 0),
         (0, 3),
-        n_iterations=3,
+        n_iterations=4,
         sampler="exact",
         simulator=tb.simulation.ModelSimulator(workspace, truth),
         progress=False,
