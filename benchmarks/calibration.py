@@ -41,11 +41,11 @@ def cases():
     for observation in ("censored", "beta_binomial"):
         yield PooledTrust(observation=observation), "exact", 300, SMALL
         yield CoupledTrust(observation=observation, inter_robot="none"), "exact", 200, SMALL
-        yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 100, SMALL
+        yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 200, SMALL
     yield HierarchicalTrust(), "exact", 300, SMALL
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
-    yield CoupledTrust(), "exact", 100, SMALL
-    yield CoupledTrust(inter_robot="ordered"), "exact", 100, SMALL
+    yield CoupledTrust(), "exact", 200, SMALL
+    yield CoupledTrust(inter_robot="ordered"), "exact", 200, SMALL
     for sampler, n in (("exact", 300), ("nuts", 50)):
         yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
     yield PooledTrust(observation="student_t"), "joint", 100, SMALL

@@ -193,6 +193,16 @@ def test_the_worth_of_the_parts_of_a_model(with_places, planted):
     assert "give it again with model=" in said
 
 
+def test_with_places_nothing_is_compared_that_needs_nuts(planted, monkeypatch):
+    """It took minutes for what campaigns fit by default."""
+    by_nuts = importlib.import_module("trustbo.models.samplers.run")
+    monkeypatch.setattr(by_nuts, "_sample_nuts", lambda *_, **__: pytest.fail("NUTS was asked"))
+    missions, place = planted("place")[:6], tb.models.PlaceEffect()
+    worth = criticise(fit(missions, PooledTrust(place=place), "exact"), n_replicates=100).worth
+    assert "without them" in worth.loc["places", "finding"]
+    assert "of their own, both without places: " in worth.loc["robots", "finding"]
+
+
 def test_what_cannot_be_criticised_says_why(with_places, planted):
     posterior, _ = with_places
     with pytest.raises(TrustboError, match=r"takes a posterior of trustbo.models.fit; got dict"):

@@ -76,11 +76,20 @@ def _rows(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of single influential missions, by k-hat
         own = loo(posterior)
+        without_places = own
         for name, (data, other, how) in others.items():
             if other.place is not None and model.place is None and not _has_places(missions):
                 continue
+            beside = own
+            if other.why_not_exact and not model.why_not_exact:  # NUTS would take minutes
+                bare = replace(other, place=None)
+                if other.place is None or model.place is None or bare.why_not_exact:
+                    rows[name] = np.nan, np.nan, f"not compared: {other.why_not_exact}."
+                    continue
+                other, how, beside = bare, f"{how}, both without places", without_places
             found = loo(fit(data, other, seed=int(posterior.attrs["seed"]), check=False))
-            gap = np.asarray(own.elpd_i) - np.asarray(found.elpd_i)  # pyright: ignore
+            without_places = found if name == "places" else without_places
+            gap = np.asarray(beside.elpd_i) - np.asarray(found.elpd_i)  # pyright: ignore
             rows[name] = _compared(gap, how)
     return rows
 
