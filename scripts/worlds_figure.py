@@ -2,9 +2,9 @@
 
     python scripts/worlds_figure.py FILE.png default=FOLDER:optimistic paper=FOLDER:paper ...
 
-Each curve is named, default, neither, botorch, paper or shortest, with the folder of
-`benchmarks/worlds.py` or `trustbo worlds` and the contender in it that it is of. Kinds of worlds
-that only some of the runs have are drawn in one panel.
+Each curve is named, default, without, botorch, paper or shortest, with the folder of
+`benchmarks/worlds.py` or `trustbo worlds` and the contender in it that it is of. With `--together`
+before the file, all kinds of worlds are in one panel, as in docs/figures/worlds_outsider.png.
 """
 
 import sys
@@ -28,7 +28,7 @@ KINDS = {
 }
 STYLES = {
     "default": ("trustbo", "#0072B2", "-"),
-    "neither": ("trustbo without places and failures", "#56B4E9", (0, (6, 1.5, 1, 1.5))),
+    "without": ("trustbo without places", "#56B4E9", (0, (6, 1.5, 1, 1.5))),
     "botorch": ("BoTorch over path averages", "#D55E00", "--"),
     "paper": ("the paper's method", "#009E73", (0, (1, 1))),
     "shortest": ("a shortest path", "0.45", (0, (3, 1, 1, 1))),
@@ -37,14 +37,14 @@ STYLES = {
 
 def main() -> None:
     """Draw the panels."""
-    file, *given = sys.argv[1:]
+    whole = sys.argv[1] != "--together"
+    file, *given = sys.argv[1 if whole else 2 :]
     results = {}
     for one in given:
         name, _, source = one.partition("=")
         folder, _, contender = source.rpartition(":")
         runs = load_study(folder)
         results[name] = runs.isel(run=runs["contender"].values == contender)
-    whole = all(set(KINDS) <= set(runs["kind"].values) for runs in results.values())
     kinds = {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): ""}
     shape, size = ((2, 3), (9, 5.4)) if whole else ((1, 1), (5, 3.4))
     figure, axes = plt.subplots(

@@ -119,22 +119,12 @@ def fit(
         group = place_group(draws.places, places, seed)
         posterior["places"] = xr.DataTree(group)
     posterior.attrs |= {
-        "model": type(model).__name__,
-        "inter_robot": "none",
-        **model.options(),
-        "place": "none" if model.place is None else json.dumps(model.place.to_record()),
-        "model_record": json.dumps(model_to_record(model)),
+        **_record(model, batch, resolution(ticks)),
+        **draws.summary,
         "observation_reason": family_reason,
         "sampler": draws.sampler,
         "sampler_reason": reason if draws.sampler == chosen else "weights were too uneven",
         "seed": seed,
-        **model.marks(batch.awareness.shape[2:]),
-        **draws.summary,
-        "x0_mean": float(model.priors.x0_mean),
-        "x0_sd": float(model.priors.x0_sd),
-        "delta_v_floor": resolution(ticks) if model.family.rounds else 0.0,
-        **{f"prior_{name}": text for name, text in model.priors.describe().items()},
-        **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
     }
     if weights is not None:
         counted = xr.DataArray(weight[: len(missions)], dims="mission")
@@ -152,6 +142,23 @@ def fit(
             "Give more missions or firmer priors, or pass check=False to have it as it is.",
         )
     return posterior
+
+
+def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, object]:
+    """Attributes of a posterior that say what it is of; `finest` is the resolution of the rates."""
+    return {
+        "model": type(model).__name__,
+        "inter_robot": "none",
+        **model.options(),
+        "place": "none" if model.place is None else json.dumps(model.place.to_record()),
+        "model_record": json.dumps(model_to_record(model)),
+        **model.marks(batch.awareness.shape[2:]),
+        "x0_mean": float(model.priors.x0_mean),
+        "x0_sd": float(model.priors.x0_sd),
+        "delta_v_floor": finest if model.family.rounds else 0.0,
+        **{f"prior_{name}": text for name, text in model.priors.describe().items()},
+        **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
+    }
 
 
 def _of_rates(model: TrustModel, batch: MissionBatch, *, weighted: bool) -> tuple[TrustModel, str]:
