@@ -55,7 +55,8 @@ def page_of(namespace):
     return ROOT / "docs" / "api" / f"{namespace.split('.')[-1]}.md"
 
 
-SLOW = {"docs/howto/use-arviz.md", "docs/gallery.md"}  # all figures
+# All figures; drifts of one's own, whose programs compile for this alone.
+SLOW = {"docs/howto/use-arviz.md", "docs/gallery.md", "docs/howto/your-own-model.md"}
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
     for page in PAGES

@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -98,8 +99,10 @@ def test_whichever_write_it_dies_at_it_comes_to_the_same(workspace, tmp_path, mo
         whole = run(workspace, tmp_path / "whole", 2)
     copies[0].mkdir()  # and when nothing is there yet
     assert len(copies) == len(names) > 40
-    last = dict(zip(names, copies, strict=True))
-    assert len(last) > 15, last
+    # Of the first and the second mission alike: a file is one whatever its number.
+    kinds = [name and (re.sub(r"\d+", "N", name[0]), name[1]) for name in names]
+    last = dict(zip(kinds, copies, strict=True))
+    assert len(last) > 10, last
     for folder in copies if every else last.values():
         resume_or_begin(workspace, folder, 2)
         same(tb.load_result(folder), whole)

@@ -173,6 +173,7 @@ def test_a_posterior_is_around_its_truth_and_read_by_arviz(posterior, missions):
     assert table.index[0] == "own"
 
 
+@pytest.mark.slow  # its programs compile for this alone
 def test_with_places_a_linear_drift_has_the_pooled_posterior_too(missions):
     """Dense factors in JAX against normal equations in numba; tolerances as above."""
     own = fit(missions[:2], DriftTrust(linear, LINEAR.parameters, place=PlaceEffect()), seed=3)
@@ -243,6 +244,7 @@ def make_workspace():
     return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
 
 
+@pytest.mark.slow  # its programs compile for this alone
 def test_a_campaign_that_was_killed_comes_to_the_same(tmp_path, monkeypatch):
     workspace = make_workspace()
     simulator = tb.simulation.ModelSimulator(workspace, OWN.params(TRUTH, 2), OWN)
