@@ -45,14 +45,14 @@ def main() -> None:
         folder, _, contender = source.rpartition(":")
         runs = load_study(folder)
         results[name] = runs.isel(run=runs["contender"].values == contender)
-    kinds = {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): ""}
+    kinds = {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): "all worlds"}
     shape, size = ((2, 3), (9, 5.4)) if whole else ((1, 1), (5, 3.4))
     figure, axes = plt.subplots(
         *shape, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
     for ax, (chosen, title) in zip(axes.flat, kinds.items(), strict=True):
         n = draw(ax, {name: curves(runs, chosen) for name, runs in results.items()})
-        ax.set_title(f"{title} ({n})".strip(), fontsize=9, loc="left")
+        ax.set_title(f"{title} ({n})", fontsize=9, loc="left")
     for ax in axes[-1]:
         ax.set_xlabel("missions learned from", fontsize=9)
     for ax in axes[:, 0]:
