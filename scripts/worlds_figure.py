@@ -45,7 +45,9 @@ def main() -> None:
         folder, _, contender = source.rpartition(":")
         runs = load_study(folder)
         results[name] = runs.isel(run=runs["contender"].values == contender)
-    kinds = {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): "all worlds"}
+    kinds = (
+        {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): "all worlds"}
+    )
     shape, size = ((2, 3), (9, 5.4)) if whole else ((1, 1), (5, 3.4))
     figure, axes = plt.subplots(
         *shape, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
