@@ -55,8 +55,10 @@ def page_of(namespace):
     return ROOT / "docs" / "api" / f"{namespace.split('.')[-1]}.md"
 
 
-# All figures; drifts of one's own, whose programs compile for this alone.
-SLOW = {"docs/howto/use-arviz.md", "docs/gallery.md", "docs/howto/your-own-model.md"}
+# All figures; programs that compile for this alone; campaigns of many missions.
+_SLOW = ("api/plots", "gallery", "howto/use-arviz", "howto/your-own-model", "howto/compare-models",
+         "howto/criticise")  # fmt: skip
+SLOW = {f"docs/{page}.md" for page in _SLOW}
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
     for page in PAGES

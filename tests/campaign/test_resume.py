@@ -184,15 +184,20 @@ def test_a_folder_is_for_one_campaign_at_a_time(workspace, tmp_path):
     with tb.Campaign(workspace, *ENDS, directory=tmp_path):
         with pytest.raises(tb.TrustboError, match="another campaign is at work in"):
             tb.Campaign.load(tmp_path)
-        code = f"import trustbo; trustbo.Campaign.load({str(tmp_path)!r})"
-        other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-        assert "another campaign is at work in" in other.stderr
     with pytest.raises(tb.TrustboError, match="holds a campaign already: go on with it by"):
         tb.Campaign(workspace, *ENDS, directory=tmp_path)
     tb.Campaign.load(tmp_path).close()
     with pytest.raises(tb.TrustboError, match="holds no campaign"):
         tb.Campaign.load(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
+
+
+@pytest.mark.slow  # a process starts for long
+def test_another_process_is_kept_out_of_a_folder_too(workspace, tmp_path):
+    with tb.Campaign(workspace, *ENDS, directory=tmp_path):
+        code = f"import trustbo; trustbo.Campaign.load({str(tmp_path)!r})"
+        other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert "another campaign is at work in" in other.stderr
 
 
 def test_saving_is_a_copy_and_loading_goes_on(workspace, tmp_path):

@@ -74,14 +74,11 @@ def test_run_passes_every_choice_on(invoke, flags, tmp_path):
     ("name", "epsg", "shape", "ends", "place"),
     [
         ("wellington", 2193, "10,10", ("9,0", "0,9"), (175.40, -40.92)),
-        pytest.param(
-            "tahoe", 32611, "10,10", ("9,0", "0,9"), (-119.93, 39.29), marks=pytest.mark.slow
-        ),
-        pytest.param(
-            "bcts", 3005, "20,4", ("19,0", "0,3"), (-127.63, 50.67), marks=pytest.mark.slow
-        ),
+        ("tahoe", 32611, "10,10", ("9,0", "0,9"), (-119.93, 39.29)),
+        ("bcts", 3005, "20,4", ("19,0", "0,3"), (-127.63, 50.67)),
     ],
 )
+@pytest.mark.slow  # test_demo runs on wellington, too
 def test_run_on_real_terrain(
     name, epsg, shape, ends, place, invoke, real_terrain, tmp_path, request
 ):

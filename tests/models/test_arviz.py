@@ -47,8 +47,8 @@ def posterior(missions):
     ("model", "stationary"),
     [
         (PooledTrust(place=PlaceEffect()), True),
-        (CoupledTrust(inter_robot="none"), True),
-        (CoupledTrust(inter_robot="ordered"), False),
+        pytest.param(CoupledTrust(inter_robot="none"), True, marks=pytest.mark.slow),
+        pytest.param(CoupledTrust(inter_robot="ordered"), False, marks=pytest.mark.slow),
         (CoupledTrust(), False),
         (HierarchicalTrust(), True),
     ],

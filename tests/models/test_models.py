@@ -150,7 +150,7 @@ def nuts_data(missions):
     return NutsData(*(jnp.asarray(a) for a in batch), jnp.ones(len(batch.awareness)))
 
 
-@pytest.mark.parametrize("name", fast(MODELS, "pooled", "apart", "ordered"))
+@pytest.mark.parametrize("name", fast(MODELS, "pooled", "apart"))
 def test_the_change_of_variables_leaves_the_posterior_as_it_is(name):
     """Its Jacobian, and the density at the point it leads to, by automatic differentiation."""
     model = MODELS[name]
