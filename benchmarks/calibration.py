@@ -52,7 +52,8 @@ def cases():
     for observation in ("gaussian", "censored", "beta_binomial"):
         sampler = "nuts" if observation == "gaussian" else "joint"
         for model in (PooledTrust, HierarchicalTrust):
-            yield model(observation=observation), sampler, 100, SMALL
+            n = 200 if (model, sampler) == (PooledTrust, "nuts") else 100
+            yield model(observation=observation), sampler, n, SMALL
         yield CoupledTrust(observation=observation), sampler, 50, SMALL
     yield PooledTrust(response="change"), "nuts", 100, SMALL
     yield CoupledTrust(inter_robot="ordered"), "nuts", 50, SMALL

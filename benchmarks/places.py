@@ -1,8 +1,9 @@
 """Effects of places: what they cost, what they cost where there are none, and learned priors.
 
-Run: python benchmarks/places.py times|absent|terrains|sights|stopping [--data ../shared/data]
+Run: python benchmarks/places.py times|nuts|absent|terrains|sights|stopping [--data ../shared/data]
 
 - times: refits and draws, median of five, one core, beside NUTS on the same marginal (the peer).
+- nuts: means and sds of twelve seeds together, beside long NUTS (the peer); five minutes.
 - absent: truths without effects of places; regret with them in the model and without.
 - terrains: priors from campaigns on the other terrains, leave-one-terrain-out.
 - sights: line of sight under one wrong assumption, and under three that bracket the truth.
@@ -225,9 +226,35 @@ def stopping(data):
     print(f"{n} campaigns; missions {np.median(missions):g} ({np.quantile(missions, 0.9):g})")
 
 
+def nuts(_):
+    workspace, missions = driven(6, 8, random_ends=False)
+    seeds = [
+        moments(tb.models.fit(missions, PLACES, "exact", workspace=workspace, seed=seed))
+        for seed in range(12)
+    ]
+    longer = {"n_warmup": 600, "n_draws": 2000, "check": False}
+    long = moments(tb.models.fit(missions, PLACES, "nuts", workspace=workspace, **longer))
+    print("largest differences: of means in sd, of sds\n")
+    for name, (mean, square) in long.items():
+        sd = np.sqrt(square - mean**2)
+        means, squares = (np.mean([one[name][i] for one in seeds], 0) for i in (0, 1))
+        ratio = np.sqrt(squares - means**2) / sd
+        print(f"{name}: {np.abs((means - mean) / sd).max():.3f}, {np.abs(ratio - 1.0).max():.1%}")
+
+
+def moments(posterior):
+    """Mean and mean square of every parameter and every effect of a place."""
+    found, axes = {}, ("chain", "draw")
+    for group in ("posterior", "places"):
+        for name, draws in posterior[group].data_vars.items():
+            if set(axes) <= set(draws.dims):
+                found[name] = np.ravel(draws.mean(axes)), np.ravel((draws**2).mean(axes))
+    return found
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parts = {f.__name__: f for f in (times, absent, terrains, sights, stopping)}
+    parts = {f.__name__: f for f in (times, nuts, absent, terrains, sights, stopping)}
     parser.add_argument("part", nargs="*", choices=[*parts, []], default=["times", "absent"])
     parser.add_argument("--data")
     given = parser.parse_args()
