@@ -49,7 +49,7 @@ def posterior(missions):
         (PooledTrust(place=PlaceEffect()), True),
         pytest.param(CoupledTrust(inter_robot="none"), True, marks=pytest.mark.slow),
         pytest.param(CoupledTrust(inter_robot="ordered"), False, marks=pytest.mark.slow),
-        (CoupledTrust(), False),
+        pytest.param(CoupledTrust(), False, marks=pytest.mark.slow),
         (HierarchicalTrust(), True),
     ],
     ids=["places", "none", "ordered", "full", "hierarchical"],

@@ -114,6 +114,7 @@ def test_posterior_means_equal_those_of_a_grid():
     assert points.k_hat < 0.5
 
 
+@pytest.mark.slow  # many data sets
 def test_the_hazard_is_calibrated():
     """SBC: ranks of hyperparameters and of chances are uniform over 200 data sets."""
     prior, n_sets, n_bounds, n_ranks = Hazard(), 200, 25, 20

@@ -14,6 +14,7 @@ from trustbo.models import CoupledTrust, PooledTrust, Priors, sbc
 from trustbo.models.sbc import _uniformity
 
 
+@pytest.mark.slow  # many data sets; others rank a few
 def test_the_exact_sampler_is_calibrated():
     ranks = sbc(n_datasets=200, shape=(2, 4, 2, 2), progress=False)
     assert list(ranks["parameter"].values) == [
