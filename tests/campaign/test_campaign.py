@@ -83,7 +83,7 @@ def test_a_mission_off_the_grid_is_refused(workspace):
     mission = Mission.from_arrays([(3, 0), (50, 50)], z, np.full((1, 3), 0.5))
     with pytest.raises(TrustboError, match=r"path enters \(50, 50\), outside the grid of 4 rows"):
         campaign.tell(mission)
-    with pytest.raises(TrustboError, match="tell takes a Mission; got 7"):
+    with pytest.raises(TrustboError, match="tell takes one Mission at a time; got int"):
         campaign.tell(7)
 
 

@@ -77,7 +77,7 @@ def test_a_plan_that_was_only_evaluated_says_so():
     workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.5))
     params = TrustParams(0.5, np.ones(1), 0.0, 0.1, 0.1)
     planner = tb.planning.Planner(workspace, (2, 0), (0, 2))
-    assert "not searched for" in repr(planner.evaluate([(2, 0), (1, 1), (0, 2)], params))
+    assert "a policy's choice" in repr(planner.evaluate([(2, 0), (1, 1), (0, 2)], params))
 
 
 def test_long_cards_say_how_much_is_left_out():

@@ -73,6 +73,8 @@ def test_a_posterior_brings_its_robots_and_a_reset_starts_over(posterior):
 
 def test_bad_input_is_named():
     _, params = mixture()
+    with pytest.raises(TrustboError, match="got None"):
+        TrustFilter(None)
     with pytest.raises(TrustboError, match="say how many robots"):
         TrustFilter(params)
     live = TrustFilter(params, n_robots=3)

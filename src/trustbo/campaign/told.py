@@ -34,7 +34,8 @@ def require_mission(
         TrustboError: The path leaves the grid, jumps, or is not the one that was asked for.
     """
     if not isinstance(mission, Mission):
-        raise TrustboError(f"tell takes a Mission; got {mission!r}.")
+        kind = type(mission).__name__
+        raise TrustboError(f"tell takes one Mission at a time; got {kind}.")
     own = workspace.in_order(mission)
     _require_path(own, list(path), workspace.grid.shape, other_path)
     return own

@@ -83,13 +83,19 @@ class TrustFilter:
 
         Raises:
             ShapeError: Draws of another number of robots.
-            TrustboError: `TrustParams` without `n_robots`, or an unknown response or family.
+            TrustboError: No posterior, `TrustParams` without `n_robots`, or an unknown response or
+                family.
         """
         if isinstance(posterior, xr.DataTree):
             n_robots = posterior["constant_data"].sizes["robot"]
             response = posterior.attrs["response"]
             observation = posterior.attrs["observation"]
             posterior = params_of(posterior)
+        elif not isinstance(posterior, Params):
+            raise TrustboError(
+                f"a filter follows a posterior of fit, or draws of parameters; got {posterior!r}. "
+                "Before its first mission a campaign has no posterior: take its `belief`."
+            )
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
             raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")

@@ -65,7 +65,7 @@ class Plan(Displayed):
     def _card(self) -> Card:
         best = "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"
         if np.isnan(self.bound):
-            best = "not searched for"
+            best = "given, or a policy's choice: value and trust are the means"
         rows = [
             ("path", f"{len(self.path) - 1} bounds, {self.length:.4g} m"),
             ("value", f"{self.value:.4g} ({self.objective})"),
@@ -76,7 +76,8 @@ class Plan(Displayed):
             band = self.p_arrive_band
             between = "" if band is None else f" ({band[0]:.3f} to {band[1]:.3f}, 90 %)"
             rows.append(("chance to arrive", f"{self.p_arrive:.3f}{between}"))
-        rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
+        if self.engine != "given":
+            rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 
         def area() -> str:
             return self.workspace.picture(self.path)
