@@ -270,3 +270,11 @@ def test_a_feature_of_one_s_own():
         register_feature("other", sign=0)
     with pytest.raises(TrustboError, match="unknown feature 'stepheight'; choose one of slope"):
         pixel_features(rough_terrain(), ["stepheight"])
+
+
+def test_a_hole_in_the_surface_leaves_the_means_around_it():
+    terrain = make_terrain(tilted(n=30), 1.0)
+    surface = terrain["dsm"].values.copy()
+    surface[5, 6] = np.nan
+    holed = terrain.assign(dsm=terrain["dsm"].copy(data=surface))
+    np.testing.assert_allclose(vegetation_density(holed), vegetation_density(terrain), rtol=1e-6)
