@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from PIL import Image as Raster
 from PIL import features
@@ -57,7 +58,9 @@ def _figure(axes: Axes | np.ndarray) -> Figure:
 
 def _image(figure: Figure) -> Image:
     file = io.BytesIO()
-    figure.savefig(file, format="svg", dpi=_DOTS, metadata={"Date": None})
+    figure.set_dpi(_DOTS)
+    # The same bytes as of `savefig`, which draws once more to know its layout.
+    FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None})
     plt.close(figure)
     width, height = (round(_PIXELS * inches) for inches in figure.get_size_inches())
     svg = _PNG.sub(_smaller, file.getvalue().decode("utf-8"))
