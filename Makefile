@@ -10,9 +10,7 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
-# Python compiles modules when they are first imported; to compile all of them takes half a minute.
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
-	--constraint constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 PYTEST := TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 .PHONY: demo test notebooks slow lint docs bench peers clean
@@ -54,8 +52,9 @@ $(BIN)/python:
 		"$$python" -m venv --clear $(VENV)
 
 # The stamps make a second call fast; they are renewed when what is to be installed changes.
+# Python compiles modules when they are first imported; to compile all of them takes half a minute.
 $(VENV)/.installed: pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .
+	$(PIP) --no-compile --editable .
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
