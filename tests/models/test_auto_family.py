@@ -1,10 +1,13 @@
 """Families of observations chosen by the rates."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 import trustbo as tb
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, fit
+from trustbo.models.samplers import run
 from trustbo.simulation import KinematicSimulator
 
 PATH = [(2, 0), (1, 1), (0, 2)]
@@ -58,6 +61,42 @@ def test_the_exact_sampler_and_weights_come_first():
     assert weighted.attrs["observation_reason"] == "missions have weights"
     change = PooledTrust(observation="auto", response="change")
     assert fit(missions(0.0), change, n_draws=50).attrs["observation"] == "gaussian"
+
+
+def force_uneven_weights(monkeypatch):
+    """Of scores, which Gaussian rates of pooled robots have none of."""
+    sample = run.sample_scores
+
+    def uneven(*args):
+        found = sample(*args)
+        return found._replace(draws=found.draws._replace(khat=0.83))
+
+    monkeypatch.setattr(run, "sample_scores", uneven)
+
+
+def test_uneven_weights_leave_gaussian_rates_where_nobody_asked_for_others(monkeypatch):
+    some = missions(0.5, n=3)
+    force_uneven_weights(monkeypatch)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = fit(some, PooledTrust(observation="auto"), n_draws=50, whole=False)
+    assert (found.attrs["sampler"], found.attrs["observation"]) == ("exact", "gaussian")
+    assert found.attrs["observation_reason"] == (
+        "50% of the rates are 0 or 1, but the censored ones' weights are too uneven (k-hat 0.83, "
+        "limit 0.7): Gaussian ones instead"
+    )
+    gaussian = fit(some, PooledTrust(), n_draws=50, whole=False)["posterior"].to_dataset()
+    assert found["posterior"].to_dataset().drop_attrs().identical(gaussian.drop_attrs())
+
+
+@pytest.mark.slow  # NUTS compiles for this alone
+def test_uneven_weights_of_a_family_that_was_asked_for_are_said_and_left_to_nuts(monkeypatch):
+    force_uneven_weights(monkeypatch)
+    model = PooledTrust(observation="censored")
+    with pytest.warns(UserWarning, match="weights are too uneven .k-hat 0.83.*NUTS is used inst"):
+        found = fit(missions(0.5, n=3), model, n_draws=50, whole=False, check=False)
+    assert found.attrs["sampler"] == "joint"
+    assert found.attrs["sampler_reason"] == "weights are too uneven (k-hat 0.83, limit 0.7)"
 
 
 def test_priors_of_one_s_own_are_kept():

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -22,7 +23,7 @@ from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.record import model_to_record
 from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.nuts import NutsSettings
-from trustbo.models.samplers.run import draw_posterior
+from trustbo.models.samplers.run import Draws, UnevenWeightsError, draw_posterior
 from trustbo.models.samplers.student import Student
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
@@ -55,8 +56,9 @@ def fit(
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
             attributes say which, and why. `"exact"`: near-independent draws by importance sampling,
             without compiling, for robots that share their parameters, have nothing in common, are
-            partially pooled or influence each other; it falls back on NUTS, with a warning, where
-            its weights are too uneven. `"nuts"`. Or `"joint"`: NUTS on
+            partially pooled or influence each other; where its weights are too uneven, rates are
+            taken for Gaussian ones if observation is `"auto"`, else NUTS is used, with a warning.
+            `"nuts"`. Or `"joint"`: NUTS on
             parameters and latent trust together, which `"nuts"` is too where trust does not
             integrate out.
         workspace: Workspace of the missions. A model with effects of places then knows them over
@@ -95,20 +97,33 @@ def fit(
     model = PooledTrust() if model is None else model
     require_model(model)
     batch = stack_missions(missions)
-    model, family_reason = _of_rates(model, batch, weighted=weights is not None)
-    model = model.for_features(missions[0].features)
-    chosen, reason = resolve_sampler(model, sampler)
+    asked = model
+    model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
     places = _places(model, missions, batch, workspace)
     require_ticks(model.family, batch)
     weight = _weights(weights, model, batch, len(missions))
     ticks = _weigh_rates(batch, weight)
-    floored = model.at_resolution(ticks)
-    settings = NutsSettings(n_warmup, n_draws, n_chains)
     started = time.perf_counter()
-    prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
-    draws, complaints = draw_posterior(
-        floored, chosen, settings, seed, batch, weight, places, _proposal(earlier), check=check
-    )
+
+    def draw(model: TrustModel, *, fallback: bool) -> _Drawn:
+        model = model.for_features(missions[0].features)
+        chosen, reason = resolve_sampler(model, sampler)
+        floored = model.at_resolution(ticks)
+        settings = NutsSettings(n_warmup, n_draws, n_chains)
+        prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
+        start = _proposal(earlier)
+        draws, complaints = draw_posterior(
+            floored, chosen, settings, seed, batch, weight, places, start, check=check,
+            fallback=fallback,
+        )  # fmt: skip
+        return _Drawn(model, prior, draws, complaints, draws.fallback or reason)
+
+    try:
+        drawn = draw(model, fallback=asked.observation != AUTO or model.family.integrates_out)
+    except UnevenWeightsError as error:
+        family_reason += f", but the {model.observation} ones' {error}: Gaussian ones instead"
+        drawn = draw(asked.observing("gaussian"), fallback=True)
+    model, prior, draws, complaints, reason = drawn
     groups = {
         "posterior": {name: draws.params[name] for name in model.dims},
         "sample_stats": draws.stats,
@@ -123,7 +138,7 @@ def fit(
         **draws.summary,
         "observation_reason": family_reason,
         "sampler": draws.sampler,
-        "sampler_reason": reason if draws.sampler == chosen else "weights were too uneven",
+        "sampler_reason": reason,
         "seed": seed,
     }
     if weights is not None:
@@ -142,6 +157,17 @@ def fit(
             "Give more missions or firmer priors, or pass check=False to have it as it is.",
         )
     return posterior
+
+
+class _Drawn(NamedTuple):
+    """Draws of a model's parameters, and what they came by."""
+
+    model: TrustModel
+    prior: dict[str, np.ndarray]
+    draws: Draws
+    complaints: list[str]
+    reason: str
+    """Why the sampler is the one it is."""
 
 
 def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, object]:

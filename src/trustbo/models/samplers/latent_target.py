@@ -158,5 +158,6 @@ def _fill_places(P: np.ndarray, places: Visited, theta: np.ndarray) -> float:
     log_det = 2.0 * np.log(M.diagonal()).sum() + 2.0 * (n_units - n_cells) * np.log(tau_e)
     place_prior.invert(M)
     place_prior.fill_units(A, M, places.cell_of, n_c, tau_e)
-    P[:] = np.tril(A) + np.tril(A, -1).T
+    P[:] = A + A.T
+    P[np.diag_indices(n_units)] *= 0.5
     return log_det

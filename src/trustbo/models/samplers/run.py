@@ -45,6 +45,12 @@ class Draws(NamedTuple):
     """Innovations of latent trust, with the same leading axes, if it was sampled."""
     places: Mapping[str, np.ndarray] = {}
     """Effects of visited places, see `place_maps.place_group`."""
+    fallback: str = ""
+    """Why NUTS was used where the exact sampler was to be."""
+
+
+class UnevenWeightsError(Exception):
+    """The exact sampler's weights are too uneven, or leave out a mode."""
 
 
 def draw_posterior(
@@ -58,6 +64,7 @@ def draw_posterior(
     start: Student | None = None,
     *,
     check: bool,
+    fallback: bool = True,
 ) -> tuple[Draws, list[str]]:
     """Draws given a batch, and complaints about them.
 
@@ -72,22 +79,29 @@ def draw_posterior(
         start: First proposal of the exact sampler with places or coupled robots, from an earlier
             posterior.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
+        fallback: Whether NUTS takes over, with a warning, where the exact sampler fails.
+
+    Raises:
+        UnevenWeightsError: The exact sampler fails, and there is no fallback.
     """
     weight = np.ones(len(batch.contact_rate)) if weight is None else weight
+    failure = ""
     if sampler == "exact":
-        exact = (
-            _sample_exact(model, settings, seed, batch, weight)
-            if places is None and model.family.integrates_out and model.robot_sets
-            else _sample_scores(model, settings, seed, batch, weight, places, start)
-        )
-        if exact is not None:
-            return exact, []
+        try:
+            if places is None and model.family.integrates_out and model.robot_sets:
+                return _sample_exact(model, settings, seed, batch, weight), []
+            return _sample_scores(model, settings, seed, batch, weight, places, start), []
+        except UnevenWeightsError as error:
+            if not fallback:
+                raise
+            failure = str(error)
+            warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
     data = nuts_data(model, batch, weight, places)
     with own_settings():
         draws, complaints = _sample_nuts(model, settings, random.key(seed), data, check=check)
     if places is not None:
         draws = _with_effects(model, draws, places, seed)
-    return draws, complaints
+    return draws._replace(fallback=failure), complaints
 
 
 def nuts_data(
@@ -119,15 +133,14 @@ def _sample_exact(
     seed: int,
     batch: MissionBatch,
     weight: np.ndarray | None,
-) -> Draws | None:
-    """Draws by importance sampling, or None, with a warning, where its weights are too uneven."""
+) -> Draws:
+    """Draws by importance sampling; UnevenWeightsError: its weights are too uneven."""
     shape = (settings.n_chains, settings.n_draws)
     each = [
         sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
         for i, statistics in enumerate(model.gather(batch, weight))
     ]
-    if not _is_even(max(exact.khat for exact in each)):
-        return None
+    _require_even(each)
     params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     return Draws(params, stats, _summarize(each), "exact")
 
@@ -140,7 +153,7 @@ def _sample_scores(
     weight: np.ndarray,
     places: Visited | None,
     start: Student | None,
-) -> Draws | None:
+) -> Draws:
     """The same for places, partial pooling, coupled robots, and rates that are not Gaussian."""
     shape = (settings.n_chains, settings.n_draws)
     targets = _targets(model, batch, weight, places)
@@ -149,15 +162,11 @@ def _sample_scores(
         start = None  # of another team
     found = [sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)]
     each = [one.draws for one in found]
-    if not _is_even(max(drawn.khat for drawn in each)):
-        return None
+    _require_even(each)
     if any(getattr(target, "has_modes", False) for target in targets):
-        warnings.warn(
-            "the posterior has more than one mode, which the exact sampler cannot weigh for a "
-            "drift of your own: NUTS is used instead.",
-            stacklevel=4,
+        raise UnevenWeightsError(
+            "weights do not tell the shares of modes, of which the posterior has more than one"
         )
-        return None
     params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
     effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
     summary = _summarize(each)
@@ -199,16 +208,11 @@ def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
     }
 
 
-def _is_even(khat: float) -> bool:
-    """Whether importance weights can be used; warns where they cannot."""
-    if khat <= MAX_KHAT:
-        return True
-    warnings.warn(
-        f"the exact sampler's k-hat is {khat:.2f} (limit {MAX_KHAT}): its weights are too uneven "
-        "here, so NUTS is used instead.",
-        stacklevel=5,
-    )
-    return False
+def _require_even(each: list[ExactDraws]) -> None:
+    """Refuse importance weights that are too uneven to be used."""
+    khat = max(exact.khat for exact in each)
+    if not khat <= MAX_KHAT:
+        raise UnevenWeightsError(f"weights are too uneven (k-hat {khat:.2f}, limit {MAX_KHAT})")
 
 
 def _join(each: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):

@@ -18,6 +18,7 @@ from numba import njit
 
 from trustbo.models.likelihood.ep.joint import backward, propagate, start_sites
 from trustbo.models.likelihood.ep.terms import (
+    AT_ONE,
     COUNT,
     GAUSSIAN,
     LOG_2PI,
@@ -31,6 +32,7 @@ from trustbo.models.likelihood.ep.terms import (
 )
 
 N_CANDIDATES = 8
+_TEMPER = 0.6
 
 
 @njit(**OPTIONS)
@@ -77,46 +79,63 @@ def draw_chain(b0, delta_w, delta_v, x0, chains, c, u, table, constant, lam, eta
 
 
 @njit(**OPTIONS)
+def _log_student(x, mean, L, nu):
+    """Log density of a Student-t of precision LL', but for (2 pi)^(-D / 2)."""
+    D, square = len(x), 0.0
+    total = math.lgamma(0.5 * (nu + D)) - math.lgamma(0.5 * nu) - 0.5 * D * np.log(0.5 * nu)
+    for i in range(D):
+        z = 0.0
+        for k in range(i, D):
+            z += L[k, i] * (x[k] - mean[k])
+        square += z * z
+        total += np.log(L[i, i])
+    return total - 0.5 * (nu + D) * np.log(1.0 + square / nu)
+
+
+@njit(**OPTIONS)
 def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu, gamma, rng):
     """Coefficients at one value of the hyperparameters, and the log weight of each draw.
 
     `gamma` (draw, coefficient) holds numbers of a standard Student-t of `nu` degrees, and then
-    draws of one with the mean and scale of EP's normal law: rates at a limit say little of one
-    side, where the coefficients' law is as wide as their prior, and normal weights uneven. A
-    weight is the prior density times an unbiased estimate of each chain's evidence, over EP's
-    density: its mean is the evidence, but for |P|^(1/2).
+    draws of a mixture of two, with the mean and scale of EP's normal law, and of that under sites
+    of `_TEMPER` times the precision. Rates at a limit say little of one side, where the
+    coefficients' law has a tail as wide as their prior; and where many are of the same place, EP's
+    law is too narrow. A weight is the prior density times an unbiased estimate of each chain's
+    evidence, over the mixture's density: its mean is the evidence, but for |P|^(1/2).
     """
     n, D = gamma.shape
     K, last = chains.y.shape[1], chains.of.shape[1]
     table, sites = np.zeros((chains.tables.shape[1], N_X)), np.empty(kept.shape)
     table_at(chains.tables, delta_v, table)
     start_sites(chains, delta_v, kept, sites[0], sites[1])
-    mean, L = np.empty(D), np.zeros((D, D))
+    mean, L = np.empty((2, D)), np.zeros((2, D, D))
     propagate(
-        b0, delta_w, delta_v, x0, P, g, chains, table, sites[0], sites[1], n_sweeps, 1.0, mean, L,
-        np.bool_(False),
+        b0, delta_w, delta_v, x0, P, g, chains, table, sites[0], sites[1], n_sweeps, 1.0, mean[0],
+        L[0], np.bool_(False),
+    )  # fmt: skip
+    wide = np.where(chains.kind >= AT_ONE, _TEMPER, 1.0) * sites
+    propagate(
+        b0, delta_w, delta_v, x0, P, g, chains, table, wide[0], wide[1], np.int64(1), 1.0, mean[1],
+        L[1], np.bool_(False),
     )  # fmt: skip
     constant = constants(chains.counts, concentration(delta_v))
-    norm = math.lgamma(0.5 * (nu + D)) - math.lgamma(0.5 * nu) - 0.5 * D * np.log(0.5 * nu)
     weight, u, x, ahead = np.empty(n), np.empty(K), np.empty(K), np.empty((K, 2))
     choice = np.empty((2, N_CANDIDATES))
     for t in range(n):
-        z, square, total = gamma[t], 0.0, -norm
+        z, component = gamma[t], int(rng.random() < 0.5)
+        backward(L[component], z)
         for i in range(D):
-            square += z[i] * z[i]
-            total -= np.log(L[i, i])
-        total += 0.5 * (nu + D) * np.log(1.0 + square / nu)
-        backward(L, z)
-        for i in range(D):
-            z[i] += mean[i]
+            z[i] += mean[component, i]
+        a, b = _log_student(z, mean[0], L[0], nu), _log_student(z, mean[1], L[1], nu)
+        total = np.log(2.0) - max(a, b) - np.log1p(np.exp(-abs(a - b)))
         for i in range(D):
             for j in range(D):
                 total -= 0.5 * (z[i] - g[i]) * P[i, j] * (z[j] - g[j])
         for c in range(len(chains.y)):
             for k in range(K):
                 u[k] = chains.drift[c, k]
-                for a in range(last):
-                    u[k] += chains.u[c, k, a] * z[chains.of[c, a]]
+                for j in range(last):
+                    u[k] += chains.u[c, k, j] * z[chains.of[c, j]]
             total += draw_chain(
                 b0[chains.robot[c]], delta_w, delta_v, x0, chains, c, u, table, constant, sites[0],
                 sites[1], ahead, x, choice, rng,
