@@ -42,6 +42,7 @@ def cases():
         yield PooledTrust(observation=observation), "exact", 300, SMALL
         yield CoupledTrust(observation=observation, inter_robot="none"), "exact", 200, SMALL
         yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 200, SMALL
+        yield HierarchicalTrust(observation=observation), "exact", 200, SMALL
     yield HierarchicalTrust(), "exact", 300, SMALL
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     yield CoupledTrust(), "exact", 200, SMALL

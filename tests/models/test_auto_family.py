@@ -53,10 +53,10 @@ def test_the_rates_choose_the_family_and_the_posterior_says_why(share, ticks, fa
 
 def test_the_exact_sampler_and_weights_come_first():
     some = missions(0.5)
-    posterior = fit(some, HierarchicalTrust(observation="auto"), n_draws=50)
+    posterior = fit(some, HierarchicalTrust(observation="auto", response="change"), n_draws=50)
     assert posterior.attrs["sampler"] == "exact"
     assert posterior.attrs["observation"] == "gaussian"
-    assert "but its robots are partially pooled" in posterior.attrs["observation_reason"]
+    assert "but it measures changes of trust" in posterior.attrs["observation_reason"]
     weighted = fit(some, PooledTrust(observation="auto"), weights=np.full(10, 0.5), n_draws=50)
     assert weighted.attrs["observation_reason"] == "missions have weights"
     change = PooledTrust(observation="auto", response="change")

@@ -167,7 +167,7 @@ class _Drawn(NamedTuple):
     draws: Draws
     complaints: list[str]
     reason: str
-    """Why the sampler is the one it is."""
+    """Reason of the sampler."""
 
 
 def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, object]:

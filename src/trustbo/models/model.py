@@ -414,10 +414,8 @@ class TrustModel(Displayed, ABC):
             return "expectation propagation does not know its observations"
         if self.robot_sets is None and self.partial_pooling is None:
             return "its robots share some parameters only, or influence each other"
-        if self.partial_pooling is not None:
-            if not self.family.integrates_out:
-                return "its robots are partially pooled, and its observations are not Gaussian"
-            return "it has effects of places, and robots partially pooled" if self.place else None
+        if self.partial_pooling is not None and self.place is not None:
+            return "it has effects of places, and robots partially pooled"
         if not self.family.integrates_out and self.lag:
             return "it measures changes of trust, and its observations are not Gaussian"
         if self.place is not None and (self.robot_sets == "each" or self.lag):

@@ -195,8 +195,8 @@ def test_families_that_do_not_suit_are_refused():
         PooledTrust(observation="beta_binomial", response="change")
     with pytest.raises(TrustboError, match="unknown observation 'poisson'"):
         PooledTrust(observation="poisson")
-    with pytest.raises(TrustboError, match=r'observation="censored".*not Gaussian'):
-        fit(missions, HierarchicalTrust(observation="censored"), sampler="exact")
+    with pytest.raises(TrustboError, match=r'observation="student_t".*does not know its observat'):
+        fit(missions, HierarchicalTrust(observation="student_t"), sampler="exact")
     with pytest.raises(TrustboError, match='sampler "joint" is for observations'):
         fit(missions, sampler="joint")
     with pytest.raises(TrustboError, match="fractional mission"):

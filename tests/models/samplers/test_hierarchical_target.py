@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import HierarchicalTrust, Priors, complete, diagnostics, fit
+from trustbo.models import HierarchicalTrust, PlaceEffect, Priors, complete, diagnostics, fit
 from trustbo.models.model import TrustModel
 from trustbo.models.samplers import scores
 from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
@@ -43,7 +43,7 @@ def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
     target.look(np.zeros(9))
     z = 0.7 * rng.standard_normal((4, 9))
     found = target.log_density(z)
-    theta, log_prior = target._constrain(z)
+    theta, log_prior = target.constrain(z)
     for t in range(len(z)):
         delta_w, delta_v = theta["delta_w"][t], theta["delta_v"][t]
         tau, rest = theta["tau"][t], 1.0
@@ -77,14 +77,14 @@ def test_coordinates_leave_the_priors_as_they_are():
     z = 0.5 * np.random.default_rng(0).standard_normal(9)
 
     def natural(z):
-        theta, _ = target._constrain(z[None])
+        theta, _ = target.constrain(z[None])
         noises = np.log([theta["delta_w"][0], theta["delta_v"][0]])
         taus = np.log([theta["tau_beta0"][0], *theta["tau"][0]])
         return np.concatenate([theta["mean"], theta["beta0"][0], noises, taus])
 
     h = 1e-5
     jacobian = np.array([(natural(z + h * e) - natural(z - h * e)) / (2 * h) for e in np.eye(9)])
-    theta, log_prior = target._constrain(z[None])
+    theta, log_prior = target.constrain(z[None])
     mean, beta0 = theta["mean"][0], theta["beta0"][0]
     expected = stats.beta(2, 2).logpdf(special.expit(mean))
     expected += special.log_expit(mean) + special.log_expit(-mean)
@@ -185,8 +185,11 @@ def test_odd_data_have_a_posterior(rates):
 
 def test_what_it_cannot_treat_is_refused():
     missions = small()
-    with pytest.raises(TrustboError, match="partially pooled, and its observations are not Gaus"):
-        fit(missions, HierarchicalTrust(observation="censored"), "exact")
+    change = HierarchicalTrust(observation="censored", response="change")
+    with pytest.raises(TrustboError, match="it measures changes of trust, and its observations"):
+        fit(missions, change, "exact")
+    with pytest.raises(TrustboError, match="places, and robots partially pooled"):
+        fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
     with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
         HierarchicalTrust().update(None, missions)
 

@@ -13,6 +13,8 @@ likelihoods, and so is that of each robot given the mean and tau_beta0 (partiall
 Papaspiliopoulos, Roberts and Skold 2007). This only moves coordinates; the target keeps the priors.
 """
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 from numpyro.distributions import constraints
 from scipy import special
@@ -29,42 +31,56 @@ _WIDE = 0.01  # variance added to what a grid says of a robot's beta0
 _LEAST_TAU = 1e-6
 
 
-class HierarchicalTarget:
-    """Log posterior density of the scores."""
+class HierarchicalScores(ABC):
+    """Log posterior density of the scores, for any likelihood given these."""
 
     n_pilot, widths = 1024, (1.1, 1.05)
-    n_final = 4096
+    n_final: int
     """Points of the last proposal."""
-    n_corrected = None
+    n_corrected: int | None
+    log_sizes: np.ndarray
+    """Scores of the size of the noises to search the mode from."""
+    steps: tuple[int, ...]
+    """Newton's steps before coordinates move to the mode, time after time."""
 
-    def __init__(self, statistics: Statistics, priors: Priors) -> None:
-        """Take the statistics of each robot, and the priors."""
-        self.statistics, self.priors = statistics, priors
-        self.n_robots, n_features = len(statistics), statistics[0].n_features
-        self.n_coefficients = n_features + 1
+    def __init__(self, priors: Priors, n_robots: int, n_features: int) -> None:
+        """Take the priors."""
+        self.priors = priors
+        self.n_robots, self.n_coefficients = n_robots, n_features + 1
         self.mean, self.precision = of_coefficients(priors.beta, priors.b, n_features)
         self._unit = priors.beta0.support is constraints.unit_interval
-        low, middle, high = self._to_line(scores.quantile(priors.beta0, np.array([-1.0, 0.0, 1.0])))
+        low, middle, high = self.to_line(scores.quantile(priors.beta0, np.array([-1.0, 0.0, 1.0])))
         self._prior = middle, (2.0 / (high - low)) ** 2
         self._center, self._var = np.full(self.n_robots, middle), np.ones(self.n_robots)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density of scores (point, score), shape (point,)."""
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
-            theta, log_prior = self._constrain(z)
-            value = self._integrate(theta)[0] + log_prior
+            theta, log_prior = self.constrain(z)
+            value = self.log_likelihood(theta) + log_prior
         return np.where(np.isfinite(value), value, -np.inf)
+
+    @abstractmethod
+    def log_likelihood(self, theta: dict[str, np.ndarray]) -> np.ndarray:
+        """Log likelihood at hyperparameters, coefficients integrated out, (point,)."""
+
+    @abstractmethod
+    def of_beta0(self, i: int, grid: np.ndarray, theta: dict[str, np.ndarray]) -> np.ndarray:
+        """Log likelihood, but for a constant, of robot i's beta0 on a grid, (point,).
+
+        All else is that of theta, with one point.
+        """
 
     def first(self) -> Student:
         """Gaussian fit at the best mode, found from the best of a grid of noises."""
-        spread = np.log(np.clip(max(s.spread for s in self.statistics) / 0.2, 1e-2, 3.0))
-        grid = np.stack(np.meshgrid(spread - np.linspace(0.2, 3.0, 8), [-0.8, 0.0, 0.8],
-                                    indexing="ij"), axis=-1).reshape(-1, 2)  # fmt: skip
+        axes = np.meshgrid(self.log_sizes, [-0.8, 0.0, 0.8], indexing="ij")
+        grid = np.stack(axes, axis=-1).reshape(-1, 2)
         z = np.zeros((len(grid), 4 + self.n_coefficients + self.n_robots))
         z[:, 1:3] = grid
         self.look(z[len(z) // 2])
         z = z[[self.log_density(z).argmax()]]
-        for n_steps in (8, 12):  # coordinates move with what the noises leave of beta0
+        scale = np.eye(z.shape[1])[None]
+        for n_steps in self.steps:  # coordinates move with what the noises leave of beta0
             self.look(z[0])
             z[:, 0], z[:, -self.n_robots :] = 0.0, 0.0
             z, _, scale = laplace(self.log_density, z, n_steps)
@@ -74,34 +90,7 @@ class HierarchicalTarget:
         """Proposal that spans all angles between the two noises."""
         return Spanning.of(proposal, 2, widen=1.2)
 
-    def draw(
-        self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
-    ) -> tuple[dict[str, np.ndarray], None]:
-        """Parameters at the points of indices; these draws need no weights."""
-        theta, _ = self._constrain(z[chosen])
-        _, (factor, half), robots = self._integrate(theta)
-        mu = backward(factor, half + rng.standard_normal(half.shape))  # (coefficient, draw)
-        tau = theta["tau"].T
-        of_robots = np.stack([
-            mu + tau * backward(L, r - (A * mu).sum(1) + rng.standard_normal(mu.shape))
-            for L, A, r in robots
-        ])  # fmt: skip
-        own = np.moveaxis(of_robots, -1, 0)  # (draw, robot, coefficient)
-        return {
-            "beta0": self._from_line(theta["beta0"]),
-            "beta": own[..., :-1],
-            "b": own[..., -1],
-            "delta_w": theta["delta_w"],
-            "delta_v": theta["delta_v"],
-            "mean_beta0": self._from_line(theta["mean"]),
-            "mean_beta": mu[:-1].T,
-            "mean_b": mu[-1],
-            "tau_beta0": theta["tau_beta0"],
-            "tau_beta": theta["tau"][:, :-1],
-            "tau_b": theta["tau"][:, -1],
-        }, None
-
-    def _constrain(self, z: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def constrain(self, z: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Hyperparameters of scores, beta0 on the real line, and the log prior density."""
         p, priors = self.n_coefficients, self.priors
         _, delta_w, delta_v = scores.beta0_and_noises(priors, np.insert(z[:, 1:3], 0, 0.0, 1)).T
@@ -123,10 +112,94 @@ class HierarchicalTarget:
 
     def _log_prior_of_mean(self, mean: np.ndarray) -> np.ndarray:
         """Log prior density of mean_beta0 on the real line."""
-        log_density = log_prob(self.priors.beta0, self._from_line(mean))
+        log_density = log_prob(self.priors.beta0, self.from_line(mean))
         if not self._unit:
             return log_density
         return log_density + special.log_expit(mean) + special.log_expit(-mean)
+
+    def name_draws(
+        self, theta: dict[str, np.ndarray], mu: np.ndarray, c: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Parameters of means (draw, coefficient) and coefficients (draw, robot, coefficient)."""
+        return {
+            "beta0": self.from_line(theta["beta0"]),
+            "beta": c[..., :-1],
+            "b": c[..., -1],
+            "delta_w": theta["delta_w"],
+            "delta_v": theta["delta_v"],
+            "mean_beta0": self.from_line(theta["mean"]),
+            "mean_beta": mu[:, :-1],
+            "mean_b": mu[:, -1],
+            "tau_beta0": theta["tau_beta0"],
+            "tau_beta": theta["tau"][:, :-1],
+            "tau_b": theta["tau"][:, -1],
+        }
+
+    def of_means(self, theta: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Prior mean and precision of the coefficients' means, each (point, coefficient)."""
+        rest = np.ones_like(theta["mean"])[:, None]
+        if self.priors.stationary:
+            rest = 1.0 - self.from_line(theta["mean"])[:, None]
+        return self.mean * rest, self.precision / rest**2
+
+    def look(self, z: np.ndarray) -> None:
+        """See what rates leave of each robot's beta0 at the noises of one point."""
+        theta, _ = self.constrain(z[None])
+        grid = np.linspace(-3.5, 4.5, 49) if self._unit else np.linspace(-1.5, 1.5, 49)
+        for i in range(self.n_robots):
+            value = self.of_beta0(i, grid, theta)
+            weight = np.exp(value - value.max())
+            weight /= weight.sum()
+            self._center[i] = weight @ grid
+            self._var[i] = weight @ (grid - self._center[i]) ** 2 + _WIDE
+
+    def to_line(self, beta0: np.ndarray) -> np.ndarray:
+        """Beta0 on the real line."""
+        return special.logit(beta0) if self._unit else beta0
+
+    def from_line(self, x: np.ndarray) -> np.ndarray:
+        """Beta0 from the real line."""
+        return special.expit(x) if self._unit else x
+
+
+class HierarchicalTarget(HierarchicalScores):
+    """Log posterior density of the scores where rates are Gaussian."""
+
+    n_final, n_corrected, steps = 4096, None, (8, 12)
+
+    def __init__(self, statistics: Statistics, priors: Priors) -> None:
+        """Take the statistics of each robot, and the priors."""
+        super().__init__(priors, len(statistics), statistics[0].n_features)
+        self.statistics = statistics
+        spread = np.log(np.clip(max(s.spread for s in statistics) / 0.2, 1e-2, 3.0))
+        self.log_sizes = spread - np.linspace(0.2, 3.0, 8)
+
+    def log_likelihood(self, theta: dict[str, np.ndarray]) -> np.ndarray:
+        """See `HierarchicalScores.log_likelihood`; exact."""
+        return self._integrate(theta)[0]
+
+    def of_beta0(self, i: int, grid: np.ndarray, theta: dict[str, np.ndarray]) -> np.ndarray:
+        """See `HierarchicalScores.of_beta0`; with the means' prior for the coefficients'."""
+        w, v = (np.full(len(grid), theta[name][0]) for name in ("delta_w", "delta_v"))
+        q = self._quadratic(self.statistics[i], grid, w, v)
+        P = q.P + np.diag(self.precision)
+        h = q.h + self.precision * self.mean
+        mean = np.linalg.solve(P, h[..., None])[..., 0]
+        return -0.5 * (q.alpha + q.log_det - (h * mean).sum(1) + np.linalg.slogdet(P)[1])
+
+    def draw(
+        self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
+    ) -> tuple[dict[str, np.ndarray], None]:
+        """Parameters at the points of indices; these draws need no weights."""
+        theta, _ = self.constrain(z[chosen])
+        _, (factor, half), robots = self._integrate(theta)
+        mu = backward(factor, half + rng.standard_normal(half.shape))  # (coefficient, draw)
+        tau = theta["tau"].T
+        of_robots = np.stack([
+            mu + tau * backward(L, r - (A * mu).sum(1) + rng.standard_normal(mu.shape))
+            for L, A, r in robots
+        ])  # fmt: skip
+        return self.name_draws(theta, mu.T, np.moveaxis(of_robots, -1, 0)), None
 
     def _integrate(self, theta: dict[str, np.ndarray]):
         """Log likelihood (point,), coefficients integrated out.
@@ -135,9 +208,7 @@ class HierarchicalTarget:
         precision of mu; and for each robot that of e_i, and how it depends on mu.
         """
         beta0, tau = theta["beta0"], theta["tau"].T  # (coefficient, point)
-        rest = 1.0 - self._from_line(theta["mean"]) if self.priors.stationary else 1.0
-        mean = self.mean[:, None] * np.broadcast_to(rest, len(beta0))
-        precision = self.precision[:, None] / np.broadcast_to(rest, len(beta0)) ** 2
+        mean, precision = (each.T for each in self.of_means(theta))
         eye = np.eye(self.n_coefficients)[..., None]
         P, h, robots = precision * eye, precision * mean, []
         total = 0.5 * np.log(precision).sum(0) - 0.5 * (precision * mean**2).sum(0)
@@ -159,27 +230,5 @@ class HierarchicalTarget:
         return total, (factor, half), robots
 
     def _quadratic(self, statistics, beta0, delta_w, delta_v):
-        theta = np.stack([self._from_line(beta0), delta_w**2, delta_v**2], axis=1)
+        theta = np.stack([self.from_line(beta0), delta_w**2, delta_v**2], axis=1)
         return statistics.evaluate(theta, self.priors.x0_sd)
-
-    def look(self, z: np.ndarray) -> None:
-        """See what rates leave of each robot's beta0 at the noises of one point."""
-        theta, _ = self._constrain(z[None])
-        grid = np.linspace(-3.5, 4.5, 49) if self._unit else np.linspace(-1.5, 1.5, 49)
-        w, v = (np.full(len(grid), theta[name][0]) for name in ("delta_w", "delta_v"))
-        for i, statistics in enumerate(self.statistics):
-            q = self._quadratic(statistics, grid, w, v)
-            P = q.P + np.diag(self.precision)
-            h = q.h + self.precision * self.mean
-            mean = np.linalg.solve(P, h[..., None])[..., 0]
-            value = -0.5 * (q.alpha + q.log_det - (h * mean).sum(1) + np.linalg.slogdet(P)[1])
-            weight = np.exp(value - value.max())
-            weight /= weight.sum()
-            self._center[i] = weight @ grid
-            self._var[i] = weight @ (grid - self._center[i]) ** 2 + _WIDE
-
-    def _to_line(self, beta0: np.ndarray) -> np.ndarray:
-        return special.logit(beta0) if self._unit else beta0
-
-    def _from_line(self, x: np.ndarray) -> np.ndarray:
-        return special.expit(x) if self._unit else x

@@ -11,6 +11,9 @@ The rates tell the larger of two noises and leave the other's thin tail towards 
 points do not tell of: the defensive proposal spans all angles between the two.
 """
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
 from trustbo.models.likelihood import place_prior
@@ -23,7 +26,7 @@ from trustbo.models.samplers.place_target import hyperparameters, name_draws, pr
 from trustbo.models.samplers.priors_numpy import of_coefficients
 from trustbo.models.samplers.student import Spanning, Student
 
-_ROUGH, _SWEEPS, _SETTLED = 4, 2, 8  # sweeps far from the sites' mode, near it, and to find it
+_ROUGH, SWEEPS, _SETTLED = 4, 2, 8  # sweeps far from the sites' mode, near it, and to find it
 _GRID = [-1.2, 0.0, 1.2], [-2.2, -1.2, -0.2, 0.6], [-1.2, 0.0, 1.2]
 _MEMORY = 4e6  # numbers of precisions at once
 _ROUNDS, _STILL = 4, 0.1  # of finding the mode and its sites; a step that is none, in sd
@@ -53,7 +56,7 @@ class LatentTarget:
         self._nu = max(8.0, 3.0 * self._size)  # more where a heavy tail would cost evenness
         self._x0 = np.array([priors.x0_mean, priors.x0_sd], dtype=float)
 
-    def log_density(self, z: np.ndarray, n_sweeps: int = _SWEEPS) -> np.ndarray:
+    def log_density(self, z: np.ndarray, n_sweeps: int = SWEEPS) -> np.ndarray:
         """Log posterior density of scores (point, score), by EP, shape (point,)."""
         step = max(1, int(_MEMORY / self._size**2))
         parts = [self._evaluate(z[i : i + step], n_sweeps) for i in range(0, len(z), step)]
@@ -89,17 +92,15 @@ class LatentTarget:
         """Parameters at the points of sorted indices, and the log weight of each draw."""
         unique, count = np.unique(chosen, return_counts=True)
         theta = self._theta(z[unique])
-        gamma, nu = rng.standard_normal((len(chosen), self._size)), self._nu
-        gamma /= np.sqrt(rng.chisquare(nu, (len(gamma), 1)) / nu)
-        log_weight, at = np.empty(len(chosen)), 0
-        for i, n in enumerate(count):
-            rows = slice(at, at := at + int(n))
-            (beta0, delta_w, delta_v, x0, P, g), log_det = self._given(theta[i : i + 1])
-            log_weight[rows] = draws.draw_coefficients(
-                beta0[0], delta_w[0], delta_v[0], x0, P[0], g[0], self.chains, self._sites, _SWEEPS,
-                nu, gamma[rows], rng,
-            )  # fmt: skip
-            log_weight[rows] += 0.5 * log_det
+        log_det = np.empty(len(unique))
+
+        def given():  # point by point: precisions of places are large
+            for i in range(len(unique)):
+                of, (log_det[i],) = self._given(theta[i : i + 1])
+                yield *(each[0] for each in of[:3]), self._x0, of[4][0], of[5][0]
+
+        gamma, log_weight = draw_weighted(given(), count, self._nu, self.chains, self._sites, rng)
+        log_weight += 0.5 * np.repeat(log_det, count)
         log_weight += scores.log_prior(z[chosen]) - log_p[chosen]
         theta = np.repeat(theta, count, axis=0)
         c, g = np.split(gamma, [len(self.mean)], axis=1)
@@ -143,6 +144,38 @@ class LatentTarget:
         beta0, delta_w, delta_v = np.ascontiguousarray(theta[:, :3].T)
         args = beta0[:, None], delta_w, delta_v, self._x0, P, mean
         return args, log_det + np.log(precision).sum(1)
+
+
+def draw_weighted(
+    given: Iterable[tuple[Any, ...]],
+    count: np.ndarray,
+    nu: float,
+    chains: joint.Chains,
+    sites: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (draw, coefficient) at each of some points, and log weights but for |P|^(1/2).
+
+    Args:
+        given: Arguments of the kernel at each point: beta0 of the robots, noises, mean and sd of
+            x0, prior precision and mean of the coefficients.
+        count: Draws at each point.
+        nu: Degrees of freedom of the proposals.
+        chains: Rates.
+        sites: Sites to begin with.
+        rng: Random number generator.
+    """
+    gammas, log_weights = [], []
+    for of, n in zip(given, count, strict=True):
+        gamma = rng.standard_normal((n, len(of[-1])))
+        gamma /= np.sqrt(rng.chisquare(nu, (n, 1)) / nu)
+        beta0, delta_w, delta_v, x0, P, g = of
+        weights = draws.draw_coefficients(
+            beta0, delta_w, delta_v, x0, P, g, chains, sites, SWEEPS, nu, gamma, rng
+        )
+        gammas.append(gamma)
+        log_weights.append(weights)
+    return np.concatenate(gammas), np.concatenate(log_weights)
 
 
 def _fill_places(P: np.ndarray, places: Visited, theta: np.ndarray) -> float:

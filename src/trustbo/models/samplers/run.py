@@ -25,6 +25,7 @@ from trustbo.models.samplers.drift_target import DriftTarget
 from trustbo.models.samplers.exact import ExactDraws, sample_exact
 from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.models.samplers.importance import ScoreTarget, sample_scores
+from trustbo.models.samplers.latent_hierarchical_target import LatentHierarchicalTarget
 from trustbo.models.samplers.latent_target import LatentTarget
 from trustbo.models.samplers.nuts import NutsSettings, run_nuts
 from trustbo.models.samplers.place_draws import split_units
@@ -46,7 +47,7 @@ class Draws(NamedTuple):
     places: Mapping[str, np.ndarray] = {}
     """Effects of visited places, see `place_maps.place_group`."""
     fallback: str = ""
-    """Why NUTS was used where the exact sampler was to be."""
+    """Failure of the exact sampler, where NUTS was used for it."""
 
 
 class UnevenWeightsError(Exception):
@@ -192,6 +193,9 @@ def _targets(
         rates = batch.awareness, batch.contact_rate
         rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
         return [PlaceTarget(rows, places, priors, place)]
+    if model.partial_pooling is not None and not family.integrates_out:
+        gathered = gather_chains(family, batch, apart=True)
+        return [LatentHierarchicalTarget(*gathered, priors, batch.contact_rate.shape[2])]
     if model.partial_pooling is not None:
         return [HierarchicalTarget(model.gather(batch, weight), priors)]
     if is_coupled(model):

@@ -16,6 +16,7 @@ def gather_chains(
     *,
     places: Visited | None = None,
     whole: np.ndarray | None = None,
+    apart: bool = False,
 ) -> tuple[Chains, np.ndarray]:
     """Chains of a batch, and the sites to begin with, (2, chain, bound).
 
@@ -25,9 +26,11 @@ def gather_chains(
         places: Visited places, where these have effects.
         whole: Bounds of each mission, (mission,): chains are as long, and those without a rate
             are kept; by default they end at their last rate.
+        apart: Whether each robot has its own beta0, weights and intercept.
 
     Returns:
-        Chains whose gamma is (weights, intercept, effects of visited units).
+        Chains whose gamma is (weights, intercept, effects of visited units), or where robots are
+        apart (weights, intercept) of one robot after the other.
     """
     n_robots = batch.contact_rate.shape[2]
     # One row per mission and robot: (chain, bound[, column]).
@@ -37,7 +40,8 @@ def gather_chains(
     u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
     seen = ~np.isnan(y)
     kept = np.flatnonzero(seen.any(1)) if whole is None else np.arange(len(y))
-    column = plain(np.broadcast_to(np.arange(u.shape[-1]), (len(kept), u.shape[-1])))
+    robot = kept % n_robots if apart else np.zeros(len(kept), dtype=int)
+    column = plain(u.shape[-1] * robot[:, None] + np.arange(u.shape[-1]))
     drift = u[kept]
     if places is not None:  # each bound has the effect of its unit, one column for each bound
         own = np.minimum(kept % n_robots, places.unit.shape[2] - 1)
@@ -55,7 +59,7 @@ def gather_chains(
         terms.case,
         np.ascontiguousarray(drift),
         np.ascontiguousarray(column),
-        np.zeros(len(kept), dtype=int),
+        robot,
         length,
         np.where(late.any(1), np.argmax(late, axis=1), length),
         np.stack([gaussian.sum(1), (np.where(gaussian, y[kept], 0.0) ** 2).sum(1)], axis=1),
