@@ -26,7 +26,7 @@ from trustbo.study.world import COURSES, World
 from trustbo.workspace.moves import bounds_along
 
 GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
-WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 4, 8)]
+WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 4, 8, "aged")]
 LEAST = 100
 """Missions in a bin of predicted chances from which on its reliability counts."""
 SAFE = 0.9
@@ -158,7 +158,7 @@ def limits(world, simulator, given):
     """Failures of the plan after 8 missions under each `max_failure`."""
     return {
         str(most): {
-            course: one_campaign(world, simulator, course, 8, {"max_failure": most}, 200)
+            course: one_campaign(world, simulator, course, 8, {"max_failure": most}, given.after)
             for course in given.courses
         }
         for most in LIMITS
@@ -265,6 +265,7 @@ def main():
     parser.add_argument("--simulator", default="kinematic", choices=["kinematic", "mujoco"])
     parser.add_argument("--unseen", type=int, default=5000)
     parser.add_argument("--missions", type=int, default=15)
+    parser.add_argument("--after", type=int, default=200)
     parser.add_argument("--policy")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
