@@ -101,7 +101,7 @@ def learn(world, simulator, given):
 
 def safe_paths(world, simulator, given):
     """Share of 100 missions that arrive on the safest path, by course and by its class."""
-    truth, found = Truth.of(simulator, standard_error=0.02), {}
+    truth, found = Truth.of(simulator, standard_error=0.05), {}
     data = truth.bounds.data
     fails = np.clip(1.0 - data["outcome"].sel(status="ok").values, 0.0, 1.0 - 1e-9)
     # The best path by this contact has the least sum of -log(1 - p).

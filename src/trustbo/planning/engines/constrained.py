@@ -43,8 +43,10 @@ from trustbo.planning.engines.costs_to_go import (
     can_be_feasible,
     joined,
     least_to_come,
+    least_trust,
     look_ahead,
     loss_of,
+    with_safest,
 )
 from trustbo.planning.engines.lagrangian import Best, failure, lagrangian
 from trustbo.planning.engines.layers import Layers
@@ -74,7 +76,8 @@ def best_within(
         aim = root + step
     for _ in range(_AIMS if bounds.law == LEAST else 1):
         if bounds.law == LEAST:
-            need, risk = _below(layers, bounds, risk, aim)
+            need = least_trust(layers, bounds, aim)
+            risk = with_safest(layers, bounds, risk, need)
         path, cost, complete = _search(
             layers, bounds, risk, ahead, need, cheap, priced, offset, aim, max_labels
         )
@@ -88,53 +91,6 @@ def best_within(
             root, aim = aim, min(aim + step, known.cost)
     proven = complete and (bounds.law != LEAST or aim == known.cost or root >= known.cost)
     return Best(known.path, known.cost, known.cost if proven else root)
-
-
-@_part
-def _below(layers, bounds, risk, aim):
-    """Find the least trust at nodes with which losses -x can stay below an aim, (node,).
-
-    Infinite where no completion does. Also the risk with the safest of these completions.
-    """
-    n_nodes, n_risks = len(layers.cell), len(risk.limits)
-    need, hi = np.full(n_nodes, np.inf), np.full(n_nodes, -np.inf)
-    safest = np.full((n_nodes, n_risks), np.inf)
-    for node in range(n_nodes):
-        if layers.left[node] == 0:
-            need[node], safest[node] = -aim, 0.0
-            continue
-        for e in range(layers.first[node], layers.first[node + 1]):
-            lack = need[layers.head[e]] - bounds.drift[e]
-            if bounds.beta0 > 0.0:
-                need[node] = min(need[node], lack / bounds.beta0)
-            elif lack <= 0.0:
-                need[node] = -np.inf
-        need[node] = max(need[node], -aim)
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] < np.inf:
-            hi[node] = bounds.x0
-    for node in range(n_nodes - 1, -1, -1):
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, x = layers.head[e], bounds.beta0 * hi[node] + bounds.drift[e]
-            if x >= need[h]:
-                hi[h] = max(hi[h], x)
-    for node in range(n_nodes):
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, b = layers.head[e], risk.bound[e]
-            if bounds.beta0 * hi[node] + bounds.drift[e] >= need[h]:
-                for k in range(n_risks):
-                    safest[node, k] = min(safest[node, k], risk.of_bounds[b, k] + safest[h, k])
-    return need, EdgeRisk(
-        risk.of_bounds,
-        risk.bound,
-        risk.priced,
-        risk.priced_limit,
-        risk.limits,
-        risk.needed,
-        risk.failure_cost,
-        safest,
-    )
 
 
 class _Labels(NamedTuple):
