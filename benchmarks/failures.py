@@ -219,7 +219,8 @@ def print_learning(results, csv):
     for name, found in results.items():
         learnt = found["learn"]
         often = [c for c, share in enumerate(learnt["failed"]) if share > 0.2]
-        cells = [shown([s for c, s in learnt[n] if c in often]) for n in ("15", "60")]
+        # No skill is defined on a course all of whose missions fail at the first bound.
+        cells = [shown([s for c, s in learnt[n] if c in often and s == s]) for n in ("15", "60")]
         for n in ("15", "60"):
             bins = np.array(learnt["bins"][n])
             total[n] = total.get(n, 0.0) + bins
