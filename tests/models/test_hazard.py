@@ -53,6 +53,17 @@ def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
     np.testing.assert_allclose(_Density(of, exposures(n, failed)).known(z), expected, rtol=1e-9)
 
 
+def test_prior_means_are_logistic_in_difficulty_with_the_tilt_by_its_log():
+    x = np.array([[0.5, 0.5], [1.0, 0.5], [0.5, 0.9]])
+    prior = Hazard(intercept=(-3.0, 0.5), coefficient=(1.0, 2.0), log_tilt=(0.7, 0.4))
+    of = prior.law(x, ("tilt", "narrowness"))
+    alpha, beta = (part[0] for part in of(np.array([[0.2, -1.0, 0.5, 2.0]])))
+    tilt, narrow = np.exp(0.7 - 0.4), 1.0 + 2.0 * 0.5
+    logit = -3.0 + 0.5 * 0.2 + np.array([0.0, tilt * 0.5, narrow * 0.4])
+    np.testing.assert_allclose(alpha + beta, np.exp(-0.5 + 2.0), rtol=1e-10)
+    np.testing.assert_allclose(alpha / (alpha + beta), special.expit(logit), rtol=1e-10)
+
+
 def test_fractional_weights_have_the_ratio_of_beta_functions():
     of, z = law(np.empty((2, 0))), np.array([[0.3, -0.8]])
     n, failed = np.array([2.5, 0.81]), np.array([0.5, 0.81])

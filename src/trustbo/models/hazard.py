@@ -37,9 +37,9 @@ class Hazard:
     Attributes:
         intercept: Prior of the logit of the mean chance at medium difficulty.
         coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
-            limit (1), but for
-        tilt: that of the tilt, with which the chance rises steeply where the true limit is passed:
-            by a weight of w, from .1 to .9 within 4.4 / w of the assumed limit.
+            limit (1), but for the tilt.
+        log_tilt: Prior of the log of the weight w of the tilt. It may be large: where the true
+            limit is passed, the chance rises from .1 to .9 within 4.4 / w of the assumed limit.
         log_strength: Prior of the log of the strength s: the failures and successes that the mean
             is worth, few where bounds fail always or never.
         cause: Concentration of the Dirichlet over the causes of failure, for each.
@@ -50,7 +50,7 @@ class Hazard:
 
     intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
-    tilt: tuple[float, float] = (4.0, 4.0)
+    log_tilt: tuple[float, float] = (0.7, 1.0)
     log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
 
@@ -63,10 +63,11 @@ class Hazard:
 
     def law(self, difficulty: np.ndarray, measures: Sequence[str]) -> Law:
         """Law of bounds of these difficulties, (bound, measure), from the names of the measures."""
-        weights = [self.tilt if name == "tilt" else self.coefficient for name in measures]
-        priors = [self.intercept, *weights, self.log_strength]
-        center, scale = np.array(priors).T
-        return Law(center, scale, difficulty - REFERENCE)
+        is_tilt = [name == "tilt" for name in measures]
+        weights = [self.log_tilt if is_log else self.coefficient for is_log in is_tilt]
+        center, scale = np.array([self.intercept, *weights, self.log_strength]).T
+        is_log = np.array([False, *is_tilt, True])
+        return Law(center, scale, is_log, difficulty - REFERENCE)
 
     def prior(self, workspace: Workspace, *, seed: int = 0, n_draws: int = 1000) -> BoundRisk:
         """Risk of the bounds of a workspace before any mission."""
@@ -161,7 +162,7 @@ def _dataset(
     """The group without the maps of chances."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(systematic(points.weights, n_draws, rng))
-    values = law.center + law.scale * points.z[chosen]
+    values = law.values(points.z[chosen])
     shape = workspace.difficulty.shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)
     n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
@@ -174,7 +175,7 @@ def _dataset(
         {
             "intercept": ("draw", values[:, 0]),
             "coefficient": (("draw", "measure"), values[:, 1:-1]),
-            "strength": ("draw", np.exp(values[:, -1])),
+            "strength": ("draw", values[:, -1]),
             "place": (("draw", "lost"), points.places[chosen] + 1),
             "lost_bound": (("lost", "bound", "axis"), lost),
             "lost_weight": ("lost", exposures.lost_weights),
@@ -200,4 +201,4 @@ def _dataset(
     )
 
 
-_NORMALS = ("intercept", "coefficient", "tilt", "log_strength")
+_NORMALS = ("intercept", "coefficient", "log_tilt", "log_strength")

@@ -32,7 +32,7 @@ _GOOD = 0.5  # k-hat beyond which the proposal is fitted to its own points
 _PASSES = 3  # at most
 _KERNELS, _NARROW = 32, 0.9  # components of that proposal, and their width in units of all points'
 _STRONGEST = 50.0
-"""Largest log strength: the mode search may try what overflows."""
+"""Largest log of a parameter: the mode search may try what overflows."""
 _LOG2_POINTS = 11
 _DEGREES = 5.0
 _WIDTH = 1.2  # proposals are wider than the posterior's curvature says
@@ -56,14 +56,20 @@ class Law(NamedTuple):
 
     center: np.ndarray  # (parameter,), means of the priors
     scale: np.ndarray  # (parameter,), their sds
+    is_log: np.ndarray  # (parameter,), whether the prior is of the log
     difficulty: np.ndarray  # (bound, measure)
 
     def __call__(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Alpha and beta of each Beta, each (point, bound)."""
-        values = self.center + self.scale * z
-        logit = values[:, :1] + values[:, 1:-1] @ self.difficulty.T
-        strength = np.exp(np.minimum(values[:, -1:], _STRONGEST))
+        values = self.values(z)
+        logit, strength = values[:, :1] + values[:, 1:-1] @ self.difficulty.T, values[:, -1:]
         return strength * special.expit(logit) + FLOOR, strength * special.expit(-logit) + FLOOR
+
+    def values(self, z: np.ndarray) -> np.ndarray:
+        """Intercept, coefficients and strength, (point, parameter)."""
+        values = self.center + self.scale * z
+        values[:, self.is_log] = np.exp(np.minimum(values[:, self.is_log], _STRONGEST))
+        return values
 
 
 def sample(law: Law, exposures: Exposures, seed: int) -> Points:
@@ -196,8 +202,7 @@ class _Density:
         total += _rising(beta, n - failed).sum(1) + _rising(alpha[:, bad], failed[bad]).sum(1)
         many, index = np.unique(n, return_inverse=True)
         counts = np.bincount(index, minlength=len(many))
-        log_strength = self._law.center[-1] + self._law.scale[-1] * z[:, -1:]
-        strength = np.exp(np.minimum(log_strength, _STRONGEST))
+        strength = self._law.values(z)[:, -1:]
         return total - _rising(strength + 2.0 * FLOOR, many) @ counts
 
     def __call__(self, z: np.ndarray) -> np.ndarray:

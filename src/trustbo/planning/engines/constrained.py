@@ -20,7 +20,9 @@ risk that it could still keep within its limit. Where U-turns are forbidden, the
 come by the same move, or there must be two of these that came by different moves.
 
 With `LEAST` a path is sought whose every loss is below an aim: the cost so far does not matter then
-to what dominates, and the aim halves the interval between the bound and the best path known.
+to what dominates, labels with less trust than every completion needs are dropped, and the safest
+completion is that over edges which the largest trust can take. The lower the aim, the fewer labels:
+it rises from the bound until there is a path, then halves the interval between both.
 
 Exact because the labels that are left include the best path, unless it is the one known. Beyond
 `max_labels` the best path known is returned, with the Lagrangian bound.
@@ -41,8 +43,10 @@ from trustbo.planning.engines.costs_to_go import (
     can_be_feasible,
     joined,
     least_to_come,
+    least_trust,
     look_ahead,
     loss_of,
+    with_safest,
 )
 from trustbo.planning.engines.lagrangian import Best, failure, lagrangian
 from trustbo.planning.engines.layers import Layers
@@ -65,18 +69,26 @@ def best_within(
     known, cheap, priced, offset, root = lagrangian(layers, bounds, risk, ahead, best)
     if root >= known.cost:
         return known
-    aim, complete = known.cost, True
+    aim, complete, need = known.cost, True, np.full(len(layers.cell), -np.inf)
+    gap = known.cost - root if known.cost < np.inf else 1.0
+    step = gap / 32.0
+    if bounds.law == LEAST:
+        aim = root + step
     for _ in range(_AIMS if bounds.law == LEAST else 1):
+        if bounds.law == LEAST:
+            need = least_trust(layers, bounds, aim)
+            risk = with_safest(layers, bounds, risk, need)
         path, cost, complete = _search(
-            layers, bounds, risk, ahead, cheap, priced, offset, aim, max_labels
+            layers, bounds, risk, ahead, need, cheap, priced, offset, aim, max_labels
         )
         if len(path) > 0:
             known = Best(path, cost, root)
-            aim = 0.5 * (root + cost)
+            aim, step = 0.5 * (root + cost), np.inf
         elif not complete or aim == known.cost:
             break
         else:
-            root, aim = aim, known.cost
+            step = 1.1 * step if step < 0.25 * gap else np.inf
+            root, aim = aim, min(aim + step, known.cost)
     proven = complete and (bounds.law != LEAST or aim == known.cost or root >= known.cost)
     return Best(known.path, known.cost, known.cost if proven else root)
 
@@ -90,7 +102,7 @@ class _Labels(NamedTuple):
 
 
 @_part
-def _search(layers, bounds, risk, ahead, cheap, priced, offset, best, max_labels):
+def _search(layers, bounds, risk, ahead, need, cheap, priced, offset, best, max_labels):
     """Find a path that costs less than `best`, empty if none; its cost, and if all was seen."""
     n_risks, law = len(risk.limits), bounds.law
     labels = _Labels(np.empty((256, 4), np.int64), np.empty((256, 3)), np.zeros((256, n_risks)))
@@ -123,7 +135,7 @@ def _search(layers, bounds, risk, ahead, cheap, priced, offset, best, max_labels
                         np.concatenate((labels.risk, labels.risk)),
                     )
                 n = _extend(
-                    layers, bounds, risk, ahead, cheap, priced, of_risk, offset, best, label,
+                    layers, bounds, risk, ahead, need, cheap, priced, of_risk, offset, best, label,
                     labels, heads, n,
                 )  # fmt: skip
             label = labels.link[label, 3]
@@ -132,7 +144,7 @@ def _search(layers, bounds, risk, ahead, cheap, priced, offset, best, max_labels
 
 @_part
 def _extend(
-    layers, bounds, risk, ahead, cheap, priced, of_risk, offset, best, label, labels, heads, n
+    layers, bounds, risk, ahead, need, cheap, priced, of_risk, offset, best, label, labels, heads, n
 ):
     """Add the labels of one more bound that may lead to less than `best`; their number so far."""
     law, node, came = bounds.law, labels.link[label, 0], labels.link[label, 1]
@@ -146,6 +158,8 @@ def _extend(
         if not can_be_feasible(risk, labels.risk[n], h):
             continue
         after = bounds.beta0 * x + bounds.drift[e]
+        if after < need[h]:
+            continue
         now = joined(law, cost, loss_of(law, after, bounds.noise_sd)) + bounds.toll[e]
         lack = ahead.slope[h] * (ahead.hi[h] - after)
         least = joined(law, now, least_to_come(layers, cheap, h, m) + lack)

@@ -195,3 +195,52 @@ def least_to_come(layers: Layers, to_go: ToGo, node: int, move: int) -> float:
     if layers.u_turns or to_go.by[node] != layers.n_moves - 1 - move:
         return to_go.best[node]
     return to_go.second[node]
+
+
+@_part
+def least_trust(layers: Layers, bounds: Bounds, aim: float) -> np.ndarray:
+    """Least trust at nodes with which losses -x can stay below an aim, (node,); else infinite."""
+    need = np.full(len(layers.cell), np.inf)
+    for node in range(len(need)):
+        if layers.left[node] == 0:
+            need[node] = -aim
+        for e in range(layers.first[node], layers.first[node + 1]):
+            lack = need[layers.head[e]] - bounds.drift[e]
+            if bounds.beta0 > 0.0:
+                need[node] = min(need[node], lack / bounds.beta0)
+            elif lack <= 0.0:
+                need[node] = -np.inf
+        need[node] = max(need[node], -aim)
+    return need
+
+
+@_part
+def with_safest(layers: Layers, bounds: Bounds, risk: EdgeRisk, need: np.ndarray) -> EdgeRisk:
+    """Replace the safest completions by those over edges which leave the trust that nodes need."""
+    n_nodes, n_risks = len(layers.cell), len(risk.limits)
+    hi, safest = np.full(n_nodes, -np.inf), np.full((n_nodes, n_risks), np.inf)
+    for length in range(len(layers.starts)):
+        node = layers.starts[length]
+        if node >= 0 and bounds.start_cost[length] < np.inf:
+            hi[node] = bounds.x0
+    for node in range(n_nodes - 1, -1, -1):
+        for e in range(layers.first[node], layers.first[node + 1]):
+            h, x = layers.head[e], bounds.beta0 * hi[node] + bounds.drift[e]
+            hi[h] = max(hi[h], x) if x >= need[h] else hi[h]
+    for node in range(n_nodes):
+        if layers.left[node] == 0:
+            safest[node] = 0.0
+        for e in range(layers.first[node], layers.first[node + 1]):
+            h, of_edge = layers.head[e], risk.of_bounds[risk.bound[e]]
+            if bounds.beta0 * hi[node] + bounds.drift[e] >= need[h]:
+                safest[node] = np.minimum(safest[node], of_edge + safest[h])
+    return EdgeRisk(
+        risk.of_bounds,
+        risk.bound,
+        risk.priced,
+        risk.priced_limit,
+        risk.limits,
+        risk.needed,
+        risk.failure_cost,
+        safest,
+    )
