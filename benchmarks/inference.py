@@ -1,13 +1,15 @@
 """Speed of our inference beside other tools on the same posteriors, and how it grows with data.
 
-Run: python benchmarks/inference.py [pooled] [large] [coupled] [scaling] [latency] [quick]
+Run: python benchmarks/inference.py [pooled] [families] [large] [coupled] [scaling] [latency]
+[quick]
 
 All sections by default; `quick` cuts the numbers of draws by ten, to see that everything runs.
 Cold is the first call in this process, compilation included (PyTensor's disk cache is empty); warm
 the median of later ones with other seeds, which compile only what a tool compiles each time, as
 numpyro's MCMC does to find its starts. "off" is the largest distance of a parameter's mean from the
 reference's, in posterior standard deviations: about 0.1 is the Monte Carlo error of a few hundred
-effective draws, so rows that show it have the same posterior.
+effective draws, so rows that show it have the same posterior. In `families` cold is the first call
+of a process of its own, and moments and quantiles are averaged over seeds.
 """
 
 import importlib.util
@@ -18,6 +20,7 @@ import sys
 import time
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import arviz as az
@@ -30,6 +33,7 @@ from trustbo import Mission
 from trustbo.models import (
     CoupledParams,
     CoupledTrust,
+    HierarchicalTrust,
     PooledTrust,
     TrustFilter,
     TrustParams,
@@ -306,6 +310,83 @@ def nutpie_rows(build, data, reference, lengths, finish=None, n_warm=N_WARM):
     return rows
 
 
+COUNTED = {  # model, truth, most seconds cold and warm
+    "pooled censored": (PooledTrust(observation="censored"), "rates", 0.6, 0.2),
+    "pooled counts": (PooledTrust(observation="beta_binomial"), "logits", 0.8, 0.3),
+    "hierarchical Gaussian": (HierarchicalTrust(), "rates", 0.2, 0.1),
+    "hierarchical censored": (HierarchicalTrust(observation="censored"), "rates", None, None),
+}
+TICKS = 40
+
+
+def counted(name):
+    """The model at the resolution of its rates, and 20 missions of 8 bounds of 3 robots."""
+    model, scale, *_ = COUNTED[name]
+    truth = TrustParams(0.6, np.array([0.4, 0.3]), 0.05, 0.1, 0.08)
+    if scale == "logits":
+        truth = TrustParams(0.6, np.array([2.0, 1.0]), -0.3, 0.4, 0.25, 0.0, 1.5)
+    z = np.random.default_rng(0).uniform(size=(20, 8, N_ROBOTS, N_FEATURES))
+    of = PooledTrust(observation=model.observation)
+    rates = of.simulate(jax.random.key(0), truth, z, n_ticks=TICKS).contact_rate.clip(0.0, 1.0)
+    path, ticks = [(0, k) for k in range(9)], np.full((8, N_ROBOTS), TICKS)
+    missions = [
+        Mission.from_arrays(path, *pair, n_ticks=ticks)
+        for pair in zip(z, np.round(TICKS * rates) / TICKS, strict=True)
+    ]
+    return model.at_resolution({float(TICKS): 1.0}), stack_missions(missions)
+
+
+def draws_of(name, sampler, settings, seed):
+    """Draws of every unknown, (draw, unknown)."""
+    model, batch = counted(name)
+    if sampler == "nuts" and not model.family.integrates_out:
+        sampler = "joint"
+    drawn = draw_posterior(model, sampler, settings, seed, batch, check=False)[0]
+    if sampler == "exact" and drawn.sampler != "exact":
+        sys.exit(f"{name}: {drawn.fallback}")
+    return unknowns(drawn.params).reshape(settings.n_chains * settings.n_draws, -1)
+
+
+def moments(draws):
+    """Means, sds, and 5 and 95 % quantiles of draws (draw, unknown)."""
+    return draws.mean(0), draws.std(0), *np.quantile(draws, [0.05, 0.95], axis=0)
+
+
+def cold_seconds(name, sampler, settings):
+    """Seconds of the first draws of a fresh process."""
+    code = f"import inference; inference.print_cold({name!r}, {sampler!r}, {tuple(settings)})"
+    found = subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, text=True,
+                           capture_output=True, cwd=Path(__file__).parent)  # fmt: skip
+    return float(found.stdout.split()[-1])
+
+
+def print_cold(name, sampler, settings):
+    counted(name)
+    print(seconds_of(partial(draws_of, name, sampler, NutsSettings(*settings), 0))[0])
+
+
+def families(quick):
+    print("\n## families: 20 missions x 8 bounds x 3 robots; exact beside NUTS of 4 x (300 + 1000)")
+    print("Distances from long NUTS, target acceptance .98, the largest of all unknowns.\n")
+    print_header(("", "cold s", "target", "warm s", "target", "mean, sd", "sd, %", "5-95 %, sd"))
+    settings = NutsSettings(30, 50) if quick else NutsSettings()
+    length = settings if quick else NutsSettings(500, 3000, 4, 0.98)
+    for name, (*_, cold, warm) in COUNTED.items():
+        mean, sd, low, high = moments(draws_of(name, "nuts", length, 1000))
+        for sampler, n in (("exact", 5), ("nuts", 1)):
+            first = cold_seconds(name, sampler, settings)
+            draws_of(name, sampler, settings, 0)
+            runs = [seconds_of(partial(draws_of, name, sampler, settings, i)) for i in range(n)]
+            ours = np.mean([moments(draws) for _, draws in runs], axis=0)
+            off = np.abs((ours - [mean, sd, low, high]) / sd).max(1)
+            again = float(np.median([seconds for seconds, _ in runs]))
+            exact = sampler == "exact"
+            cells = (f"{first:.2f}", f"{cold or ''}" * exact, f"{again:.3f}",
+                     f"{warm or ''}" * exact, f"{off[0]:.3f}", f"{100 * off[1]:.1f}",
+                     f"{off[2:].max():.3f}")  # fmt: skip
+            print_row((f"{name}, {sampler}", *cells))
+
+
 def large(quick):
     data = pooled_data(640)
     print(f"\n## large: {data.rates.size} observations, 6 unknowns\n")
@@ -477,6 +558,7 @@ def print_machine():
 
 SECTIONS: dict[str, Any] = {
     "pooled": pooled,
+    "families": families,
     "large": large,
     "coupled": coupled,
     "scaling": scaling,
