@@ -150,6 +150,10 @@ def fit(
             posterior, missions, model=model, n_trajectories=n_trajectories, latents=draws.latents
         )
     posterior.attrs["seconds"] = time.perf_counter() - started
+    return _require_sound(posterior, complaints)
+
+
+def _require_sound(posterior: xr.DataTree, complaints: Sequence[str]) -> xr.DataTree:
     if complaints:
         raise PosteriorError(
             f"posterior refused after a longer retry: {'; '.join(complaints)}.",
