@@ -370,7 +370,7 @@ def families(quick):
     print("Distances from long NUTS, target acceptance .98, the largest of all unknowns.\n")
     print_header(("", "cold s", "target", "warm s", "target", "mean, sd", "sd, %", "5-95 %, sd"))
     settings = NutsSettings(30, 50) if quick else NutsSettings()
-    length = settings if quick else NutsSettings(500, 3000, 4, 0.98)
+    length = settings if quick else NutsSettings(300, 1500, 4, 0.98)
     for name, (*_, cold, warm) in COUNTED.items():
         mean, sd, low, high = moments(draws_of(name, "nuts", length, 1000))
         for sampler, n in (("exact", 5), ("nuts", 1)):

@@ -53,13 +53,14 @@ class LatentTarget:
         self.n_final = 1024 if place is None else 512
         self.n_corrected = 1000 if place is None else 500
         self._size = len(self.mean) + n_units
+        self._step = max(1, int(_MEMORY / self._size**2))  # points at once
         self._nu = max(8.0, 3.0 * self._size)  # more where a heavy tail would cost evenness
         self._x0 = np.array([priors.x0_mean, priors.x0_sd], dtype=float)
 
     def log_density(self, z: np.ndarray, n_sweeps: int = SWEEPS) -> np.ndarray:
         """Log posterior density of scores (point, score), by EP, shape (point,)."""
-        step = max(1, int(_MEMORY / self._size**2))
-        parts = [self._evaluate(z[i : i + step], n_sweeps) for i in range(0, len(z), step)]
+        step, n = self._step, len(z)
+        parts = [self._evaluate(z[i : i + step], n_sweeps) for i in range(0, n, step)]
         return np.concatenate(parts)
 
     def first(self) -> Student:
@@ -92,12 +93,14 @@ class LatentTarget:
         """Parameters at the points of sorted indices, and the log weight of each draw."""
         unique, count = np.unique(chosen, return_counts=True)
         theta = self._theta(z[unique])
-        log_det = np.empty(len(unique))
+        log_det, step = np.empty(len(unique)), self._step
 
-        def given():  # point by point: precisions of places are large
-            for i in range(len(unique)):
-                of, (log_det[i],) = self._given(theta[i : i + 1])
-                yield *(each[0] for each in of[:3]), self._x0, of[4][0], of[5][0]
+        def given():
+            for i in range(0, len(unique), step):
+                (beta0, delta_w, delta_v, x0, P, g), found = self._given(theta[i : i + step])
+                log_det[i : i + step] = found
+                for t in range(len(found)):
+                    yield beta0[t], delta_w[t], delta_v[t], x0, P[t], g[t]
 
         gamma, log_weight = draw_weighted(given(), count, self._nu, self.chains, self._sites, rng)
         log_weight += 0.5 * np.repeat(log_det, count)
