@@ -471,7 +471,7 @@ def gradient_row(model, data, quick):
             value, gradient = potential(theta)
             return theta - 1e-9 * gradient, total + value
 
-        return lax.fori_loop(0, n, step, (target.start, 0.0))
+        return lax.fori_loop(0, n, step, (target.starts[0], 0.0))
 
     with jax.enable_x64(True):
         jax.block_until_ready(run(missions))

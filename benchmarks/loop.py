@@ -59,7 +59,7 @@ def main():
     ours, exact, theirs = [], [], []
     fit(same, sampler="exact")  # imports and caches
     for n in range(1, len(same) + 1):
-        seconds, posterior = seconds_of(lambda n=n: fit(same[:n], check=False))
+        seconds, posterior = seconds_of(lambda n=n: fit(same[:n], sampler="nuts", check=False))
         ours.append((seconds, diagnostics(posterior)["ess_bulk"]))
         seconds, posterior = seconds_of(lambda n=n: fit(same[:n], sampler="exact"))
         exact.append((seconds, posterior.attrs.get("kish", np.nan)))

@@ -131,3 +131,16 @@ def test_robots_and_teams_are_checked():
         Team(n_robots=3, names=("a", "b", "c", "a"))
     with pytest.raises(TrustboError, match="2 distinct names"):
         Team(n_robots=2, names=("a", "a"))
+
+
+def test_bounds_of_odd_shapes_are_named():
+    z, y, seconds = np.full((3, 2), 0.5), np.full(3, 0.4), np.full(3, 10.0)
+    with pytest.raises(ShapeError, match=r"awareness of a bound must be \(robot, feature\)"):
+        Bound((1, 1), z[0], y, seconds)
+    with pytest.raises(ShapeError, match="one row per robot; got 3, 2, 3"):
+        Bound((1, 1), z, y[:2], seconds)
+    with pytest.raises(ShapeError, match=r"n_ticks of a bound must be \(3,\); got shape \(2,\)"):
+        Bound((1, 1), z, y, seconds, n_ticks=np.full(2, 5.0))
+    bounds = [Bound((1, 1), z, y, seconds), Bound((0, 2), z[:, :1], y, seconds)]
+    with pytest.raises(ShapeError, match=r"bounds disagree on \(robot, feature\)"):
+        Mission(tuple(PATH), tuple(bounds))

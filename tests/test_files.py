@@ -9,6 +9,7 @@ import threading
 import pytest
 
 import trustbo.files
+from trustbo.campaign.damage import read_json
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import read_checked, require_file, require_folder, write_checked, write_file
 
@@ -128,3 +129,23 @@ def test_what_is_no_path_is_named(require):
     """Arguments in the wrong order, say."""
     with pytest.raises(TrustboError, match="give the path of a file or folder; got a dict"):
         require({})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"seed": ', "is damaged: no JSON"),
+        ("3", "is damaged: no JSON"),
+        ('{"path": []}', "is damaged: it lacks seed, model"),
+    ],
+)
+def test_a_record_that_is_none_is_named(tmp_path, content, message):
+    file = tmp_path / "record.json"
+    file.write_text(content)
+    with pytest.raises(DamagedFileError, match=message):
+        read_json(file, "seed", "path", "model")
+    with pytest.raises(DamagedFileError, match="is missing"):
+        read_json(tmp_path / "other.json")
+    (tmp_path / "folder.json").mkdir()
+    with pytest.raises(DamagedFileError, match="cannot be read"):
+        read_json(tmp_path / "folder.json")

@@ -17,6 +17,7 @@ from trustbo.models import (
     CoupledParams,
     CoupledTrust,
     HierarchicalTrust,
+    PlaceEffect,
     PooledTrust,
     Priors,
     RobotParams,
@@ -403,3 +404,22 @@ def test_covariances_and_sizes_that_do_not_fit_are_named():
         fit(missions, "pooled")
     with pytest.raises(TrustboError, match=r'"exact" cannot treat CoupledTrust.*influence'):
         fit(missions, CoupledTrust(observation="censored"), sampler="exact")
+
+
+@pytest.mark.parametrize(
+    ("model", "reason"),
+    [
+        (PooledTrust(observation="censored"), "its observations are not Gaussian"),
+        (PooledTrust(place=PlaceEffect()), "places have effects"),
+        (CoupledTrust(), "its robots share some parameters only, or influence each other"),
+        (
+            CoupledTrust(place=PlaceEffect(), inter_robot="none"),
+            "robots with nothing else in common",
+        ),
+        (PooledTrust(place=PlaceEffect(), response="change"), "and rates measure changes"),
+        (HierarchicalTrust(place=PlaceEffect()), "effects of places, and robots partially pooled"),
+    ],
+)
+def test_models_without_sufficient_statistics_say_why(model, reason):
+    with pytest.raises(TrustboError, match=f"has no sufficient statistics: .*{reason}"):
+        model.require_statistics()

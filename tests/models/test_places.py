@@ -4,6 +4,7 @@ import itertools
 
 import jax
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 import xarray as xr
 from scipy import stats
@@ -568,6 +569,9 @@ def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(lear
     assert base.b.scale == 0.5
     with pytest.raises(TrustboError, match="there are no posteriors"):
         tb.models.prior_from([])
+    wide = PooledTrust(Priors(b=dist.StudentT(4.0, 0.0, 0.5)))
+    with pytest.raises(TrustboError, match="needs Normal priors of beta and b"):
+        tb.models.prior_from([posterior], wide)
     other = fit(missions[:2], PooledTrust(), whole=False)
     other.attrs["model"] = "HierarchicalTrust"  # sampled in no time
     with pytest.raises(TrustboError, match="takes posteriors of PooledTrust"):

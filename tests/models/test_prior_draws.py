@@ -9,7 +9,17 @@ import pytest
 from numpyro.infer import Predictive
 from scipy import special, stats
 
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, sample_prior
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.models import (
+    CoupledTrust,
+    DriftTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    Priors,
+    prior_predictive,
+    sample_prior,
+)
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.generate import draw_missions
 from trustbo.models.samplers.priors_numpy import draw_lkj_cholesky
@@ -151,3 +161,23 @@ def test_draws_have_the_moments_of_the_numpyro_program(model):
         error = np.sqrt((one.var(0) + other.var(0)) / N) + 1e-12
         # Some 600 moments, products of normals with heavy tails among them.
         assert (np.abs(one.mean(0) - other.mean(0)) < 5.5 * error).all()
+
+
+def test_a_prior_without_quantiles_is_drawn_from_too():
+    """By the model's own sample statements, in batches of which the last is not full."""
+    model = DriftTrust(lambda z, top: top * z[:, 0], {"top": dist.Gamma(4.0, 2.0)})
+    assert model.draw_prior((2, 1), 10, np.random.default_rng(0)) is None
+    drawn = prior_predictive(model, np.full((1, 2, 2, 1), 0.5), n_draws=1200, seed=3)["prior"]
+    assert drawn["top"].sizes["draw"] == 1200
+    # One chance in a hundred thousand of a false alarm.
+    assert stats.kstest(drawn["top"].values.ravel(), stats.gamma(4.0, scale=0.5).cdf).pvalue > 1e-5
+
+
+def test_what_the_prior_cannot_predict_is_refused():
+    z = np.full((1, 2, 2, 1), 0.5)
+    with pytest.raises(ShapeError, match=r"awareness must be \(mission, bound, robot, feature\)"):
+        prior_predictive(PooledTrust(), z[0])
+    with pytest.raises(ShapeError, match="features must be 1 names"):
+        prior_predictive(PooledTrust(), z, features=("a", "b"))
+    with pytest.raises(TrustboError, match="effects of places need the paths of missions"):
+        prior_predictive(PooledTrust(place=PlaceEffect()), z)

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, PooledTrust, Priors, sbc
+from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors, sbc
 from trustbo.models.sbc import _uniformity
 
 
@@ -41,6 +41,20 @@ def test_a_posterior_of_another_prior_is_found_out(monkeypatch):
     monkeypatch.setattr(calibration, "draw_posterior", of_another_prior)
     ranks = sbc(n_datasets=50, shape=(2, 6, 2, 2), progress=False)
     assert float(ranks["p_value"].sel(parameter="delta_v")) < 1e-6
+
+
+def test_effects_of_places_are_ranked_as_parameters_are():
+    model = PooledTrust(place=PlaceEffect())
+    options = {"shape": (2, 5, 2, 1), "n_datasets": 12, "n_ranked": 40, "progress": False}
+    ranks = sbc(model, "exact", **options)
+    names = ["beta0", "beta[0]", "b", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e"]
+    effects = ["place[first]", "place[last]", "place_bound[first]", "place_bound[second]"]
+    assert sorted(ranks["parameter"].values) == sorted(names + effects)
+    # In twelve data sets no true effect leaves all draws on one side each time: 2 / 41^11.
+    assert (np.ptp(ranks["rank"].values, axis=0) > 10).all()
+    one_kind = PooledTrust(place=PlaceEffect(cells=False))
+    options["n_datasets"] = 1
+    assert not {"tau_s", "place[last]"} & set(sbc(one_kind, "exact", **options)["parameter"].values)
 
 
 def test_uniform_ranks_pass_and_others_do_not():

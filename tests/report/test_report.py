@@ -206,6 +206,14 @@ def test_doubtful_posteriors_are_called_so(rhat, ess, divergences, good, result)
     assert fact.text.startswith("They are well sampled" if good else "Do not rely on them")
 
 
+def test_missions_that_failed_and_tolls_on_length_are_said(result):
+    history = result.history.assign(status=("iteration", ["ok", "lost_contact"]))
+    settings = {**result.settings, "length_weight": 0.1}
+    facts = facts_of(dataclasses.replace(result, history=history, settings=settings))
+    assert facts[0].text.endswith("1 of them did not reach the goal (lost contact).")
+    assert "less the toll on its length" in facts[2].text
+
+
 def test_reasons_to_end_are_sentences(result):
     for reason, sentence in (
         ("n_iterations", "All missions asked for were run."),

@@ -232,3 +232,25 @@ def test_without_botorch_its_baseline_is_left_out(tiny, tmp_path, monkeypatch):
     with pytest.warns(UserWarning, match="the baseline botorch is left out: BoTorch is not inst"):
         results = run(tmp_path, baselines=["botorch"], n_iterations=1)
     assert results["contender"].values.tolist() == ["corner"]
+
+
+def survey(folder, missing):
+    """A survey of 700 m x 20 m on disk, its first rows missing; the folder's name."""
+    made = tb.terrain.synthetic_terrain((700.0, 20.0), seed=0)
+    (folder / "tahoe").mkdir(parents=True)
+    for name in ("dem", "dsm"):
+        known = made[name].where(np.arange(700)[:, None] >= missing)
+        known.rio.write_crs(made.rio.crs).rio.to_raster(folder / "tahoe" / f"{name}.tif")
+    return str(folder)
+
+
+def test_of_a_long_survey_the_part_with_most_data_is_taken(tmp_path):
+    world = World("long", "right", "tahoe", data=survey(tmp_path / "one", 330))
+    kept = world.true_terrain()
+    assert kept.sizes["y"] == 250  # of pixels of 1 m
+    assert np.isfinite(kept["dem"].values).all()
+    moved = dataclasses.replace(world, data=survey(tmp_path / "two", 330))
+    assert moved.identity() == world.identity()  # by contents, not by place
+    other = dataclasses.replace(world, data=survey(tmp_path / "three", 100))
+    assert other.identity() != world.identity()
+    assert "wellington" in World("here", "right", "wellington").files()[0]

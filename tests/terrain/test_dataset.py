@@ -368,3 +368,16 @@ def test_synthetic_terrain_refuses_what_it_cannot_make():
         synthetic_terrain((3.0, 3.0))
     with pytest.raises(TerrainError, match="need hurst in"):
         synthetic_terrain((50.0, 50.0), canopy_cover=1.5)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "message"),
+    [
+        ({"nodata": "none"}, "has a nodata attribute that is no number: none; correct it"),
+        ({"scales": (1.0, 0.1)}, "has bands scaled differently; open it with"),
+    ],
+)
+def test_tags_of_an_array_that_make_no_sense_are_named(attribute, message):
+    dem = synthetic_terrain((20.0, 20.0), seed=0)["dem"].assign_attrs(attribute)
+    with pytest.raises(TerrainError, match=message):
+        read_terrain(dem)

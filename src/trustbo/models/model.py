@@ -111,11 +111,6 @@ class TrustModel(Displayed, ABC):
         return None
 
     @property
-    def robots_are_apart(self) -> bool:
-        """Whether robots do not influence each other."""
-        return True
-
-    @property
     def priors_are_independent(self) -> bool:
         """Whether each field of the parameters is drawn from the prior of its name, alone."""
         return False

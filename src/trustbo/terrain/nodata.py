@@ -24,7 +24,7 @@ def tagged(array: xr.DataArray, name: str) -> list[float]:
         return [float(tag) for tag in tags if tag is not None]
     except (TypeError, ValueError):
         raise TerrainError(
-            f"{name} has a nodata attribute that is no number: {tags}; correct it."
+            f"{name} has a nodata attribute that is no number: {', '.join(map(str, tags))}; correct it."
         ) from None
 
 
