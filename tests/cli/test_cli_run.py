@@ -148,8 +148,8 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--team", "max"), "unknown team 'max'; choose one of mean, min"),
         (("--stop-regret", "2"), "--stop-regret must be in (0, 1); got 2.0"),
         (
-            ("--model", "hierarchical", "--observation", "censored"),
-            'sampler "exact" cannot treat Hier',
+            ("--model", "coupled", "--observation", "censored"),
+            'sampler "exact" cannot treat Coup',
         ),
         (("--iterations", "0"), "--iterations must be a whole number from 1 on; got 0"),
         (("--sight", "fog"), "unknown sight mode 'fog'; choose one of bare, wall, transmittance"),
@@ -192,7 +192,7 @@ def test_errors_speak_of_the_flags_that_mend_them(invoke, flags, tmp_path):
         ([], "pass both --crs and --resolution (metres).\n"),
         (["--crs", "EPSG:32633", "--resolution", 1], "Pass --nodata 12345.0, or set the tag"),
         (
-            ["--nodata", "12345.0", "--model", "hierarchical", "--observation", "censored"],
+            ["--nodata", "12345.0", "--model", "coupled", "--observation", "censored"],
             "Use --sampler auto.\n",
         ),
     ):

@@ -242,6 +242,7 @@ def test_priors_out_of_reach_are_named(missions, name, prior, what):
         fit(missions, PooledTrust(Priors(**{name: prior})), sampler="exact")
 
 
+@pytest.mark.slow  # compiles NUTS
 def test_uneven_weights_fall_back_on_nuts_and_say_so(missions, monkeypatch):
     # By its module: the package's `fit` is the function.
     monkeypatch.setattr(importlib.import_module("trustbo.models.samplers.run"), "MAX_KHAT", -10.0)
