@@ -396,6 +396,37 @@ def test_the_exact_sampler_agrees_with_nuts(learned):
             assert np.abs(ratio - 1.0).max() < 0.15, name
 
 
+def test_the_exact_sampler_agrees_with_a_quadrature():
+    """Hyperparameters by Sobol points of their prior, then of a Student-t at these' moments."""
+    rng, missions = np.random.default_rng(5), []
+    for _ in range(2):
+        path, z = walk(rng, 8), rng.uniform(size=(8, 3, 2))
+        noise = 0.15 * rng.normal(size=(8, 1)) + 0.05 * rng.normal(size=(8, 3))
+        rate = np.clip(0.3 + 0.3 * z[..., 0] + noise, 0.0, 1.0)
+        missions.append(Mission.from_arrays(path, z, rate))
+    target = target_of(missions, PlaceEffect())
+    d = target.n_scores
+    uniform = [stats.qmc.Sobol(d + k, seed=k).random_base2(13) for k in (0, 1)]
+    z = stats.norm.ppf(uniform[0])
+    weight = np.exp(target.log_density(z) - stats.norm.logpdf(z).sum(1))
+    center, cov = np.average(z, axis=0, weights=weight), np.cov(z.T, aweights=weight)
+    normal, size = stats.norm.ppf(uniform[1][:, :d]), 5.0 / stats.chi2(5).ppf(uniform[1][:, d])
+    z = center + np.sqrt(1.5 * size)[:, None] * normal @ np.linalg.cholesky(cov).T
+    proposal = stats.multivariate_t(center, 1.5 * cov, df=5)
+    weight = np.exp(target.log_density(z) - proposal.logpdf(z))
+    assert weight.sum() ** 2 / (weight**2).sum() > 1500
+    theta, _ = target.constrain(z)
+    mean = np.average(theta, axis=0, weights=weight)
+    sd = np.sqrt(np.average((theta - mean) ** 2, axis=0, weights=weight))
+    drawn = [sample_scores(target, 4000, seed).draws.params for seed in range(3)]
+    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
+    for k, name in enumerate(names):
+        values = np.concatenate([np.ravel(draws[name]) for draws in drawn])
+        # The quadrature's own error is .026 sd, that of 10 000 draws .01; skew tails double them.
+        assert abs(values.mean() - mean[k]) < 0.06 * sd[k], name
+        assert abs(values.std() / sd[k] - 1.0) < 0.05, name
+
+
 def test_rates_within_the_limits_have_the_gaussian_effects_of_places():
     """Draws by expectation propagation and its weights, against those of the exact marginal."""
     missions = random_missions(5, n_missions=5, gaps=False)
