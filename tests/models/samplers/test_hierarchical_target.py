@@ -97,6 +97,15 @@ def test_coordinates_leave_the_priors_as_they_are():
     assert abs(log_prior[0] - expected - log_det) < 1e-6
 
 
+def named(mean, mu, taus, delta_w, delta_v, own):
+    """Parameters by name; `own` has beta0 and coefficients (draw, 4) of each robot."""
+    own = np.stack(own, axis=1)
+    return {"mean_beta0": mean, "mean_beta": mu[:, :2], "mean_b": mu[:, 2], "delta_w": delta_w,
+            "delta_v": delta_v, "tau_beta0": taus[:, 0], "tau_beta": taus[:, 1:3],
+            "tau_b": taus[:, 3], "beta0": own[..., 0],
+            "beta": own[..., 1:3].reshape(len(own), -1), "b": own[..., 3]}  # fmt: skip
+
+
 def from_the_prior(missions, n, rng):
     """Parameters drawn from the prior, and the log likelihood of the rates (Kalman filter)."""
     mean, taus = rng.beta(2, 2, n), np.abs(rng.normal(0, 0.3, (n, 4)))
@@ -114,12 +123,7 @@ def from_the_prior(missions, n, rng):
                 S = v + delta_v**2
                 log_weight += stats.norm.logpdf(y, m, np.sqrt(S))
                 m, v = m + v / S * (y - m), v * delta_v**2 / S
-    named = {"mean_beta0": mean, "mean_beta": mu[:, :2], "mean_b": mu[:, 2], "delta_w": delta_w,
-             "delta_v": delta_v, "tau_beta0": taus[:, 0], "tau_beta": taus[:, 1:3],
-             "tau_b": taus[:, 3]}  # fmt: skip
-    own = np.stack(own, axis=1)
-    named |= {"beta0": own[..., 0], "beta": own[..., 1:3].reshape(n, -1), "b": own[..., 3]}
-    return named, log_weight
+    return named(mean, mu, taus, delta_w, delta_v, own), log_weight
 
 
 def test_draws_and_evidence_are_those_of_the_weighted_prior():

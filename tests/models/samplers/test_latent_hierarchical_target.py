@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from models.samplers.test_hierarchical_target import named
 from scipy import special, stats
 
 from trustbo.data import Mission
@@ -78,12 +79,7 @@ def from_the_prior(missions, family, n, seed=0):
                     S = v + delta_v**2
                     log_weight += stats.norm.logpdf(y, m, np.sqrt(S))
                     m, v = m + v / S * (y - m), v * delta_v**2 / S
-    named = {"mean_beta0": mean, "mean_beta": beta, "mean_b": mu[:, 2], "delta_w": delta_w,
-             "delta_v": delta_v, "tau_beta0": taus[:, 0], "tau_beta": taus[:, 1:3],
-             "tau_b": taus[:, 3]}  # fmt: skip
-    own = np.stack(own, axis=1)
-    named |= {"beta0": own[..., 0], "beta": own[..., 1:3].reshape(n, -1), "b": own[..., 3]}
-    return named, log_weight
+    return named(mean, mu, taus, delta_w, delta_v, own), log_weight
 
 
 @pytest.mark.parametrize("family", FAMILIES)
