@@ -1,6 +1,7 @@
 """Simulation-based calibration of every model, family and sampler; prints the table of the docs.
 
 Run: python benchmarks/calibration.py [folder, default out/calibration] [share of data sets, 1]
+     [samplers, all by default]
 
 Ranks are kept in the folder after each data set: a run that was stopped goes on where it was.
 """
@@ -47,31 +48,31 @@ def cases():
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     yield CoupledTrust(), "exact", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "exact", 200, SMALL
-    for sampler, n in (("exact", 300), ("nuts", 50)):
-        yield PooledTrust(place=PlaceEffect()), sampler, n, SMALL
-    yield PooledTrust(observation="student_t"), "joint", 100, SMALL
+    yield PooledTrust(place=PlaceEffect()), "exact", 300, SMALL
+    yield PooledTrust(observation="student_t"), "joint", 200, SMALL
     for observation in ("gaussian", "censored", "beta_binomial"):
         sampler = "nuts" if observation == "gaussian" else "joint"
-        for model in (PooledTrust, HierarchicalTrust):
-            n = 200 if (model, sampler) == (PooledTrust, "nuts") else 100
-            yield model(observation=observation), sampler, n, SMALL
-        yield CoupledTrust(observation=observation), sampler, 50, SMALL
-    yield PooledTrust(response="change"), "nuts", 100, SMALL
-    yield CoupledTrust(inter_robot="ordered"), "nuts", 50, SMALL
+        for model in (PooledTrust, HierarchicalTrust, CoupledTrust):
+            yield model(observation=observation), sampler, 200, SMALL
+    yield PooledTrust(response="change"), "nuts", 200, SMALL
+    yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
+    yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
 
 
-def main(folder="out/calibration", share="1"):
+def main(folder="out/calibration", share="1", *samplers):
     print("| model | observation | sampler | data sets | parameters | smallest p | limit | "
           "50 % interval | 90 % interval | uniform |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|---|")
     for model, sampler, n, shape in cases():
+        if samplers and sampler not in samplers:
+            continue
         n = max(2, round(n * float(share)))
         name = type(model).__name__
         detail = getattr(model, "inter_robot", model.response)
         detail = "saturating" if isinstance(model, DriftTrust) else detail
         detail = "places" if model.place is not None else detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
-        file = Path(folder) / f"{name}-{detail}-{model.observation}-{sampler}-{n}.json"
+        file = Path(folder) / f"{name}-{detail}-{model.observation}-{sampler}.json"
         started = time.perf_counter()
         result = sbc(
             model, sampler, n_datasets=n, shape=shape, checkpoint=file, n_ranked=396, progress=False

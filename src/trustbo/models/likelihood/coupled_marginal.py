@@ -108,16 +108,19 @@ def _integrate(data, at, first, last, value, factor):
     spread = np.empty((n, p))
     for t in range(first, last):
         for c in range(p):
-            spread[:, c] = at.G[t, :, data.robot[c]]
-        total, n_rows = 0.0, 0
+            for i in range(n):
+                spread[i, c] = at.G[t, i, data.robot[c]]
+        total, n_rows = 0.0, np.int64(0)  # a plain 0 has a type of its own, compiled for too
         for s in range(n_missions):
             if s == 0 or data.kind[s] != data.kind[s - 1]:
                 _filter(data.seen[s], data.length[s], at.B0[t], at.Q[t], at.R[t], data.x0[1],
                         data.lag, gain, scale, of_bound)  # fmt: skip
             total += data.weight[s] * of_bound[: data.length[s]].sum()
             n_rows = _whiten(data, s, at.B0[t], spread, gain, scale, m, J, rows, n_rows)
-        A = factor[t]
-        A[:] = rows[:n_rows].T @ rows[:n_rows]
+        A, squares = factor[t], rows[:n_rows].T @ rows[:n_rows]
+        for c in range(p + 1):
+            for d in range(p + 1):
+                A[c, d] = squares[c, d]
         for c in range(p):
             of_prior = at.precision[t, c]
             A[c, c] += of_prior
@@ -135,9 +138,10 @@ def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
     """Gains and inverse scales of innovations of each bound, robot by robot (`vector`)."""
     n = len(B0)
     F, J = np.empty((2 * n, n)), np.empty((2 * n, 2 * n))
-    F[:n], F[n:] = B0, B0
     P = np.zeros((n, n))
     for i in range(n):
+        for j in range(n):
+            F[i, j] = F[n + i, j] = B0[i, j]
         F[n + i, i] -= lag
         P[i, i] = x0_sd**2
     half = np.empty((2 * n, n))
@@ -152,25 +156,30 @@ def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
                 J[a, b] = Q[a % n, b % n]
                 for j in range(n):
                     J[a, b] += half[a, j] * F[b, j]
-        J[n:, n:] += R
+        for a in range(n):
+            for b in range(n):
+                J[n + a, n + b] += R[a, b]
         of_bound[k] = 0.0
         for i in range(n):
             if seen[k, i]:
                 var = J[n + i, n + i]
-                gain[k, i] = J[n + i] / var
                 scale[k, i] = 1.0 / np.sqrt(var) if var > 0.0 else np.nan
                 of_bound[k] += np.log(var) + LOG_2PI if var > 0.0 else np.nan
                 for a in range(2 * n):
+                    gain[k, i, a] = J[n + i, a] / var
+                for a in range(2 * n):
                     for b in range(2 * n):
                         J[a, b] -= gain[k, i, a] * gain[k, i, b] * var
-        P[:] = J[:n, :n]
+        for a in range(n):
+            for b in range(n):
+                P[a, b] = J[a, b]
 
 
 @nb.njit(**PART)
 def _whiten(data, s, B0, spread, gain, scale, m, J, rows, n_rows):
     """Write the whitened innovations of one mission as rows; number of rows then."""
     n, q = m.shape
-    m[:] = 0.0
+    m[:, :] = 0.0
     m[:, q - 1] = data.x0[0]
     w = np.sqrt(data.weight[s])
     for k in range(data.length[s]):
@@ -198,7 +207,9 @@ def _whiten(data, s, B0, spread, gain, scale, m, J, rows, n_rows):
                         for c in range(q):
                             J[a, c] += g * e[c]
                 n_rows += 1
-        m[:] = J[:n]
+        for a in range(n):
+            for c in range(q):
+                m[a, c] = J[a, c]
     return n_rows
 
 

@@ -30,6 +30,7 @@ _part = njit(nogil=True, error_model="numpy", **PART)
 _MAX_BUCKETS = 1 << 16
 _MAX_SCANS = 4  # of each cell, on average, before the heap takes over
 _SETTLED = -2
+_SOME = 23  # cells whose costs give the width of buckets
 _CELLS = 1 << 16  # of several draws at once, to fit the cache
 
 
@@ -133,10 +134,16 @@ def _settle_draws(costs, length_cost, steps, cols, start, goal, totals, n_cells,
 @_part
 def _usual(cost):
     """Median cost of evenly spaced cells; 0 if none of them can be entered."""
-    step = len(cost) // 23 + 1
-    some = cost[::step]
-    some = some[some < np.inf]
-    return np.median(some) if len(some) > 0 else 0.0
+    some, n = np.empty(_SOME), 0
+    for i in range(0, len(cost), len(cost) // _SOME + 1):
+        if cost[i] < np.inf:  # sorted in place: np.median takes a second to compile
+            j = n
+            while j > 0 and some[j - 1] > cost[i]:
+                some[j] = some[j - 1]
+                j -= 1
+            some[j] = cost[i]
+            n += 1
+    return 0.5 * (some[(n - 1) // 2] + some[n // 2]) if n > 0 else 0.0
 
 
 @_part

@@ -229,11 +229,12 @@ def with_safest(layers: Layers, bounds: Bounds, risk: EdgeRisk, need: np.ndarray
             hi[h] = max(hi[h], x) if x >= need[h] else hi[h]
     for node in range(n_nodes):
         if layers.left[node] == 0:
-            safest[node] = 0.0
+            safest[node, :] = 0.0
         for e in range(layers.first[node], layers.first[node + 1]):
-            h, of_edge = layers.head[e], risk.of_bounds[risk.bound[e]]
+            h, b = layers.head[e], risk.bound[e]
             if bounds.beta0 * hi[node] + bounds.drift[e] >= need[h]:
-                safest[node] = np.minimum(safest[node], of_edge + safest[h])
+                for k in range(n_risks):
+                    safest[node, k] = min(safest[node, k], risk.of_bounds[b, k] + safest[h, k])
     return EdgeRisk(
         risk.of_bounds,
         risk.bound,

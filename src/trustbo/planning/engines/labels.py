@@ -112,8 +112,9 @@ def _search(problem, tolerance, max_labels):
     # Tests of trust, then minus the sums of risks.
     tested, state = np.zeros((size, n_tests + n_risks)), np.empty((size, len(problem.start_state)))
     seen = np.zeros((size, 1 if revisit else n_cells // 64 + 1), np.uint64)
-    labels[0] = (problem.start, 0, -1, -1, -1)
-    cost[0], state[0] = -np.inf if mode == BOTTLENECK else 0.0, problem.start_state
+    _fill(labels[0], problem.start, 0, -1, -1)
+    cost[0] = -np.inf if mode == BOTTLENECK else 0.0
+    _copy(problem.start_state, state[0])
     n, least_dropped = 1, np.inf
     queue = [(-np.inf, np.int64(0))]
     while queue:
@@ -123,7 +124,7 @@ def _search(problem, tolerance, max_labels):
             return _path_of(labels, label), estimate, min(estimate, least_dropped), True
         if not revisit:
             seen[label, cell // 64] |= np.uint64(1) << np.uint64(cell % 64)
-        tested[label, :n_tests] = problem.tests @ state[label]
+        _copy(problem.tests @ state[label], tested[label])
         key = (cell * n_before + (0 if u_turns else by + 1)) + (
             n_bounds * n_cells * n_before if fixed else 0
         )
@@ -139,9 +140,7 @@ def _search(problem, tolerance, max_labels):
             if n == len(cost):
                 if n >= max_labels:
                     return np.empty(0, np.int64), np.inf, -np.inf, False
-                labels, cost = np.concatenate((labels, labels)), np.concatenate((cost, cost))
-                state, tested = np.concatenate((state, state)), np.concatenate((tested, tested))
-                seen = np.concatenate((seen, seen))
+                labels, cost, state, tested, seen = _double(labels, cost, state, tested, seen)
             if n_risks > 0 and not _spend(
                 problem.risk, tested, n, label, m * n_cells + other, other
             ):
@@ -160,11 +159,38 @@ def _search(problem, tolerance, max_labels):
                 least = problem.risk.safest[other, 0] - tested[n, n_tests]
                 reach -= problem.risk.failure_cost * math.expm1(-least)
             if reach < np.inf:
-                labels[n] = (other, n_bounds + 1, label, m, -1)
-                cost[n], state[n], seen[n] = total, x, seen[label]
+                _fill(labels[n], other, n_bounds + 1, label, m)
+                cost[n] = total
+                _copy(x, state[n])
+                _copy(seen[label], seen[n])
                 heapq.heappush(queue, (reach, np.int64(n)))
                 n += 1
     return np.empty(0, np.int64), np.inf, least_dropped, True
+
+
+@_part
+def _copy(source, target):
+    """Copy numbers; the assignment of slices takes two seconds to compile, for its messages."""
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@_part
+def _double(labels, cost, state, tested, seen):
+    """Make room for as many labels again."""
+    return (
+        np.concatenate((labels, labels)),
+        np.concatenate((cost, cost)),
+        np.concatenate((state, state)),
+        np.concatenate((tested, tested)),
+        np.concatenate((seen, seen)),
+    )
+
+
+@_part
+def _fill(label, cell, n_bounds, parent, move):
+    """Write down a label that no other follows yet."""
+    label[0], label[1], label[2], label[3], label[4] = cell, n_bounds, parent, move, -1
 
 
 @_part

@@ -24,6 +24,7 @@ from trustbo.models.likelihood.ep.terms import (
     LOG_2PI,
     N_X,
     OPTIONS,
+    PART_OPTIONS,
     concentration,
     constants,
     draw_censored,
@@ -35,7 +36,7 @@ N_CANDIDATES = 8
 _TEMPER = 0.6
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def draw_chain(b0, delta_w, delta_v, x0, chains, c, u, table, constant, lam, eta,
                ahead, x, choice, rng):  # fmt: skip
     """Trust of chain c given its drifts u, into x (bound,); the log weight."""
@@ -78,7 +79,7 @@ def draw_chain(b0, delta_w, delta_v, x0, chains, c, u, table, constant, lam, eta
     return total - 0.5 * np.log(det)
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def _log_student(x, mean, L, nu):
     """Log density of a Student-t of precision LL', but for (2 pi)^(-D / 2)."""
     D, square = len(x), 0.0
@@ -113,7 +114,12 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
         b0, delta_w, delta_v, x0, P, g, chains, table, sites[0], sites[1], n_sweeps, 1.0, mean[0],
         L[0], np.bool_(False),
     )  # fmt: skip
-    wide = np.where(chains.kind >= AT_ONE, _TEMPER, 1.0) * sites
+    wide = sites.copy()
+    for c in range(len(chains.y)):
+        for k in range(K):
+            if chains.kind[c, k] >= AT_ONE:
+                wide[0, c, k] *= _TEMPER
+                wide[1, c, k] *= _TEMPER
     propagate(
         b0, delta_w, delta_v, x0, P, g, chains, table, wide[0], wide[1], np.int64(1), 1.0, mean[1],
         L[1], np.bool_(False),

@@ -28,6 +28,7 @@ from trustbo.models.likelihood.ep.terms import (
     LOG_2PI,
     N_X,
     OPTIONS,
+    PART_OPTIONS,
     match,
     table_at,
 )
@@ -52,7 +53,7 @@ class Chains(NamedTuple):
     tables: np.ndarray  # (phi, case, x), see `terms.count_tables`
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def _filter(b0, q, x0, chain, u, drift, n, lam, eta, predicted, filtered, var, Q, h):
     """Filter a chain under its sites: log integral at gamma = 0; adds to a quadratic form in gamma.
 
@@ -94,7 +95,15 @@ def _filter(b0, q, x0, chain, u, drift, n, lam, eta, predicted, filtered, var, Q
     return total - 0.5 * np.log(det)
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
+def copy(source, target):
+    """Copy a matrix; the assignment of slices takes two seconds to compile, for its messages."""
+    for i in range(len(source)):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@njit(**PART_OPTIONS)
 def cholesky(A, L):
     """Lower factor of A's lower triangle; whether it is positive definite."""
     for j in range(len(A)):
@@ -112,7 +121,7 @@ def cholesky(A, L):
     return True
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def backward(L, b):
     """L'^-1 b, in place."""
     for i in range(len(b) - 1, -1, -1):
@@ -121,15 +130,16 @@ def backward(L, b):
         b[i] /= L[i, i]
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def _solve(Q, h, L, mean, covariance):
     """Factor of Q, mean Q^-1 h and covariance Q^-1; returns h'Q^-1 h - log |Q|, or NaN."""
     D, total = len(h), 0.0
     if D > _BY_LOOPS:
         try:
-            L[:] = np.linalg.cholesky(Q)
+            factor = np.linalg.cholesky(Q)
         except Exception:  # not positive definite: numba knows no narrower one
             return np.nan
+        copy(factor, L)
     elif not cholesky(Q, L):
         return np.nan
     for i in range(D):
@@ -143,7 +153,7 @@ def _solve(Q, h, L, mean, covariance):
         for i in range(D):
             for j in range(i):
                 Q[j, i] = Q[i, j]
-        covariance[:] = np.linalg.inv(Q)
+        copy(np.linalg.inv(Q), covariance)
         return total
     inverse = np.zeros((D, D))  # L^-1
     for j in range(D):
@@ -162,7 +172,7 @@ def _solve(Q, h, L, mean, covariance):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def _match_chain(b0, chain, chains, delta_v, table, predicted, filtered, var, mean, cov,
                  lam, eta, damp, gamma, Sigma, s):  # fmt: skip
     """Smooth a chain, match its sites, in place if `damp` > 0; log of the masses' ratios."""
@@ -207,7 +217,7 @@ def _match_chain(b0, chain, chains, delta_v, table, predicted, filtered, var, me
     return total
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def start_sites(chains, delta_v, kept, lam, eta):
     """Sites to begin with: exact ones of Gaussian terms, those kept of the others."""
     for c in range(len(chains.y)):
@@ -218,7 +228,7 @@ def start_sites(chains, delta_v, kept, lam, eta):
                 eta[c, k] = lam[c, k] * chains.y[c, k]
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps, damp, mean, L,
               evaluate):  # fmt: skip
     """Log evidence at one value of the hyperparameters, but for log |P| / 2.

@@ -10,18 +10,21 @@ never weights. Sites are log-concave, as terms are, so that lam > 0.
 """
 
 import math
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numba import njit
 from scipy.stats import norm
 
+from trustbo.parallel import PART
+
 NONE, GAUSSIAN, AT_ONE, AT_ZERO, COUNT = range(5)
-OPTIONS = {
-    "cache": True,
+_NUMERICS = {
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},  # NaN and inf keep their meaning
     "error_model": "numpy",
 }
+OPTIONS: dict[str, Any] = {"cache": True, **_NUMERICS}
+PART_OPTIONS: dict[str, Any] = {**PART, **_NUMERICS}
 LOG_2PI = 1.8378770664093453
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
@@ -109,7 +112,7 @@ def count_tables(counts):
     return out
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def _lagrange(s):
     """Weights of the cubic through -1, 0, 1, 2."""
     return (
@@ -150,7 +153,7 @@ def _read(row, x):
     return a * row[i - 1] + b * row[i] + c * row[i + 1] + d * row[i + 2]
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def log_phi(h):
     """Log Phi(h), and phi(h) / Phi(h)."""
     if h > -6.0:
@@ -161,13 +164,13 @@ def log_phi(h):
     return -0.5 * h * h - math.log(-h / s) - 0.5 * LOG_2PI, -h / s
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def side_of(kind):
     """Side beyond which a censored rate lies, and its limit."""
     return (1.0, 1.0) if kind == AT_ONE else (-1.0, 0.0)
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def match(kind, delta_v, row, m, v, lam, eta):
     """Log of the mass of cavity times term over that of cavity times old site; the new site."""
     if kind < COUNT:
@@ -235,14 +238,14 @@ def count_moments(mean, var, y, n_ticks, delta_v):
     return found
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def log_overlap(m, v, lam, eta):
     """Log of the integral of N(x; m, v) exp(-lam x^2 / 2 + eta x)."""
     D = 1.0 + lam * v
     return -0.5 * math.log(D) + (m * (eta - 0.5 * lam * m) + 0.5 * eta * eta * v) / D
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def _beyond(h, log_p, rng):
     """Standard normal draw above -h, of log probability log_p."""
     if h < -4.0:  # Marsaglia's tail (1964), by rejection
@@ -281,7 +284,7 @@ def draw_censored(kind, delta_v, mean, sd, rng):
     return x, log_p
 
 
-@njit(**OPTIONS)
+@njit(**PART_OPTIONS)
 def draw_count(count, phi, row, mean, sd, lam, eta, choice, rng):
     """Trust drawn from N(mean, sd^2) times term over site, and a log weight whose mean is right.
 

@@ -13,7 +13,7 @@ from numba import njit
 
 from trustbo.models.likelihood.ep.chains import gather_chains
 from trustbo.models.likelihood.ep.draws import N_CANDIDATES, draw_chain
-from trustbo.models.likelihood.ep.joint import Chains, propagate, start_sites
+from trustbo.models.likelihood.ep.joint import Chains, copy, propagate, start_sites
 from trustbo.models.likelihood.ep.terms import N_X, OPTIONS, concentration, constants, table_at
 from trustbo.models.likelihood.families import Family
 from trustbo.models.likelihood.kalman_numpy import TrustSummary
@@ -160,7 +160,7 @@ def _trajectories(theta, drift, chains, kept, x, log_weight, rng):
         b0, delta_w, delta_v, x0 = theta[t, :1], theta[t, 1], theta[t, 2], theta[t, 3:]
         table_at(chains.tables, delta_v, table)
         start_sites(chains, delta_v, kept, sites[0], sites[1])
-        chains.drift[:] = drift[t]
+        copy(drift[t], chains.drift)
         propagate(
             b0, delta_w, delta_v, x0, empty, nothing, chains, table, sites[0], sites[1],
             np.int64(_SWEEPS), 1.0, nothing, empty, np.bool_(False),
