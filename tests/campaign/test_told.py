@@ -343,14 +343,21 @@ def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, n
             assert name in str(error.value)
         if not (name == "result.json" and damage == "missing"):
             assert "trustbo.logs.read_missions(" in str(error.value)
-    if name != "measured.nc":  # which alone rebuilds the campaign
-        old = tb.load_result(folder)
-        again = begin(old.workspace, objective="terminal", model=None)
-        for mission in tb.logs.read_missions(copy / "measured.nc"):
-            again.tell(mission, other_path=True)
-        np.testing.assert_array_equal(
-            again.posterior["posterior"]["b"], old.posterior["posterior"]["b"]
-        )
+    if name != "measured.nc":  # which alone rebuilds the campaign, as the next test does
+        kept, left = (tb.logs.read_missions(path / "measured.nc") for path in (folder, copy))
+        for one, other in zip(kept, left, strict=True):
+            np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+            assert one.path == other.path
+
+
+def test_a_campaign_is_rebuilt_from_the_missions_measured(folder):
+    old = tb.load_result(folder)
+    again = begin(old.workspace, objective="terminal", model=None)
+    for mission in tb.logs.read_missions(folder / "measured.nc"):
+        again.tell(mission, other_path=True)
+    np.testing.assert_array_equal(
+        again.posterior["posterior"]["b"], old.posterior["posterior"]["b"]
+    )
 
 
 def test_leftovers_of_dead_runs_are_removed_and_sums_kept(folder, tmp_path):

@@ -12,7 +12,7 @@ from numpyro import handlers
 
 import trustbo as tb
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, Priors
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import call, own_settings
 from trustbo.models.log_prior import log_prior
 
 FEATURES = ("traversability", "line_of_sight")
@@ -80,7 +80,7 @@ def test_log_priors_are_those_of_the_sample_statements(model, stationary):
             continue
         with own_settings():
             asked = [
-                float(np.sum(np.asarray(site["fn"].log_prob(site["value"]))))
+                float(np.sum(np.asarray(call(site["fn"], "log_prob", site["value"]))))
                 for site in (trace[named.get(label, label)] for trace in traces)
             ]
         own = values[:, 0]

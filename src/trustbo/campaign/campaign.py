@@ -4,7 +4,6 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Self
 
@@ -26,6 +25,7 @@ from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath
 from trustbo.models import CAUSES, TrustModel, params_of
+from trustbo.models.backend import VERSIONS
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -334,7 +334,7 @@ class Campaign(LearnedMissions, Displayed):
             best.value,
             self.trust_map(),
             self.history,
-            {**self.settings, **self.log.notes, "trustbo_version": version("trustbo")},
+            {**self.settings, **self.log.notes, "trustbo_version": VERSIONS["trustbo"]},
             self.log.stop_reason,
             self._believed_awareness(),
         )

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -17,6 +16,7 @@ from trustbo.errors import DamagedFileError
 from trustbo.files import checksum
 from trustbo.logs.netcdf import read_tree
 from trustbo.models import TrustModel, complete
+from trustbo.models.backend import VERSIONS
 from trustbo.models.posterior_groups import parameters_alone
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -233,7 +233,7 @@ class History:
             "failures": self.failures,
             "notes": self.notes,
             "stop_reason": self.stop_reason,
-            "versions": {name: version(name) for name in ("trustbo", "numpyro", "jax", "numpy")},
+            "versions": VERSIONS | {"numpy": np.__version__},
         }
 
     @classmethod

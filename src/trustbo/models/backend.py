@@ -9,16 +9,30 @@ something first avoids it; where it has happened already, the submodules are put
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from importlib.metadata import version
+from typing import Any
 
 import jax
 import numpyro
 
-NUMPYRO_VERSION: str = numpyro.__version__
+VERSIONS: dict[str, str] = {
+    "trustbo": version("trustbo"),
+    "numpyro": numpyro.__version__,
+    "jax": jax.__version__,
+}
+"""Versions that posteriors record, read once: each takes 4 ms."""
 
 for _name, _module in list(sys.modules.items()):
     _package, _, _child = _name.rpartition(".")
     if _package.startswith("numpyro") and not hasattr(sys.modules[_package], _child):
         setattr(sys.modules[_package], _child, _module)
+
+
+@partial(jax.jit, static_argnums=1)
+def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
+    """Call a method of a distribution as one program; else each operation in it is compiled."""
+    return getattr(prior, method)(x)
 
 
 @contextmanager

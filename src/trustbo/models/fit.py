@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
+from trustbo.models.backend import VERSIONS
 from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.place import Visited, bounds_of, visited
@@ -187,7 +187,7 @@ def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, 
         "x0_sd": float(model.priors.x0_sd),
         "delta_v_floor": finest if model.family.rounds else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
-        **{f"{name}_version": version(name) for name in ("trustbo", "numpyro", "jax")},
+        **{f"{name}_version": version for name, version in VERSIONS.items()},
     }
 
 

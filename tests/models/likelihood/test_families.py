@@ -39,10 +39,12 @@ def on_a_grid(family, p, z, y, n_points=1201, *, last_trust=False):
     step = x[1] - x[0]
     likelihood = np.ones(n_points)
     weights = stats.norm.pdf(x, p.x0_mean, p.x0_sd) * step
+    scale = 1.0 / (p.delta_w * np.sqrt(2.0 * np.pi))  # a normal density over all pairs, by hand
     log_total = 0.0
     for k in range(len(y)):
         mean = p.beta0 * x + z[k] @ p.beta + p.b
-        weights = stats.norm.pdf(x[:, None], mean[None], p.delta_w) @ weights * step
+        move = scale * np.exp(-0.5 * ((x[:, None] - mean[None]) / p.delta_w) ** 2)
+        weights = move @ weights * step
         if np.isnan(y[k]):
             likelihood = np.ones(n_points)
         elif family == "beta_binomial":

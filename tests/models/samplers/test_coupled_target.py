@@ -139,7 +139,8 @@ def test_scores_of_correlations_are_normal_under_the_lkj_prior():
         for step in 1e-5 * np.eye(3)
     ]
     with jax.enable_x64(True):
-        prior = dist.LKJ(3, target.priors.concentration).log_prob(correlations(z))
+        law = dist.LKJ(3, target.priors.concentration)
+        prior = jax.jit(law.log_prob)(correlations(z))
     found = float(prior) + np.linalg.slogdet(np.array(slopes))[1]
     assert found == pytest.approx(-0.5 * (z**2).sum() - 1.5 * np.log(2.0 * np.pi), abs=1e-6)
 

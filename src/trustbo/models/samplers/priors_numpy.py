@@ -12,7 +12,7 @@ from numpyro.distributions.transforms import biject_to
 from scipy import special
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import call, own_settings
 from trustbo.models.floored import Floored
 
 _LEAST_MASS = 1e-3  # above a floor: with less, rejection would draw for long
@@ -35,7 +35,7 @@ def log_prob(prior: Distribution, x: np.ndarray) -> np.ndarray:
         log_x = np.log(x)
         return _normal(log_x, number(prior, "loc"), number(prior, "scale")) - log_x
     with own_settings():
-        return np.asarray(prior.log_prob(jax.numpy.asarray(x)), dtype=float)
+        return np.asarray(call(prior, "log_prob", jax.numpy.asarray(x)), dtype=float)
 
 
 def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
@@ -74,7 +74,7 @@ def draw(prior: Distribution, shape: tuple[int, ...], rng: np.random.Generator) 
         return rng.normal(numbers(prior, "loc"), numbers(prior, "scale"), shape)
     with own_settings():
         key = jax.random.key(int(rng.integers(1 << 31)))
-        return np.asarray(prior.expand(shape).sample(key), dtype=float)
+        return np.asarray(call(prior.expand(shape), "sample", key), dtype=float)
 
 
 def draw_lkj_cholesky(

@@ -13,7 +13,7 @@ from numpyro.distributions import Distribution
 from scipy import special
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import call, own_settings
 from trustbo.models.floored import Floored
 from trustbo.models.priors import Priors
 from trustbo.models.samplers.priors_numpy import number
@@ -94,7 +94,8 @@ def why_no_quantiles(priors: Priors, *, partial_pooling: bool) -> str | None:
 def _by_numpyro(prior: Distribution, p: np.ndarray) -> np.ndarray:
     try:
         with own_settings():
-            return np.asarray(prior.icdf(jnp.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))), dtype=float)
+            share = jnp.asarray(np.clip(p, 1e-300, 1.0 - 1e-16))
+            return np.asarray(call(prior, "icdf", share), dtype=float)
     except (NotImplementedError, ImportError):  # quantiles of a few need another package
         raise TrustboError(
             f'sampler "exact" needs the quantiles of priors here; {prior!r} has none. Use another '
