@@ -8,8 +8,6 @@ import matplotlib as mpl
 import pytest
 from matplotlib.figure import Figure
 
-from trustbo.report.blocks import Image, Picture
-
 mpl.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -19,6 +17,8 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 @pytest.fixture(scope="session")
 def leave_figures_blank():
     """Save figures without what they show, and draw none in a report, which takes seconds."""
+    from trustbo.report.blocks import Image, Picture  # 3 s, of no use where workers run tests
+
     save = Figure.savefig
 
     def save_blank(figure, file, **options):
