@@ -125,9 +125,7 @@ def _search(problem, tolerance, max_labels):
         if not revisit:
             seen[label, cell // 64] |= np.uint64(1) << np.uint64(cell % 64)
         _copy(problem.tests @ state[label], tested[label])
-        key = (cell * n_before + (0 if u_turns else by + 1)) + (
-            n_bounds * n_cells * n_before if fixed else 0
-        )
+        key = (n_bounds * n_cells * fixed + cell) * n_before + (0 if u_turns else by + 1)
         verdict = _dominance(label, heads[key], labels, cost, tested, seen, tolerance, revisit)
         if verdict:
             least_dropped = min(least_dropped, estimate) if verdict == 2 else least_dropped
@@ -147,17 +145,14 @@ def _search(problem, tolerance, max_labels):
                 continue
             x = problem.transition @ state[label] + problem.drift[:, m * by_move, other]
             total = _add_cost(
-                mode,
-                cost[label],
-                (problem.views @ x).min(),
-                problem.length_cost[m],
+                mode, cost[label], (problem.views @ x).min(), problem.length_cost[m],
                 problem.noise_sd,
-            )
+            )  # fmt: skip
             left = most - n_bounds - 1 if fixed else to_goal[other]
             reach = _estimate(mode, problem.heuristic, x, total, other, left, problem.noise_sd)
             if n_risks > 0:
-                least = problem.risk.safest[other, 0] - tested[n, n_tests]
-                reach -= problem.risk.failure_cost * math.expm1(-least)
+                spent = problem.risk.safest[other, 0] - tested[n, n_tests]
+                reach -= problem.risk.failure_cost * math.expm1(-spent)
             if reach < np.inf:
                 _fill(labels[n], other, n_bounds + 1, label, m)
                 cost[n] = total
