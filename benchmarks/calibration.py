@@ -56,7 +56,7 @@ def cases():
             yield model(observation=observation), sampler, 200, SMALL
     yield PooledTrust(response="change"), "nuts", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
-    yield PooledTrust(place=PlaceEffect()), "nuts", 50, SMALL  # half a minute each
+    yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
 
 
 def main(folder="out/calibration", share="1", *samplers):
