@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from trustbo.models.likelihood.ep.joint import copy
 from trustbo.parallel import PART, over_rows, plain
 
 LOG_2PI = np.log(2.0 * np.pi)
@@ -117,10 +118,8 @@ def _integrate(data, at, first, last, value, factor):
                         data.lag, gain, scale, of_bound)  # fmt: skip
             total += data.weight[s] * of_bound[: data.length[s]].sum()
             n_rows = _whiten(data, s, at.B0[t], spread, gain, scale, m, J, rows, n_rows)
-        A, squares = factor[t], rows[:n_rows].T @ rows[:n_rows]
-        for c in range(p + 1):
-            for d in range(p + 1):
-                A[c, d] = squares[c, d]
+        A = factor[t]
+        copy(rows[:n_rows].T @ rows[:n_rows], A)
         for c in range(p):
             of_prior = at.precision[t, c]
             A[c, c] += of_prior
@@ -138,10 +137,10 @@ def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
     """Gains and inverse scales of innovations of each bound, robot by robot (`vector`)."""
     n = len(B0)
     F, J = np.empty((2 * n, n)), np.empty((2 * n, 2 * n))
+    copy(B0, F[:n])
+    copy(B0, F[n:])
     P = np.zeros((n, n))
     for i in range(n):
-        for j in range(n):
-            F[i, j] = F[n + i, j] = B0[i, j]
         F[n + i, i] -= lag
         P[i, i] = x0_sd**2
     half = np.empty((2 * n, n))
@@ -170,9 +169,7 @@ def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
                 for a in range(2 * n):
                     for b in range(2 * n):
                         J[a, b] -= gain[k, i, a] * gain[k, i, b] * var
-        for a in range(n):
-            for b in range(n):
-                P[a, b] = J[a, b]
+        copy(J[:n, :n], P)
 
 
 @nb.njit(**PART)
@@ -207,9 +204,7 @@ def _whiten(data, s, B0, spread, gain, scale, m, J, rows, n_rows):
                         for c in range(q):
                             J[a, c] += g * e[c]
                 n_rows += 1
-        for a in range(n):
-            for c in range(q):
-                m[a, c] = J[a, c]
+        copy(J[:n], m)
     return n_rows
 
 
