@@ -1,7 +1,6 @@
 """Page of a result: one HTML file that needs no other."""
 
 from collections.abc import Iterator
-from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.models import criticise
+from trustbo.models.backend import VERSIONS
 from trustbo.report import figures, tables
 from trustbo.report.blocks import Section
 from trustbo.report.numbers import counted
@@ -57,7 +57,7 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
         facts=facts_of(result),
         sections=list(_sections(result)),
         explorer=explorer and explorer.name,
-        version=result.settings.get("trustbo_version", version("trustbo")),
+        version=result.settings.get("trustbo_version", VERSIONS["trustbo"]),
     )
     write_text(target, page)
     return [target] if explorer is None else [target, explorer]

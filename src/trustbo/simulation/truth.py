@@ -3,7 +3,6 @@
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -21,6 +20,7 @@ from trustbo.errors import (
 )
 from trustbo.files import FilePath, cache_folder, require_folder, to_json
 from trustbo.logs.netcdf import read_tree, write_tree
+from trustbo.models.backend import VERSIONS
 from trustbo.planning import Plan
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.simulation.bound_table import BoundTable, tabulate
@@ -267,7 +267,7 @@ def _table(
     describe = getattr(simulator, "describe", None)
     file = None
     if describe is not None:  # else nobody knows whether it is the same
-        about = [describe(), world, seed, standard_error, version("trustbo"), _code()]
+        about = [describe(), world, seed, standard_error, VERSIONS["trustbo"], _code()]
         kept = cache_folder("truth") if folder is None else require_folder(folder)
         digest = hashlib.sha256(to_json(about).encode())
         for part in _content(simulator):

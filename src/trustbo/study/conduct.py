@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
 from os import PathLike
 from typing import Any, Protocol
 
@@ -12,6 +11,7 @@ from tqdm import tqdm
 
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
+from trustbo.models.backend import VERSIONS
 from trustbo.study.configuration import Study, read_study
 from trustbo.study.executors import completed, require_executor
 from trustbo.study.run import Run
@@ -147,7 +147,7 @@ def failures(directory: FilePath) -> pd.DataFrame:
 
 def _require_version(record: dict[str, Any]) -> None:
     """Make a record by another version of trustbo an error: the key has ours."""
-    ours, theirs = version("trustbo"), record.get("versions", {}).get("trustbo")
+    ours, theirs = VERSIONS["trustbo"], record.get("versions", {}).get("trustbo")
     if theirs not in (None, ours):
         record["error"] = f"the worker has trustbo {theirs}, and the study {ours}"
 

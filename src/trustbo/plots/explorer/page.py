@@ -3,11 +3,11 @@
 import html
 import json
 from dataclasses import dataclass, field
-from importlib.metadata import version
 
 import jinja2
 
 from trustbo.files import FilePath, require_file, write_text
+from trustbo.models.backend import VERSIONS
 from trustbo.plots.explorer import canvas
 from trustbo.plots.explorer.scene import Scene
 
@@ -85,7 +85,7 @@ def draw_explorer(scene: Scene) -> Explorer:
         library=Resources(mode="inline", components=["bokeh"], log_level="error").render_js(),
         scene=_script(record),
         figures={name: _script(json_item(figure)) for name, figure in figures.items()},
-        version=version("trustbo"),
+        version=VERSIONS["trustbo"],
     )
     return Explorer(scene.title, page)
 
