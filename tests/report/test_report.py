@@ -106,7 +106,7 @@ def test_the_page_is_whole_and_needs_nothing_else(page, text):
     assert "script" not in names
     assert dict(page.tags)["html"]["lang"] == "en"
     for tag, own in page.tags:
-        for name in ("src", "srcset", "href"):
+        for name in ("src", "href"):
             if name in own:
                 if own[name] != "explore.html":  # the interactive page beside it
                     assert own[name].startswith(("data:", "#")), own[name][:80]
@@ -137,12 +137,11 @@ def test_the_interactive_page_is_a_file_beside_it_where_bokeh_is_installed(
     assert [file.name for file in (tmp_path / "without").iterdir()] == ["report.html"]
 
 
-def test_every_figure_has_a_phone_s_variant_with_text_as_outlines(page):
-    phone = [own for tag, own in page.tags if tag == "source"]
-    assert len(phone) == len([1 for tag, _ in page.tags if tag == "img"]) == 10
-    assert all(int(own["width"]) <= 350 for own in phone)
-    for own in phone:
-        svg = base64.b64decode(own["srcset"].partition(",")[2]).decode()
+def test_figures_have_text_as_outlines_and_need_no_other_file(page):
+    drawn = [own for tag, own in page.tags if tag == "img"]
+    assert len(drawn) == 10
+    for own in drawn:
+        svg = base64.b64decode(own["src"].partition(",")[2]).decode()
         assert "<text" not in svg  # needs no font
         assert "http-equiv" not in svg
         assert not re.search(r'href="(?!#|data:)', svg)

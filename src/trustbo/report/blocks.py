@@ -23,35 +23,22 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Image:
-    """Image and its size on the page.
+class Picture:
+    """Figure, and its size on the page.
 
     Attributes:
+        alt: Description for readers who cannot see the figure.
+        caption: Caption, one or two sentences.
         uri: Content of the image, as a data URI.
         width: Width, CSS pixels.
         height: Height, CSS pixels.
     """
 
+    alt: str
+    caption: str
     uri: str
     width: int
     height: int
-
-
-@dataclass(frozen=True)
-class Picture:
-    """Figure, drawn for wide pages and again for phones.
-
-    Attributes:
-        alt: Description for readers who cannot see the figure.
-        caption: Caption, one or two sentences.
-        wide: Image for wide pages.
-        narrow: Image for phones, with fewer panels in a row, so that text stays legible.
-    """
-
-    alt: str
-    caption: str
-    wide: Image
-    narrow: Image
     kind: str = field(default="picture", init=False)
 
 

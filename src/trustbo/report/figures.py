@@ -25,11 +25,9 @@ def trust_maps(result: Result) -> Picture:
     shown = np.unique(np.linspace(0, n - 1, min(n, MOST_MAPS)).round().astype(int))
     some = replace(result, history=result.history.isel(iteration=shown))
 
-    def draw(n_columns: int | None):
-        axes = some.plot_maps(n_columns=n_columns)
+    def draw():
+        axes = some.plot_maps()
         axes[-1].set_title(f"after {counted(n, 'mission')}", fontsize=9)
-        if n_columns is not None:  # narrow, for phones
-            axes[0].set_title("mission 1 (prior)", fontsize=9)
         return axes
 
     low, high = _ends(result.trust_map)
@@ -45,8 +43,6 @@ def trust_maps(result: Result) -> Picture:
         f"{len(shown) + 1} maps of expected trust. After the last mission trust goes from {low} to "
         f"{high}. Over {counted(n, 'mission')} the path changed {counted(n_changes, 'time')}.",
         caption,
-        phone_columns=2,
-        shrink=True,
     )
 
 
@@ -61,12 +57,10 @@ def orders(result: Result) -> Picture:
     if len(shown) < n:
         caption += f" {len(shown)} of the {n} bounds are shown."
     return picture(
-        lambda n_columns: plots.plan_map(result.plan, bounds=shown, n_columns=n_columns),
+        lambda: plots.plan_map(result.plan, bounds=shown),
         f"A map of the path, and {counted(len(shown), 'map')} of single bounds: stops and way of "
         f"the lead, posts of {names}, their sight lines and ways.",
         caption,
-        phone_columns=2,
-        shrink=True,
     )
 
 
@@ -77,12 +71,11 @@ def path_posterior(result: Result) -> Picture:
     sure = int((values >= 0.95).sum())
     likely = int(((values >= 0.05) & (values < 0.95)).sum())
     return picture(
-        lambda _: plots.path_posterior(share, result.workspace, path=result.path),
+        lambda: plots.path_posterior(share, result.workspace, path=result.path),
         f"Map of the probability of each cell to be on the best path: {counted(sure, 'cell')} with "
         f"at least 95 %, {counted(likely, 'more cell')} with 5 % to 95 %.",
         "Share of posterior draws whose best path enters a cell; white, the recommended path. "
         "If other cells are likely too, more missions may change the path.",
-        shrink=True,
     )
 
 
@@ -92,12 +85,11 @@ def hazard(result: Result) -> Picture:
     assert risk is not None  # noqa: S101
     low, high = _ends(risk.p_fail)
     return picture(
-        lambda _: plots.hazard_map(risk.p_fail, result.workspace, path=result.path),
+        lambda: plots.hazard_map(risk.p_fail, result.workspace, path=result.path),
         f"Map of the chance that a bound into each cell fails, from the worst side. Over bounds it "
         f"goes from {low} to {high}.",
         "Chance that a bound into a cell ends the mission, from the side where it is largest; "
         "white, the recommended path.",
-        shrink=True,
     )
 
 
@@ -109,13 +101,12 @@ def places(result: Result) -> Picture:
     of = "cells" if name == "place_mean" else "bounds"
     n_visited = result.posterior["places"].sizes["bound"]
     return picture(
-        lambda n_columns: plots.place_map(result.posterior, result.workspace, n_columns=n_columns),
+        lambda: plots.place_map(result.posterior, result.workspace),
         f"Maps of the effects of places on trust: the mean of {of} goes from {low} to {high}; and "
         f"their standard deviation. Arrows are the {counted(n_visited, 'place')} visited.",
         "Left, the mean effect on trust of entering a cell, its sign large where it has a "
         "probability of 95 %; right, its standard deviation. Arrows are bounds that were made, "
         "their colour the further effect of the bound.",
-        shrink=True,
     )
 
 
@@ -125,10 +116,8 @@ def robot_costs(result: Result) -> Picture:
     alike = bool(np.allclose(cost.values, cost.values[:1], equal_nan=True))
     shown = cost.isel(robot=slice(1)) if alike else cost
 
-    def draw(n_columns: int | None):
-        axes = plots.robot_maps(
-            shown, result.workspace, path=result.path, label="cost", n_columns=n_columns
-        )
+    def draw():
+        axes = plots.robot_maps(shown, result.workspace, path=result.path, label="cost")
         if alike:
             axes[0].set_title("every robot", fontsize=9)
         return axes
@@ -141,8 +130,6 @@ def robot_costs(result: Result) -> Picture:
         f"Maps of the cost of reaching each cell, for {names}: from {low} to {high}.{same}",
         "The paper's cost 1 \N{MINUS SIGN} \N{GREEK SMALL LETTER SIGMA}(trust) of reaching each "
         f"cell, for {names}; white, the recommended path.{same}",
-        phone_columns=1 if alike else 2,
-        shrink=True,
     )
 
 
@@ -151,12 +138,11 @@ def terrain(result: Result) -> Picture:
     features = joined(result.workspace.features)
     closed = int((~result.workspace.passable).sum())
     return picture(
-        lambda n_columns: plots.terrain_maps(result.workspace, n_columns=n_columns),
+        lambda: plots.terrain_maps(result.workspace, n_columns=2),
         f"Maps of the surface's height, and of {features}. {counted(closed, 'cell')} of the "
         "planning grid cannot be entered.",
         f"Surface (DSM), and the index of each pixel: {features}, 0 worst, 1 best. "
         "Lines are the planning grid.",
-        shrink=True,
     )
 
 
@@ -181,13 +167,10 @@ def parameters(result: Result) -> Picture | None:
     if rest:
         caption += f" Of {joined(rest)}, see the table."
     return picture(
-        lambda n_columns: plots.parameter_history(
-            result.posteriors, names=shown, n_columns=n_columns
-        ),
+        lambda: plots.parameter_history(result.posteriors, names=shown),
         f"{counted(total, 'panel')}, one for each parameter: its posterior over "
         f"{counted(len(result.posteriors), 'mission')}. The table has the numbers.",
         caption,
-        phone_columns=2,
     )
 
 
@@ -196,13 +179,11 @@ def criticism(found: Criticism) -> Picture:
     odd = found.groups.loc[found.groups["stands_out"].to_numpy(), :]
     said = f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
     return picture(
-        lambda n_columns: plots.criticism(found, n_columns=n_columns),
+        lambda: plots.criticism(found),
         "Nine panels: adjusted p of each test, PIT, coverage, autocorrelation, and mean residuals "
         f"by mission, bound, robot, expected contact and cell; {said}. The table has the tests.",
         "Tests (hollow: once the named fault is accounted for), predictions and mean residuals. "
         "Grey bands hold a whole panel with 95 % where the model is right; red is outside.",
-        phone_columns=1,
-        shrink=True,
     )
 
 
@@ -211,7 +192,7 @@ def last_mission(result: Result) -> Picture:
     mission = result.missions[-1]
     low, high = (number(float(f(mission.contact_rate)), 2) for f in (np.nanmin, np.nanmax))
     return picture(
-        lambda n_columns: plots.mission_trust(result.posterior, n_columns=n_columns),
+        lambda: plots.mission_trust(result.posterior),
         f"{counted(len(mission.robots), 'panel')}, one for each robot: latent trust over the "
         f"{counted(len(mission.bounds), 'bound')} of the last mission. Contact rates measured go "
         f"from {low} to {high}.",
@@ -224,7 +205,7 @@ def history(result: Result) -> Picture:
     """Draw the objective and the contact rate over the campaign."""
     first, last = (number(float(v)) for v in result.history["objective"].values[[0, -1]])
     return picture(
-        lambda _: plots.campaign_history(result.history),
+        lambda: plots.campaign_history(result.history),
         f"Two curves over {counted(len(result.missions), 'mission')}: the objective when planned, "
         f"from {first} to {last}, and the contact rate measured.",
         "Objective of each plan, and mean contact rate of its mission. The first plan comes from "
