@@ -1,4 +1,4 @@
-"""The command line: `trustbo demo`, `run`, `resume`, `report`, `export` and `study`."""
+"""The command line: `trustbo demo`, `run`, `resume`, `report`, `export`, `study` and `worlds`."""
 
 from trustbo.cli.program import app, main
 

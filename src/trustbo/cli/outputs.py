@@ -79,11 +79,14 @@ def use_no_screen() -> None:
 def write_figure(path: Path, axes) -> None:
     """Write the figure that holds these Axes, and let go of it."""
     import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from trustbo.files import write_file
 
     figure = axes[0].figure
-    write_file(path, lambda file: figure.savefig(file, dpi=150))
+    figure.set_dpi(150)
+    # The same bytes as of `savefig`, which draws once more to know its layout.
+    write_file(path, lambda file: FigureCanvasAgg(figure).print_png(file))
     plt.close(figure)
 
 
