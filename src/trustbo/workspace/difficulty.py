@@ -5,6 +5,8 @@ worst in it, of the lead and of T2. T2's ways go on to the next cell straight ah
 """
 
 import math
+from collections.abc import Sequence
+from itertools import batched
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +14,7 @@ from numba import njit
 from scipy import ndimage
 
 from trustbo.data import Cell
+from trustbo.parallel import in_order
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.surface import Surface
 from trustbo.workspace.ways import Ways
@@ -23,6 +26,7 @@ _STEP, _SUSTAINED = 0.25, 4  # m between samples of a way, and samples that a ti
 _WIDTH = 2.0  # m of room on either side that count as half narrow
 _MOST = 2.0  # a cliff is no worse than twice the limit
 _TIGHT = 3.0  # log(1 + m) along impassable ground that count as 1: 19 m
+_BLOCK = 16  # bounds for each call of a thread
 
 
 class _Pixels(NamedTuple):
@@ -43,12 +47,17 @@ def bound_difficulty(ways: Ways, traversability: np.ndarray, exists: np.ndarray)
     """
     maps = _pixel_maps(ways.posts.surface, traversability)
     out = np.full((*exists.shape, len(MEASURES)), np.nan)
-    for m, row, col in np.argwhere(exists).tolist():
-        (down, right), cell = MOVES[8][m], (row, col)
-        ahead = row + down, col + right
-        inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
-        onward = ahead if inside and exists[m, *ahead] else None
-        out[m, row, col] = _of_bound(ways, maps, (row - down, col - right), cell, onward)
+
+    def work(block: Sequence[list[int]]) -> None:
+        for m, row, col in block:
+            (down, right), cell = MOVES[8][m], (row, col)
+            ahead = row + down, col + right
+            inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
+            onward = ahead if inside and exists[m, *ahead] else None
+            out[m, row, col] = _of_bound(ways, maps, (row - down, col - right), cell, onward)
+
+    for _ in in_order(work, batched(np.argwhere(exists).tolist(), _BLOCK)):
+        pass
     return out
 
 
