@@ -29,6 +29,7 @@ FAULTS = {
     "none": "none",
     "place": "place",
     "robot": "robot",
+    "weights of a robot": "robot",
     "change": "change",
     "saturation": "curvature",
     "wrong sign": "prior",
@@ -72,6 +73,8 @@ def draw_missions(fault, rng):
         if fault == "saturation":
             bent = np.minimum(z[..., 2], 0.5) * 1.5
             response = response + slopes[2] * (bent - z[..., 2])
+        if fault == "weights of a robot":  # as of a poor detector
+            response[:, odd] *= 0.7
         drift = (1.0 - beta0) * response
         if fault == "robot":
             drift[:, odd] += side * 0.06

@@ -10,6 +10,7 @@ import trustbo as tb
 from trustbo.campaign.failures import to_avoid
 from trustbo.errors import PosteriorError
 from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace.moves import moves_along
 
 ENDS = ((3, 0), (0, 3))
@@ -38,6 +39,10 @@ class Trap:
 
 def begin(workspace, **options):
     return tb.Campaign(workspace, *ENDS, sampler="exact", seed=1, **options)
+
+
+def recommended(workspace, limit):
+    return begin(workspace, max_failure=limit).recommend()
 
 
 def at(bound):
@@ -106,6 +111,43 @@ def test_a_mission_that_did_not_report_is_learned_from(workspace):
     campaign.ask()
     campaign.fail("rain")
     assert campaign.hazard["failures_by_cause"].values.tolist() == [0, 1, 0, 0, 0]
+
+
+def test_a_plan_beyond_the_limit_says_so(workspace):
+    with pytest.warns(UserWarning, match=r"fails with a chance of .* beyond max_failure = 1e-06"):
+        plan = begin(workspace, max_failure=1e-6).ask()
+    assert plan.infeasible
+    assert plan_from_record(plan_to_record(plan), workspace).infeasible
+    assert "none keeps within max_failure" in repr(recommended(workspace, 1e-6))
+    assert "fails beyond max_failure" in repr(plan)
+    within = begin(workspace, max_failure=0.9).ask()  # no warning, which would be an error
+    assert not within.infeasible
+    assert "max_failure" not in repr(within)
+
+
+@pytest.mark.parametrize(
+    ("reason", "message"),
+    [
+        ("Stuck", "did you mean 'stuck'"),
+        ("stucked", "did you mean 'stuck'"),
+        ("lost contact", "did you mean 'lost_contact'"),
+        ("", "give a reason, such as one of stuck, tipped"),
+        (None, "got None"),
+    ],
+)
+def test_a_reason_that_would_teach_nothing_by_mistake_is_refused(workspace, reason, message):
+    campaign = begin(workspace)
+    with pytest.raises(tb.TrustboError, match=message):
+        campaign.fail(reason)
+    assert campaign.log.failures == []
+
+
+def test_a_mission_that_arrived_did_not_fail(workspace):
+    campaign = begin(workspace)
+    mission = ModelSimulator(workspace).run(campaign.ask().path, seed=0)
+    with pytest.raises(tb.TrustboError, match="its status is 'ok', and 'stuck' is a failure"):
+        campaign.fail("stuck", mission)
+    assert campaign.missions == []
 
 
 def test_where_is_checked(workspace):

@@ -1,6 +1,7 @@
 """The loop: it learns, repeats itself, survives failures, and is saved as it goes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -247,3 +248,13 @@ def test_the_record_is_plain_json(result, tmp_path):
     record = json.loads((tmp_path / "result.json").read_text())
     assert record["settings"]["policy"] == "optimistic"
     assert record["settings"]["start"] == [3, 0]
+
+
+def test_a_simulator_that_swaps_row_and_col_is_refused(workspace):
+    class Swapped(ModelSimulator):
+        def run(self, path, *, seed):
+            mission = super().run(path, seed=seed)
+            return replace(mission, path=tuple((col, row) for row, col in path))
+
+    with pytest.raises(tb.TrustboError, match="were row and col swapped"):
+        run(workspace, simulator=Swapped(workspace))

@@ -13,6 +13,7 @@ def test_a_file_gives_every_flag_and_flags_win(invoke, rasters, tmp_path, monkey
     (rasters / "mission.yaml").write_text(
         "dem: dem.tif\ndsm: dsm.tif\nstart: [2, 0]\ngoal: 0,2\nshape: 3,3\nsampler: exact\n"
         "iterations: 5\nmax-slope: 40\nlidar_range: 80\nquiet: true\nseed: 3\n"
+        "max-failure: 0.05\nfailure-cost: 2.5\n"
     )
     monkeypatch.chdir(tmp_path)  # rasters are found beside the file
     config = rasters / "mission.yaml"
@@ -21,10 +22,19 @@ def test_a_file_gives_every_flag_and_flags_win(invoke, rasters, tmp_path, monkey
     record = json.loads((tmp_path / "here" / "result.json").read_text())
     assert record["n_missions"] == 1
     assert record["settings"]["seed"] == 4
+    assert record["settings"]["max_failure"] == 0.05
+    assert record["settings"]["failure_cost"] == 2.5
     assert record["path"][0] == [2, 0]
     state = (tmp_path / "here" / "report.html").read_text()
     assert "after 1 mission" in state
     assert "mission  status" not in done.output
+
+
+def test_what_must_be_a_number_is_one(invoke, rasters):
+    ends = ("--dem", rasters / "dem.tif", "--start", "2,0", "--goal", "0,2")
+    done = invoke("run", *ends, "--max-failure", "ten")
+    assert done.exit_code == 2
+    assert "'ten' is no number" in done.output
 
 
 KNOWN = ("dem", "dsm", "start", "max_slope", "max_bounds", "crs", "quiet", "policy")

@@ -24,7 +24,7 @@ from trustbo.models import (
 )
 from trustbo.models.criticism import joint_normal as dense
 from trustbo.models.criticism.departures import departures
-from trustbo.models.criticism.score import Innovations, derivatives, holm
+from trustbo.models.criticism.score import Innovations, Outcome, derivatives, holm
 from trustbo.models.likelihood import kalman_numpy
 
 _SOURCE = Path(__file__).resolve().parents[2] / "benchmarks" / "criticism.py"
@@ -139,6 +139,7 @@ def test_p_values_of_the_right_model_are_uniform():
     ("fault", "name", "words"),
     [
         ("robot", "robot", "differs from the other robots"),
+        ("weights of a robot", "robot", "differs from the other robots"),
         ("change", "change", "from mission 10 on"),
         ("saturation", "curvature", "the response to line_of_sight bends: it flattens"),
         ("wrong sign", "prior", "line_of_sight has the wrong sign"),
@@ -225,12 +226,52 @@ def test_what_cannot_be_criticised_says_why(with_places, planted):
         criticise(alone)
     first = planted("none")[0]
     short = replace(first, path=first.path[:5], bounds=first.bounds[:4])
+    alone = posterior.copy()
+    del alone["constant_data"]
     with pytest.raises(TrustboError, match="12 rates are too few to criticise 9 parameters"):
-        criticise(posterior, [short])
+        criticise(alone, [short])
     with pytest.raises(TrustboError, match="2475 rates are more than the 2000"):
-        criticise(posterior, planted("none") * 5)
+        criticise(alone, planted("none") * 5)
     with pytest.raises(TrustboError, match="n_replicates must be a whole number from 100 on"):
         criticise(posterior, n_replicates=10)
+
+
+def test_the_missions_are_those_of_the_posterior(with_places, planted):
+    posterior, found = with_places
+    missions = planted("place")
+    given = criticise(posterior, missions, compare=False)
+    assert given.table.equals(found.table)
+    with pytest.raises(TrustboError, match="is of 15 missions, and 14 are given"):
+        criticise(posterior, missions[:14])
+    with pytest.raises(TrustboError, match="mission 0 has other contact rates"):
+        criticise(posterior, planted("none"))
+    # One of a campaign says which of its missions it learned from.
+    later = posterior.copy()
+    later.attrs = posterior.attrs | {"missions": np.arange(1, 16)}
+    assert criticise(later, [missions[3], *missions], compare=False).verdict == found.verdict
+    del later["constant_data"]
+    with pytest.raises(TrustboError, match="learned from mission 16, and 14 are given"):
+        criticise(later, missions[:14])
+
+
+def test_the_finding_that_explains_the_others_is_named():
+    """As for a robot of a poor detector, whose rates go together in a mission with the least p."""
+    outcome = lambda log_p: Outcome(np.exp(log_p), log_p, "", 0.0)  # noqa: E731
+    before = {"robot": -71.1, "correlation": -115.5, "family": -11.0, "change": -0.1}
+    left = {
+        "robot": {"correlation": -1.3, "family": -5.8, "change": -0.1},
+        "correlation": {"robot": -101.8, "family": -15.7, "change": -0.2},
+        "family": {},
+    }
+    before = {name: outcome(p) for name, p in before.items()}
+    left = {name: {n: outcome(p) for n, p in each.items()} for name, each in left.items()}
+    choose = importlib.import_module("trustbo.models.criticise")._most_explaining
+    assert choose(before, left) == "robot"
+    assert choose(before, {}) == "none"
+    # Of two that leave nothing, the one of least p.
+    left["correlation"] |= {"robot": outcome(-0.2), "family": outcome(-0.3)}
+    left["robot"] |= {"family": outcome(-0.1)}
+    assert choose(before, left) == "correlation"
 
 
 def test_holm_adjusts_for_the_number_of_tests():

@@ -13,7 +13,7 @@ import xarray as xr
 from jax import random
 
 from trustbo.campaign.card import campaign_card
-from trustbo.campaign.failures import Failure, to_avoid, under_risk
+from trustbo.campaign.failures import Failure, require_reason, to_avoid, under_risk
 from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import SET_ASIDE, TOLD, Entry, History
 from trustbo.campaign.learned import LearnedMissions
@@ -290,11 +290,13 @@ class Campaign(LearnedMissions, Displayed):
             Posterior of the parameters, if there was something to learn.
 
         Raises:
-            TrustboError: The mission is one that `tell` refuses; or a `where` that the plan does
+            TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
+                a cause; a reason that is empty, or nearly a cause; or a `where` that the plan does
                 not enter, beside a mission, or for another reason.
         """
         if mission is not None and where is not None:
             raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
+        require_reason(reason, mission)
         posterior, path = None, ()
         if mission is not None:
             posterior = self.tell(mission, other_path=other_path)
@@ -486,6 +488,12 @@ class Campaign(LearnedMissions, Displayed):
         bands = self.planner_now().bands(plan.path, self.belief)
         now = time.perf_counter()
         self._asked = now - started, now
+        if plan.infeasible and plan.p_arrive is not None:
+            warnings.warn(
+                f"the plan fails with a chance of {1.0 - plan.p_arrive:.3g}, beyond max_failure = "
+                f"{self.options.max_failure:g}; no safer path keeps within it, or none was found.",
+                stacklevel=4,
+            )
         return replace(plan, bands=bands)
 
     def planner_now(self) -> Planner:

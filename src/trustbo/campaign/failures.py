@@ -1,5 +1,6 @@
 """Failures of a campaign: missions given up, the hazard of bounds, and bounds to keep away from."""
 
+import difflib
 import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -8,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.told import never_to_be_learned
-from trustbo.data import Cell
+from trustbo.data import Cell, Mission
 from trustbo.errors import PosteriorError, TrustboError, require_pair
 from trustbo.models import CAUSES, BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.planning import Planner
@@ -22,6 +23,27 @@ STOPPED = 2
 """Failures of a bound from which on it is not entered again without need."""
 RECOVERED = 0.2
 """Mean chance to fail below which such a bound may be entered again all the same."""
+
+
+def require_reason(reason: object, mission: Mission | None) -> None:
+    """Refuse a reason that is none or a misspelt cause, or a cause beside a mission that arrived.
+
+    Raises TrustboError.
+    """
+    if not isinstance(reason, str) or not reason.strip():
+        raise TrustboError(f"give a reason, such as one of {', '.join(CAUSES)}; got {reason!r}.")
+    if reason in CAUSES:
+        if mission is not None and mission.status == "ok":
+            raise TrustboError(
+                f"the mission reached the goal, its status is 'ok', and {reason!r} is a failure; "
+                "give the bounds that were run and their status, or tell the mission."
+            )
+        return
+    plain = reason.strip().lower().replace(" ", "_")
+    if near := difflib.get_close_matches(plain, CAUSES, n=1, cutoff=0.8):
+        raise TrustboError(
+            f"{reason!r} is no cause of failures, and teaches nothing; did you mean {near[0]!r}?"
+        )
 
 
 class Failure(NamedTuple):

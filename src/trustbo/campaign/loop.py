@@ -21,7 +21,7 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
-from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
 from trustbo.simulation.protocol import require_bounds, takes
 from trustbo.workspace import Workspace
 
@@ -226,8 +226,10 @@ def _missions(
             if truth is not None:
                 now = truth.at(len(campaign.missions))
                 extra["regret"] = now.regret(plan, **path_class(campaign.planner))
-            # Another path is the loop's own doing, and so is a simulator that repeats itself.
-            campaign.tell(mission, other_path=True, again=True, **extra)
+            # Another path from the same start is the loop's own doing, or the simulator's, and so
+            # is one that repeats itself; from another start, row and col may be swapped.
+            other = mission.path[:1] == plan.path[:1] or isinstance(runner, ReplaySimulator)
+            campaign.tell(mission, other_path=other, again=True, **extra)
             shown.step()
             for callback in campaign.options.callbacks:
                 callback(campaign, mission)

@@ -45,8 +45,8 @@ class CampaignOptions:
             `Planner`, also for the default.
         team: Trust of the team, the mean or the min of its robots'.
         length_weight: Cost of a metre of the path, in units of the objective. See `Planner`.
-        max_failure: Largest chance that a mission fails; by default no limit. Where no path
-            keeps within it, the safest is taken.
+        max_failure: Largest chance that a mission fails; where no path keeps within it, the
+            safest is taken, with a warning. By default no limit.
         failure_cost: Cost of a failure for lost_contact, in bounds. By default all bounds of the
             shortest path, see `Planner`.
         initial: Source of the first plan: prior_mean, or prior_draw (one random draw of the prior,

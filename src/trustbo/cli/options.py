@@ -158,15 +158,23 @@ def _campaign_flags() -> list[inspect.Parameter]:
         kind = type(option.default)
         if kind not in _METAVARS:
             continue
+        numeric = option.type == float | None
         flag = typer.Option(
             help=texts.get(option.name, ""),
             rich_help_panel=_PANELS[option.metadata["part"]],
-            metavar=_METAVARS[kind],
-            parser=_whole_or_name if option.default is None else None,
+            metavar=_METAVARS[float if numeric else kind],
+            parser=_number if numeric else _whole_or_name if option.default is None else None,
         )
         of_flag: Any = {"default": option.default, "annotation": Annotated[kind, flag]}
         parameters.append(inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, **of_flag))
     return parameters
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no number.") from None
 
 
 def _whole_or_name(text: str) -> int | str:

@@ -1,6 +1,6 @@
 """Criticism of a fitted trust model: tests, residuals and comparisons, with a verdict."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,12 +86,14 @@ def criticise(
     feature that bends, a prior in conflict with the rates, correlated noise, and the family of
     observations. Each is a score test by the standardised residuals of predictions one bound ahead,
     calibrated by replicates; Holm's method holds the chance of any finding, where the model is
-    right, to 5 %. Of several findings the one of least p is named; the others are tested again with
-    it in the model. Missions are counted from 0, as in the posterior.
+    right, to 5 %. Each finding is put into the model and the others are tested again: the one that
+    leaves the least evidence is named, of those that leave none the one of least p. Missions are
+    counted from 0, as in the posterior.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`; Gaussian observations.
-        missions: Missions that it was fitted to; needed where it holds no data.
+        missions: Missions that it was fitted to, or all of its campaign; needed where it holds no
+            data.
         model: Its model, needed for comparisons where its priors are your own.
         compare: Whether to compare, by LOO, with the model without each feature, and with and
             without places and robots' own coefficients: each is a fit.
@@ -100,8 +102,8 @@ def criticise(
 
     Raises:
         TrustboError: The posterior is not of a linear model with Gaussian observations, or holds no
-            data and no missions are given; there are too few rates, or more than 2000; or they
-            are all but equal.
+            data and no missions are given; the missions are others than it was fitted to; there are
+            too few rates, or more than 2000; or they are all but equal.
     """
     require_whole("n_replicates", n_replicates, 100)
     missions = _checked(posterior, missions)
@@ -139,18 +141,21 @@ def _criticise(
     of = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
     outcomes = _test_all(found, tests, of, seed)
     adjusted = holm(np.array([each.p for each in outcomes.values()]))
-    first = min(outcomes, key=lambda name: outcomes[name].log_p)
-    fault = first if adjusted.min() <= _LEVEL else "none"
-    after: dict[str, Outcome] = {}
-    if chosen := [each for each in tests if each.name == fault]:
-        wider = _account_for(chosen[0], outcomes[fault].label, found, data, by_parameter, draws)
-        after = _test_all(wider, [each for each in tests if each.name != fault], of, seed)
+    after: dict[str, dict[str, Outcome]] = {}
+    for name, p in zip(outcomes, adjusted, strict=True):
+        if p <= _LEVEL:
+            after[name] = {}  # of the prior and the family, which no part of a model accounts for
+            for each in (each for each in tests if each.name == name):
+                label = outcomes[name].label
+                wider = _account_for(each, label, found, data, by_parameter, draws)
+                after[name] = _test_all(wider, [o for o in tests if o is not each], of, seed)
+    fault = _most_explaining(outcomes, after)
     rows = {}
     for (name, one), p in zip(outcomes.items(), adjusted, strict=True):
         said = "nothing found."
         if p <= _LEVEL:
             said = finding(name, one, found, data, missions, tests, of)
-        p_after = after[name].p if name in after else np.nan
+        p_after = after[fault][name].p if name in after.get(fault, {}) else np.nan
         rows[name] = one.label, one.statistic, one.p, p, p_after, said
     rows |= {name: ("", *[np.nan] * 4, f"not tested: {why}") for name, why in left_out.items()}
     rates = table_of_rates(missions, data, found)
@@ -169,6 +174,23 @@ def _test_all(
     """Outcome of each departure, of the prior and of the family."""
     outcomes = {each.name: found.test(each) for each in tests}
     return outcomes | {"prior": test_prior(found, of, seed), "family": family_test(found)}
+
+
+def _most_explaining(
+    outcomes: Mapping[str, Outcome], after: Mapping[str, Mapping[str, Outcome]]
+) -> str:
+    """Finding with which in the model the least evidence of others is left; `"none"` if none.
+
+    `after` has, by finding, the outcomes of the others with it in the model. Of findings that leave
+    no other one, it is that of least p.
+    """
+    enough = np.log(_LEVEL / len(outcomes))
+
+    def rank(name: str) -> tuple[float, float]:
+        left = [one.log_p for other, one in {**outcomes, **after[name]}.items() if other != name]
+        return min(*left, enough), -outcomes[name].log_p
+
+    return max(after, key=rank, default="none")
 
 
 def _account_for(
@@ -214,10 +236,40 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
             "see az.plot_ppc_dist and loo for the family."
         )
     if missions is not None:
-        return list(missions)
+        return _learned(posterior, missions)
     if "constant_data" not in posterior.children:
         raise TrustboError(
             "this posterior holds parameters alone: give the missions it was fitted to, such as "
             "criticise(result.posteriors[j], result.missions[: j + 1])."
         )
     return missions_of(posterior)
+
+
+def _learned(posterior: xr.DataTree, missions: Sequence[Mission]) -> list[Mission]:
+    """Missions that a posterior is of, among those given: a campaign may leave some out.
+
+    TrustboError: some are not given, or are others than the posterior holds the data of.
+    """
+    given, numbers = list(missions), np.atleast_1d(posterior.attrs.get("missions", []))
+    if len(numbers) not in (0, len(given)):
+        if len(given) <= numbers.max():
+            raise TrustboError(
+                f"the posterior learned from mission {numbers.max() + 1}, and {len(given)} are "
+                "given; give all missions that the campaign had."
+            )
+        given = [given[j] for j in numbers]
+    if "constant_data" in posterior.children:
+        known = missions_of(posterior)
+        if len(known) != len(given):
+            raise TrustboError(
+                f"the posterior is of {len(known)} missions, and {len(given)} are given; give "
+                "those it was fitted to, or none, as it holds their data."
+            )
+        for j, (own, other) in enumerate(zip(known, given, strict=True)):
+            rates = own.contact_rate, np.asarray(other.contact_rate)
+            if rates[0].shape != rates[1].shape or not np.allclose(*rates, equal_nan=True):
+                raise TrustboError(
+                    f"mission {j} has other contact rates than the posterior was fitted to; give "
+                    "the missions it was fitted to, or none, as it holds their data."
+                )
+    return given

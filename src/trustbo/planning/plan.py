@@ -44,6 +44,8 @@ class Plan(Displayed):
         seconds: Time of the search, s.
         workspace: Workspace of the path.
         risk: Chance of each bound to end the mission, None without a hazard.
+        infeasible: Whether its chance to fail is beyond `max_failure`: it is the safest, as no
+            admissible path keeps within that, or it was given.
     """
 
     path: tuple[Cell, ...]
@@ -61,11 +63,14 @@ class Plan(Displayed):
     seconds: float
     workspace: Workspace
     risk: PathRisk | None = None
+    infeasible: bool = False
 
     def _card(self) -> Card:
         best = "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"
         if np.isnan(self.bound):
             best = "given, or a policy's choice: value and trust are the means"
+        elif self.infeasible:
+            best = "none of the safest paths is better; none keeps within max_failure"
         rows = [
             ("path", f"{len(self.path) - 1} bounds, {self.length:.4g} m"),
             ("value", f"{self.value:.4g} ({self.objective})"),
@@ -75,7 +80,8 @@ class Plan(Displayed):
         if self.p_arrive is not None:
             band = self.p_arrive_band
             between = "" if band is None else f" ({band[0]:.3f} to {band[1]:.3f}, 90 %)"
-            rows.append(("chance to arrive", f"{self.p_arrive:.3f}{between}"))
+            beyond = "; fails beyond max_failure" if self.infeasible else ""
+            rows.append(("chance to arrive", f"{self.p_arrive:.3f}{between}{beyond}"))
         if self.engine != "given":
             rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 

@@ -149,6 +149,12 @@ class PlanningProblem:
             return None
         return risk_table(self.risk, self.rule, self.failure_cost, self.paths)
 
+    def is_within_risk(self, path: Sequence[Cell] | np.ndarray) -> bool:
+        """Whether a path keeps within `max_failure`; True without one."""
+        if self.rule.max_failure is None or (table := self.risk_table) is None:
+            return True
+        return table.is_feasible(table.along(path, self.paths.passable.shape))
+
     @property
     def failure_cost(self) -> float:
         """Cost of a failure, in bounds; 0 for other objectives than lost_contact."""

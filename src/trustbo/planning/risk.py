@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -48,6 +49,10 @@ class FailureRule(NamedTuple):
     def checked(self, objective: str) -> Self:
         """Return the rule; TrustboError if a number is out of its range or of no use."""
         require_choice("infeasible", self.infeasible, INFEASIBLE)
+        for name in ("max_failure", "confidence", "failure_cost"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, Real) or isinstance(value, bool)):
+                raise TrustboError(f"{name} must be a number; got {value!r}.")
         if self.max_failure is not None and not 0.0 <= self.max_failure < 1.0:
             raise TrustboError(f"max_failure must be in [0, 1); got {self.max_failure!r}.")
         if self.confidence is not None:

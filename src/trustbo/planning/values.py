@@ -97,6 +97,7 @@ def evaluate(
         seconds=0.0,
         workspace=problem.workspace,
         risk=risk,
+        infeasible=risk is not None and not problem.is_within_risk(cells),
     )
 
 

@@ -71,6 +71,8 @@ def _value(result: Result) -> str:
 
 
 def _exactness(plan: Plan) -> str:
+    if plan.infeasible:
+        return "No path that was found keeps within max_failure: it is of the safest."
     if plan.exact:
         return "It is exact: under the posterior mean, no admissible path is better."
     if np.isfinite(plan.bound):
