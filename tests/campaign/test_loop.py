@@ -1,7 +1,6 @@
 """The loop: it learns, repeats itself, survives failures, and is saved as it goes."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -253,8 +252,8 @@ def test_the_record_is_plain_json(result, tmp_path):
 def test_a_simulator_that_swaps_row_and_col_is_refused(workspace):
     class Swapped(ModelSimulator):
         def run(self, path, *, seed):
-            mission = super().run(path, seed=seed)
-            return replace(mission, path=tuple((col, row) for row, col in path))
+            mission, swapped = super().run(path, seed=seed), [(col, row) for row, col in path]
+            return tb.Mission.from_arrays(swapped, mission.awareness, mission.contact_rate)
 
     with pytest.raises(tb.TrustboError, match="were row and col swapped"):
         run(workspace, simulator=Swapped(workspace))
