@@ -1,11 +1,14 @@
 """What a newcomer gets wrong: each gives one line that says what was wrong, and what to do."""
 
+from functools import cached_property
+
 import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.models import PooledTrust, Priors, TrustFilter, TrustParams, fit, params_of
-from trustbo.planning import Planner
+from trustbo.models import PooledTrust, Priors, TrustFilter, TrustParams, fit, loo, params_of
+from trustbo.planning import Planner, roll_trust
+from trustbo.plots import regret_curves
 from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
 
 ENDS = (5, 0), (0, 5)
@@ -25,6 +28,10 @@ class Case:
         self.path = tb.Campaign(self.workspace, *ENDS).ask().path
         self.mission = self.simulator.run(self.path, seed=0)
         self.z, self.y = self.mission.awareness, self.mission.contact_rate
+
+    @cached_property
+    def result(self):
+        return self.iterate(model=PooledTrust())
 
     def tell(self, path=None, z=None, y=None):
         z, y = (self.z if z is None else z), (self.y if y is None else y)
@@ -58,6 +65,9 @@ MISTAKES = {
     "a rate too few": (lambda c: c.tell(y=c.y[:-1]), "and contact_rate .bound, robot.; got"),
     "a mission, no list": (lambda c: fit(c.mission), "Write .mission."),
     "no missions": (lambda c: fit([]), "give at least one"),
+    "a result, no missions": (lambda c: fit(c.result), "got a Result. Give its .missions"),
+    "a number, no missions": (lambda c: fit(3), "must be a list of missions; got a int"),
+    "missions as text": (lambda c: fit(["a"]), "mission 0 is no Mission; got 'a'"),
     # places
     "start off the grid": (lambda c: c.iterate((6, 0), (0, 5)), "rows are 0..5 from the top"),
     "start of floats": (lambda c: c.iterate((5.0, 0.5), (0, 5)), "two whole numbers .row, col."),
@@ -117,6 +127,26 @@ MISTAKES = {
     "a pair for a prior": (lambda c: Priors(b=(0, 1)), "numpyro.distributions.Normal.loc=0"),
     "an unknown objective": (
         lambda c: Planner(c.workspace, *ENDS, objective="trust"), "choose one of lost_contact"
+    ),
+    "places of a map along a path": (
+        lambda c: roll_trust(TRUTH._replace(place=np.zeros((1, 6, 6))), c.z),
+        "With the awareness of a path's bounds, give params.along.path.",
+    ),
+    "no draws": (lambda c: fit([c.mission], n_draws=0), "n_draws must be a .* 1 on; got 0"),
+    "no chains": (lambda c: fit([c.mission], n_chains=0), "n_chains must be a .* 1 on; got 0"),
+    "a warm-up below 0": (lambda c: fit([c.mission], n_warmup=-1), "n_warmup must .*0 on; got -1"),
+    "half a trajectory": (
+        lambda c: fit([c.mission], n_trajectories=0.5), "n_trajectories must be .* 1 on; got 0.5"
+    ),
+    "a fit's negative seed": (lambda c: fit([c.mission], seed=-1), "seed must be .* 0 on; got -1"),
+    "a fit's broken seed": (lambda c: fit([c.mission], seed=1.5), "seed must be .* 0 on; got 1.5"),
+    "LOO of a result": (lambda c: loo(c.result), "a posterior from fit; .* Give its .posterior"),
+    "curves of a result": (
+        lambda c: regret_curves(c.result), "a study.s dataset, from study.load_study; got a Result"
+    ),
+    "a number for a truth": (lambda c: c.iterate(truth=3), "must be Truth.of.simulator.; got 3"),
+    "a policy of two": (
+        lambda c: c.iterate(policy=lambda key, draws: None), "is called policy.key, draws, planner."
     ),
     "weights of other features": (
         lambda c: Planner(made(3, 6, 6, 3), *ENDS).plan(TRUTH), "2 weights, but awareness has 3"

@@ -57,10 +57,17 @@ def require_same_team(missions: Sequence[Mission]) -> None:
     """Check that there are missions, all with the same robots and features: ShapeError if not."""
     if isinstance(missions, Mission):
         raise ShapeError("missions must be a list of missions; got one. Write [mission].")
+    if not isinstance(missions, Sequence):
+        remedy = " Give its .missions." if hasattr(missions, "missions") else ""
+        raise ShapeError(
+            f"missions must be a list of missions; got a {type(missions).__name__}.{remedy}"
+        )
     if not missions:
         raise ShapeError("there are no missions; give at least one.")
     first = missions[0]
     for j, mission in enumerate(missions):
+        if not isinstance(mission, Mission):
+            raise ShapeError(f"mission {j} is no Mission; got {mission!r}.")
         if (mission.robots, mission.features) != (first.robots, first.features):
             raise ShapeError(
                 f"mission {j} has robots {mission.robots} and features {mission.features}, mission "

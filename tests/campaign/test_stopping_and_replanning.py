@@ -183,6 +183,7 @@ def test_true_regret_goes_into_the_history(workspace):
     simulator = simulation.ModelSimulator(workspace, TRUTH)
     truth = simulation.Truth.of(simulator)
     result = iterate(workspace, n_iterations=2, simulator=simulator, truth=truth)
+    assert result.history["regret"].attrs["units"] == "%"
     regret = result.history["regret"].values
     paths = [mission.path for mission in result.missions]
     best = truth.value(truth.best(*ENDS, max_bounds="shortest+4"))

@@ -65,6 +65,10 @@ def hierarchy(n_robots, n_features):
     return {"own": mean + spread * off, "level": numpyro.sample("level", dist.Normal(0.0, 0.5))}
 
 
+ONE_LINE = r"^(?!.*\n)(?s:.)*cannot be compiled: .*traced array.*\. "
+"""A message of one line, of a function that JAX cannot trace."""
+
+
 def by_robot(z, own, level):
     return level + own * z[:, 1]
 
@@ -402,6 +406,12 @@ def test_a_model_that_is_none_is_refused_when_it_is_made(drift, parameters, mess
         (lambda z, top: top * z[:, 2], TrustboError, "fails for awareness .* IndexError: index 2"),
         (lambda z, top: top * jnp.log(z[:, 0]), TrustboError, r"is -inf at awareness \[0.0, 0.0\]"),
         (lambda z, top: jnp.sqrt(-top - z[:, 0]), TrustboError, "is nan at awareness .* top = "),
+        (lambda z, top: np.log1p(top * z[:, 0]), TrustboError, ONE_LINE + "Use jax.numpy in place"),
+        (
+            lambda z, top: z[:, 0] if top > 0 else 0 * z[:, 0],
+            TrustboError,
+            ONE_LINE + ".*jnp.where",
+        ),
         (lambda z, top: nothing + top, TrustboError, "NameError: name 'nothing'"),  # noqa: F821
     ],
 )

@@ -1,6 +1,7 @@
 """Effects of places against dense joint normals, which share no code with them."""
 
 import itertools
+from importlib import import_module
 
 import jax
 import numpy as np
@@ -503,6 +504,27 @@ def test_places_that_cannot_be_are_named():
         fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
     with pytest.raises(TrustboError, match='need inter_robot="none"'):
         tb.models.CoupledTrust(place=PlaceEffect())
+
+
+def test_places_by_nuts_are_said_to_take_minutes(monkeypatch):
+    class BegunError(Exception):
+        """Sampling has begun, of which nothing is needed here."""
+
+    def begin(*args, **options):
+        raise BegunError
+
+    monkeypatch.setattr(import_module("trustbo.models.fit"), "draw_posterior", begin)
+    missions, model = random_missions(0), HierarchicalTrust(place=PlaceEffect())
+    said = pytest.warns(UserWarning, match=r"by NUTS, .* minutes .* PooledTrust\(place=...\)")
+    with said, pytest.raises(BegunError):
+        fit(missions, model)
+    for quick in (
+        lambda: fit(missions, model, "nuts"),  # asked for
+        lambda: fit(missions, HierarchicalTrust()),
+        lambda: fit(missions, PooledTrust(place=PlaceEffect())),
+    ):
+        with pytest.raises(BegunError):  # a warning would be an error
+            quick()
 
 
 def test_forgetting_follows_a_place_that_changes():

@@ -15,7 +15,7 @@ from trustbo.plots.maps import draw_hillshade
 def test_one_panel_per_iteration_and_one_for_the_end(result):
     axes = result.plot_maps()
     assert [ax.get_title() for ax in axes] == [
-        "mission 1 (from the prior)",
+        "mission 1 (prior)",
         "mission 2",
         "after 2 missions",
     ]

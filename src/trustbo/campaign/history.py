@@ -204,7 +204,10 @@ class History:
         maps = np.stack([entry.trust_map.values for entry in self.entries])
         return xr.Dataset(
             {
-                **{name: ("iteration", values) for name, values in scalars.items()},
+                **{
+                    name: ("iteration", values, {"units": "%"} if name == "regret" else {})
+                    for name, values in scalars.items()
+                },
                 "path": (("iteration", "step", "axis"), steps),
                 "trust_map": (("iteration", "row", "col"), maps, trust_map.attrs),
             },

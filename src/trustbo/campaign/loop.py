@@ -189,6 +189,8 @@ def missions(
     if campaign.options.replan == "bound":
         require_bounds(runner, 'replan="bound"')
     if truth is not None:
+        if not isinstance(truth, Truth):
+            raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")
         truth.require_workspace(campaign.workspace)
     rules = require_stops(stop)
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})

@@ -247,6 +247,12 @@ class DriftTrust(TrustModel):
             found = some.values(z, many=True)
         except TrustboError:
             raise
+        except jax.errors.JAXTypeError as error:
+            raise TrustboError(
+                f"the drift {self.form.name} cannot be compiled: "
+                f"{str(error).splitlines()[0].rstrip('.')}. Use jax.numpy in place of NumPy, and "
+                "jnp.where in place of if."
+            ) from error
         except Exception as error:
             raise TrustboError(
                 f"the drift {self.form.name} fails for awareness (robot, feature) = {shape}: "

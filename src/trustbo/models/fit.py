@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
-from trustbo.errors import PosteriorError, ShapeError, TrustboError
+from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_whole
 from trustbo.models.backend import VERSIONS
 from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import TrustModel, require_model
@@ -21,7 +22,7 @@ from trustbo.models.posterior_groups import Law, complete
 from trustbo.models.posterior_tree import to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.record import model_to_record
-from trustbo.models.samplers.choice import resolve_sampler
+from trustbo.models.samplers.choice import resolve_sampler, slow_places
 from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import Draws, UnevenWeightsError, draw_posterior
 from trustbo.models.samplers.student import Student
@@ -91,11 +92,18 @@ def fit(
     Raises:
         ShapeError: There are no missions, or they disagree on robots or features.
         TrustboError: An awareness value is NaN, the sampler is unknown or does not suit the model,
-            or no contact rate was measured.
+            no contact rate was measured, or a number of draws or the seed is no whole number.
         PosteriorError: The diagnostics are beyond their limits.
     """
     model = PooledTrust() if model is None else model
     require_model(model)
+    settings = NutsSettings(
+        require_whole("n_warmup", n_warmup, 0),
+        require_whole("n_draws", n_draws, 1),
+        require_whole("n_chains", n_chains, 1),
+    )
+    n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
+    seed = require_whole("seed", seed, 0)
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
@@ -108,8 +116,9 @@ def fit(
     def draw(model: TrustModel, *, fallback: bool) -> _Drawn:
         model = model.for_features(missions[0].features)
         chosen, reason = resolve_sampler(model, sampler)
+        if sampler == "auto" and chosen != "exact" and model.place is not None:
+            warnings.warn(slow_places(reason), stacklevel=3)
         floored = model.at_resolution(ticks)
-        settings = NutsSettings(n_warmup, n_draws, n_chains)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
         start = _proposal(earlier)
         draws, complaints = draw_posterior(

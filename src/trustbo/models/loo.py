@@ -29,6 +29,11 @@ def loo(posterior: xr.DataTree) -> ELPDData:
     Raises:
         TrustboError: Fewer than two missions have rates; or see `complete`.
     """
+    if not isinstance(posterior, xr.DataTree):
+        remedy = " Give its .posterior." if hasattr(posterior, "posterior") else ""
+        raise TrustboError(
+            f"loo takes a posterior from fit; got a {type(posterior).__name__}.{remedy}"
+        )
     posterior = complete(posterior)
     (group,) = (name for name in LIKELIHOODS if name in posterior.children)
     each = posterior[group].to_dataset()["contact_rate"]

@@ -187,7 +187,8 @@ def _with_places(u: np.ndarray, params: Params, moves: np.ndarray | None) -> np.
     for name, effect in params.places.items():
         if effect.shape[-2:] != u.shape[-2:]:
             raise ShapeError(
-                f"params.{name} is of {effect.shape[-2:]} cells, the workspace has {u.shape[-2:]}."
+                f"params.{name} is of {effect.shape[-2:]} cells, the awareness of {u.shape[-2:]}. "
+                "With the awareness of a path's bounds, give params.along(path)."
             )
         if name == "place":
             effect = effect[..., None, :, :]
@@ -212,7 +213,8 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         Shape (..., bound, robot).
 
     Raises:
-        ShapeError: The number of robots or features differs from that of the parameters.
+        ShapeError: The number of robots or features differs from that of the parameters, or effects
+            of places are of a map, not of the path's bounds.
     """
     z = np.asarray(awareness, dtype=float)
     return roll(trust_dynamics(params, as_map(z), "min", x0))

@@ -5,6 +5,7 @@ name. Trust and value of every plan are expectations under the posterior mean, f
 uncertain awareness, the planner holds one map for each draw of the parameters.
 """
 
+import inspect
 from collections.abc import Callable, Mapping
 
 import jax
@@ -106,12 +107,31 @@ POLICIES: Mapping[str, Policy] = {
 
 
 def resolve_policy(policy: str | Policy) -> Policy:
-    """Return the policy of that name, or the callable itself; TrustboError if neither."""
+    """Return the policy of that name, or the callable itself.
+
+    Raises:
+        TrustboError: It is neither, or takes other arguments than (key, draws, planner).
+    """
     if callable(policy):
+        _require_arguments(policy)
         return policy
     if not isinstance(policy, str):
         raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
     return POLICIES[require_choice("policy", policy, POLICIES)]
+
+
+def _require_arguments(policy: Policy) -> None:
+    try:
+        signature = inspect.signature(policy)
+    except (TypeError, ValueError):  # of a built-in, not known
+        return
+    try:
+        signature.bind(None, None, None)
+    except TypeError as error:
+        name = getattr(policy, "__name__", type(policy).__name__)
+        raise TrustboError(
+            f"a policy is called policy(key, draws, planner); {name}{signature} cannot be: {error}."
+        ) from None
 
 
 def _random_paths(planner: Planner, rng: np.random.Generator, n: int) -> list[tuple[Cell, ...]]:

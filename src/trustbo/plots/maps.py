@@ -59,7 +59,7 @@ def trust_maps(
     maps = [history["trust_map"].isel(iteration=i) for i in range(history.sizes["iteration"])]
     paths: list[Sequence[Cell]] = [_cells(cells) for cells in history["path"].values]
     titles = [f"mission {i}" for i in history["iteration"].values]
-    titles[0] += " (from the prior)"
+    titles[0] += " (prior)"
     maps, paths = [*maps, trust_map], [*paths, path]
     titles.append(f"after {len(titles)} mission{'s' if len(titles) > 1 else ''}")
     # The first map comes from the prior, and the trust of the start cell is assumed: neither sets

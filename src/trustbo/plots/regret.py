@@ -42,10 +42,15 @@ def regret_curves(
         Axes, shape (panel,).
 
     Raises:
-        TrustboError: A coordinate is unknown; or no regret is, as no simulator of the study knows
-            the truth.
+        TrustboError: This is no dataset; a coordinate is unknown; or no regret is, as no simulator
+            of the study knows the truth.
     """
     require_choice("variable", variable, _MEANING)
+    if not isinstance(dataset, xr.Dataset):
+        raise TrustboError(
+            "regret_curves takes a study's dataset, from study.load_study; got a "
+            f"{type(dataset).__name__}."
+        )
     for name in (by, panels or by):
         require_choice(
             "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]

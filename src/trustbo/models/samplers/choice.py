@@ -53,6 +53,14 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     return ("nuts" if model.family.integrates_out else "joint"), reason
 
 
+def slow_places(reason: str) -> str:
+    """Warning that NUTS samples effects of places, for that reason."""
+    return (
+        f"effects of places are sampled by NUTS, as {reason}: minutes for some 10 missions. Fast "
+        "are PooledTrust(place=...) and the same model with place=None."
+    )
+
+
 def is_coupled(model: TrustModel) -> bool:
     """Whether robots influence each other."""
     return isinstance(model, CoupledTrust) and not model.robots_are_apart
