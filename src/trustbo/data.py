@@ -222,6 +222,11 @@ class Mission(Displayed):
             TrustboError: A value outside [0, 1], or an unknown status.
         """
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
+        if z.ndim == 3 and len(z) == len(y) == 0:
+            raise ShapeError(
+                "a mission has at least one bound; got 0. If the robots were stopped before "
+                'bound 1 ended, tell campaign.fail("stuck", where=cell).'
+            )
         if z.ndim != 3 or y.shape != z.shape[:2] or not y.size:
             raise ShapeError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "

@@ -350,6 +350,30 @@ def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, n
             assert one.path == other.path
 
 
+def test_the_advice_says_where_awareness_is_filled_in(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "measured.nc").unlink()
+    with pytest.raises(tb.DamagedFileError) as error:
+        tb.Campaign.load(copy)
+    assert "missions.nc'); tell them, in order" in str(error.value)
+    assert "as they were told can be read" not in str(error.value)
+    assert "awareness that was not measured is filled in there" in str(error.value)
+
+
+def test_a_folder_that_may_not_be_written_to_is_named(workspace, folder, monkeypatch):
+    def refuse_lock(self, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", self.lock_file)
+
+    monkeypatch.setattr("trustbo.campaign.folder.FileLock.acquire", refuse_lock)
+    with pytest.raises(tb.TrustboError, match=r"cannot write to .*: Permission denied; give a fol"):
+        begin(workspace, folder.parent / "new")
+    with pytest.raises(
+        tb.TrustboError, match=r"written to\. tb\.load_result reads one that may not"
+    ):
+        tb.Campaign.load(folder)
+
+
 def test_a_campaign_is_rebuilt_from_the_missions_measured(folder):
     old = tb.load_result(folder)
     again = begin(old.workspace, objective="terminal", model=None)
