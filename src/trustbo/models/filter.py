@@ -15,7 +15,7 @@ from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
 from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.belief import AwarenessBelief
-from trustbo.workspace.moves import bounds_along, moves_along
+from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
 
 class TrustState(NamedTuple):
@@ -280,13 +280,8 @@ class TrustFilter:
                 f"first; got {path!r}."
             )
         cells = [require_pair("a cell", cell) for cell in path]
-        for rows, cols in self._grid:
-            for row, col in cells:
-                if not (0 <= row < rows and 0 <= col < cols):
-                    raise TrustboError(
-                        f"{(row, col)} is outside the grid of {rows} rows and {cols} columns; "
-                        "cells are (row, col) from 0, row 0 at the top."
-                    )
+        for shape in self._grid:
+            require_on_grid(cells, shape)
         moves_along(cells)
         return cells
 
@@ -321,7 +316,8 @@ class TrustFilter:
             )
         if np.isnan(z).any() and self._maps is None:
             raise TrustboError(
-                "awareness must not be NaN without a belief=; take unmeasured values from the map."
+                "awareness must not be NaN without a belief=; take unmeasured values from the map: "
+                "campaign.known_along(path), or workspace.along(path), (bound, robot, feature)."
             )
         require_unit_interval("awareness", z)
         return z
