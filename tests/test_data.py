@@ -110,9 +110,9 @@ def test_a_missing_duration_does_not_stop_the_clock():
 def test_missing_awareness_is_filled_from_a_map():
     z, y = arrays()
     z[0, 1] = np.nan
-    known = np.random.default_rng(0).uniform(size=(3, 2, 2))
+    known = np.random.default_rng(0).uniform(size=(2, 3, 2))
     filled = fill_awareness(Mission.from_arrays(PATH, z, y), known)
-    np.testing.assert_array_equal(filled.awareness[0, 1], known[1, 0])
+    np.testing.assert_array_equal(filled.awareness[0, 1], known[0, 1])
     np.testing.assert_array_equal(filled.awareness[1], z[1])
 
 

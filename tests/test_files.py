@@ -1,6 +1,7 @@
 """Files are whole or not there, whatever interrupts their writing."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -122,6 +123,18 @@ def test_whenever_it_dies_a_file_and_its_sum_agree(tmp_path, monkeypatch):
     file.write_bytes(b"noise")
     with pytest.raises(DamagedFileError, match=r"a.bin' is damaged: its bytes are not those"):
         read_checked(file)
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="a folder that even root cannot write")
+def test_a_folder_that_may_not_be_written_to_is_named():
+    for file in ("/proc/a.txt", "/proc/none/a.txt"):
+        with pytest.raises(TrustboError, match=r"cannot write to '/proc.*; give a folder that may"):
+            write_checked(file, b"")
+
+
+def test_another_file_that_is_missing_is_no_folder_that_refuses(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        write_file(tmp_path / "a.txt", lambda file: shutil.copyfile(tmp_path / "none", file))
 
 
 @pytest.mark.parametrize("require", [require_file, require_folder])

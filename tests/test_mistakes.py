@@ -63,6 +63,9 @@ MISTAKES = {
         lambda c: c.tell([(r + 20, k) for r, k in c.path]), "outside the grid of 6 rows"
     ),
     "a rate too few": (lambda c: c.tell(y=c.y[:-1]), "and contact_rate .bound, robot.; got"),
+    "stuck before bound 1 ended": (
+        lambda c: c.tell(z=c.z[:0], y=c.y[:0]), "got 0. .* campaign.fail..stuck., where=cell"
+    ),
     "a mission, no list": (lambda c: fit(c.mission), "Write .mission."),
     "no missions": (lambda c: fit([]), "give at least one"),
     "a result, no missions": (lambda c: fit(c.result), "got a Result. Give its .missions"),

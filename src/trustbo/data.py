@@ -64,7 +64,7 @@ class Bound(Displayed):
 
     def __post_init__(self) -> None:
         for name, n_axes in (("awareness", 2), ("contact_rate", 1), ("duration", 1)):
-            array = _as_array(name, getattr(self, name))
+            array = as_array(name, getattr(self, name))
             if array.ndim != n_axes:
                 axes = "(robot, feature)" if n_axes == 2 else "(robot,)"
                 raise ShapeError(f"{name} of a bound must be {axes}; got shape {array.shape}.")
@@ -77,25 +77,13 @@ class Bound(Displayed):
             )
         require_choice("status", self.status, STATUSES)
         ticks = np.full(lengths[0], np.nan) if self.n_ticks is None else self.n_ticks
-        object.__setattr__(self, "n_ticks", _as_array("n_ticks", ticks))
+        object.__setattr__(self, "n_ticks", as_array("n_ticks", ticks))
         for name, values in (("awareness", self.awareness), ("contact_rate", self.contact_rate)):
-            _require_unit_interval(f"{name} of the bound into cell {self.cell}", values)
+            require_unit_interval(f"{name} of the bound into cell {self.cell}", values)
         if (self.duration <= 0).any():
             robot = int(np.argmax(self.duration <= 0))
             raise TrustboError(f"duration[{robot}] = {self.duration[robot]:g} s must be positive.")
-        self._require_ticks()
-
-    def _require_ticks(self) -> None:
-        ticks, rate = self.n_ticks, self.contact_rate
-        if ticks.shape != rate.shape:
-            raise ShapeError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
-        for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
-            raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
-        off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
-        for i in np.flatnonzero(off):
-            raise TrustboError(
-                f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
-            )
+        require_shares(self.contact_rate, self.n_ticks)
 
     @property
     def contact_time(self) -> np.ndarray:
@@ -233,7 +221,12 @@ class Mission(Displayed):
             ShapeError: Axes that do not fit together.
             TrustboError: A value outside [0, 1], or an unknown status.
         """
-        z, y = _as_array("awareness", awareness), _as_array("contact_rate", contact_rate)
+        z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
+        if z.ndim == 3 and len(z) == len(y) == 0:
+            raise ShapeError(
+                "a mission has at least one bound; got 0. If the robots were stopped before "
+                'bound 1 ended, tell campaign.fail("stuck", where=cell).'
+            )
         if z.ndim != 3 or y.shape != z.shape[:2] or not y.size:
             raise ShapeError(
                 "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
@@ -350,7 +343,7 @@ def default_features(n_features: int) -> tuple[str, ...]:
 
 def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
     """Values per (bound, robot), from values per (bound, robot), per bound, or None."""
-    array = _as_array(what, np.nan if values is None else values)
+    array = as_array(what, np.nan if values is None else values)
     if array.ndim == 1:
         array = array[:, None]
     try:
@@ -359,14 +352,29 @@ def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> n
         raise ShapeError(f"{what} must be {shape}; got {array.shape}.") from None
 
 
-def _as_array(what: str, values: ArrayLike) -> np.ndarray:
+def as_array(what: str, values: ArrayLike) -> np.ndarray:
+    """Return an array of floats; ShapeError if these are no numbers."""
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise ShapeError(f"{what} must be an array of numbers; got {values!r}.") from None
 
 
-def _require_unit_interval(what: str, values: np.ndarray) -> None:
+def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
+    """Refuse ticks that are no whole numbers, or a rate that is no share of them; (robot,) both."""
+    if ticks.shape != rate.shape:
+        raise ShapeError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
+    for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):
+        raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
+    off = np.abs(rate * ticks - np.round(rate * ticks)) > 1e-6 * ticks
+    for i in np.flatnonzero(off):
+        raise TrustboError(
+            f"contact_rate[{i}] = {rate[i]:g} is no share of {ticks[i]:g} ticks (n_ticks)."
+        )
+
+
+def require_unit_interval(what: str, values: np.ndarray) -> None:
+    """Refuse values outside [0, 1], except NaN: TrustboError."""
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
         index = ", ".join(str(i) for i in np.argwhere(bad)[0])

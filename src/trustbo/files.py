@@ -20,6 +20,7 @@ import numpy as np
 from trustbo.errors import DamagedFileError, TrustboError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR)
 _LEAST_FREE = 1 << 20
 """Bytes; libraries that write files by themselves do not say why they failed."""
 
@@ -36,10 +37,12 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
         write: Function that writes to the path it is given, which has the same suffix.
 
     Raises:
-        TrustboError: The disk is full; a file of that name is as it was.
+        TrustboError: The disk is full, or the folder may not be written to; a file of that name is
+            as it was.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    with naming_refusal(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         with defer_interrupt():
@@ -47,14 +50,34 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
             os.replace(temporary, path)
     except Exception as error:
         full = isinstance(error, OSError) and error.errno in _FULL
-        if full or shutil.disk_usage(path.parent).free < _LEAST_FREE:
+        disk = shutil.disk_usage(path.parent)
+        if full or (disk.free < _LEAST_FREE and disk.total > 0):  # /proc has no bytes at all
             raise TrustboError(
                 f"the disk is full: {str(path)!r} was not written. What was there before is as it "
                 "was; make room and go on, or run the same again."
             ) from error
-        raise
+        with naming_refusal(path.parent, temporary):
+            raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming_refusal(folder: Path, file: Path | None = None, remedy: str = "") -> Iterator[None]:
+    """Make the system's refusal to write to a folder a TrustboError that says what to do.
+
+    Only that of one `file` in it, if given: others may be read meanwhile.
+    """
+    try:
+        yield
+    except OSError as error:
+        of_others = file is not None and error.filename not in (str(file), file)
+        if error.errno not in _REFUSED or of_others:
+            raise
+        raise TrustboError(
+            f"cannot write to {str(folder)!r}: {error.strerror}; give a folder that may be "
+            f"written to.{remedy}"
+        ) from error
 
 
 @contextmanager
@@ -125,8 +148,9 @@ def checksum(path: Path) -> str | None:
 
 def remove_checked(path: Path) -> None:
     """Remove a file and its sum, if they are there."""
-    path.unlink(missing_ok=True)
-    _sum_file(path).unlink(missing_ok=True)
+    with naming_refusal(path.parent):
+        path.unlink(missing_ok=True)
+        _sum_file(path).unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> None:

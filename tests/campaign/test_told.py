@@ -166,8 +166,13 @@ def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
     np.testing.assert_array_equal(
         again["posterior"]["beta"], campaign.posterior["posterior"]["beta"]
     )
-    with pytest.raises(tb.TrustboError, match="there is no mission 2 to set aside; 3 were told"):
+    with pytest.raises(tb.TrustboError, match="mission 2 is set aside already: the lidar was"):
         campaign.set_aside("again", 2)
+    with pytest.raises(tb.TrustboError, match="there is no mission 4 to set aside; 3 were told"):
+        campaign.set_aside("again", 4)
+    assert "3 told, 0 not learned from yet, 1 set aside" in repr(campaign)
+    campaign.fail("rain")
+    assert "1 set aside, 1 given up" in repr(campaign)
     campaign.tell(missions[1], other_path=True)
     assert campaign.posterior["constant_data"].sizes["mission"] == 3
     only.tell(missions[0], other_path=True)
@@ -348,6 +353,40 @@ def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, n
         for one, other in zip(kept, left, strict=True):
             np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
             assert one.path == other.path
+
+
+def test_awareness_along_a_path_fits_missions_and_filters(workspace):
+    campaign, path = begin(workspace), DIAGONAL[1:]
+    np.testing.assert_array_equal(campaign.known_along(path), workspace.along(path))
+    live = tb.models.TrustFilter(campaign.belief, 3)
+    assert live.predict(campaign.known_along(path), path).mean.shape == (2, 3)
+    for off, said in {(4, 0): r"\(4, 0\) is outside", (1, 3): "no bound leads from"}.items():
+        with pytest.raises(tb.TrustboError, match=said):
+            campaign.known_along([(3, 0), off])
+
+
+def test_the_advice_says_where_awareness_is_filled_in(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    (copy / "measured.nc").unlink()
+    with pytest.raises(tb.DamagedFileError) as error:
+        tb.Campaign.load(copy)
+    assert "missions.nc'); tell them, in order" in str(error.value)
+    assert "as they were told can be read" not in str(error.value)
+    assert "awareness that was not measured is filled in there" in str(error.value)
+
+
+def test_a_folder_that_may_not_be_written_to_is_named(workspace, folder, monkeypatch):
+    def refuse_lock(self, *args, **kwargs):
+        raise PermissionError(13, "Permission denied", self.lock_file)
+
+    monkeypatch.setattr("trustbo.campaign.folder.FileLock.acquire", refuse_lock)
+    with pytest.raises(tb.TrustboError, match=r"cannot write to .*: Permission denied; give a fol"):
+        begin(workspace, folder.parent / "new")
+    with pytest.raises(
+        tb.TrustboError, match=r"written to\. tb\.load_result reads one that may not"
+    ):
+        tb.Campaign.load(folder)
 
 
 def test_a_campaign_is_rebuilt_from_the_missions_measured(folder):

@@ -83,13 +83,67 @@ def test_bad_input_is_named():
         live.update(good[:2], [0.5, 0.5, 0.5])
     with pytest.raises(ShapeError, match=r"contact_rate must be \(3,\); got shape \(2,\)"):
         live.update(good, [0.5, 0.5])
-    with pytest.raises(TrustboError, match=r"contact_rate must be in \[0, 1\]"):
+    with pytest.raises(TrustboError, match=r"contact_rate: \[2\] = 1.5 is outside \[0, 1\]"):
         live.update(good, [0.5, 0.5, 1.5])
     with pytest.raises(TrustboError, match="awareness must not be NaN"):
         live.update(good * np.nan, [0.5, 0.5, 0.5])
     with pytest.raises(ShapeError, match=r"awareness must be \(bound, 3 robots"):
         live.predict(good)
     assert live.n_bounds == 0
+
+
+def test_impossible_values_leave_the_filter_as_it_was(posterior):
+    """Trust of 44 is what a filter says that takes 85 for the contact of a tick."""
+    _, params = mixture()
+    live, good = TrustFilter(params, n_robots=3), np.full((3, 2), 0.5)
+    for call in (live.update, live.begin_bound):
+        rates = [[0.5] * 3] if call == live.update else []
+        with pytest.raises(
+            TrustboError, match=r"awareness: \[0, 0\] = 80 is outside \[0, 1\] \(per"
+        ):
+            call(good * 160, *rates)
+        with pytest.raises(ShapeError, match="awareness must be an array of numbers; got 'high'"):
+            call("high", *rates)
+    with pytest.raises(TrustboError, match=r"awareness: \[1, 0, 0\] = -1 is outside"):
+        live.predict([good, good - 1.5])
+    with pytest.raises(TrustboError, match=r"n_ticks\[0\] = 0 must be a whole number"):
+        live.update(good, [0.5] * 3, n_ticks=0)
+    with pytest.raises(TrustboError, match="is no share of 25 ticks"):
+        live.update(good, [0.5] * 3, n_ticks=25)
+    with pytest.raises(ShapeError, match="n_ticks of a bound must be"):
+        live.update(good, [0.5] * 3, n_ticks=[4, 4])
+    live.begin_bound(good)
+    with pytest.raises(TrustboError, match=r"in_contact: \[0\] = 85 is outside"):
+        live.update_tick([85, 90, np.nan])
+    assert 0.0 < live.update_tick([True, False, np.nan]).mean[0] < 1.5
+    with pytest.raises(ShapeError, match="posterior is of 3 robots; got n_robots=2"):
+        TrustFilter(posterior, 2)
+    with pytest.raises(TrustboError, match=r"has observation='gaussian'; got 'censored'\. Leave"):
+        TrustFilter(posterior, observation="censored")
+    TrustFilter(posterior, 3, observation="gaussian", response="level")
+    for most in (0, 2.5):
+        with pytest.raises(TrustboError, match="max_draws must be a whole number from 1 on"):
+            TrustFilter(params, 3, max_draws=most)
+
+
+def test_bounds_that_cannot_be_are_named():
+    _, params = mixture()
+    params = params._replace(place=np.zeros((4, 1, 5, 6)))
+    live, z, y = TrustFilter(params, n_robots=3), np.full((3, 2), 0.5), [0.5] * 3
+    for bound, message in {
+        ((0, 0), (-1, 0)): r"\(-1, 0\) is outside the grid of 5 rows and 6 columns",
+        ((4, 0), (5, 0)): r"\(5, 0\) is outside the grid",
+        ((0.0, 0.5), (1, 0)): r"a cell must be two whole numbers \(row, col\); got \(0.0, 0.5\)",
+        ((0, 0), (2, 0)): "no bound leads from",
+        (2, 0): r"two whole numbers \(row, col\); got 2",
+        ((0, 0),): "say which 2 cells the 1 bounds lead over",
+    }.items():
+        with pytest.raises(TrustboError, match=message):
+            live.update(z, y, bound)
+    with pytest.raises(TrustboError, match="say which 3 cells the 2 bounds lead over"):
+        live.predict([z, z], [(0, 0), (0, 1)])
+    assert live.n_bounds == 0
+    np.testing.assert_array_equal(live.predict([z], np.array([(4, 4), (4, 5)])).mean.shape, (1, 3))
 
 
 @pytest.mark.parametrize("kind", ["pooled", "apart", "coupled"])

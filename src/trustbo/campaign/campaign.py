@@ -32,7 +32,7 @@ from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import resolve_policy
 from trustbo.stacking import fill_awareness
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import along
+from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 _N_MAPS = 500
 """Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
@@ -128,9 +128,14 @@ class Campaign(LearnedMissions, Displayed):
 
     def _card(self) -> Card:
         told, settings = len(self.missions), self.settings
+        others = {
+            "set aside": len(self.log.numbers(SET_ASIDE)),
+            "given up": len(self.log.failures),
+        }
+        also = "".join(f", {n} {what}" for what, n in others.items() if n)
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
-            ("missions", f"{told} told, {len(self.waiting)} not learned from yet"),
+            ("missions", f"{told} told, {len(self.waiting)} not learned from yet{also}"),
             ("model", self.model.describe()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
@@ -225,8 +230,10 @@ class Campaign(LearnedMissions, Displayed):
         """
         n = len(self.log.entries)
         number = n if mission is None else require_whole("mission", mission, 1)
-        if not 1 <= number <= n or self.log.entries[number - 1].state == SET_ASIDE:
+        if not 1 <= number <= n:
             raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
+        if (entry := self.log.entries[number - 1]).state == SET_ASIDE:
+            raise TrustboError(f"mission {number} is set aside already: {entry.row['reason']}")
         if self.options.update == "moment_matched":
             raise TrustboError('update="moment_matched" cannot forget a mission; use "refit".')
         self.log.entries[number - 1].become(SET_ASIDE, str(reason))
@@ -515,8 +522,20 @@ class Campaign(LearnedMissions, Displayed):
         return self._believed
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
-        """Awareness expected in the bounds of a path, shape (robot, bound, feature)."""
-        return along(self.planner_now().mean_awareness, path)
+        """Awareness expected in the bounds of a path, shape (bound, robot, feature).
+
+        That of the map, or of the belief after the missions so far; what `TrustFilter` and
+        missions take where robots do not measure it.
+
+        Args:
+            path: Cell where the team is and the cells to be entered; need not begin at the start.
+
+        Raises:
+            TrustboError: A cell is off the grid, or no neighbour of the one before.
+        """
+        cells = require_on_grid(path, self.workspace.grid.shape)
+        moves_along(cells)
+        return np.swapaxes(along(self.planner_now().mean_awareness, cells), 0, 1)
 
     def _believed_awareness(self) -> xr.Dataset | None:
         """`Result.believed`."""

@@ -9,7 +9,8 @@ from typing import Any
 from trustbo.errors import DamagedFileError
 from trustbo.files import read_checked
 
-MEASURED = "measured.nc"
+MEASURED, FILLED = "measured.nc", "missions.nc"
+_TELL = "tell them, in order, to a new campaign in another folder, with other_path=True"
 
 
 def read_json(file: Path, *fields: str) -> dict[str, Any]:
@@ -35,9 +36,9 @@ def naming_what_is_left(folder: Path) -> Iterator[None]:
     try:
         yield
     except DamagedFileError as error:
-        for name in (MEASURED, "missions.nc"):  # the latter with awareness filled in
+        for name, described in ((MEASURED, salvage), (FILLED, _salvage_filled)):
             if str(folder / name) not in str(error) and (folder / name).exists():
-                raise DamagedFileError(f"{error} {salvage(folder / name)}") from None
+                raise DamagedFileError(f"{error} {described(folder / name)}") from None
         raise
 
 
@@ -45,6 +46,15 @@ def salvage(measured: Path) -> str:
     """Describe the way on where only the missions as told can be read."""
     return (
         "All missions as they were told can be read: trustbo.logs.read_missions("
-        f"{str(measured)!r}); tell them, in order, to a new campaign in another folder, with "
-        "other_path=True."
+        f"{str(measured)!r}); {_TELL}."
+    )
+
+
+def _salvage_filled(missions: Path) -> str:
+    """Describe the way on where only the missions with awareness filled in can be read."""
+    return (
+        f"The missions can be read: trustbo.logs.read_missions({str(missions)!r}); {_TELL}. They "
+        "are not quite as they were told: awareness that was not measured is filled in there from "
+        "the map or the belief. A campaign with awareness='belief' would take it for measured, and "
+        "be too sure of its map; with awareness='map' nothing changes."
     )

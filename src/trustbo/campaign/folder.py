@@ -15,6 +15,7 @@ from trustbo.data import Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
+    naming_refusal,
     remove_checked,
     remove_leftovers,
     require_folder,
@@ -56,8 +57,8 @@ class CampaignFolder:
             begun: Whether it has to hold a campaign already.
 
         Raises:
-            TrustboError: The folder holds no campaign and has to; another process holds it; or its
-                name belongs to a file.
+            TrustboError: The folder holds no campaign and has to; another process holds it; it
+                may not be written to; or its name belongs to a file.
         """
         self.path = Path(directory)
         if begun and not self.is_used:
@@ -66,10 +67,12 @@ class CampaignFolder:
             if measured.exists():
                 raise DamagedFileError(f"{said} {STATE!r} is missing. {salvage(measured)}")
             raise TrustboError(f"{said} give a folder that one was saved to.")
-        require_folder(directory).mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self.path / ".lock", timeout=0)
+        read = " tb.load_result reads one that may not." if begun else ""
         try:
-            self._lock.acquire()
+            with naming_refusal(self.path, remedy=read):
+                require_folder(directory).mkdir(parents=True, exist_ok=True)
+                self._lock.acquire()
         except Timeout:
             raise TrustboError(
                 f"another campaign is at work in {str(self.path)!r}; close it first, or choose "

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trustbo.errors import TrustboError
+from trustbo.files import naming_refusal
 from trustbo.logs.messages import CONTACT_TYPES, POSE_TYPES, READERS, Messages, stamp_of
 from trustbo.logs.recording import Series
 
@@ -162,7 +163,8 @@ def write_messages(
         raise TrustboError(_NO_ROSBAGS) from None
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     serialize = store.serialize_ros1 if version == 1 else store.serialize_cdr
-    path.parent.mkdir(parents=True, exist_ok=True)
+    with naming_refusal(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         file = Path(folder) / path.name  # files within a bag are named after it
         if version == 1:

@@ -1,21 +1,21 @@
 """Trust in real time, bound by bound or tick by tick of a running mission."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.data import Cell, as_array, require_shares, require_unit_interval
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_pair, require_whole
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.likelihood.live import Effect, Rates
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
 from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.belief import AwarenessBelief
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
 
 
 class TrustState(NamedTuple):
@@ -65,8 +65,8 @@ class TrustFilter:
         posterior: xr.DataTree | Params,
         n_robots: int | None = None,
         *,
-        response: str = "level",
-        observation: str = "gaussian",
+        response: str | None = None,
+        observation: str | None = None,
         max_draws: int = 1000,
         belief: AwarenessBelief | None = None,
     ) -> None:
@@ -75,21 +75,28 @@ class TrustFilter:
         Args:
             posterior: DataTree from `fit`, or draws with leading axis (draw,).
             n_robots: Number of robots; needed with `TrustParams`, others know their own.
-            response: `"level"` or `"change"`; needed with draws, a posterior knows its own.
-            observation: Family of observations; needed with draws, a posterior knows its own.
+            response: `"level"` or `"change"`, of draws; `"level"` by default. A posterior knows
+                its own.
+            observation: Family of observations, of draws; `"gaussian"` by default. A posterior
+                knows its own.
             max_draws: Largest number of draws to follow; they are evenly spaced.
             belief: Belief about awareness: a map drawn from it goes with each draw, and gives what
                 was not measured in a bound.
 
         Raises:
-            ShapeError: Draws of another number of robots.
-            TrustboError: No posterior, `TrustParams` without `n_robots`, or an unknown response or
-                family.
+            ShapeError: Draws, a posterior or a belief of another number of robots or features.
+            TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown response or
+                family, or one that is not the posterior's.
         """
         if isinstance(posterior, xr.DataTree):
-            n_robots = posterior["constant_data"].sizes["robot"]
-            response = posterior.attrs["response"]
-            observation = posterior.attrs["observation"]
+            own = posterior["constant_data"].sizes["robot"]
+            if n_robots not in (None, own):
+                raise ShapeError(
+                    f"the posterior is of {own} robots; got n_robots={n_robots!r}. Leave it out."
+                )
+            n_robots = own
+            response = _of_posterior(posterior, "response", response)
+            observation = _of_posterior(posterior, "observation", observation)
             posterior = params_of(posterior)
         elif not isinstance(posterior, Params):
             raise TrustboError(
@@ -99,17 +106,28 @@ class TrustFilter:
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:
             raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
+        n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
         check_params(posterior, n_robots, self._n_features)
         flat = posterior.flat()
-        n = len(flat.b)
-        kept = np.linspace(0, n - 1, min(n, max_draws)).astype(int)
+        n, most = len(flat.b), require_whole("max_draws", max_draws, 1)
+        kept = np.linspace(0, n - 1, min(n, most)).astype(int)
         self.params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
         self._n_robots = n_robots
-        self._family = FAMILIES[require_choice("observation", observation, FAMILIES)]
-        lag = float(require_choice("response", response, RESPONSES) == "change")
+        family = require_choice("observation", observation or "gaussian", FAMILIES)
+        self._family = FAMILIES[family]
+        lag = float(require_choice("response", response or "level", RESPONSES) == "change")
         self._core = self.params.live(lag, n_robots)
         self._maps = None if belief is None else belief.draw(len(kept))
+        self._grid = [np.shape(value)[-2:] for value in self.params.places.values()]
+        if self._maps is not None:
+            of_belief = self._maps.shape[1], self._maps.shape[-1]
+            if of_belief != (n_robots, self._n_features):
+                raise ShapeError(
+                    f"the belief is of {of_belief} (robot, feature), the parameters are of "
+                    f"{(n_robots, self._n_features)}; give the belief of the same workspace."
+                )
+            self._grid.append(self._maps.shape[2:4])
         self.reset()
 
     def reset(self) -> None:
@@ -147,16 +165,17 @@ class TrustFilter:
 
         Raises:
             ShapeError: Another number of robots or features.
-            TrustboError: Awareness that is NaN, a rate outside [0, 1], ticks that are missing, a
-                bound that is missing or none, or one that is running.
+            TrustboError: Awareness that is NaN, a value outside [0, 1], ticks that are missing or
+                that the rate is no share of, a bound that is missing, leaves the grid or is none,
+                or one that is running.
         """
         self._require_running(running=False)
-        z, y = self._awareness(awareness, bound), np.asarray(contact_rate, dtype=float)
-        effect = self._effects(bound, 1)[0]
-        if y.shape != (self._n_robots,):
-            raise ShapeError(f"contact_rate must be ({self._n_robots},); got shape {y.shape}.")
-        if ((y < 0.0) | (y > 1.0)).any():
-            raise TrustboError(f"contact_rate must be in [0, 1]; got {y}.")
+        z, effect = self._bound(awareness, bound)
+        y = self._by_robot("contact_rate", contact_rate)
+        if n_ticks is not None:
+            n_ticks = as_array("n_ticks", n_ticks)
+            n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
+            require_shares(y, n_ticks)
         ticks = broadcast_ticks(self._family, n_ticks, y.shape)
         self._commit(z, effect, Rates(self._family, y, ticks))
         return self.state
@@ -164,7 +183,7 @@ class TrustFilter:
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
         """Begin a bound whose ticks `update_tick` takes in; arguments as those of `update`."""
         self._require_running(running=False)
-        z, effect = self._awareness(awareness, bound), self._effects(bound, 1)[0]
+        z, effect = self._bound(awareness, bound)
         self._running = _Running(z, effect, *np.zeros((2, self._n_robots)))
 
     def update_tick(self, in_contact: ArrayLike) -> TrustState:
@@ -178,12 +197,10 @@ class TrustFilter:
 
         Raises:
             ShapeError: Another number of robots.
-            TrustboError: No bound was begun.
+            TrustboError: No bound was begun, or a value outside [0, 1].
         """
         running = self._require_running(running=True)
-        seen = np.asarray(in_contact, dtype=float)
-        if seen.shape != (self._n_robots,):
-            raise ShapeError(f"in_contact must be ({self._n_robots},); got shape {seen.shape}.")
+        seen = self._by_robot("in_contact", in_contact)
         running.contacts[:] += np.nan_to_num(seen)
         running.ticks[:] += ~np.isnan(seen)
         mean, var, increment = self._core.update(
@@ -217,13 +234,15 @@ class TrustFilter:
 
         Raises:
             ShapeError: Another number of robots or features.
-            TrustboError: Awareness that is NaN.
+            TrustboError: Awareness that is NaN or outside [0, 1], or a path that is missing, of
+                another length, that jumps or that leaves the grid.
         """
         mean, var, ahead = self._mean, self._var, []
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
-        zs = [self._filled(z, None if path is None else path[k + 1]) for k, z in enumerate(given)]
+        cells = self._cells(path, len(given))
+        zs = [self._filled(z, None if cells is None else cells[k + 1]) for k, z in enumerate(given)]
         x = self._core.draw(rng, mean, var)
-        for z, effect in zip(zs, self._effects(path, len(zs)), strict=True):
+        for z, effect in zip(zs, self._effects(cells, len(zs)), strict=True):
             mean, var = self._core.predict(mean, var, z, effect)
             x, rates = self._core.roll(rng, self._family, x, z, effect)
             order = np.argsort(rates, axis=0)
@@ -250,16 +269,32 @@ class TrustFilter:
             raise TrustboError("a bound runs: call end_bound() first.")
         return self._running
 
-    def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[np.ndarray | float]:
+    def _cells(self, path: Sequence[Cell] | None, n_bounds: int) -> list[Cell] | None:
+        """The cells of a path of so many bounds, checked; None where there are none."""
+        if path is None:
+            return None
+        path = list(path) if isinstance(path, Iterable) else []
+        if len(path) != n_bounds + 1:
+            raise TrustboError(
+                f"say which {n_bounds + 1} cells the {n_bounds} bounds lead over, the cell left "
+                f"first; got {path!r}."
+            )
+        cells = [require_pair("a cell", cell) for cell in path]
+        for shape in self._grid:
+            require_on_grid(cells, shape)
+        moves_along(cells)
+        return cells
+
+    def _effects(self, cells: Sequence[Cell] | None, n_bounds: int) -> Sequence[np.ndarray | float]:
         """Effect of each bound's place (draw, robot or 1); 0 where there are none."""
         if not self.params.places:
             return [0.0] * n_bounds
-        if path is None or len(path) != n_bounds + 1:
+        if cells is None:
             raise TrustboError(
                 f"places have effects: say which {n_bounds + 1} cells the bounds lead over, the "
-                f"cell left first; got {path!r}."
+                "cell left first."
             )
-        return list(np.moveaxis(self.params.of_places(bounds_along(path)), -2, 0))
+        return list(np.moveaxis(self.params.of_places(bounds_along(cells)), -2, 0))
 
     def _average(
         self, mean: np.ndarray, var: np.ndarray, weights: np.ndarray | None = None
@@ -272,7 +307,7 @@ class TrustFilter:
         return TrustState(center, np.sqrt(spread))
 
     def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
-        z = np.asarray(awareness, dtype=float)
+        z = as_array("awareness", awareness)
         expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
             raise ShapeError(
@@ -281,14 +316,29 @@ class TrustFilter:
             )
         if np.isnan(z).any() and self._maps is None:
             raise TrustboError(
-                "awareness must not be NaN without a belief=; take unmeasured values from the map."
+                "awareness must not be NaN without a belief=; take unmeasured values from the map: "
+                "campaign.known_along(path), or workspace.along(path), (bound, robot, feature)."
             )
+        require_unit_interval("awareness", z)
         return z
 
-    def _awareness(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None) -> np.ndarray:
-        """Awareness of one bound, (robot, feature) or, filled in, (draw, robot, feature)."""
-        z = self._checked(awareness, 2)
-        return self._filled(z, None if bound is None else bound[1])
+    def _by_robot(self, what: str, values: ArrayLike) -> np.ndarray:
+        """Values of the robots, in [0, 1] or NaN."""
+        array = as_array(what, values)
+        if array.shape != (self._n_robots,):
+            raise ShapeError(f"{what} must be ({self._n_robots},); got shape {array.shape}.")
+        require_unit_interval(what, array)
+        return array
+
+    def _bound(
+        self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None
+    ) -> tuple[np.ndarray, np.ndarray | float]:
+        """Awareness of one bound, (robot, feature) or, filled in, (draw, robot, feature); effect.
+
+        The effect is that of its place.
+        """
+        z, cells = self._checked(awareness, 2), self._cells(bound, 1)
+        return self._filled(z, None if cells is None else cells[1]), self._effects(cells, 1)[0]
 
     def _filled(self, z: np.ndarray, cell: Cell | None) -> np.ndarray:
         """Awareness with that of each draw's map in the place of NaN."""
@@ -312,6 +362,14 @@ class _Running(NamedTuple):
         """Rates so far."""
         with np.errstate(invalid="ignore"):
             return Rates(family, self.contacts / self.ticks, self.ticks)
+
+
+def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
+    """The posterior's own response or observation; TrustboError if another is given."""
+    own = posterior.attrs[name]
+    if given not in (None, own):
+        raise TrustboError(f"the posterior has {name}={own!r}; got {given!r}. Leave it out.")
+    return own
 
 
 def _normalised(log_weight: np.ndarray) -> np.ndarray:

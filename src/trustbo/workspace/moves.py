@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_pair
 
 Steps = tuple[tuple[int, int], ...]
 MOVES: Mapping[int, Steps] = {
@@ -27,6 +27,22 @@ def require_connectivity(connectivity: int) -> int:
 def move_indices(connectivity: int) -> np.ndarray:
     """Indices of a connectivity's moves among the eight of `MOVES[8]`, shape (move,)."""
     return np.array([MOVES[8].index(step) for step in MOVES[require_connectivity(connectivity)]])
+
+
+def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
+    """Return the cells of a path as pairs of ints.
+
+    TrustboError: one is no pair, or is outside the grid of that shape, (row, col).
+    """
+    cells = [require_pair("a cell", cell) for cell in path]
+    rows, cols = shape
+    for row, col in cells:
+        if not (0 <= row < rows and 0 <= col < cols):
+            raise TrustboError(
+                f"{(row, col)} is outside the grid of {rows} rows and {cols} columns; cells are "
+                "(row, col) from 0, row 0 at the top."
+            )
+    return cells
 
 
 def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:

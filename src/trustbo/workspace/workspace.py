@@ -403,7 +403,7 @@ class Workspace(Displayed):
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
         """
-        return fill_awareness(self.in_order(mission), np.swapaxes(self.along(mission.path), 0, 1))
+        return fill_awareness(self.in_order(mission), self.along(mission.path))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""
