@@ -9,6 +9,7 @@ import trustbo as tb
 from trustbo.models import PooledTrust, Priors, TrustFilter, TrustParams, fit, loo, params_of
 from trustbo.planning import Planner, roll_trust
 from trustbo.plots import regret_curves
+from trustbo.report import write_report
 from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
 
 ENDS = (5, 0), (0, 5)
@@ -17,6 +18,13 @@ TRUTH = TrustParams(0.5, np.array([0.2, 0.1]), 0.2, 0.05, 0.05)
 
 def made(*shape):
     return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=shape))
+
+
+class Own:
+    """A simulator of these methods."""
+
+    def __init__(self, **methods):
+        self.__dict__.update(methods)
 
 
 class Case:
@@ -111,6 +119,23 @@ MISTAKES = {
     "a model's name": (lambda c: c.iterate(model="pooled"), "e.g. PooledTrust..; got 'pooled'"),
     "a simulator's class": (
         lambda c: c.iterate(simulator=KinematicSimulator), "make one of the class"
+    ),
+    "a simulator without a seed": (
+        lambda c: c.iterate(simulator=Own(run=lambda path: c.mission)),
+        "needs run.path, .*, seed.; the call of Own.run fails: got an unexpected .* 'seed'",
+    ),
+    "a bound that is none": (
+        lambda c: c.iterate(
+            simulator=Own(
+                run=print, reset=lambda start, seed: None,
+                run_bound=lambda k, cell: None,
+            ),
+            replan="bound",
+        ),
+        "run_bound.1, .*. must return a trustbo.Bound; got None",
+    ),
+    "a report in another format": (
+        lambda c: write_report("rep.pdf", None), "'rep.pdf' must end in .html or .htm"
     ),
     "no terrain to drive on": (
         lambda c: tb.iterate(c.workspace, *ENDS, progress=False), "make the workspace with Work"

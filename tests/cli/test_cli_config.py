@@ -5,6 +5,7 @@ import json
 import pytest
 
 from trustbo.cli.config import flags_of
+from trustbo.cli.program import main
 from trustbo.errors import TrustboError
 
 
@@ -89,9 +90,15 @@ def test_the_program_says_so_in_one_line(invoke, tmp_path):
     assert not (tmp_path / "never").exists()
 
 
-def test_a_number_that_is_none_is_refused(invoke, tmp_path):
-    (tmp_path / "a.yaml").write_text("iterations: 1.5")
-    done = invoke("demo", "--config", tmp_path / "a.yaml", "--out", tmp_path / "never")
-    assert done.exit_code == 2
-    assert "--iterations" in done.stderr
-    assert not (tmp_path / "never").exists()
+def test_a_number_that_is_none_is_refused_with_its_file(tmp_path, capsys):
+    file, never = tmp_path / "a.yaml", tmp_path / "never"
+    file.write_text("iterations: three")
+    for words, message in {
+        (): f"error: {file}: iterations cannot be 'three': ",
+        ("--iterations", "four"): "error: Invalid value for '--iterations': ",
+    }.items():
+        with pytest.raises(SystemExit) as caught:
+            main(["demo", "--config", str(file), *words, "--out", str(never)])
+        assert caught.value.code == 2
+        assert capsys.readouterr().err.startswith(message)
+    assert not never.exists()

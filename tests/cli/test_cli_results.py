@@ -158,7 +158,7 @@ def complete(line, **more):
         "COMP_CWORD": line.count(" "),
     }
     done = subprocess.run(
-        [sys.executable, "-m", "trustbo.cli"],
+        [sys.executable, "-m", "trustbo"],
         env=os.environ | {name: str(value) for name, value in (words | more).items()},
         capture_output=True, text=True, check=True,
     )  # fmt: skip

@@ -156,6 +156,10 @@ def test_onward_plans_what_is_left_from_the_trust_of_now(workspace, draws):
     assert (rest.max_bounds, rest.longest, rest.paths.u_turns) == ("shortest+4", 6, False)
     with pytest.raises(TrustboError, match=r"the mission began at \(0, 0\)"):
         planner.onward([(0, 0), (1, 0)])
+    with pytest.raises(TrustboError, match=r"no bound leads from \(3, 0\) to \(0, 1\)"):
+        planner.onward([(3, 0), (0, 1)])
+    with pytest.raises(TrustboError, match="give the cells so far, the start first"):
+        planner.onward([])
     with pytest.raises(NoPathError, match=r"it takes 3 bounds, but 2 are left"):
         planner.onward([(3, 0), (2, 0), (3, 0), (2, 0)])
 

@@ -22,7 +22,7 @@ from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
-from trustbo.simulation.protocol import require_bounds, takes
+from trustbo.simulation.protocol import require_bounds, require_call, takes
 from trustbo.workspace import Workspace
 
 
@@ -188,6 +188,9 @@ def missions(
         )
     if campaign.options.replan == "bound":
         require_bounds(runner, 'replan="bound"')
+        require_call(runner, "reset", campaign.planner.start, seed=0)
+    else:
+        require_call(runner, "run", [], seed=0)
     if truth is not None:
         if not isinstance(truth, Truth):
             raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")

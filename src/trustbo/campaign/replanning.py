@@ -7,6 +7,7 @@ import numpy as np
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError
 from trustbo.models import TrustFilter, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
@@ -100,7 +101,10 @@ def weighted_mean(params: Params, weights: np.ndarray) -> Params:
 def _run_bound(simulator: Any, k: int, cell: Cell, ahead: Cell | None) -> Bound:
     """Run a bound; a simulator that takes `next_cell`, which is optional, gets it."""
     known = {"next_cell": ahead} if takes(simulator.run_bound, "next_cell") else {}
-    return simulator.run_bound(k, cell, **known)
+    bound = simulator.run_bound(k, cell, **known)
+    if not isinstance(bound, Bound):
+        raise TrustboError(f"run_bound({k}, {cell}) must return a trustbo.Bound; got {bound!r}.")
+    return bound
 
 
 def _known(campaign: Campaign, left: Cell, bound: Bound) -> np.ndarray:

@@ -247,7 +247,8 @@ def _state(folder: Path) -> dict[str, Any]:
     if name != "KinematicSimulator":
         raise TrustboError(
             f"the campaign in {str(folder)!r} was run by {name or 'robots of your own'}, not by "
-            "trustbo run; go on with it in Python: trustbo.resume(folder, simulator=...)."
+            "trustbo run; go on with it in Python: trustbo.resume(folder, simulator=...), or, of "
+            "ask and tell, trustbo.Campaign.load(folder)."
         )
     return state
 

@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        said = _missing(error) or str(error.format_message())
+        said = _missing(error) or _of_file(error) or str(error.format_message())
         complain(said, f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)
@@ -91,3 +91,15 @@ def _missing(error: Any) -> str:
     ]
     kind = "argument" if any(not name.startswith("-") for name in lacking) else "option"
     return f"missing {kind}{'s' * (len(lacking) > 1)} {', '.join(lacking)}."
+
+
+def _of_file(error: Any) -> str:
+    """Name the file and its value where that of a flag cannot be used; else nothing."""
+    param, context = getattr(error, "param", None), getattr(error, "ctx", None)
+    if param is None or context is None or param.name not in (context.default_map or {}):
+        return ""
+    source = context.get_parameter_source(param.name)
+    if source is None or source.name != "DEFAULT_MAP":
+        return ""
+    flag, value = param.name.replace("_", "-"), context.default_map[param.name]
+    return f"{context.params['config']}: {flag} cannot be {value!r}: {error.message}"

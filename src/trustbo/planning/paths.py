@@ -27,6 +27,7 @@ from trustbo.workspace.moves import (
     move_indices,
     moves_along,
     require_connectivity,
+    require_on_grid,
 )
 
 DEFAULT_EXTRA = 8
@@ -177,9 +178,13 @@ class AdmissiblePaths:
         Extra bounds that were not used are left, and U-turns stay forbidden; but the first bound of
         the rest may lead anywhere.
 
-        TrustboError: they begin at another cell, or end at the goal. NoPathError: too few bounds
-        are left to reach the goal.
+        TrustboError: there are none, they jump, or begin at another cell. NoPathError: too few
+        bounds are left to reach the goal.
         """
+        done = require_on_grid(done, self.passable.shape)
+        if not done:
+            raise TrustboError(f"give the cells so far, the start first: [{self.start}, ...].")
+        moves_along(done)
         here = self.workspace.require_cell("done[-1]", done[-1])
         if done[0] != self.start:
             raise TrustboError(f"the mission began at {done[0]}; the paths at {self.start}.")

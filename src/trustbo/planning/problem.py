@@ -176,11 +176,11 @@ class PlanningProblem:
         `max_failure`. The value of a plan is that of the rest alone: for `mean`, the mean over the
         bounds still to come. Raises what `AdmissiblePaths.onward` raises.
         """
-        rule, most = self.rule, self.rule.max_failure
+        paths, rule, most = self.paths.onward(done), self.rule, self.rule.max_failure
         if self.risk is not None and most is not None and len(done) > 1:
             survived = self.risk.survival(done)
             rule = rule._replace(max_failure=max(0.0, 1.0 - (1.0 - most) / max(survived, 1e-300)))
-        return replace(self, paths=self.paths.onward(done), rule=rule)
+        return replace(self, paths=paths, rule=rule)
 
     def of_draw(self, index: int) -> Self:
         """Return the problem with the awareness map of one draw, where awareness is uncertain."""

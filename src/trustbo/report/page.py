@@ -26,7 +26,7 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     would take the page beyond the 3 MB that it may have.
 
     Args:
-        path: HTML file to write, or to replace.
+        path: HTML file to write, or to replace; ends in .html or .htm.
         result: Result of a campaign.
         title: Title of the page; by default it has the number of missions.
 
@@ -36,7 +36,7 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     Raises:
         TrustboError: The result has no mission, or the file cannot be written.
     """
-    target = require_file(path)
+    target = require_file(path, ".html", ".htm")
     if not result.missions:
         raise TrustboError("the result has no mission; run one first.")
     explorer = None

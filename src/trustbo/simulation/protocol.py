@@ -68,3 +68,18 @@ def require_bounds(simulator: object, what: str) -> None:
 def takes(function: Callable[..., object], name: str) -> bool:
     """Whether a function has a parameter of that name."""
     return name in inspect.signature(function).parameters
+
+
+def require_call(simulator: object, name: str, *arguments: object, **named: object) -> None:
+    """Refuse a simulator whose method cannot be called so, without calling it: TrustboError."""
+    method = getattr(simulator, name)
+    if takes(method, "mission"):
+        named["mission"] = 0
+    try:
+        inspect.signature(method).bind(*arguments, **named)
+    except TypeError as error:
+        how = {"run": "run(path, *, seed)", "reset": "reset(start, seed)"}[name]
+        raise TrustboError(
+            f"a simulator needs {how}; the call of {type(simulator).__name__}.{name} fails: "
+            f"{error}."
+        ) from None

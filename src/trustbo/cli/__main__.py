@@ -1,6 +1,0 @@
-"""`python -m trustbo.cli`, where the script `trustbo` is not on the path."""
-
-from trustbo.cli.program import main
-
-if __name__ == "__main__":
-    main()
