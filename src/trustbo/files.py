@@ -223,10 +223,10 @@ def require_file(path: FilePath, *suffixes: str) -> Path:
     folder of that name, or a file of that of its folder.
     """
     file = _as_path(path)
-    if suffixes and file.suffix.lower() not in suffixes:
-        raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
     if file.is_dir():
         raise TrustboError(f"cannot write {str(file)!r}: it is a folder; name a file in it.")
+    if suffixes and file.suffix.lower() not in suffixes:
+        raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
     require_folder(file.parent)
     return file
 

@@ -191,21 +191,23 @@ def choose(chromium, name, value, event):
 
 
 def point(chromium, x, y):
-    """Move the pointer to a place of the map, m from its lower left corner."""
-    at = chromium.execute_script(
-        """
-        const plot = Bokeh.documents.map((d) => d.get_model_by_name("map")).find((found) => found)
-        const view = Bokeh.index.get_by_id(plot.id)
-        view.el.scrollIntoView({block: "center"})
-        const box = view.el.getBoundingClientRect()
-        const [x, y] = arguments
-        return [view.frame.x_scale.compute(x) + box.left, view.frame.y_scale.compute(y) + box.top]
-        """, x, y,
-    )  # fmt: skip
-    chromium.execute_cdp_cmd(
-        "Input.dispatchMouseEvent", {"type": "mouseMoved", "x": at[0], "y": at[1]}
-    )
-    time.sleep(0.2)
+    """Move the pointer to a place of the map, m from its lower left corner, until it is shown."""
+    before, until = numbers(chromium)[0], time.monotonic() + 10.0
+    while numbers(chromium)[0] == before and time.monotonic() < until:
+        at = chromium.execute_script(
+            """
+            const plot = Bokeh.documents.map((d) => d.get_model_by_name("map")).find((it) => it)
+            const view = Bokeh.index.get_by_id(plot.id)
+            view.el.scrollIntoView({block: "center"})
+            const box = view.el.getBoundingClientRect()
+            const [x, y] = arguments
+            return [view.frame.x_scale.compute(x) + box.left,
+                    view.frame.y_scale.compute(y) + box.top]
+            """, x, y,
+        )  # fmt: skip
+        moved = {"type": "mouseMoved", "x": at[0], "y": at[1]}
+        chromium.execute_cdp_cmd("Input.dispatchMouseEvent", moved)
+        time.sleep(0.2)
 
 
 def numbers(chromium):

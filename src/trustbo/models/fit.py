@@ -97,11 +97,7 @@ def fit(
     """
     model = PooledTrust() if model is None else model
     require_model(model)
-    settings = NutsSettings(
-        require_whole("n_warmup", n_warmup, 0),
-        require_whole("n_draws", n_draws, 1),
-        require_whole("n_chains", n_chains, 1),
-    )
+    settings = NutsSettings(n_warmup, n_draws, n_chains).checked()
     n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
     seed = require_whole("seed", seed, 0)
     batch = stack_missions(missions)
@@ -140,8 +136,7 @@ def fit(
     }
     posterior = to_datatree(groups, missions, model.dims)
     if places is not None:
-        group = place_group(draws.places, places, seed)
-        posterior["places"] = xr.DataTree(group)
+        posterior["places"] = xr.DataTree(place_group(draws.places, places, seed))
     posterior.attrs |= {
         **_record(model, batch, resolution(ticks)),
         **draws.summary,

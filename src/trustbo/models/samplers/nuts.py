@@ -8,13 +8,14 @@ modes, in coordinates that the Hessian there makes standard normal (Laplace).
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax, random
 from numpyro.infer.hmc import hmc
 
+from trustbo.errors import require_whole
 from trustbo.models.model import TrustModel
 from trustbo.models.samplers.modes import Modes, find_modes
 from trustbo.models.samplers.reparam import reparametrise
@@ -32,6 +33,14 @@ class NutsSettings(NamedTuple):
     target_accept: float = 0.9
     collapse: bool = False
     """Collapse the pooled model's weights and intercept: slower, but no funnel for few data."""
+
+    def checked(self) -> Self:
+        """Return the settings with numbers that are whole; TrustboError if one is not."""
+        return self._replace(
+            n_warmup=require_whole("n_warmup", self.n_warmup, 0),
+            n_draws=require_whole("n_draws", self.n_draws, 1),
+            n_chains=require_whole("n_chains", self.n_chains, 1),
+        )
 
 
 class NutsDraws(NamedTuple):
