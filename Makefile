@@ -13,6 +13,9 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 PYTEST := TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
+# Where a container's shell says so, Python would compile all modules anew at each start, 7 s.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test notebooks slow lint docs bench peers clean
 
 demo: $(VENV)/.installed
