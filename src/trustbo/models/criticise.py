@@ -141,14 +141,12 @@ def _criticise(
     of = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
     outcomes = _test_all(found, tests, of, seed)
     adjusted = holm(np.array([each.p for each in outcomes.values()]))
-    after: dict[str, dict[str, Outcome]] = {}
-    for name, p in zip(outcomes, adjusted, strict=True):
-        if p <= _LEVEL:
-            after[name] = {}  # of the prior and the family, which no part of a model accounts for
-            for each in (each for each in tests if each.name == name):
-                label = outcomes[name].label
-                wider = _account_for(each, label, found, data, by_parameter, draws)
-                after[name] = _test_all(wider, [o for o in tests if o is not each], of, seed)
+    wrong = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
+    # No part of a model accounts for the prior or the family: they leave all others.
+    after: dict[str, dict[str, Outcome]] = {name: {} for name in wrong}
+    for each in (each for each in tests if each.name in wrong):
+        wider = _account_for(each, outcomes[each.name].label, found, data, by_parameter, draws)
+        after[each.name] = _test_all(wider, [o for o in tests if o is not each], of, seed)
     fault = _most_explaining(outcomes, after)
     rows = {}
     for (name, one), p in zip(outcomes.items(), adjusted, strict=True):

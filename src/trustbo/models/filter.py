@@ -119,7 +119,7 @@ class TrustFilter:
         lag = float(require_choice("response", response or "level", RESPONSES) == "change")
         self._core = self.params.live(lag, n_robots)
         self._maps = None if belief is None else belief.draw(len(kept))
-        self._grid = [np.shape(value)[-2:] for value in self.params.places.values()]
+        self._grids = {np.shape(value)[-2:] for value in self.params.places.values()}
         if self._maps is not None:
             of_belief = self._maps.shape[1], self._maps.shape[-1]
             if of_belief != (n_robots, self._n_features):
@@ -127,7 +127,7 @@ class TrustFilter:
                     f"the belief is of {of_belief} (robot, feature), the parameters are of "
                     f"{(n_robots, self._n_features)}; give the belief of the same workspace."
                 )
-            self._grid.append(self._maps.shape[2:4])
+            self._grids.add(self._maps.shape[2:4])
         self.reset()
 
     def reset(self) -> None:
@@ -280,7 +280,7 @@ class TrustFilter:
                 f"first; got {path!r}."
             )
         cells = [require_pair("a cell", cell) for cell in path]
-        for shape in self._grid:
+        for shape in self._grids:
             require_on_grid(cells, shape)
         moves_along(cells)
         return cells
