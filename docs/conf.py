@@ -1,5 +1,6 @@
 """How Sphinx builds the site (`make docs`); neither it nor a reader needs the network."""
 
+import re
 import shutil
 import sys
 from importlib.metadata import version as installed_version
@@ -10,6 +11,8 @@ from sphinx.application import Sphinx
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "extensions"))
+
+FIGURE = re.compile(r"!\[([^]]*)\]\(((?:\.\./)?figures/)(\w+\.png)\)")
 
 project = "trustbo"
 author = "The trustbo developers"
@@ -26,7 +29,7 @@ extensions = [
 exclude_patterns = ["_build", "extensions"]
 
 # Pages are Markdown; notebooks are kept executed, and `make test` runs them again.
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_extensions = ["attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
 nb_merge_streams = True
@@ -72,6 +75,19 @@ def point_to_copies(app: Sphinx, docname: str, source: list[str]) -> None:
     source[0] = source[0].replace("../notebooks/", "notebooks/").replace("../docs/", "../")
 
 
+def show_dark_figures(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Show the dark form of a figure where the reader's page is dark, if there is one."""
+
+    def both(image: re.Match[str]) -> str:
+        alt, folder, name = image.groups()
+        if not (HERE / "figures" / "dark" / name).exists():
+            return image[0]
+        light = f"![{alt}]({folder}{name}){{.only-light}}"
+        return f"{light}\n![{alt}]({folder}dark/{name}){{.only-dark}}"
+
+    source[0] = FIGURE.sub(both, source[0])
+
+
 def drop_words_of_python(
     app: Sphinx, kind: str, name: str, value: object, options: Any, lines: list[str]
 ) -> None:
@@ -85,4 +101,5 @@ def setup(app: Sphinx) -> None:
     """Connect the above."""
     app.connect("builder-inited", copy_notebooks)
     app.connect("source-read", point_to_copies)
+    app.connect("source-read", show_dark_figures)
     app.connect("autodoc-process-docstring", drop_words_of_python)

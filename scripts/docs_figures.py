@@ -1,12 +1,15 @@
-"""Draw the figures of the documentation: those of docs/gallery.md by its own code, and two more.
+"""Draw the figures of the documentation on light and dark paper: those of docs/gallery.md, and more.
 
 The figures of long campaigns and of reliability are of the tables that `benchmarks/campaigns.py
---csv` and `benchmarks/failures.py --csv` wrote.
+--csv` and `benchmarks/failures.py --csv` wrote. Run: python scripts/docs_figures.py [name ...]
 """
 
 import io
 import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -20,40 +23,60 @@ mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 RESULTS = FIGURES.parents[1] / "benchmarks" / "results"
 STEP = re.compile(r"^```python\n(.*?)^```|^!\[[^]]*\]\(figures/(\w+)\.png\)", flags=re.S | re.M)
+PAPERS = {"": plots.LIGHT._replace(paper="#ffffff"), "dark": plots.DARK._replace(paper="#131416")}
+"""Themes by folder; their papers are those of the pages of the documentation."""
 
 
-def main() -> None:
-    """Draw them all."""
-    names: dict = {}
-    for code, name in STEP.findall((FIGURES.parent / "gallery.md").read_text()):
-        if code:
-            exec(code, names)
-        elif plt.get_fignums():
-            save(plt.gcf(), name)
-            plt.close("all")
-    save(criticism(), "criticism")
-    save(long_campaigns(), "long_campaigns")
-    save(reliability(), "reliability")
-    result = names["result"]
-    film = plots.animate_mission(result.missions[-1], result.workspace)
-    contact = np.concatenate([bound.contact for bound in result.missions[-1].bounds])
+def main(wanted: list[str]) -> None:
+    """Draw the figures of these names, by default all."""
+    names: dict[str, Any] = {}
+    code = ""
+    for block, name in STEP.findall((FIGURES.parent / "gallery.md").read_text()):
+        if block and ("plot" not in block or "import" in block):
+            exec(block, names)
+        elif block:
+            code = block
+        elif code:
+            draw(name, wanted, lambda code=code: exec(code, names))
+            code = ""
+    draw("criticism", wanted, criticism)
+    draw("long_campaigns", wanted, long_campaigns)
+    draw("reliability", wanted, reliability)
+    draw("animate_mission", wanted, lambda: frame(names["result"]))
+
+
+def draw(name: str, wanted: list[str], drawing: Callable[[], Any]) -> None:
+    """Draw a figure on each paper."""
+    if wanted and name not in wanted:
+        return
+    for folder, theme in PAPERS.items():
+        with plt.rc_context(theme.settings()):
+            drawing()
+            save(plt.gcf(), FIGURES / folder / f"{name}.png", theme.paper)
+        plt.close("all")
+
+
+def frame(result: Any) -> None:
+    """Draw the frame of the last mission's film at which contact is most divided."""
+    mission = result.missions[-1]
+    film = plots.animate_mission(mission, result.workspace)
+    contact = np.concatenate([bound.contact for bound in mission.bounds])
     divided = np.flatnonzero(contact.any(1) & ~contact.all(1))
     film._draw_frame(divided[len(divided) // 2])  # matplotlib has no public way to one frame
     film._draw_was_started = True
-    save(film._fig, "animate_mission")
 
 
-def criticism() -> Figure:
-    """Criticism of the first example of docs/howto/criticise.md."""
+def criticism() -> None:
+    """Draw the criticism of the first example of docs/howto/criticise.md."""
     page = (FIGURES.parent / "howto" / "criticise.md").read_text()
-    namespace: dict = {}
+    namespace: dict[str, Any] = {}
     exec(page.split("```python\n")[1].split("```")[0], namespace)
-    return plots.criticism(namespace["found"])[0].figure
+    plots.criticism(namespace["found"])
 
 
 def long_campaigns() -> Figure:
-    """Seconds, memory and disk over 200 missions, by version 0.1 and now."""
-    figure, axes = plt.subplots(1, 3, figsize=(9, 2.8), layout="constrained")
+    """Draw seconds, memory and disk over 200 missions, by version 0.1 and now."""
+    figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.6), layout="constrained")
     styles = {"0.1": ("#D55E00", "--", "version 0.1"), "0.2": ("#0072B2", "-", "now")}
     for version, (color, line, label) in styles.items():
         table = np.genfromtxt(RESULTS / f"campaigns_{version}.csv", delimiter=",", names=True)
@@ -70,7 +93,7 @@ def long_campaigns() -> Figure:
 
 
 def reliability() -> Figure:
-    """Share of missions that arrived, by the chance predicted, after 15 and 60 missions."""
+    """Draw the share of missions that arrived by the chance predicted, after 15 and 60 missions."""
     table = np.genfromtxt(
         RESULTS / "failures_reliability.csv", delimiter=",", names=True, dtype=None, encoding=None
     )
@@ -81,7 +104,8 @@ def reliability() -> Figure:
         "synthetic-0": ("#009E73", "^"),
     }
     for ax, missions in zip(axes, (15, 60), strict=True):
-        ax.fill_between([0, 1], [-0.05, 0.95], [0.05, 1.05], color="0.9", label="off by .05")
+        ax.fill_between([0, 1], [-0.05, 0.95], [0.05, 1.05], color="0.5", alpha=0.25, linewidth=0,
+                        label="off by .05")  # fmt: skip
         ax.plot([0, 1], [0, 1], color="0.5", linewidth=0.8)
         for name, (color, marker) in styles.items():
             of = table[np.char.startswith(table["world"], name) & (table["missions"] == missions)]
@@ -98,13 +122,13 @@ def reliability() -> Figure:
     return figure
 
 
-def save(figure: Figure, name: str) -> None:
-    """Write a PNG without an alpha channel."""
+def save(figure: Figure, path: Path, paper: str) -> None:
+    """Write a PNG without an alpha channel, and without an empty margin."""
+    path.parent.mkdir(exist_ok=True)
     file = io.BytesIO()
-    figure.savefig(file, dpi=85)
-    plt.close(figure)
-    Image.open(file).convert("RGB").save(FIGURES / f"{name}.png", optimize=True)
+    figure.savefig(file, dpi=110, bbox_inches="tight", pad_inches=0.05, facecolor=paper)
+    Image.open(file).convert("RGB").save(path, optimize=True)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

@@ -67,7 +67,7 @@ def test_dots_are_missions_and_crosses_those_that_failed(result):
     assert [text.get_text() for text in measured.texts] == ["stuck"]
     np.testing.assert_allclose(promised.lines[0].get_ydata(), history["objective"])
     np.testing.assert_allclose(measured.lines[0].get_ydata(), history["contact_rate"])
-    shown = np.r_[drawn["a new path"].get_xdata(), drawn["the same"].get_xdata()]
+    shown = np.r_[drawn["a new path"].get_xdata(), drawn["the same path"].get_xdata()]
     assert sorted(shown) == [1, 2]
     assert 1 in drawn["a new path"].get_xdata()
 

@@ -3,6 +3,7 @@
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import LogNorm
 from matplotlib.text import Text
 
 import trustbo as tb
@@ -13,13 +14,16 @@ def test_each_robot_has_its_map_in_the_same_colours(result):
     cost = result.planner.cost_map(mean, per_robot=True)
     axes = tb.plots.robot_maps(cost, result.workspace, result.path, label="cost 1 - sigma(trust)")
     assert [ax.get_title() for ax in axes] == ["r1", "r2", "r3"]
+    known = np.where(result.workspace.passable, cost.transpose("robot", "row", "col"), np.nan)
+    known[:, *result.path[0]] = np.nan  # trust at the start is assumed
+    limits = tuple(np.nanquantile(known, [0.02, 0.98]))
     for ax in axes:
         own = cost.sel(robot=ax.get_title())
         np.testing.assert_array_equal(ax.images[0].get_array(), own)
-        assert ax.images[0].get_clim() == (float(cost.min()), float(cost.max()))
+        assert ax.images[0].get_clim() == limits
         assert ax.lines[0].get_xdata().size == len(result.path)
     (bar,) = [ax for ax in axes[0].figure.axes if ax.get_label() == "<colorbar>"]
-    assert bar.get_ylabel().startswith("cost 1 - sigma(trust)")
+    assert " ".join(bar.get_ylabel().split()).startswith("cost 1 - sigma(trust)")
 
 
 def test_probabilities_of_cells_go_from_0_to_1(result):
@@ -47,7 +51,7 @@ def test_fonts_are_the_user_s_and_sizes_the_figure_s(result):
         texts = [text for text in figure.findobj(Text) if text.get_text()]
         sizes.append(([text.get_fontsize() for text in texts], *figure.get_size_inches()))
     assert sizes[0] == sizes[1]
-    assert {7.0, 8.0, 9.0} == set(sizes[0][0])
+    assert {8.0, 9.0} == set(sizes[0][0])
     assert {text.get_fontfamily()[0] for text in texts} == {"serif"}
 
 
@@ -56,7 +60,7 @@ def test_figures_are_vectors_but_for_the_maps(result, tmp_path):
     axes[0].figure.savefig(tmp_path / "maps.svg")
     text = (tmp_path / "maps.svg").read_text()
     assert text.count("<path") > 20  # lines and letters
-    assert text.count("<image") <= 2 * len(axes) + 1  # colours and shadows of each, the bar
+    assert text.count("<image") <= len(axes) + 1  # colours of each, the bar
 
 
 def test_the_hazard_of_a_cell_is_that_from_its_worst_side(result):
@@ -66,5 +70,6 @@ def test_the_hazard_of_a_cell_is_that_from_its_worst_side(result):
     for row, col in np.ndindex(shown.shape):
         into = [p for p in p_fail[:, row, col] if not np.isnan(p)]
         np.testing.assert_equal(shown[row, col], max(into, default=np.nan))
-    assert ax.images[0].get_clim() == (0.0, max(0.2, np.nanmax(shown)))  # small chances are seen
+    assert ax.images[0].get_clim() == (1e-3, 1.0)
+    assert isinstance(ax.images[0].norm, LogNorm)  # small chances are seen
     assert ax.lines[0].get_xdata().size == len(result.path)

@@ -6,19 +6,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.colors import to_hex
+from scipy.spatial import cKDTree
 
 import trustbo as tb
 from trustbo.models import PlaceEffect, PooledTrust, fit
-from trustbo.plots.maps import draw_hillshade
+from trustbo.plots import LIGHT
+from trustbo.plots.maps import contour_interval, contours
 
 
 def test_one_panel_per_iteration_and_one_for_the_end(result):
     axes = result.plot_maps()
-    assert [ax.get_title() for ax in axes] == [
-        "mission 1 (prior)",
-        "mission 2",
-        "after 2 missions",
-    ]
+    assert [ax.get_title() for ax in axes] == ["prior", "after 1 mission", "after 2 missions"]
     figure = axes[0].figure
     bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
     assert len(bars) == 1
@@ -30,9 +29,27 @@ def test_one_panel_per_iteration_and_one_for_the_end(result):
     limits = {axes[i].images[0].get_clim() for i in range(3)}
     assert len(limits) == 1
     # The start's trust is assumed: it must not stretch the colours of what was learned.
-    learned = np.stack([result.history["trust_map"].values[1], result.trust_map.values])
-    learned[:, 2, 0] = np.nan
-    assert limits.pop() == (np.nanmin(learned), np.nanmax(learned))
+    maps = np.concatenate([result.history["trust_map"].values, result.trust_map.values[None]])
+    maps[:, 2, 0] = np.nan
+    low, high = np.nanquantile(maps, [0.02, 0.98])
+    assert limits.pop() == (low, min(high, 1.0))
+
+
+def test_moments_of_a_long_campaign_are_the_prior_and_after_1_and_3_missions(result):
+    n = 6
+    history = result.history.isel(iteration=[0, 1, 0, 1, 0, 1]).assign_coords(
+        iteration=np.arange(1, n + 1)
+    )
+    draw = tb.plots.trust_maps
+    rest = result.trust_map, result.path, result.workspace
+    titles = [ax.get_title() for ax in draw(history, *rest)]
+    assert titles == ["prior", "after 1 mission", "after 3 missions", "after 6 missions"]
+    assert len(draw(history, *rest, missions="all")) == n + 1
+    assert draw(history, *rest, missions=[5])[0].get_title() == "after 4 missions"
+    with pytest.raises(tb.TrustboError, match=r"missions must be some of 1\.\.6; got \[7\]"):
+        draw(history, *rest, missions=[7])
+    with pytest.raises(tb.TrustboError, match="missions must be 'moments', 'all' or numbers"):
+        draw(history, *rest, missions="some")
 
 
 def test_the_path_is_drawn_from_start_to_goal_where_its_cells_are(result):
@@ -61,7 +78,10 @@ def test_a_map_s_top_row_is_north(result):
 def test_terrain_maps_show_surface_traversability_and_visibility(result):
     axes = tb.plots.terrain_maps(result.workspace)
     names = ["traversability", "visibility", "line_of_sight"]
-    assert [ax.get_title() for ax in axes] == ["surface (DSM)", *names]
+    assert [ax.get_title() for ax in axes] == [
+        "surface (DSM)",
+        *(name.replace("_", " ") for name in names),
+    ]
     np.testing.assert_allclose(axes[2].images[0].get_array(), result.workspace.pixels["visibility"])
     seen = result.workspace.awareness.sel(feature="line_of_sight").mean("robot")
     np.testing.assert_allclose(axes[3].images[0].get_array(), seen)
@@ -70,13 +90,50 @@ def test_terrain_maps_show_surface_traversability_and_visibility(result):
         tb.plots.terrain_maps(bare)
 
 
-def test_every_map_has_shadows_and_the_first_a_scale(result):
+def test_every_map_has_contour_lines_and_the_first_a_scale(result):
     first, *others = result.plot_maps()
     assert [text.get_text() for text in first.texts] == ["20 m"]
     for ax in (first, *others):
-        shadow = ax.images[1].get_array()
-        assert shadow.shape[2] == 4
-        assert 0.0 < shadow[..., 3].max() <= 0.55
+        assert len(ax.images) == 1
+        (lines,) = ax.collections
+        assert len(lines.get_segments()) == len(contours(result.workspace)) > 0
+    flat = result.plot_maps(relief=False)
+    assert not any(ax.collections for ax in flat)
+
+
+def pixels_of(ax):
+    """RGB of the pixels of Axes as drawn, (colour, 3), and the number of pixels of each."""
+    image = np.asarray(ax.figure.canvas.buffer_rgba())[..., :3]
+    x0, y0, x1, y1 = (int(v) for v in ax.get_window_extent().extents)
+    part = image[image.shape[0] - y1 : image.shape[0] - y0, x0:x1].reshape(-1, 3)
+    return np.unique(part, axis=0, return_counts=True)
+
+
+def test_maps_have_the_colours_of_their_bar(result):
+    """Of all pixels, path and scale included, 85 % are within 30 RGB units of the bar's."""
+    mean = tb.models.params_of(result.posterior).mean()
+    cost = result.planner.cost_map(mean, per_robot=True)
+    share = result.planner.path_posterior(result.posterior, n_draws=200)
+    p_fail = result.planner.problem.risk.p_fail
+    drawn = {
+        "viridis": [
+            *result.plot_maps(),
+            *tb.plots.robot_maps(cost, result.workspace, result.path),
+            tb.plots.path_posterior(share, result.workspace, result.path),
+            tb.plots.hazard_map(p_fail, result.workspace, result.path),
+            *tb.plots.terrain_maps(result.workspace)[1:],
+            tb.plots.place_map(result.posterior, result.workspace)[1],
+        ],
+        "RdBu": [tb.plots.place_map(result.posterior, result.workspace)[0]],
+    }
+    for name, axes in drawn.items():
+        bar = 255.0 * plt.get_cmap(name)(np.linspace(0.0, 1.0, 256))[:, :3]
+        for figure in {ax.figure for ax in axes}:
+            figure.canvas.draw()
+        for ax in axes:
+            colours, counts = pixels_of(ax)
+            near = cKDTree(bar).query(colours)[0] <= 30.0
+            assert counts[near].sum() >= 0.85 * counts.sum(), (name, ax.get_title())
 
 
 def test_loadings_are_those_of_the_composites(result):
@@ -97,27 +154,33 @@ def test_impassable_cells_are_grey():
     trust = workspace.awareness.isel(robot=0, feature=0)
     image = tb.plots.cell_map(ax, trust, workspace)
     assert np.ma.getmaskarray(image.get_array()).tolist() == (~passable).tolist()
-    assert ax.get_facecolor() == (0.75, 0.75, 0.75, 1.0)
+    assert to_hex(ax.get_facecolor()) == LIGHT.closed
 
 
-def test_level_ground_keeps_its_colour_whatever_lies_beside_it():
-    height = np.zeros((40, 40))
-    height[:, 20:] = np.arange(20) * 0.2  # a bank that faces the west, towards the sun
-    height[20:, :20] -= np.arange(20)[:, None] * 0.3  # and one that faces the south
-    y, x = np.arange(40.0)[::-1] + 0.5, np.arange(40.0) + 0.5
+def test_contour_lines_are_where_the_ground_has_their_height():
+    y, x = np.arange(60.0)[::-1] + 0.5, np.arange(90.0) + 0.5
+    height = np.broadcast_to(0.5 * x, (60, 90))  # a plane: smoothing leaves it as it is
     dem = xr.DataArray(height, {"y": y, "x": x}, ("y", "x"))
     terrain = tb.terrain.assemble_terrain(dem.rio.write_crs("EPSG:32633"), dem)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # such ground makes for odd indices
-        workspace = tb.Workspace.from_terrain(terrain, (2, 2))
-    _, ax = plt.subplots()
-    draw_hillshade(ax, workspace, exaggerate=1.0)
-    shadow = ax.images[0].get_array()[..., 3]
-    np.testing.assert_allclose(shadow[2:18, 2:18], 0.0, atol=1e-12)  # level
-    np.testing.assert_allclose(shadow[2:18, 23:38], 0.0, atol=1e-12)  # lit
-    # Lambert's law on the bank to the south: n = (0, -0.3, 1), sun (-1, 1, sqrt 2) / 2, over level.
-    light = (1.0 - 0.3 / np.sqrt(2.0)) / np.sqrt(1.0 + 0.3**2)
-    np.testing.assert_allclose(shadow[23:38, 2:18], 0.55 * (1.0 - light), rtol=1e-9)
+        workspace = tb.Workspace.from_terrain(terrain, (2, 3))
+    lines = contours(workspace)
+    interval = contour_interval(0.5 * 89.0)
+    assert interval == 5.0
+    inner = [line for line in lines if 10.0 < line[:, 0].mean() < 80.0]  # edges are smoothed
+    assert len(inner) == 6  # 10 m to 35 m
+    for line in inner:
+        rises = 0.5 * line[:, 0] / interval
+        np.testing.assert_allclose(rises, np.round(rises), atol=2e-3)
+        assert np.ptp(line[:, 1]) == pytest.approx(59.0)
+
+
+@pytest.mark.parametrize(
+    ("relief", "interval"), [(0.0, None), (1.0, 0.1), (24.0, 2.0), (25.0, 5.0), (1200.0, 100.0)]
+)
+def test_contour_lines_are_at_round_heights_and_at_most_a_dozen(relief, interval):
+    assert contour_interval(relief) == pytest.approx(interval)
 
 
 def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(result):
@@ -126,7 +189,6 @@ def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(re
     assert [ax.get_title() for ax in axes] == ["better (+) or worse (\N{MINUS SIGN})", "how sure"]
     for ax, kind in zip(axes, ("mean", "sd"), strict=True):
         np.testing.assert_allclose(ax.images[0].get_array(), maps[f"place_{kind}"])
-        assert ax.images[1].get_array().shape[2] == 4  # the hillshade
     low, high = axes[0].images[0].get_clim()
     assert low == -high  # no effect has the colour in the middle
     (arrows,) = [c for c in axes[0].collections if hasattr(c, "U")]

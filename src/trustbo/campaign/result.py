@@ -210,13 +210,11 @@ class Result(Displayed):
         found = effects.drop_vars(["place_bound_mean", "place_bound_sd", "move"], errors="ignore")
         return found.mean("robot", keep_attrs=True) if "robot" in found.dims else found
 
-    def plot_maps(self, *, n_columns: int | None = None) -> np.ndarray:
-        """Plot the trust map and path of each iteration, and the last; returns the Axes."""
+    def plot_maps(self, **options: Any) -> np.ndarray:
+        """Draw trust maps and paths of four moments; options and Axes as of `plots.trust_maps`."""
         from trustbo import plots  # imports matplotlib
 
-        return plots.trust_maps(
-            self.history, self.trust_map, self.path, self.workspace, n_columns=n_columns
-        )
+        return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
     def explore(self) -> "Explorer":
         """Draw an interactive page: layers of the map, missions on a slider, numbers of places.

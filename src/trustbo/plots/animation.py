@@ -1,4 +1,4 @@
-"""Animation of a mission: robots over the hillshade, lines of sight to the lead, contact."""
+"""Animation of a mission: robots on the terrain, lines of sight to the lead, contact."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +18,7 @@ from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.files import FilePath, write_file
 from trustbo.plots.layout import as_text, extent_of, plain
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
+from trustbo.plots.style import MEDIUM, SMALL, require_kind, theme
 from trustbo.workspace import Workspace
 
 SEEN, UNSEEN = "#009e73", "#d55e00"
@@ -52,8 +53,8 @@ def animate_mission(
 ) -> FuncAnimation:
     """Animate a mission: robots, lines of sight, and the contact rate of the bound so far.
 
-    The left panel follows the team over the hillshade of the surface, vegetation in grey; the right
-    one shows the whole terrain. A line from a robot to the lead is green and solid during contact,
+    The left panel follows the team, over contour lines of the surface and vegetation; the right one
+    shows the whole terrain. A line from a robot to the lead is green and solid during contact,
     else red and dashed; the bar of the robot is then filled or hatched. In a notebook,
     `HTML(animation.to_jshtml())` shows the animation.
 
@@ -72,6 +73,8 @@ def animate_mission(
         TrustboError: The mission has no poses, the suffix is another, a number is not positive, or
             there is no ffmpeg.
     """
+    require_kind("animate_mission", mission, Mission, "a Mission and its Workspace")
+    require_kind("animate_mission", workspace, Workspace, "a Mission and its Workspace")
     target = None if path is None else Path(path)
     if target is not None:
         require_choice("suffix", target.suffix.lower(), SUFFIXES)
@@ -149,19 +152,19 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
         _draw_ground(ax, mission, workspace)
     draw_path(axes["all"], mission.path, workspace.grid)
     draw_scale(axes["all"], workspace.grid)
-    frame = Rectangle((0, 0), 1, 1, fill=False, edgecolor="black", linewidth=1.2, zorder=9)
+    frame = Rectangle((0, 0), 1, 1, fill=False, edgecolor=theme().ink, linewidth=1.2, zorder=9)
     axes["all"].add_patch(frame)
     team = _Team(near, mission.robots)
     heights = bars.barh(
         [as_text(name) for name in mission.robots],
         np.zeros(len(mission.robots)),
         height=0.6,
-        edgecolor="black",
+        edgecolor=theme().ink,
         linewidth=0.6,
     )
     bars.invert_yaxis()
     bars.set_xlim(0.0, 1.0)
-    bars.set_xlabel("contact rate so far", fontsize=8)
+    bars.set_xlabel("contact rate so far", fontsize=SMALL)
     plain(bars)
     center, half = _window(film, workspace)
     draw_scale_of(near, 2.0 * half)
@@ -179,7 +182,7 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
         frame.set(x=x - half, y=y - half, width=2 * half, height=2 * half)
         clock = f"{film.time[tick]:.0f} s, bound {k} of {len(mission.path) - 1}"
         ended = tick == len(film.time) - 1
-        near.set_title(clock + (f": {mission.status}" if ended else ""), fontsize=9)
+        near.set_title(clock + (f": {mission.status}" if ended else ""), fontsize=MEDIUM)
         return []
 
     return figure, draw
@@ -203,10 +206,12 @@ class _Team:
         lines = [
             Line2D([], [], color=SEEN, label="in contact"),
             Line2D([], [], color=UNSEEN, linestyle=_DASHED, label="no contact"),
-            Line2D([], [], color="0.3", linestyle=_DOTTED, linewidth=1.0, label="planned path"),
+            Line2D(
+                [], [], color=theme().quiet, linestyle=_DOTTED, linewidth=1.0, label="planned path"
+            ),
             Patch(facecolor=VEGETATION, label="vegetation"),
         ]
-        ax.legend(handles=[*own, *lines], loc="upper left", fontsize=7, framealpha=0.85)
+        ax.legend(handles=[*own, *lines], loc="upper left", fontsize=SMALL, framealpha=0.85)
 
     def place(self, poses: np.ndarray, contact: np.ndarray) -> None:
         """Move the markers to the poses of a tick, the lead first."""
@@ -232,7 +237,9 @@ def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
     left, right, bottom, top = extent_of(workspace.grid)
     draw_ground(ax, workspace)
     cells = np.array([workspace.grid.center(cell) for cell in mission.path])
-    ax.plot(*(cells - workspace.grid.corner).T, color="0.3", linewidth=1.0, linestyle=_DOTTED)
+    ax.plot(
+        *(cells - workspace.grid.corner).T, color=theme().quiet, linewidth=1.0, linestyle=_DOTTED
+    )
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 
 

@@ -1,20 +1,22 @@
 """History of a campaign: posteriors of the parameters, and outcomes of the missions."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any, Unpack
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.posterior_tree import labelled_draws
 from trustbo.planning import QUANTILES
-from trustbo.plots.layout import as_text, lowest, plain, small_multiples
-from trustbo.plots.mission import INNER, LINE
+from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
+from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
 
 MOST_PANELS = 64
-_PRIOR = "0.6"
+_TRUE = (0, (4, 2))
 
 
 def parameter_history(
@@ -22,7 +24,7 @@ def parameter_history(
     *,
     names: Sequence[str] | None = None,
     truth: Mapping[str, float] | None = None,
-    n_columns: int | None = None,
+    **style: Unpack[StyleOptions],
 ) -> np.ndarray:
     """Draw the posterior of each parameter after each mission, and the prior.
 
@@ -34,12 +36,15 @@ def parameter_history(
         posteriors: Posterior after each mission, such as `Result.posteriors`.
         names: Parameters to draw, such as `["beta0", "beta"]`; by default all.
         truth: True values by label, such as `{"beta[visibility]": 0.4}`, where they are known.
-        n_columns: Panels per row; by default three.
+        **style: Options of `Style`.
 
     Raises:
         TrustboError: There are no posteriors, a parameter or label is unknown, or there are too
             many parameters to be legible.
     """
+    such = "a list of posteriors, such as Result.posteriors"
+    require_kind("parameter_history", posteriors, Sequence, such)
+    look, colours = Style.of(style), theme()
     if not posteriors:
         raise TrustboError("there are no posteriors; give one for each mission.")
     known = [str(name) for name in posteriors[-1]["posterior"].data_vars]
@@ -54,22 +59,36 @@ def parameter_history(
         require_choice("label in truth", label, last)
     prior = _scalars(posteriors[-1], "prior", chosen)
     after = [_scalars(posterior, "posterior", chosen) for posterior in posteriors]
-    _, axes, panels = small_multiples(len(last), n_columns, (2.5, 1.7), sharex=True)
-    for ax, label in zip(panels, last, strict=True):
+    made = small_multiples(len(last), (2.5, 1.6), look, sharex=True, least=1.4)
+    for ax, label in zip(made.panels, last, strict=True):
         _draw_parameter(ax, prior.get(label), [draws[label] for draws in after])
         if truth is not None and label in truth:
-            ax.axhline(truth[label], color="black", linewidth=0.9, linestyle=(0, (4, 2)))
-        ax.set_title(as_text(label), fontsize=8)
+            ax.axhline(truth[label], color=colours.ink, linewidth=0.9, linestyle=_TRUE)
         ax.set_xlim(-0.6, len(after) + 0.6)
-        ax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
+        ax.xaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
+        ax.yaxis.set_major_locator(MaxNLocator(nbins=4))
         plain(ax)
-    for ax in lowest(axes):
-        ax.set_xlabel("missions learned from", fontsize=8)
-        ax.tick_params(labelbottom=True)
-    return panels
+    set_titles(made, list(last), look)
+    label_lower(made, "missions")
+    legend(made, _keys(truth is not None), look, ncols=4)
+    return made.panels
 
 
-def campaign_history(history: xr.Dataset) -> np.ndarray:
+def _keys(with_truth: bool) -> list[Line2D]:
+    """Legend of the bars and dots of parameters."""
+    colours = theme()
+    dot: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 4.5}
+    keys = [
+        Line2D([], [], color=colours.line, label="median", **dot),
+        Line2D([], [], color=colours.line, linewidth=3.0, label="50 %"),
+        Line2D([], [], color=colours.line, linewidth=1.0, label="90 % of the posterior"),
+        Line2D([], [], color=colours.quiet, linewidth=3.0, label="prior"),
+    ]
+    truth = Line2D([], [], color=colours.ink, linewidth=0.9, linestyle=_TRUE, label="truth")
+    return [*keys, truth] if with_truth else keys
+
+
+def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
     """Draw the objective of each plan, and the contact rate of its mission.
 
     A filled dot marks a path that differs from the previous one; a cross, with the status, a
@@ -77,6 +96,7 @@ def campaign_history(history: xr.Dataset) -> np.ndarray:
 
     Args:
         history: `Result.history` or `Campaign.history`.
+        **style: Options of `Style`.
 
     Returns:
         Axes, shape (2,): objective of the plans, mean contact rate of the missions.
@@ -84,9 +104,12 @@ def campaign_history(history: xr.Dataset) -> np.ndarray:
     Raises:
         TrustboError: The history has no mission.
     """
+    require_kind("campaign_history", history, xr.Dataset, "a history, such as Result.history")
+    look, colours = Style.of(style), theme()
     if not history.sizes.get("iteration"):
         raise TrustboError("the history has no mission yet; tell the campaign one first.")
-    _, axes, panels = small_multiples(2, 1, (4.6, 1.6), sharex=True)
+    made = small_multiples(2, (4.6, 1.6), look, columns=1, sharex=True)
+    panels = made.panels
     mission, changed = history["iteration"].values, history["path_changed"].values.astype(bool)
     changed[0] |= mission[0] == 1  # the first path is new
     status = [str(s) for s in history["status"].values]
@@ -96,38 +119,44 @@ def campaign_history(history: xr.Dataset) -> np.ndarray:
         (panels[1], "contact_rate", "contact rate\nmeasured"),
     ):
         values = history[name].values
-        dots = {"linestyle": "none", "marker": "o", "markersize": 5.5, "markeredgecolor": LINE}
-        ax.plot(mission, values, color=INNER, linewidth=1.0, zorder=1)
-        for which, fill, text in ((changed, LINE, "a new path"), (~changed, "white", "the same")):
+        dots = {
+            "linestyle": "none",
+            "marker": "o",
+            "markersize": 5.5,
+            "markeredgecolor": colours.line,
+        }
+        ax.plot(mission, values, color=colours.inner, linewidth=1.0, zorder=1)
+        fills = (changed, colours.line, "a new path"), (~changed, colours.paper, "the same path")
+        for which, fill, text in fills:
             ax.plot(mission[which], values[which], color=fill, label=text, **dots)
-        ax.set_ylabel(label, fontsize=8)
+        ax.set_ylabel(label, fontsize=SMALL)
         plain(ax)
-    crosses = {"linestyle": "none", "marker": "x", "markersize": 9, "color": "black"}
+    crosses = {"linestyle": "none", "marker": "x", "markersize": 9, "color": colours.ink}
     rate = history["contact_rate"].values
     if failed.any():
         panels[1].plot(mission[failed], rate[failed], label="not at the goal", **crosses)
     for j in np.flatnonzero(failed):
         panels[1].annotate(
-            status[j], (mission[j], rate[j]), (5, 5), textcoords="offset points", fontsize=7
+            status[j], (mission[j], rate[j]), (5, 5), textcoords="offset points", fontsize=SMALL
         )
-    axes[-1, 0].set_xlabel("mission", fontsize=8)
-    axes[-1, 0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    keys = panels[1].get_legend_handles_labels()
-    panels[0].figure.legend(*keys, loc="outside upper right", ncols=3, fontsize=7, frameon=False)
+    label_lower(made, "mission")
+    panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    set_titles(made, ["", ""], look)
+    legend(made, panels[1].get_legend_handles_labels()[0], look)
     return panels
 
 
 def _draw_parameter(ax: Axes, prior: np.ndarray | None, after: Sequence[np.ndarray]) -> None:
     ends = np.stack([np.quantile(draws, (*QUANTILES, 0.5)) for draws in after], axis=1)
-    bars = [(1.0 + np.arange(len(after)), ends, LINE)]
+    bars, colours = [(1.0 + np.arange(len(after)), ends, theme().line)], theme()
     if prior is not None:
         own = np.quantile(prior, (*QUANTILES, 0.5))[:, None]
-        bars.append((np.zeros(1), own, _PRIOR))
+        bars.append((np.zeros(1), own, colours.quiet))
     for x, (low, lower, upper, high, middle), colour in bars:
         ax.vlines(x, low, high, color=colour, linewidth=1.0)
         ax.vlines(x, lower, upper, color=colour, linewidth=3.0)
         ax.plot(
-            x, middle, "o", color=colour, markersize=4.5, markeredgecolor="white",
+            x, middle, "o", color=colour, markersize=4.5, markeredgecolor=colours.paper,
             markeredgewidth=0.6,
         )  # fmt: skip
     # The first missions may be uninformative; the later ones set the scale.

@@ -1,24 +1,35 @@
 """Figure of a criticism: tests, residuals and coverage of a fitted model."""
 
+from typing import Any, Unpack
+
 import numpy as np
 import pandas as pd
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.patches import Rectangle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.models import Criticism
-from trustbo.plots.layout import as_text, colour_bar, plain, small_multiples
+from trustbo.plots.layout import (
+    Panels,
+    as_text,
+    colour_bar,
+    legend,
+    plain,
+    set_titles,
+    small_multiples,
+)
 from trustbo.plots.places import BETTER_WORSE
+from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
 
 _LEVEL = 0.05
 _LEAST_P = 1e-6
 """Smallest p that is told from others."""
-_BAND, _ODD = "0.88", "#c1272d"
 _KINDS = ("mission", "bound", "robot", "contact")
 
 
-def criticism(found: Criticism, *, n_columns: int | None = None) -> np.ndarray:
+def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
     """Draw what a criticism looked at.
 
     Tests with their adjusted p, and once the fault that is named is accounted for (hollow); the
@@ -29,21 +40,37 @@ def criticism(found: Criticism, *, n_columns: int | None = None) -> np.ndarray:
 
     Args:
         found: Criticism of `models.criticise`.
-        n_columns: Panels per row, by default three.
+        **style: Options of `Style`; `cmap` is that of the cells.
 
     Returns:
         Axes, shape (9,).
     """
-    _, _, panels = small_multiples(9, n_columns, (2.9, 2.4))
-    tests, pit, cover, correlation, *groups, cells = panels
+    require_kind("criticism", found, Criticism, "a Criticism, from models.criticise")
+    look = Style.of(style)
+    made = small_multiples(9, (2.5, 2.2), look, least=1.8)
+    tests, pit, cover, correlation, *groups, cells = made.panels
     _draw_tests(tests, found)
     _draw_curves(pit, cover, correlation, found.curves)
     for ax, kind in zip(groups, _KINDS, strict=True):
         _draw_groups(ax, found, kind)
-    _draw_cells(cells, found)
-    for ax in panels:
+    _draw_cells(cells, found, made, look)
+    for ax in made.panels:
         plain(ax)
-    return panels
+    set_titles(made, [""] * 9, look)
+    legend(made, _keys(), look, ncols=4)
+    return made.panels
+
+
+def _keys() -> list[Line2D | Patch]:
+    colours = theme()
+    dot: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 4.5}
+    after: dict[str, Any] = dot | {"markerfacecolor": colours.paper, "markeredgecolor": colours.ink}
+    return [
+        Line2D([], [], color=colours.ink, label="as expected", **dot),
+        Line2D([], [], color=colours.odd, label="stands out", **dot),
+        Line2D([], [], label="once the fault is accounted for", **after),
+        Patch(facecolor=colours.band, label="95 % if the model is right"),
+    ]
 
 
 def _draw_tests(ax: Axes, found: Criticism) -> None:
@@ -54,57 +81,59 @@ def _draw_tests(ax: Axes, found: Criticism) -> None:
     )
     y = np.arange(len(table))[::-1]
     names = [str(name) for name in table.index]
-    ax.axvspan(_LEAST_P / 2.0, _LEVEL, color=_BAND, linewidth=0.0)
-    ax.hlines(y, p, np.where(np.isfinite(after), after, p), color="0.6", linewidth=0.8)
-    ax.scatter(after, y, s=18, facecolor="white", edgecolor="0.3", zorder=3)
-    ax.scatter(p, y, s=22, color=np.where(p <= _LEVEL, _ODD, "0.2"), zorder=4)
+    ax.axvspan(_LEAST_P / 2.0, _LEVEL, color=theme().band, linewidth=0.0)
+    ax.hlines(y, p, np.where(np.isfinite(after), after, p), color=theme().quiet, linewidth=0.8)
+    ax.scatter(after, y, s=18, facecolor=theme().paper, edgecolor=theme().ink, zorder=3)
+    ax.scatter(p, y, s=22, color=np.where(p <= _LEVEL, theme().odd, theme().ink), zorder=4)
     ax.set(xscale="log", xlim=(_LEAST_P / 2.0, 1.6), ylim=(-0.7, len(table) - 0.3))
     bold = ["bold" if name == found.fault else "normal" for name in names]
     ax.set_yticks(y, names)
     for label, weight in zip(ax.get_yticklabels(), bold, strict=True):
         label.set_fontweight(weight)
-    ax.set_xlabel("adjusted p (grey: found at 5 %)", fontsize=8)
+    ax.set_xlabel("adjusted p (grey: found at 5 %)", fontsize=SMALL)
 
 
 def _draw_curves(pit: Axes, cover: Axes, correlation: Axes, curves: xr.Dataset) -> None:
     u = curves["u"].values
-    pit.fill_between(u, curves["pit_low"], curves["pit_high"], color=_BAND, linewidth=0.0)
-    pit.plot(u, curves["pit"], color="0.2", linewidth=1.2)
+    pit.fill_between(u, curves["pit_low"], curves["pit_high"], color=theme().band, linewidth=0.0)
+    pit.plot(u, curves["pit"], color=theme().ink, linewidth=1.2)
     _mark(pit, u, curves, "pit")
-    pit.set_xlabel("PIT of rates one bound ahead", fontsize=8)
-    pit.set_ylabel("share below, less uniform", fontsize=8)
+    pit.set_xlabel("PIT of rates one bound ahead", fontsize=SMALL)
+    pit.set_ylabel("share below, less uniform", fontsize=SMALL)
     if "coverage" in curves:
         level, low, high = (curves[n].values for n in ("level", "coverage_low", "coverage_high"))
         x = np.arange(len(level))
-        cover.bar(x, high - low, 0.7, bottom=low - level, color=_BAND)
-        cover.axhline(0.0, color="0.6", linewidth=0.8)
-        cover.plot(x, curves["coverage"] - level, "o", color="0.2", markersize=4.5)
+        cover.bar(x, high - low, 0.7, bottom=low - level, color=theme().band)
+        cover.axhline(0.0, color=theme().quiet, linewidth=0.8)
+        cover.plot(x, curves["coverage"] - level, "o", color=theme().ink, markersize=4.5)
         outside = (curves["coverage"].values < low) | (curves["coverage"].values > high)
-        cover.plot(x[outside], (curves["coverage"] - level)[outside], "o", color=_ODD, markersize=5)
+        cover.plot(
+            x[outside], (curves["coverage"] - level)[outside], "o", color=theme().odd, markersize=5
+        )
         cover.set_xticks(x, [f"{p:.0%}" for p in level])
-    cover.set_xlabel("interval one mission ahead", fontsize=8)
-    cover.set_ylabel("share inside, less nominal", fontsize=8)
+    cover.set_xlabel("interval one mission ahead", fontsize=SMALL)
+    cover.set_ylabel("share inside, less nominal", fontsize=SMALL)
     ticks, lags = [], []
     for name, axis in (("autocorrelation", "lag"), ("autocorrelation_missions", "mission_lag")):
         if name not in curves:  # missions of one bound, or only one mission
             continue
         x = curves[axis].values + (ticks[-1] + 1 if ticks else 0)
         low, high = curves[f"{name}_low"].values, curves[f"{name}_high"].values
-        correlation.bar(x, high - low, 0.8, bottom=low, color=_BAND)
-        correlation.vlines(x, 0.0, curves[name], color="0.2", linewidth=1.5)
+        correlation.bar(x, high - low, 0.8, bottom=low, color=theme().band)
+        correlation.vlines(x, 0.0, curves[name], color=theme().ink, linewidth=1.5)
         _mark(correlation, x, curves, name)
         ticks, lags = [*ticks, *x], [*lags, *curves[axis].values]
-    correlation.axhline(0.0, color="0.6", linewidth=0.8)
+    correlation.axhline(0.0, color=theme().quiet, linewidth=0.8)
     correlation.set_xticks(ticks, lags)
-    correlation.set_xlabel("lag in bounds | lag in missions", fontsize=8)
-    correlation.set_ylabel("autocorrelation", fontsize=8)
+    correlation.set_xlabel("lag in bounds | lag in missions", fontsize=SMALL)
+    correlation.set_ylabel("autocorrelation", fontsize=SMALL)
 
 
 def _mark(ax: Axes, x: np.ndarray, curves: xr.Dataset, name: str) -> None:
     """Points of a curve outside its band."""
     y = curves[name].values
     outside = (y < curves[f"{name}_low"].values) | (y > curves[f"{name}_high"].values)
-    ax.plot(x[outside], y[outside], "o", color=_ODD, markersize=4, zorder=4)
+    ax.plot(x[outside], y[outside], "o", color=theme().odd, markersize=4, zorder=4)
 
 
 def _draw_groups(ax: Axes, found: Criticism, kind: str) -> None:
@@ -112,34 +141,34 @@ def _draw_groups(ax: Axes, found: Criticism, kind: str) -> None:
     mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
     odd, labels = groups["stands_out"].to_numpy(dtype=bool), list(groups["group"])
     x = np.arange(len(mean)) if kind in ("robot", "contact") else np.array(labels, dtype=float)
-    ax.bar(x, 2.0 * band, 0.8, bottom=-band, color=_BAND)
-    ax.axhline(0.0, color="0.6", linewidth=0.8)
-    ax.plot(x[~odd], mean[~odd], "o", color="0.2", markersize=4)
-    ax.plot(x[odd], mean[odd], "o", color=_ODD, markersize=5)
+    ax.bar(x, 2.0 * band, 0.8, bottom=-band, color=theme().band)
+    ax.axhline(0.0, color=theme().quiet, linewidth=0.8)
+    ax.plot(x[~odd], mean[~odd], "o", color=theme().ink, markersize=4)
+    ax.plot(x[odd], mean[odd], "o", color=theme().odd, markersize=5)
     if kind in ("robot", "contact"):
         ax.set_xticks(x, [as_text(str(label)) for label in labels])
     else:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("expected contact rate" if kind == "contact" else kind, fontsize=8)
-    ax.set_ylabel("mean residual (sd)", fontsize=8)
+    ax.set_xlabel("expected contact rate" if kind == "contact" else kind, fontsize=SMALL)
+    ax.set_ylabel("mean residual (sd)", fontsize=SMALL)
 
 
-def _draw_cells(ax: Axes, found: Criticism) -> None:
+def _draw_cells(ax: Axes, found: Criticism, made: Panels, look: Style) -> None:
     groups = _groups_of(found, "cell")
     cells = np.array(list(groups["group"]))
     values = np.full(tuple(cells.max(0) + 1), np.nan)
     mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
     values[*cells.T] = mean / band
     far = max(float(np.nanmax(np.abs(values))), 1.0)
-    image = ax.imshow(values, cmap=BETTER_WORSE, vmin=-far, vmax=far)
+    image = ax.imshow(values, cmap=look.colours(BETTER_WORSE), vmin=-far, vmax=far)
     for row, col in cells[groups["stands_out"].to_numpy(dtype=bool)]:
         corner = col - 0.5, row - 0.5
         ax.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, edgecolor="black", linewidth=1.6))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_xlabel("column of the cell entered", fontsize=8)
-    ax.set_ylabel("row", fontsize=8)
-    colour_bar(ax.figure, image, ax, "mean residual / band")
+    ax.set_xlabel("column of the cell entered", fontsize=SMALL)
+    ax.set_ylabel("row", fontsize=SMALL)
+    colour_bar(made, image, "mean residual / band", look, axes=[ax])
 
 
 def _groups_of(found: Criticism, kind: str) -> pd.DataFrame:

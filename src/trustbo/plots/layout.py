@@ -1,17 +1,20 @@
-"""Layout of figures: small multiples, maps in metres, colour bars."""
+"""Layout of figures: small multiples, maps in metres, colour bars and legends."""
 
 import textwrap
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
-from trustbo.errors import require_whole
+from trustbo.plots.style import MEDIUM, SMALL, Style
 from trustbo.workspace import Grid
 
-_LETTERS = 12
+PAGE = 7.6
+"""Width of a page, inches: figures of several panels are no wider by default."""
+_LETTERS = 11
 """Letters of a colour bar's label for each inch of the figure's height."""
 
 MARKERS = "osD^vPX*<>"
@@ -19,23 +22,58 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 
 """Line styles of curves in one panel, in order, to tell them apart without colour."""
 
 
-def small_multiples(
-    n: int, n_columns: int | None, size: tuple[float, float], margin: float = 0.0, **shared: Any
-) -> tuple[Figure, np.ndarray, np.ndarray]:
-    """Make a figure of n equal panels, row by row: `size` is a panel's width and height, inches.
+class Panels(NamedTuple):
+    """Axes of a figure, and those of them that carry the labels."""
 
-    At most `n_columns` per row, None for three, or two if there are four; `margin`, inches, is left
-    beside the panels for a colour bar or a legend; `shared` are `sharex` and `sharey` of
-    `plt.subplots`. Returns the figure, all its Axes (row, column), and those of the panels (n,);
-    the others are invisible. TrustboError: `n_columns` is not a whole number from 1 on.
+    figure: Figure | SubFigure
+    panels: np.ndarray
+    """Axes of the panels, (panel,)."""
+    left: list[Axes]
+    """Those at the left edge."""
+    lower: list[Axes]
+    """Those with no panel below."""
+    columns: int
+
+
+def small_multiples(
+    n: int,
+    size: tuple[float, float],
+    style: Style,
+    *,
+    margin: float = 0.0,
+    columns: int | None = None,
+    least: float = 1.5,
+    **shared: Any,
+) -> Panels:
+    """Lay out n equal panels row by row, in a new figure or on the user's Axes.
+
+    Args:
+        n: Number of panels.
+        size: Width and height of a panel, inches; a panel that has to be narrower keeps its height.
+        style: Options of the user.
+        margin: Width beside the panels for a colour bar or a legend, inches.
+        columns: Panels per row, by default the number from three to five that leaves the fewest
+            places empty; fewer where they would be narrower than `least` inches.
+        least: Least width of a panel, inches.
+        **shared: `sharex` and `sharey` of `plt.subplots`.
+
+    Raises:
+        TrustboError: Too few Axes of the user.
     """
-    usual = 2 if n == 4 else 3
-    columns = min(usual if n_columns is None else require_whole("n_columns", n_columns, 1), n)
-    rows = -(-n // columns)
+    if style.ax is not None:
+        panels = style.axes(n)
+        return Panels(panels[0].figure, panels, list(panels), list(panels), 1)
+    margin = margin if style.legend else 0.0
+    most = max(1, int(((style.width or PAGE) - margin) / least))
+    wanted = style.n_columns or min(columns or _columns(n), most)
+    cols = min(wanted, n)
+    rows = -(-n // cols)
+    natural = size[0] * cols + margin
+    width = style.width or (natural if cols == style.n_columns else min(natural, PAGE))
     figure, axes = plt.subplots(
         rows,
-        columns,
-        figsize=(size[0] * columns + margin, size[1] * rows),
+        cols,
+        figsize=(width, size[1] * rows),
         squeeze=False,
         layout="constrained",
         **shared,
@@ -43,28 +81,84 @@ def small_multiples(
     panels = axes.ravel()
     for ax in panels[n:]:
         ax.set_visible(False)
-    return figure, axes, panels[:n]
+    left = [row[0] for row in axes]
+    return Panels(figure, panels[:n], left, _lowest(axes), cols)
+
+
+def _columns(n: int) -> int:
+    """Number of columns for n panels: three to five, with the fewest places left empty."""
+    if n <= 4:
+        return 2 if n == 4 else n
+    return min((3, 4, 5), key=lambda cols: -n % cols)
 
 
 def map_panels(
-    grid: Grid, n: int, n_columns: int | None, width: float = 2.6
-) -> tuple[Figure, np.ndarray, np.ndarray]:
-    """Make a figure of maps, see `small_multiples`; a tall terrain has more of them in a row."""
+    grid: Grid,
+    n: int,
+    style: Style,
+    *,
+    width: float = 2.6,
+    columns: int | None = None,
+    margin: float = 1.0,
+) -> Panels:
+    """Lay out maps, see `small_multiples`; of a tall terrain there are more in a row."""
     tall = tallness(grid)
     if tall >= 2:
-        width, n_columns = 0.6 * width, 5 if n_columns is None else n_columns
-    size = width, width * tall + 0.55
-    made = small_multiples(n, n_columns, size, margin=1.2, sharex=True, sharey=True)
-    made[0].set_layout_engine("compressed")  # panels keep the terrain's proportions
+        width, columns = 0.6 * width, 5 if columns is None else columns
+    cols = min(style.n_columns or columns or _columns(n), n)
+    room = (style.width or PAGE) - (margin if style.legend else 0.0)
+    if style.width is not None or (style.n_columns is None and width * cols > room):
+        width = max(min(width, room / cols) if style.width is None else room / cols, 1.2)
+    made = small_multiples(
+        n, (width, width * tall + 0.5), style, margin=margin, columns=columns, least=1.2,
+        sharex=True, sharey=True,
+    )  # fmt: skip
+    if isinstance(made.figure, Figure) and style.ax is None:
+        made.figure.set_layout_engine("compressed")  # panels keep the terrain's proportions
     return made
 
 
-def colour_bar(figure, image, axes, label: str, **options) -> None:
-    """Add a colour bar with small numbers; a label longer than the figure is high is broken."""
-    bar = figure.colorbar(image, ax=axes, pad=0.02, **{"aspect": 18, "shrink": 0.9} | options)
-    n_letters = max(16, int(_LETTERS * figure.get_figheight()))
-    bar.set_label(textwrap.fill(label, n_letters), fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
+    """Write the titles of panels, and the user's above them or in place of a single one."""
+    titles = list(titles)
+    if style.title is not None and len(titles) == 1:
+        titles = [style.title]
+    elif style.title and style.ax is None and isinstance(made.figure, Figure):
+        made.figure.suptitle(as_text(style.title), fontsize=MEDIUM + 1.0)
+    for ax, title in zip(made.panels, titles, strict=True):
+        ax.set_title(as_text(title), fontsize=MEDIUM)
+
+
+def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: Any) -> None:
+    """Add a colour bar, unless left out; a label longer than the figure is high is broken.
+
+    `axes=` are those it belongs to, by default all panels.
+    """
+    if not style.legend:
+        return
+    axes = list(options.pop("axes", made.panels))
+    rows = -(-len(axes) // made.columns)
+    shape = {"aspect": 14 * min(rows, 3), "shrink": 0.95, "pad": 0.02}
+    bar = made.figure.colorbar(image, ax=axes, **shape | options)
+    height = sum(ax.get_position().height for ax in axes[:: made.columns]) * _inches(made.figure)
+    bar.set_label(textwrap.fill(label, max(18, int(_LETTERS * height))), fontsize=SMALL)
+    bar.ax.tick_params(labelsize=SMALL)
+
+
+def _inches(figure: Figure | SubFigure) -> float:
+    return float(figure.get_figure(root=True).get_figheight())  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def legend(made: Panels, handles: Sequence[Any], style: Style, **options: Any) -> None:
+    """Add a legend outside the panels, on the user's Axes inside the first; unless left out."""
+    if not style.legend:
+        return
+    shape: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handles": list(handles)}
+    shape |= {"handlelength": 1.6, "columnspacing": 1.2}
+    if style.ax is not None:
+        made.panels[0].legend(**shape, loc="best")
+        return
+    made.figure.legend(**shape | {"loc": "outside lower center", "ncols": 3} | options)
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
@@ -86,19 +180,25 @@ def grid_lines(ax: Axes, grid: Grid) -> None:
         ax.axhline(row * grid.cell_height, color="white", linewidth=0.3, alpha=0.5)
 
 
-def label_maps(axes: np.ndarray) -> None:
-    """Label the outer Axes of a figure (row, column) of maps in metres."""
-    for ax in axes.ravel():
+def label_maps(made: Panels) -> None:
+    """Label the outer Axes of maps in metres."""
+    for ax in made.panels:
         ax.set_aspect("equal")
-        ax.tick_params(labelsize=7)
-    for row in axes:
-        row[0].set_ylabel("north (m)", fontsize=8)
-    for ax in lowest(axes):
-        ax.set_xlabel("east (m)", fontsize=8)
+        ax.tick_params(labelsize=SMALL)
+        ax.locator_params(nbins=4)
+    for ax in made.left:
+        ax.set_ylabel("north (m)", fontsize=SMALL)
+    label_lower(made, "east (m)")
+
+
+def label_lower(made: Panels, text: str) -> None:
+    """Label the Axes with no panel below."""
+    for ax in made.lower:
+        ax.set_xlabel(text, fontsize=SMALL)
         ax.tick_params(labelbottom=True)
 
 
-def lowest(axes: np.ndarray) -> list[Axes]:
+def _lowest(axes: np.ndarray) -> list[Axes]:
     """Return the Axes, of all (row, column), with no visible ones below them."""
     last = len(axes) - 1
     return [
@@ -115,6 +215,6 @@ def as_text(name: str) -> str:
 
 
 def plain(ax: Axes) -> None:
-    """Remove the upper and right frame, and make numbers small."""
+    """Remove the upper and right frame, and set the size of numbers."""
     ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(labelsize=7)
+    ax.tick_params(labelsize=SMALL)

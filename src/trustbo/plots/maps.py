@@ -1,37 +1,48 @@
-"""Maps of planning cells over the hillshade, with a path, a scale and a colour bar."""
+"""Maps of planning cells with contour lines, a path, a scale and a colour bar."""
 
 from collections.abc import Sequence
+from typing import Any, Unpack
 
 import numpy as np
 import xarray as xr
+from contourpy import contour_generator
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
+from scipy.ndimage import gaussian_filter
 
 from trustbo.data import Cell
+from trustbo.errors import TrustboError
 from trustbo.plots.layout import (
-    as_text,
+    Panels,
     colour_bar,
     extent_of,
     grid_lines,
     label_maps,
     map_panels,
-    tallness,
+    set_titles,
 )
+from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Grid, Workspace
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
-SHADOW = 0.55
-"""Opacity of the darkest shadow of the hillshade."""
-CLOSED = "0.75"
-"""Grey of impassable cells and pixels."""
-VEGETATION = "0.78"
+VEGETATION = (0.44, 0.56, 0.39, 0.4)
+"""Green that is opaque in part, for light and dark ground."""
+MOMENTS = (1, 2, 4)
+"""Missions before which a map is drawn by default, with one after the last."""
+_ROBUST = (0.02, 0.98)
+"""Quantiles of the values at the ends of the colours."""
 _GROWN = 0.5  # least height of vegetation above the ground, m
+_CONTOURS = 12  # levels on a map, at most
+_SMOOTH = 1 / 60  # of a map's longer side: contour lines of rough ground are smoothed over it
+_MOST_PIXELS = 400  # a side, of the heights that contour lines are drawn of
+_LEAST_CHANCE = 1e-3
+"""Chance to fail from which a map of chances has colours."""
 
 
 def trust_maps(
@@ -40,42 +51,81 @@ def trust_maps(
     path: Sequence[Cell],
     workspace: Workspace,
     *,
-    n_columns: int | None = None,
+    missions: Sequence[int] | str = "moments",
+    **style: Unpack[StyleOptions],
 ) -> np.ndarray:
-    """Draw the trust map of each iteration with the path planned on it, Fig. 5 of the paper.
+    """Draw the trust map that missions were planned on, with their paths, Fig. 5 of the paper.
 
-    One more panel shows the map and the recommended path after the last mission.
+    The last panel shows the map and the recommended path after the last mission. All are on one
+    scale, from the 2 % to the 98 % quantile of the values, the start cell left out, whose trust is
+    assumed. A trust of 1 is that of unbroken contact; above it there is no other colour.
 
     Args:
         history: Map and path of each iteration, such as `Result.history`.
         trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
         path: Path recommended then, such as `Result.path`.
         workspace: Workspace of the cells.
-        n_columns: Panels per row; by default 3, or more where the terrain is tall.
+        missions: Missions to draw, numbers of the history's `iteration`; `"moments"` for the first,
+            second and fourth, as far as there are, planned with what 0, 1 and 3 missions taught;
+            or `"all"`.
+        **style: Options of `Style`.
 
     Returns:
-        Axes, shape (iteration + 1,).
+        Axes, shape (mission + 1,).
+
+    Raises:
+        TrustboError: There is no such mission.
     """
-    maps = [history["trust_map"].isel(iteration=i) for i in range(history.sizes["iteration"])]
-    paths: list[Sequence[Cell]] = [_cells(cells) for cells in history["path"].values]
-    titles = [f"mission {i}" for i in history["iteration"].values]
-    titles[0] += " (prior)"
+    require_kind("trust_maps", history, xr.Dataset, "a history, such as Result.history")
+    look, number = Style.of(style), history["iteration"].values.tolist()
+    chosen = _chosen(missions, number)
+    maps = [history["trust_map"].sel(iteration=i) for i in chosen]
+    paths: list[Sequence[Cell]] = [_cells(history["path"].sel(iteration=i).values) for i in chosen]
+    learned = [len(number) if i is None else i - 1 for i in (*chosen, None)]
+    titles = [_moment(n) for n in learned]
     maps, paths = [*maps, trust_map], [*paths, path]
-    titles.append(f"after {len(titles)} mission{'s' if len(titles) > 1 else ''}")
-    # The first map comes from the prior, and the trust of the start cell is assumed: neither sets
-    # the limits of the colours.
-    everything = np.stack([trust.values for trust in maps])
-    learned = everything[1:].copy()
-    learned[:, *paths[0][0]] = np.nan
-    low, high = np.nanmin(learned), np.nanmax(learned)
-    figure, axes, panels = map_panels(workspace.grid, len(maps), n_columns)
-    for ax, trust, path, title in zip(panels, maps, paths, titles, strict=True):
-        cell_map(ax, trust, workspace, low=low, high=high)
-        draw_path(ax, path, workspace.grid)
-        ax.set_title(title, fontsize=9)
+    everything = np.stack([trust.transpose("row", "col").values for trust in maps])
+    everything[:, *paths[0][0]] = np.nan
+    low, high = robust_limits(everything)
+    high = min(high, 1.0) if low < 1.0 else high
+    made = map_panels(workspace.grid, len(maps), look)
+    colours = look.colours(COLOURS)
+    for ax, trust, own in zip(made.panels, maps, paths, strict=True):
+        _draw_map(ax, trust, workspace, Normalize(low, high), colours, relief=look.relief)
+        draw_path(ax, own, workspace.grid)
+    set_titles(made, titles, look)
     extend = _extend(np.nanmin(everything) < low, np.nanmax(everything) > high)
-    _finish(figure, axes, workspace, "expected trust", (low, high), extend=extend)
-    return panels
+    label = "expected trust (1: contact kept)"
+    _finish(
+        made, workspace, label, ScalarMappable(Normalize(low, high), colours), look, extend=extend
+    )
+    return made.panels
+
+
+def _chosen(missions: Sequence[int] | str, known: list[int]) -> list[int]:
+    """Numbers of the missions to draw."""
+    if isinstance(missions, str):
+        if missions not in ("moments", "all"):
+            raise TrustboError(
+                f"missions must be 'moments', 'all' or numbers of missions; got {missions!r}."
+            )
+        return known if missions == "all" else [i for i in known if i in MOMENTS]
+    if not set(missions) <= set(known):
+        raise TrustboError(f"missions must be some of {known[0]}..{known[-1]}; got {missions!r}.")
+    return list(missions)
+
+
+def _moment(n: int) -> str:
+    """Title of a map that n missions taught."""
+    return "prior" if n == 0 else f"after {n} mission{'s' if n > 1 else ''}"
+
+
+def robust_limits(values: np.ndarray) -> tuple[float, float]:
+    """Values at the ends of the colours: quantiles, so that single cells do not take them all."""
+    low, high = np.nanquantile(values, _ROBUST).tolist()
+    if not low < high:
+        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    return (low, high) if low < high else (low - 0.5e-3, high + 0.5e-3)
 
 
 def robot_maps(
@@ -84,38 +134,45 @@ def robot_maps(
     path: Sequence[Cell] | None = None,
     *,
     label: str = "cost",
-    n_columns: int | None = None,
+    **style: Unpack[StyleOptions],
 ) -> np.ndarray:
-    """Draw a map for each robot, all on one scale of colours.
+    """Draw a map for each robot, all on one robust scale of colours.
 
     Args:
         maps: Maps (robot, row, col), such as `planner.cost_map(params, per_robot=True)`, the cost
             f = 1 - sigma(trust) of the paper.
         workspace: Workspace of the cells.
-        path: Path to draw on each map.
+        path: Path to draw on each map; its start, where trust is assumed, has no part in the scale.
         label: Label of the colour bar.
-        n_columns: Panels per row; by default two, or more where the terrain is tall.
+        **style: Options of `Style`.
 
     Returns:
         Axes, shape (robot,).
     """
-    maps = maps.transpose("robot", "row", "col")
-    names = [str(name) for name in maps["robot"].values]
-    limits = float(maps.min()), float(maps.max())
-    if n_columns is None and tallness(workspace.grid) < 2:
-        n_columns = 2
-    figure, axes, panels = map_panels(workspace.grid, len(names), n_columns)
-    for ax, name, own in zip(panels, names, maps, strict=True):
-        cell_map(ax, own, workspace, low=limits[0], high=limits[1])
+    such = "maps (robot, row, col), such as planner.cost_map(params, per_robot=True)"
+    require_kind("robot_maps", maps, xr.DataArray, such)
+    look, maps = Style.of(style), maps.transpose("robot", "row", "col")
+    values = np.where(workspace.passable.values, maps.values, np.nan)
+    if path is not None:
+        values[:, *path[0]] = np.nan
+    limits, colours = robust_limits(values), look.colours(COLOURS)
+    made = map_panels(workspace.grid, maps.sizes["robot"], look)
+    for ax, own in zip(made.panels, maps, strict=True):
+        _draw_map(ax, own, workspace, Normalize(*limits), colours, relief=look.relief)
         if path is not None:
             draw_path(ax, path, workspace.grid)
-        ax.set_title(as_text(name), fontsize=9)
-    _finish(figure, axes, workspace, label, limits)
-    return panels
+    set_titles(made, [str(name) for name in maps["robot"].values], look)
+    extend = _extend(np.nanmin(values) < limits[0], np.nanmax(values) > limits[1])
+    mappable = ScalarMappable(Normalize(*limits), colours)
+    _finish(made, workspace, label, mappable, look, extend=extend)
+    return made.panels
 
 
 def path_posterior(
-    share: xr.DataArray, workspace: Workspace, path: Sequence[Cell] | None = None
+    share: xr.DataArray,
+    workspace: Workspace,
+    path: Sequence[Cell] | None = None,
+    **style: Unpack[StyleOptions],
 ) -> Axes:
     """Draw the probability of each cell to be on the best path.
 
@@ -123,42 +180,65 @@ def path_posterior(
         share: Probabilities (row, col), such as `planner.path_posterior(posterior)`.
         workspace: Workspace of the cells.
         path: Path to draw, such as the recommended one.
+        **style: Options of `Style`.
 
     Returns:
         Axes of the map.
     """
-    return _one_map(share, workspace, path, "P(cell on the best path)", 1.0)
+    such = "probabilities (row, col), such as planner.path_posterior(posterior)"
+    require_kind("path_posterior", share, xr.DataArray, such)
+    return _one_map(
+        share, workspace, path, "P(cell on the best path)", Normalize(0.0, 1.0), Style.of(style)
+    )
 
 
 def hazard_map(
-    p_fail: np.ndarray, workspace: Workspace, path: Sequence[Cell] | None = None
+    p_fail: np.ndarray,
+    workspace: Workspace,
+    path: Sequence[Cell] | None = None,
+    **style: Unpack[StyleOptions],
 ) -> Axes:
     """Draw the chance of each cell that the bound into it ends the mission, from the worst side.
+
+    Colours are of the logarithm of the chance, from .001 on: chances go over many decades.
 
     Args:
         p_fail: Chances (move, row, col), NaN where there is no bound, such as
             `planner.problem.risk.p_fail`.
         workspace: Workspace of the cells.
         path: Path to draw, such as the recommended one.
+        **style: Options of `Style`.
 
     Returns:
         Axes of the map.
     """
+    p_fail = np.asarray(p_fail, dtype=float)
     worst = np.where(np.isnan(p_fail), -np.inf, p_fail).max(0)
     hazard = workspace.passable.copy(data=np.where(worst >= 0.0, worst, np.nan))
-    high = max(0.2, float(np.nanmax(hazard, initial=0.0)))
-    return _one_map(hazard, workspace, path, "chance to fail on entering, at most", high)
+    label, norm = "chance to fail on entering, at most", LogNorm(_LEAST_CHANCE, 1.0, clip=True)
+    return _one_map(hazard, workspace, path, label, norm, Style.of(style), "min")
 
 
 def _one_map(
-    values: xr.DataArray, workspace: Workspace, path: Sequence[Cell] | None, label: str, high: float
+    values: xr.DataArray,
+    workspace: Workspace,
+    path: Sequence[Cell] | None,
+    label: str,
+    norm: Normalize,
+    look: Style,
+    extend: str = "neither",
 ) -> Axes:
-    """Draw a single map in colours from 0 to `high`."""
-    figure, axes, (ax,) = map_panels(workspace.grid, 1, 1, width=3.6)
-    cell_map(ax, values, workspace, low=0.0, high=high)
+    """Draw a single map."""
+    made = map_panels(workspace.grid, 1, look, width=3.6)
+    (ax,) = made.panels
+    colours = look.colours(COLOURS)
+    _draw_map(ax, values, workspace, norm, colours, relief=look.relief)
     if path is not None:
         draw_path(ax, path, workspace.grid)
-    _finish(figure, axes, workspace, label, (0.0, high))
+    if look.title:
+        set_titles(made, [""], look)
+    of_bar = {"extend": extend} | ({"format": "%g"} if isinstance(norm, LogNorm) else {})
+    _finish(made, workspace, label, ScalarMappable(norm, colours), look, **of_bar)
     return ax
 
 
@@ -169,77 +249,123 @@ def cell_map(
     *,
     low: float | None = None,
     high: float | None = None,
+    cmap: str | Colormap = COLOURS,
+    relief: bool = True,
 ) -> AxesImage:
-    """Draw a map of the planning cells under the hillshade; impassable cells are grey.
+    """Draw a map of the planning cells in the colours of its bar; impassable cells are grey.
 
     Args:
         ax: Axes to draw on.
         values: Map (row, col).
         workspace: Workspace of the cells.
-        low: Value of the darkest colour.
-        high: Value of the brightest colour.
+        low: Value of the first colour.
+        high: Value of the last colour.
+        cmap: Colours, a name or a `Colormap` of matplotlib.
+        relief: Whether to draw contour lines of the terrain.
 
     Returns:
         Image, for a colour bar.
     """
-    ax.set_facecolor(CLOSED)
+    return _draw_map(ax, values, workspace, Normalize(low, high), cmap, relief=relief)
+
+
+def _draw_map(
+    ax: Axes,
+    values: xr.DataArray,
+    workspace: Workspace,
+    norm: Normalize,
+    cmap: str | Colormap,
+    *,
+    relief: bool,
+) -> AxesImage:
     data = np.where(workspace.passable.values, values.transpose("row", "col").values, np.nan)
+    ax.set_facecolor(theme().closed)
     extent = extent_of(workspace.grid)
-    image = ax.imshow(
-        data, cmap=COLOURS, vmin=low, vmax=high, extent=extent, interpolation="nearest"
-    )
-    draw_hillshade(ax, workspace)
+    image = ax.imshow(data, cmap=cmap, norm=norm, extent=extent, interpolation="nearest")
+    if relief:
+        draw_relief(ax, workspace)
     return image
 
 
-def draw_hillshade(
-    ax: Axes, workspace: Workspace, heights: str = "dem", *, exaggerate: float = 2.0
+def draw_relief(
+    ax: Axes,
+    workspace: Workspace,
+    heights: str = "dem",
+    colour: str = "black",
+    opacity: float = 0.22,
 ) -> None:
-    """Draw the shadows of the terrain over a map, if the terrain is in memory.
+    """Draw contour lines of the terrain, see `contours`, over a map.
 
-    `heights` is `"dem"` or `"dsm"`, `exaggerate` a factor of the slopes.
+    They are thin, and leave a map's colours as they are; a shade would change them.
     """
-    shadow = hillshade(workspace, heights, exaggerate=exaggerate)
-    if shadow is None:
-        return
-    pixels = np.zeros((*shadow.shape, 4))
-    pixels[..., 3] = shadow
-    ax.imshow(pixels, extent=extent_of(workspace.grid), interpolation="bilinear")
+    lines = contours(workspace, heights)
+    style = {"colors": colour, "alpha": opacity, "linewidths": 0.5}
+    ax.add_collection(LineCollection(lines, **style), autolim=False)
 
 
-def hillshade(
-    workspace: Workspace, heights: str = "dem", *, exaggerate: float = 2.0, most: int = 800
-) -> np.ndarray | None:
-    """Opacity of the terrain's shadows, (y, x) of some `most` pixels a side; None without one."""
+def contours(workspace: Workspace, heights: str = "dem") -> list[np.ndarray]:
+    """Contour lines of the terrain, up to a dozen levels at a round number of metres.
+
+    Args:
+        workspace: Workspace of the cells.
+        heights: `"dem"` or `"dsm"`.
+
+    Returns:
+        Lines, each (point, 2): x and y in m from the map's lower left corner. None of them on level
+        ground, or without a terrain in memory.
+    """
     terrain = workspace.terrain
     if terrain is None or workspace.pixels is None:
+        return []
+    step = -(-max(terrain[heights].shape) // _MOST_PIXELS)  # more would not be visible
+    height = terrain[heights].values[::step, ::step]
+    known = np.isfinite(height)
+    if min(height.shape) < 3 or not known.any():
+        return []
+    # Smoothed where it is known only: a normalised convolution.
+    width = max(1.0, _SMOOTH * max(height.shape))
+    weight = gaussian_filter(known.astype(float), width)
+    smooth = gaussian_filter(np.where(known, height, 0.0), width) / np.maximum(weight, 1e-9)
+    interval = contour_interval(float(np.ptp(smooth[known])))
+    if interval is None:
+        return []
+    low, high = (float(f(smooth[known])) for f in (np.min, np.max))
+    dy, dx = (float(size) for size in pixel_size(terrain))
+    _, _, _, top = extent_of(workspace.grid)
+    x = (np.arange(height.shape[1]) * step + 0.5) * dx
+    y = top - (np.arange(height.shape[0]) * step + 0.5) * dy
+    traced = contour_generator(x, y, np.ma.masked_where(~known, smooth), line_type="Separate")
+    levels = np.arange(np.ceil(low / interval), np.floor(high / interval) + 1) * interval
+    return [np.asarray(line) for level in levels for line in traced.lines(level)]
+
+
+def contour_interval(relief: float) -> float | None:
+    """Round number of metres between contour lines; None on level ground."""
+    if not relief > 0.05:
         return None
-    step = -(-max(terrain["dem"].shape) // most)  # more would not be visible
-    dem = terrain[heights].values[::step, ::step]
-    height, width = pixel_size(terrain)
-    known = np.isfinite(dem)
-    ground = np.where(known, dem, np.nanmean(dem))
-    south, east = np.gradient(exaggerate * ground, height * step, width * step)
-    # Sun in the north-west at 45 degrees. Level ground has a light of 1 and keeps the colour of the
-    # colour bar, unlike in matplotlib's shading, which stretches the light to its extremes.
-    light = (1.0 + (east + south) / np.sqrt(2.0)) / np.sqrt(1.0 + east**2 + south**2)
-    return np.where(known, SHADOW * np.clip(1.0 - light, 0.0, 1.0), 0.0)
+    magnitude = 10.0 ** np.floor(np.log10(relief / _CONTOURS))
+    return float(
+        next(f * magnitude for f in (1, 2, 5, 10) if relief / (f * magnitude) <= _CONTOURS)
+    )
 
 
-def draw_ground(ax: Axes, workspace: Workspace, heights: str = "dsm") -> None:
-    """Draw vegetation in grey under the hillshade, or the grid without a terrain.
+def draw_ground(
+    ax: Axes, workspace: Workspace, heights: str = "dsm", *, relief: bool = True
+) -> None:
+    """Draw vegetation and contour lines on a plain ground, or the grid without a terrain.
 
-    The hillshade is that of the surface, `"dsm"`, or of the ground, `"dem"`.
+    Contour lines are those of the surface, `"dsm"`, or of the ground, `"dem"`.
     """
-    terrain, grid = workspace.terrain, workspace.grid
+    terrain, grid, colours = workspace.terrain, workspace.grid, theme()
+    ax.set_facecolor(colours.ground)
     if terrain is None or workspace.pixels is None:
-        ax.set_facecolor("0.92")
         grid_lines(ax, grid)
         return
-    grown = (terrain["dsm"] - terrain["dem"]).values > _GROWN
-    extent = extent_of(grid)
-    ax.imshow(grown, cmap="Greys", vmin=0.0, vmax=3.0, extent=extent, interpolation="nearest")
-    draw_hillshade(ax, workspace, heights, exaggerate=3.0)
+    grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
+    extent, green = extent_of(grid), ListedColormap([VEGETATION])
+    ax.imshow(grown, cmap=green, extent=extent, interpolation="nearest")
+    if relief:
+        draw_relief(ax, workspace, heights, colours.contour, 1.0)
 
 
 def draw_scale(ax: Axes, grid: Grid) -> None:
@@ -247,15 +373,19 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
     draw_scale_of(ax, grid.shape[1] * grid.cell_width)
 
 
-def draw_scale_of(ax: Axes, width: float) -> None:
-    """Draw a scale bar, see `draw_scale`, on Axes `width` metres wide."""
+def draw_scale_of(ax: Axes, width: float, corner: tuple[int, int] = (1, 0)) -> None:
+    """Draw a scale bar, see `draw_scale`, on Axes `width` metres wide.
+
+    `corner` is (1, 0) for the lower right one, (0, 1) for the upper left one.
+    """
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
-    x, y = 0.96 - length / width, 0.045  # of the axes
+    share = length / width  # of the axes
+    x, y = (0.96 - share if corner[0] else 0.04), (0.87 if corner[1] else 0.045)
     (bar,) = ax.plot([x, x + length / width], [y, y], color="black", transform=ax.transAxes)
     bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=outlined(4.0))
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    text = ax.text(x, y + 0.02, label, fontsize=7, transform=ax.transAxes)
+    text = ax.text(x, y + 0.02, label, fontsize=SMALL, color="black", transform=ax.transAxes)
     text.set_path_effects(outlined(2.5))
 
 
@@ -283,17 +413,17 @@ def _extend(below: bool, above: bool) -> str:
 
 
 def _finish(
-    figure: Figure,
-    axes: np.ndarray,
+    made: Panels,
     workspace: Workspace,
     label: str,
-    limits: tuple[float, float],
-    extend: str = "neither",
+    mappable: ScalarMappable,
+    look: Style,
+    **options: Any,
 ) -> None:
     """Add the scale, labels in metres, and one colour bar for all panels."""
-    draw_scale(axes[0, 0], workspace.grid)
-    label_maps(axes)
+    draw_scale(made.panels[0], workspace.grid)
+    label_maps(made)
     if not workspace.passable.all():
-        label += " (grey: impassable)"
-    colours = ScalarMappable(Normalize(*limits), COLOURS)
-    colour_bar(figure, colours, axes, label, extend=extend, aspect=15 * len(axes))
+        label = f"{label[:-1]}; " if label.endswith(")") else f"{label} ("
+        label += "grey: impassable)"
+    colour_bar(made, mappable, label, look, **options)

@@ -1,6 +1,7 @@
 """Trust of each robot along a mission: expected, learned, and beside measured contact rates."""
 
 from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 import xarray as xr
@@ -8,15 +9,14 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.planning import QUANTILES, Plan
-from trustbo.plots.layout import as_text, lowest, plain, small_multiples
+from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
+from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
 
-OUTER, INNER, LINE = "#c6dcec", "#7fb2d6", "#003f66"
-"""Three lightnesses of one blue: the 90 % band, the 50 % band, and the line in their middle."""
-_SIZE = 2.7, 2.0
+_SIZE = 2.5, 1.9
 
 
 def mission_trust(
-    posterior: xr.DataTree, mission: int = -1, *, n_columns: int | None = None
+    posterior: xr.DataTree, mission: int = -1, **style: Unpack[StyleOptions]
 ) -> np.ndarray:
     """Draw latent trust of each robot along a mission, and the measured contact rates.
 
@@ -26,7 +26,7 @@ def mission_trust(
     Args:
         posterior: Posterior of `models.fit`, or `Result.posterior`.
         mission: Index of the mission, from 0; negative indices count from the last.
-        n_columns: Panels per row; by default three.
+        **style: Options of `Style`.
 
     Returns:
         Axes, shape (robot,).
@@ -34,7 +34,8 @@ def mission_trust(
     Raises:
         TrustboError: There is no such mission.
     """
-    latent = posterior["latent"].to_dataset()
+    require_kind("mission_trust", posterior, xr.DataTree, "a posterior, such as Result.posterior")
+    look, latent = Style.of(style), posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
     if not isinstance(mission, int | np.integer) or not -n_missions <= mission < n_missions:
         raise TrustboError(
@@ -48,15 +49,14 @@ def mission_trust(
     middle, bands = np.median(trust.values, 0), np.quantile(trust.values, QUANTILES, axis=0)
     robots = [str(name) for name in trust["robot"].values]
     named = "trust", "median"
-    return _panels(robots, trust["bound"].values, middle, bands, rates, named, n_columns)
+    return _panels(robots, trust["bound"].values, middle, bands, rates, named, look)
 
 
 def plan_trust(
     plan: Plan,
     robots: Sequence[str],
     contact_rate: np.ndarray | None = None,
-    *,
-    n_columns: int | None = None,
+    **style: Unpack[StyleOptions],
 ) -> np.ndarray:
     """Draw the expected trust of each robot along a plan, with bands over the posterior.
 
@@ -64,7 +64,7 @@ def plan_trust(
         plan: Plan over a posterior, such as `campaign.ask()` or `Result.plan`.
         robots: Names of the robots, such as `workspace.team.names`.
         contact_rate: Contact rates measured when the plan was run, shape (bound, robot), if any.
-        n_columns: Panels per row; by default three.
+        **style: Options of `Style`.
 
     Returns:
         Axes, shape (robot,).
@@ -72,7 +72,8 @@ def plan_trust(
     Raises:
         ShapeError: The number of robots or bounds differs from that of the plan.
     """
-    n_bounds, n_robots = plan.trust.shape
+    require_kind("plan_trust", plan, Plan, "a Plan, such as Result.plan or campaign.ask()")
+    look, (n_bounds, n_robots) = Style.of(style), plan.trust.shape
     if len(robots) != n_robots:
         raise ShapeError(f"the plan has {n_robots} robots; got the names {tuple(robots)}.")
     rates = np.full(plan.trust.shape, np.nan)
@@ -86,7 +87,7 @@ def plan_trust(
         rates[: len(measured)] = measured
     bounds = np.arange(1, n_bounds + 1)
     names, named = [str(robot) for robot in robots], ("expected trust", "mean")
-    return _panels(names, bounds, plan.trust, plan.bands, rates, named, n_columns)
+    return _panels(names, bounds, plan.trust, plan.bands, rates, named, look)
 
 
 def _panels(
@@ -96,31 +97,28 @@ def _panels(
     bands: np.ndarray,
     rates: np.ndarray,
     named: tuple[str, str],
-    n_columns: int | None,
+    look: Style,
 ) -> np.ndarray:
-    what, centre = named
-    figure, axes, panels = small_multiples(
-        len(robots), n_columns, _SIZE, margin=0.3, sharex=True, sharey=True
-    )
-    for i, (ax, name) in enumerate(zip(panels, robots, strict=True)):
+    (what, centre), colours = named, theme()
+    made = small_multiples(len(robots), _SIZE, look, sharex=True, sharey=True)
+    for i, ax in enumerate(made.panels):
         x, m, (low, lower, upper, high) = bounds, middle[:, i], bands[:, :, i]
         if len(x) == 1:  # a band of one bound would not be seen
             x = np.array([x[0] - 0.3, x[0] + 0.3])
             m, low, lower, upper, high = (np.repeat(v, 2) for v in (m, low, lower, upper, high))
-        ax.fill_between(x, low, high, color=OUTER, linewidth=0.0, label=f"90 % of {what}")
-        ax.fill_between(x, lower, upper, color=INNER, linewidth=0.0, label=f"50 % of {what}")
-        ax.plot(x, m, color=LINE, linewidth=1.2, label=f"{centre} of {what}")
+        ax.fill_between(x, low, high, color=colours.outer, linewidth=0.0, label=f"90 % of {what}")
+        ax.fill_between(
+            x, lower, upper, color=colours.inner, linewidth=0.0, label=f"50 % of {what}"
+        )
+        ax.plot(x, m, color=colours.line, linewidth=1.2, label=f"{centre} of {what}")
         label = "contact rate measured" if np.isfinite(rates[:, i]).any() else "_"
-        (dots,) = ax.plot(bounds, rates[:, i], "o", color="black", markersize=3.8, label=label)
-        dots.set(markeredgecolor="white", markeredgewidth=0.5)
+        (dots,) = ax.plot(bounds, rates[:, i], "o", color=colours.ink, markersize=4.0, label=label)
+        dots.set(markeredgecolor=colours.paper, markeredgewidth=0.5)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         plain(ax)
-        ax.set_title(as_text(name), fontsize=9)
-    for ax in lowest(axes):
-        ax.set_xlabel("bound", fontsize=8)
-        ax.tick_params(labelbottom=True)
-    for row in axes:
-        row[0].set_ylabel("trust, contact rate", fontsize=8)
-    keys = panels[0].get_legend_handles_labels()
-    figure.legend(*keys, loc="outside upper center", ncols=2, fontsize=7, frameon=False)
-    return panels
+    set_titles(made, robots, look)
+    label_lower(made, "bound")
+    for ax in made.left:
+        ax.set_ylabel("trust, contact rate", fontsize=SMALL)
+    legend(made, made.panels[0].get_legend_handles_labels()[0], look, ncols=2)
+    return made.panels

@@ -1,5 +1,7 @@
 """Maps of the effects of places: what was learned beyond the terrain, and how surely."""
 
+from typing import Unpack
+
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
@@ -9,8 +11,9 @@ from matplotlib.colors import Colormap, Normalize
 
 from trustbo.errors import ShapeError
 from trustbo.models import place_maps
-from trustbo.plots.layout import as_text, colour_bar, extent_of, label_maps, map_panels
-from trustbo.plots.maps import CLOSED, COLOURS, draw_hillshade, draw_scale, outlined
+from trustbo.plots.layout import colour_bar, extent_of, label_maps, map_panels, set_titles
+from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined, robust_limits
+from trustbo.plots.style import Style, StyleOptions, require_kind, theme
 from trustbo.workspace import Grid, Workspace
 from trustbo.workspace.moves import MOVES
 
@@ -26,7 +29,7 @@ _TIP, _TAIL = 0.2, 0.47
 
 
 def place_map(
-    posterior: xr.DataTree, workspace: Workspace, *, n_columns: int | None = None
+    posterior: xr.DataTree, workspace: Workspace, **style: Unpack[StyleOptions]
 ) -> np.ndarray:
     """Draw where contact is better or worse than the terrain says, and how sure that is.
 
@@ -38,7 +41,7 @@ def place_map(
         posterior: DataTree from `fit` of a model with `place=PlaceEffect()`, such as
             `Result.posterior`.
         workspace: Workspace of the cells.
-        n_columns: Panels per row, by default two.
+        **style: Options of `Style`; `cmap` is that of the standard deviation.
 
     Returns:
         Axes of the mean and of the standard deviation, shape (2,); where robots have effects of
@@ -48,7 +51,10 @@ def place_map(
         TrustboError: The model has no effects of places.
         ShapeError: The workspace has fewer cells than the posterior's grid.
     """
-    maps = place_maps(posterior)
+    such = "a posterior with places, such as Result.posterior, and a Workspace"
+    require_kind("place_map", posterior, xr.DataTree, such)
+    require_kind("place_map", workspace, Workspace, such)
+    look, maps = Style.of(style), place_maps(posterior)
     have, grid = (maps.sizes["row"], maps.sizes["col"]), workspace.grid
     if have[0] > grid.shape[0] or have[1] > grid.shape[1]:
         raise ShapeError(
@@ -59,41 +65,45 @@ def place_map(
     maps = maps if "robot" in maps.dims else maps.expand_dims("robot")
     units = posterior["places"].to_dataset()
     _, top = _ends(abs(maps), "mean", units)
-    styles = {
+    colours = {
         "mean": (Normalize(-top, top), colormaps[BETTER_WORSE]),
-        "sd": (Normalize(*_ends(maps, "sd", units)), colormaps[COLOURS]),
+        "sd": (Normalize(*_ends(maps, "sd", units)), look.colours(COLOURS)),
     }
-    titles = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
-    columns = 2 if n_columns is None else n_columns
-    figure, axes, panels = map_panels(grid, 2 * len(names), columns)
-    figure.set_figwidth(figure.get_figwidth() + 1.2 * (axes.shape[1] - 1))  # a colour bar each
+    said = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
+    made = map_panels(grid, 2 * len(names), look, columns=2, width=3.4, margin=0.0)
+    titles = []
     for i, name in enumerate(names):
         own = maps.isel(robot=i)
-        for ax, (kind, style) in zip(panels[2 * i : 2 * i + 2], styles.items(), strict=True):
-            _draw(ax, own, kind, units, i, workspace, *style)
-            title = f"{as_text(name)}: {titles[kind]}" if name else titles[kind]
-            ax.set_title(title, fontsize=9)
+        for ax, (kind, drawn) in zip(made.panels[2 * i : 2 * i + 2], colours.items(), strict=True):
+            _draw(ax, own, kind, units, i, workspace, *drawn)
+            if look.relief:
+                draw_relief(ax, workspace)
+            titles.append(f"{name}: {said[kind]}" if name else said[kind])
         if "place_mean" in own:
-            _signs(panels[2 * i], own, workspace, top)
-    draw_scale(panels[0], grid)
-    label_maps(axes)
-    labels = {"mean": "effect on trust, mean", "sd": "effect on trust, standard deviation"}
-    for k, kind in enumerate(styles):
-        colour_bar(figure, ScalarMappable(*styles[kind]), list(panels[k::2]), labels[kind])
-    return panels
+            _signs(made.panels[2 * i], own, workspace, top)
+    draw_scale(made.panels[0], grid)
+    label_maps(made)
+    set_titles(made, titles, look)
+    labels = {"mean": "effect on trust, mean", "sd": "effect on trust, sd"}
+    for k, kind in enumerate(colours):
+        of_kind = {
+            "axes": list(made.panels[k::2]),
+            "extend": "both" if kind == "mean" else "neither",
+        }
+        under = {"location": "bottom", "aspect": 24, "pad": 0.02}
+        colour_bar(made, ScalarMappable(*colours[kind]), labels[kind], look, **of_kind, **under)
+    return made.panels
 
 
 def _ends(maps: xr.Dataset, kind: str, units: xr.Dataset) -> tuple[float, float]:
-    """Least and largest value that is drawn of a kind of moment."""
+    """Robust ends of the values that are drawn of a kind of moment."""
     shown = []
     if f"place_{kind}" in maps:
         shown.append(maps[f"place_{kind}"].values.ravel())
     if f"place_bound_{kind}" in maps:
         of_bounds = maps[f"place_bound_{kind}"].transpose("robot", "move", "row", "col").values
         shown.append(of_bounds[*(units[f"bound_{n}"].values for n in _OF_BOUND)])
-    values = np.concatenate(shown)
-    low, high = float(values.min()), float(values.max())
-    return (low, high) if low < high else (low, low + 1e-6)
+    return robust_limits(np.concatenate(shown))
 
 
 def _draw(
@@ -107,7 +117,7 @@ def _draw(
     colours: Colormap,
 ) -> None:
     """Draw cells and visited bounds of one robot, or of all of them."""
-    ax.set_facecolor(CLOSED)
+    ax.set_facecolor(theme().closed)
     data = np.full(workspace.passable.shape, np.nan)
     if f"place_{kind}" in maps:
         of_cells = maps[f"place_{kind}"].transpose("row", "col").values
@@ -117,7 +127,6 @@ def _draw(
     data[~workspace.passable.values] = np.nan
     extent = extent_of(workspace.grid)
     ax.imshow(data, cmap=colours, norm=norm, extent=extent, interpolation="nearest")
-    draw_hillshade(ax, workspace)
     if f"place_bound_{kind}" in maps:
         mine = units["bound_effect"].values == effect
         move, row, col = (units[f"bound_{n}"].values[mine] for n in _OF_BOUND[1:])
@@ -152,7 +161,7 @@ def _signs(ax: Axes, maps: xr.Dataset, workspace: Workspace, top: float) -> None
             continue
         x, y = (col + 0.5) * grid.cell_width, (grid.shape[0] - row - 0.5) * grid.cell_height
         text = "+" if mean[row, col] > 0.0 else "\N{MINUS SIGN}"
-        mark = ax.text(x, y, text, fontsize=size, ha="center", va="center", zorder=4)
+        mark = ax.text(x, y, text, fontsize=size, ha="center", va="center", zorder=4, color="black")
         if sure[row, col]:
             mark.set_path_effects(outlined(1.2))
         else:

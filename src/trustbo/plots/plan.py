@@ -1,7 +1,7 @@
 """A plan on its terrain, bound by bound: stops of the lead, posts of T2, sight lines and ways."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,16 +10,26 @@ from matplotlib.patches import Patch
 
 from trustbo.errors import TrustboError
 from trustbo.planning import Plan
-from trustbo.plots.layout import MARKERS, as_text, extent_of, small_multiples
+from trustbo.plots.layout import (
+    MARKERS,
+    as_text,
+    extent_of,
+    legend,
+    set_titles,
+    small_multiples,
+)
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
+from trustbo.plots.style import Style, StyleOptions, require_kind, theme
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours of Okabe and Ito (2008), by robot; in grey, markers tell robots apart."""
 _DASHED = (0, (3, 1.5))
+_ROOM = (0.5, 0.2)
+"""Room of a scale bar in its corner, shares of the axes."""
 
 
 def plan_map(
-    plan: Plan, *, bounds: Sequence[int] | None = None, n_columns: int | None = None
+    plan: Plan, *, bounds: Sequence[int] | None = None, **style: Unpack[StyleOptions]
 ) -> np.ndarray:
     """Draw what robots are to do, an overview of the path, then each bound.
 
@@ -30,7 +40,7 @@ def plan_map(
     Args:
         plan: Plan on a terrain in memory, such as `Result.plan`.
         bounds: Numbers of the bounds to draw, from 1; by default all.
-        n_columns: Panels per row; by default three, or two if there are four.
+        **style: Options of `Style`.
 
     Returns:
         Axes, shape (1 + bound,).
@@ -38,6 +48,8 @@ def plan_map(
     Raises:
         TrustboError: The workspace has no terrain in memory, or there is no such bound.
     """
+    require_kind("plan_map", plan, Plan, "a Plan, such as Result.plan or campaign.ask()")
+    look = Style.of(style)
     if plan.waypoints is None:
         raise TrustboError(
             "plan_map needs a plan on a workspace made with Workspace.from_terrain of a terrain in "
@@ -47,25 +59,26 @@ def plan_map(
     shown = list(range(1, n_bounds + 1)) if bounds is None else list(bounds)
     if not set(shown) <= set(range(1, n_bounds + 1)):
         raise TrustboError(f"bounds must be some of 1..{n_bounds}; got {bounds!r}.")
-    figure, _, panels = small_multiples(1 + len(shown), n_columns, (2.3, 2.5))
-    whole, *others = panels
-    _stage(whole, plan, f"path of {n_bounds} bounds")
+    made = small_multiples(1 + len(shown), (2.5, 2.5), look)
+    whole, *others = made.panels
+    titles = [f"path of {n_bounds} bounds"]
+    _stage(whole, plan, look)
     draw_path(whole, plan.path, plan.workspace.grid)
     draw_scale(whole, plan.workspace.grid)
     for ax, k in zip(others, shown, strict=True):
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
-        _stage(ax, plan, f"bound {k}: {a},{b} to {c},{d}")
+        titles.append(f"bound {k}: {a},{b} to {c},{d}")
+        _stage(ax, plan, look)
         _draw_bound(ax, plan, k - 1)
-    handles = _legend(plan.workspace.team.names)
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    return panels
+    set_titles(made, titles, look)
+    legend(made, _keys(plan.workspace.team.names), look)
+    return made.panels
 
 
-def _stage(ax: Axes, plan: Plan, title: str) -> None:
-    draw_ground(ax, plan.workspace, "dem")
+def _stage(ax: Axes, plan: Plan, look: Style) -> None:
+    draw_ground(ax, plan.workspace, "dem", relief=look.relief)
     left, right, bottom, top = extent_of(plan.workspace.grid)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
-    ax.set_title(title, fontsize=9)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
@@ -77,24 +90,42 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
     stops = waypoints[k : k + 2] - corner
     seen = [stops, posts[k] - corner, *(way for way in (lead, *closing) if way is not None)]
     if lead is not None:
-        ax.plot(*lead.T, color="black", linewidth=2.6, zorder=3)
+        ax.plot(*lead.T, color=theme().ink, linewidth=2.6, zorder=3)
     for i, (post, way) in enumerate(zip(posts[k] - corner, closing, strict=True)):
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
         if way is not None:
-            ax.plot(*way.T, color="white", linewidth=2.2, zorder=4)
+            ax.plot(*way.T, color=theme().paper, linewidth=2.2, zorder=4)
             ax.plot(*way.T, color=colour, linewidth=1.4, linestyle=_DASHED, zorder=4)
             ax.plot(*way[-1], marker, **_open(colour), zorder=6)
         ax.plot(*np.stack([post, stops[1]]).T, color=colour, linewidth=0.8, zorder=5)
         ax.plot(*post, marker, **_filled(colour), zorder=7)
-    ax.plot(*stops.T, "*", **_filled("black", 11), linestyle="none", zorder=6)
+    ax.plot(*stops.T, "*", **_filled(theme().ink, 11), linestyle="none", zorder=6)
     low, high = (f(np.concatenate(seen), axis=0) for f in (np.min, np.max))
-    half, (x, y) = 0.56 * float((high - low).max()) + 2.0, (low + high) / 2.0
-    ax.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
-    draw_scale_of(ax, 2.0 * half)
+    half = 0.56 * float((high - low).max()) + 2.0
+    left, right, bottom, top = extent_of(plan.workspace.grid)
+    x, width = _window((low + high)[0] / 2.0, half, left, right)
+    y, height = _window((low + high)[1] / 2.0, half, bottom, top)
+    ax.set(xlim=(x, x + width), ylim=(y, y + height))
+    draw_scale_of(ax, width, _free_corner((np.concatenate(seen) - (x, y)) / (width, height)))
 
 
-def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
-    black = _filled("black", 11)
+def _free_corner(points: np.ndarray) -> tuple[int, int]:
+    """Corner of the axes (right, upper) with the fewest of points (point, 2), in axes' units."""
+
+    def n_points(corner: tuple[int, int]) -> int:
+        return int((np.abs(points - corner) < _ROOM).all(1).sum())
+
+    return min(((1, 0), (0, 0), (1, 1), (0, 1)), key=n_points)
+
+
+def _window(middle: float, half: float, low: float, high: float) -> tuple[float, float]:
+    """Left end and width of a window around a point, moved to be inside the map."""
+    width = min(2.0 * half, high - low)
+    return float(np.clip(middle - width / 2.0, low, high - width)), width
+
+
+def _keys(names: Sequence[str]) -> list[Line2D | Patch]:
+    black, colours = _filled(theme().ink, 11), theme()
     handles: list[Line2D | Patch] = [
         Line2D([], [], marker="*", linewidth=2.6, label="lead: stops, way", **black)
     ]
@@ -104,15 +135,16 @@ def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
         handles.append(Line2D([], [], marker=marker, linestyle=_DASHED, label=label, **style))
     return [
         *handles,
-        Line2D([], [], marker="o", linestyle="none", label="next post", **_open("0.3")),
-        Line2D([], [], color="0.3", linewidth=0.8, label="sight line"),
+        Line2D([], [], marker="o", linestyle="none", label="next post", **_open(colours.quiet)),
+        Line2D([], [], color=colours.quiet, linewidth=0.8, label="sight line"),
         Patch(facecolor=VEGETATION, label="vegetation"),
     ]
 
 
 def _filled(colour: str, size: float = 6.0) -> dict[str, Any]:
-    return {"color": colour, "markersize": size, "markeredgecolor": "white", "markeredgewidth": 0.7}
+    edge = theme().paper
+    return {"color": colour, "markersize": size, "markeredgecolor": edge, "markeredgewidth": 0.7}
 
 
 def _open(colour: str) -> dict[str, Any]:
-    return {"markersize": 5.0, "markerfacecolor": "white", "markeredgecolor": colour}
+    return {"markersize": 5.0, "markerfacecolor": theme().paper, "markeredgecolor": colour}

@@ -1,15 +1,24 @@
 """Regret of policies, mission by mission, over many runs."""
 
 from collections.abc import Sequence
+from typing import Unpack
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.plots.layout import DASHES, MARKERS, small_multiples
+from trustbo.plots.layout import (
+    DASHES,
+    MARKERS,
+    label_lower,
+    legend,
+    plain,
+    set_titles,
+    small_multiples,
+)
+from trustbo.plots.style import SMALL, Style, StyleOptions, curve_colours, theme
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Quantiles over the runs: ends of the thin bars, of the thick bars, and the marker."""
@@ -26,6 +35,7 @@ def regret_curves(
     by: str = "policy",
     panels: str | None = None,
     variable: str = "regret",
+    **style: Unpack[StyleOptions],
 ) -> np.ndarray:
     """Draw the regret of a study after each mission: its median and its spread over the runs.
 
@@ -37,6 +47,7 @@ def regret_curves(
         by: Coordinate of the runs with a value for each curve.
         panels: Coordinate of the runs with a value for each panel, such as `"terrain"`.
         variable: Variable to draw, `"regret"` or `"regret_followed"`.
+        **style: Options of `Style`; `cmap` is that of the curves.
 
     Returns:
         Axes, shape (panel,).
@@ -46,6 +57,7 @@ def regret_curves(
             of the study knows the truth.
     """
     require_choice("variable", variable, _MEANING)
+    look = Style.of(style)
     if not isinstance(dataset, xr.Dataset):
         raise TrustboError(
             "regret_curves takes a study's dataset, from study.load_study; got a "
@@ -62,32 +74,29 @@ def regret_curves(
         )
     names = list(dict.fromkeys(dataset[by].values.tolist()))
     values = [None] if panels is None else list(dict.fromkeys(dataset[panels].values.tolist()))
-    width = min(1.0 + 0.16 * len(names) * regret.sizes["mission"], 7.5)
-    size, n = (max(width, 2.5), 3.6), len(values)
-    figure, _, axes = small_multiples(n, n, size, margin=2.2, sharey=True)
-    for ax, value in zip(axes, values, strict=True):
+    width = min(1.0 + 0.16 * len(names) * regret.sizes["mission"], 6.5)
+    size, n, titles = (max(width, 2.5), 3.2), len(values), []
+    made = small_multiples(n, size, look, columns=n, least=2.2, sharey=True)
+    for ax, value in zip(made.panels, values, strict=True):
         chosen = regret if value is None else regret[dataset[panels].values == value]
-        _draw(ax, chosen, names, by)
+        _draw(ax, chosen, names, by, look)
         n_runs = [int(np.sum(chosen[by].values == name)) for name in names]
         counted = "-".join(str(n) for n in sorted({min(n_runs), max(n_runs)}))
-        title = "" if value is None else f"{panels} {value}, "
-        ax.set_title(f"{title}{counted} runs each", fontsize=9, loc="left")
-    axes[0].set_ylabel(f"{_MEANING[variable]},\n% of the contact that the best keeps")
-    axes[0].set_ylim(bottom=-0.03 * axes[0].get_ylim()[1])  # shows markers at 0 whole
-    # Beside the panels, so that it covers no curve.
-    figure.legend(
-        *axes[0].get_legend_handles_labels(),
-        title=f"{by}: median,\n50 % and 90 % of runs",
-        loc="outside right upper",
-        alignment="left",
-        frameon=False,
-    )
-    return axes
+        titles.append(f"{'' if value is None else f'{panels} {value}, '}{counted} runs each")
+    set_titles(made, titles, look)
+    label_lower(made, "mission")
+    first = made.panels[0]
+    first.set_ylabel(f"{_MEANING[variable]},\n% of the contact that the best keeps", fontsize=SMALL)
+    first.set_ylim(bottom=-0.03 * first.get_ylim()[1])  # shows markers at 0 whole
+    # Below the panels, so that it covers no curve.
+    keys = first.get_legend_handles_labels()[0]
+    said = f"{by}: median, 50 % and 90 % of runs"
+    legend(made, keys, look, title=said, title_fontsize=SMALL, ncols=min(len(keys), 4))
+    return made.panels
 
 
-def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str) -> None:
-    mission = regret["mission"].values
-    shades = colormaps["viridis"](np.linspace(0.0, 0.8, len(names)))
+def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str, look: Style) -> None:
+    mission, shades, colours = regret["mission"].values, curve_colours(len(names), look), theme()
     # Side by side; shaded bands would cover each other.
     dodge = np.linspace(-0.5, 0.5, len(names)) * _SPREAD if len(names) > 1 else [0.0]
     for i, name in enumerate(names):
@@ -101,10 +110,9 @@ def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str) -> N
         ax.vlines(place, ends[1], ends[3], linewidth=3.2, **own_style)
         (curve,) = ax.plot(place, ends[2], linewidth=1.1, label=str(name), **own_style)
         curve.set(linestyle=DASHES[i % len(DASHES)], marker=MARKERS[i % len(MARKERS)])
-        curve.set(markersize=6.0, markeredgecolor="white", markeredgewidth=0.6)
+        curve.set(markersize=6.0, markeredgecolor=colours.paper, markeredgewidth=0.6)
     for k in mission[::2]:
-        ax.axvspan(k - 0.5, k + 0.5, color="0.955", linewidth=0.0, zorder=0)
+        ax.axvspan(k - 0.5, k + 0.5, color=colours.band, alpha=0.4, linewidth=0.0, zorder=0)
     ax.set_xlim(mission[0] - 0.5, mission[-1] + 0.5)
-    ax.set_xlabel("mission")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.spines[["top", "right"]].set_visible(False)
+    plain(ax)

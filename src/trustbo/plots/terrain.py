@@ -1,11 +1,12 @@
 """Terrain, the indices of its pixels, and their composition."""
 
 from collections.abc import Mapping
+from typing import Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import Normalize
 
 from trustbo.errors import TrustboError
 from trustbo.plots.layout import (
@@ -16,9 +17,11 @@ from trustbo.plots.layout import (
     label_maps,
     map_panels,
     plain,
+    set_titles,
     small_multiples,
 )
-from trustbo.plots.maps import CLOSED, COLOURS, draw_hillshade, draw_scale
+from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined
+from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace import Workspace
 
@@ -26,7 +29,7 @@ AGREES, OPPOSES = "#0072b2", "#d55e00"
 """Blue and vermilion of Okabe and Ito (2008): safe for the colour-blind."""
 
 
-def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.ndarray:
+def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndarray:
     """Draw the surface and the index of each feature, Fig. 4 of the paper.
 
     A feature of bounds, such as line of sight, is the mean over robots and over the bounds into a
@@ -34,7 +37,7 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
 
     Args:
         workspace: Workspace made from a terrain in memory.
-        n_columns: Panels per row; by default all in one.
+        **style: Options of `Style`; `cmap` is that of the indices.
 
     Returns:
         Axes, shape (1 + feature,).
@@ -42,48 +45,57 @@ def terrain_maps(workspace: Workspace, *, n_columns: int | None = None) -> np.nd
     Raises:
         TrustboError: The workspace has no terrain, or one that is read lazily.
     """
-    terrain, pixels = workspace.terrain, workspace.pixels
+    require_kind("terrain_maps", workspace, Workspace, "a Workspace")
+    look, terrain, pixels = Style.of(style), workspace.terrain, workspace.pixels
     if terrain is None or pixels is None:
         raise TrustboError(
             "terrain_maps needs a workspace made with Workspace.from_terrain of a terrain in "
             "memory; coarsen a lazily read one first."
         )
     grid, names = workspace.grid, workspace.features
-    n_panels = 1 + len(names)
-    figure, axes, panels = map_panels(
-        grid, n_panels, n_panels if n_columns is None else n_columns, width=3.3
-    )
-    extent = extent_of(grid)
+    made = map_panels(grid, 1 + len(names), look)
+    extent, colours = extent_of(grid), look.colours(COLOURS)
     dsm = terrain["dsm"].values
-    surface, *indices = panels
+    surface, *indices = made.panels
     heights = Normalize(float(np.nanmin(dsm)), float(np.nanmax(dsm)))
     surface.imshow(dsm, cmap="cividis", norm=heights, extent=extent)
-    surface.set_title("surface (DSM)", fontsize=9)
-    colour_bar(figure, ScalarMappable(heights, "cividis"), surface, "height (m)")
     of_cells = workspace.awareness.mean("robot")
     for ax, name in zip(indices, names, strict=True):
-        index = pixels[name] if name in pixels else of_cells.sel(feature=name)
-        ax.imshow(index.values, cmap=COLOURS, vmin=0, vmax=1, extent=extent)
-        ax.set_title(as_text(name), fontsize=9)
-    steep = np.isfinite(dsm) & ~pixels["passable"].values
-    closed = np.where(steep, 1.0, np.nan)
-    indices[0].imshow(closed, cmap=ListedColormap([CLOSED]), extent=extent, interpolation="nearest")
-    for ax in panels:
-        ax.set_facecolor("white")
-        draw_hillshade(ax, workspace, "dsm" if ax is surface else "dem")
+        index = pixels[name].values if name in pixels else of_cells.sel(feature=name).values
+        if ax is indices[0] and name in pixels:
+            index = np.where(pixels["passable"].values, index, np.nan)
+        ax.set_facecolor(theme().closed)
+        ax.imshow(index, cmap=colours, vmin=0, vmax=1, extent=extent, interpolation="nearest")
+    for ax in made.panels:
+        if look.relief:
+            draw_relief(ax, workspace)
         grid_lines(ax, grid)
     draw_scale(surface, grid)
+    set_titles(made, ["surface (DSM)", *(name.replace("_", " ") for name in names)], look)
+    label_maps(made)
     label = "index (0 worst, 1 best; grey: too steep)"
-    colour_bar(figure, ScalarMappable(Normalize(0, 1), COLOURS), indices, label)
-    label_maps(axes)
-    return panels
+    colour_bar(made, ScalarMappable(Normalize(0, 1), colours), label, look)
+    # Inside, so that the panels keep one size.
+    if look.legend:
+        inset = surface.inset_axes((0.04, 0.05, 0.35, 0.05))
+        bar = made.figure.colorbar(
+            ScalarMappable(heights, "cividis"), cax=inset, orientation="horizontal"
+        )
+        ends = float(np.nanmin(dsm)), float(np.nanmax(dsm))
+        bar.set_ticks(ends, labels=[f"{ends[0]:.0f}", f"{ends[1]:.0f} m"])
+        inset.xaxis.set_ticks_position("top")
+        inset.tick_params(labelsize=SMALL, length=0, pad=1)
+        for text in inset.get_xticklabels():
+            text.set(path_effects=outlined(2.0), color="black")
+    return made.panels
 
 
-def loadings(composites: Mapping[str, CompositeIndex]) -> np.ndarray:
+def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOptions]) -> np.ndarray:
     """Draw the loadings of each composite, one bar per feature.
 
     Args:
         composites: Fitted composites by name, such as `Workspace.composites`.
+        **style: Options of `Style`.
 
     Returns:
         Axes, shape (composite,).
@@ -91,32 +103,44 @@ def loadings(composites: Mapping[str, CompositeIndex]) -> np.ndarray:
     Raises:
         TrustboError: There are no composites.
     """
+    require_kind("loadings", composites, Mapping, "composites by name, `Workspace.composites`")
+    look = Style.of(style)
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")
     most = max(len(index.signs) for index in composites.values())
-    size = 3.4, 0.9 + 0.3 * most
-    _, _, panels = small_multiples(len(composites), len(composites), size, sharex=True)
-    for ax, (name, index) in zip(panels, composites.items(), strict=True):
-        _bars(ax, index)
-        share = float(index.explained_variance_ratio_[0])
-        ax.set_title(f"{as_text(name)}: {share:.0%} of the variance", fontsize=9)
-    return panels
+    made = small_multiples(
+        len(composites),
+        (3.6, 1.0 + 0.3 * most),
+        look,
+        columns=len(composites),
+        least=2.2,
+        sharex=True,
+    )
+    for ax, index in zip(made.panels, composites.values(), strict=True):
+        _bars(ax, index, legend=look.legend)
+    shares = [float(index.explained_variance_ratio_[0]) for index in composites.values()]
+    set_titles(
+        made,
+        [f"{n}: {share:.0%} of the variance" for n, share in zip(composites, shares, strict=True)],
+        look,
+    )
+    return made.panels
 
 
-def _bars(ax: Axes, index: CompositeIndex) -> None:
+def _bars(ax: Axes, index: CompositeIndex, *, legend: bool) -> None:
     values, signs = index.loadings_.values, np.array(list(index.signs.values()))
     agrees = values * signs >= 0.0
     names = [as_text(name.replace("_", " ")) for name in index.signs]
     for which, colour, hatch in ((agrees, AGREES, ""), (~agrees, OPPOSES, "///")):
         label = "as declared" if colour == AGREES else "against its sign"
         rows = np.flatnonzero(which)
-        ax.barh(rows, values[rows], color=colour, hatch=hatch, edgecolor="white", label=label)
+        ax.barh(rows, values[rows], color=colour, hatch=hatch, edgecolor=theme().paper, label=label)
     ax.invert_yaxis()
-    ax.axvline(0.0, color="black", linewidth=0.8)
+    ax.axvline(0.0, color=theme().ink, linewidth=0.8)
     ax.set_xlim(-1.0, 1.0)
     ax.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
-    ax.set_xlabel("loading", fontsize=8)
+    ax.set_xlabel("loading", fontsize=SMALL)
     plain(ax)
-    ax.set_yticks(np.arange(len(names)), names, fontsize=8)
-    if not agrees.all():
-        ax.legend(fontsize=7, frameon=False)
+    ax.set_yticks(np.arange(len(names)), names, fontsize=SMALL)
+    if legend and not agrees.all():
+        ax.legend(fontsize=SMALL, frameon=False)

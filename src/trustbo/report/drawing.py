@@ -1,4 +1,4 @@
-"""Figures as images embedded in a page."""
+"""Figures as images embedded in a page, dark where the reader's page is dark."""
 
 import base64
 import io
@@ -13,6 +13,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from PIL import Image as Raster
 from PIL import features
 
+from trustbo.plots.style import DARK, LIGHT
 from trustbo.report.blocks import Picture
 
 _PIXELS = 96
@@ -30,22 +31,33 @@ _STYLE: dict[Any, Any] = {
 
 def picture(draw: Callable[[], Axes | np.ndarray], alt: str, caption: str) -> Picture:
     """Make a picture of the figure that `draw` draws; `alt` is for those who cannot see it."""
-    axes = draw()
-    first = axes if isinstance(axes, Axes) else axes.ravel()[0]
-    figure = first.get_figure(root=True)
-    assert figure is not None  # noqa: S101
-    figure.set_facecolor("white")
-    figure.set_dpi(_DOTS)
     file = io.BytesIO()
-    with plt.rc_context(_STYLE):
+    with plt.rc_context(LIGHT.settings() | _STYLE):
+        axes = draw()
+        first = axes if isinstance(axes, Axes) else axes.ravel()[0]
+        figure = first.get_figure(root=True)
+        assert figure is not None  # noqa: S101
+        figure.set_dpi(_DOTS)
         # The same bytes as of `savefig`, which draws once more to know its layout.
         FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None})
     plt.close(figure)
     width, height = (round(_PIXELS * inches) for inches in figure.get_size_inches())
     svg = _PNG.sub(_smaller, file.getvalue().decode("utf-8"))
-    svg = _BETWEEN.sub("><", _DIGITS.sub(r"\1", svg))
+    svg = themed(_BETWEEN.sub("><", _DIGITS.sub(r"\1", svg)))
     text = base64.b64encode(svg.encode("utf-8")).decode("ascii")
     return Picture(alt, caption, f"data:image/svg+xml;base64,{text}", width, height)
+
+
+def themed(svg: str) -> str:
+    """Replace the colours of the light theme by names, whose values follow the reader's setting."""
+    light, dark = (
+        "".join(f"--{name}:{colour};" for name, colour in theme._asdict().items())
+        for theme in (LIGHT, DARK)
+    )
+    for name, colour in LIGHT._asdict().items():
+        svg = svg.replace(f": {colour}", f": var(--{name})")
+    style = f":root{{{light}}}@media (prefers-color-scheme: dark){{:root{{{dark}}}}}"
+    return svg.replace("<defs>", f"<style>{style}</style><defs>", 1)
 
 
 def _smaller(png: re.Match[str]) -> str:

@@ -1,7 +1,5 @@
 """Figures of a page, each with its caption and its description."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from trustbo import plots
@@ -12,37 +10,24 @@ from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
 from trustbo.report.numbers import counted, joined, number
 
-MOST_MAPS = 11
-"""Number of missions with a map; of longer campaigns the first, the last, and some between."""
 MOST_BOUNDS = 3
 """Number of bounds with a map of posts and ways: the first, the last, and some between."""
 MOST_PARAMETERS = 30
 
 
 def trust_maps(result: Result) -> Picture:
-    """Draw the trust map and the path of each mission."""
+    """Draw the trust map and the path at a few moments of the campaign."""
     n = result.history.sizes["iteration"]
-    shown = np.unique(np.linspace(0, n - 1, min(n, MOST_MAPS)).round().astype(int))
-    some = replace(result, history=result.history.isel(iteration=shown))
-
-    def draw():
-        axes = some.plot_maps()
-        axes[-1].set_title(f"after {counted(n, 'mission')}", fontsize=9)
-        return axes
-
     low, high = _ends(result.trust_map)
     n_changes = int(result.history["path_changed"].sum())
-    caption = (
-        "Expected trust with which each cell can be reached, as each mission's path (white, from "
-        "circle to star) was planned, and after the last. The first map comes from the prior."
-    )
-    if len(shown) < n:
-        caption += f" {len(shown)} of the {n} missions are shown."
     return picture(
-        draw,
-        f"{len(shown) + 1} maps of expected trust. After the last mission trust goes from {low} to "
-        f"{high}. Over {counted(n, 'mission')} the path changed {counted(n_changes, 'time')}.",
-        caption,
+        result.plot_maps,
+        f"Maps of expected trust from the prior to the end. After the last mission trust goes from "
+        f"{low} to {high}. Over {counted(n, 'mission')} the path changed "
+        f"{counted(n_changes, 'time')}.",
+        "Expected trust with which each cell can be reached, and the path planned on it (white, "
+        "from circle to star): from the prior, and as missions taught it. All maps have one scale, "
+        "from the 2 % to the 98 % quantile; 1 is the trust of unbroken contact.",
     )
 
 
@@ -116,11 +101,10 @@ def robot_costs(result: Result) -> Picture:
     alike = bool(np.allclose(cost.values, cost.values[:1], equal_nan=True))
     shown = cost.isel(robot=slice(1)) if alike else cost
 
+    title = "every robot" if alike else None
+
     def draw():
-        axes = plots.robot_maps(shown, result.workspace, path=result.path, label="cost")
-        if alike:
-            axes[0].set_title("every robot", fontsize=9)
-        return axes
+        return plots.robot_maps(shown, result.workspace, path=result.path, title=title)
 
     low, high = _ends(shown)
     names = joined([str(name) for name in cost["robot"].values])

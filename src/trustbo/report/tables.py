@@ -16,7 +16,8 @@ def bounds_table(result: Result) -> Table:
     """Tabulate the recommended path: expected trust of each robot after each bound."""
     plan, names = result.plan, result.workspace.team.names
     low, high = plan.bands[0], plan.bands[-1]
-    places = max(decimals_for(float(np.median(high - low)) / 3.3), 2)  # 90 % is +- 1.65 sd
+    # One digit of the sd, where 90 % is +- 1.65 sd.
+    places = min(max(decimals_for(float(np.median(high - low)) / 3.3) - 1, 2), 3)
 
     def trust(k: int, i: int) -> str:
         ends = f"{number(low[k, i], places)} to {number(high[k, i], places)}"

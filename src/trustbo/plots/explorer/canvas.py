@@ -1,21 +1,17 @@
 """Figures of the interactive page as Bokeh models, which the page's script fills."""
 
-import base64
-import io
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex
-from PIL import Image, features
 
 from trustbo.errors import TrustboError
 from trustbo.planning import QUANTILES
 from trustbo.plots.explorer.scene import Scene
-from trustbo.plots.layout import extent_of
-from trustbo.plots.maps import CLOSED, COLOURS, hillshade
-from trustbo.plots.mission import INNER
+from trustbo.plots.maps import COLOURS, contours
 from trustbo.plots.plan import COLOURS as ROBOTS
+from trustbo.plots.style import LIGHT
 
 MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "star", "plus", "x")
 """Markers by robot, in Bokeh's names."""
@@ -47,7 +43,7 @@ def robot_marks(n: int) -> list[tuple[str, str]]:
 
 
 def draw_map(scene: Scene) -> Any:
-    """Make the figure of the map: cells under the hillshade, the path, posts, and what is chosen.
+    """Make the figure of the map: cells under contour lines, the path, posts, and what is chosen.
 
     The page's script sets its height, so that the map has its proportions at any width.
     Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
@@ -66,11 +62,11 @@ def draw_map(scene: Scene) -> Any:
     )  # fmt: skip
     cells = _source("cells", x=[], y=[], value=[])
     mapper = models.LinearColorMapper(name="colours", palette=palette(COLOURS), low=0.0, high=1.0)
-    mapper.nan_color = to_hex(CLOSED)
+    mapper.nan_color = LIGHT.closed
     field = {"field": "value", "transform": mapper}
     drawn = plot.rect("x", "y", source=cells, fill_color=field, line_color=field, **size)
     plot.x_range.renderers = plot.y_range.renderers = [drawn]
-    _draw_hillshade(plot, scene)
+    _draw_relief(plot, scene)
     _draw_path(plot)
     focus = {"fill_color": None, "line_color": "#ffffff", "line_width": 2}
     shadow = focus | {"line_color": "#000000", "line_width": 4}
@@ -133,7 +129,7 @@ def draw_chart(scene: Scene) -> Any:
     plot.vspan("bound", source=chosen, line_color="#e0b400", line_width=10, line_alpha=0.45)
     trust = _source("trust", bound=[], **{f"q{i}": [] for i in range(len(QUANTILES) + 1)})
     for inner, outer, alpha in (("q0", "q4", 0.35), ("q1", "q3", 0.6)):
-        plot.varea("bound", inner, outer, source=trust, fill_color=INNER, fill_alpha=alpha)
+        plot.varea("bound", inner, outer, source=trust, fill_color=LIGHT.inner, fill_alpha=alpha)
     plot.line("bound", "q2", source=trust, line_width=2, name="median")
     rates = _source("rates", bound=[], rate=[], marker=[], colour=[])
     plot.scatter(
@@ -143,21 +139,14 @@ def draw_chart(scene: Scene) -> Any:
     return _plain(plot)
 
 
-def _draw_hillshade(plot: Any, scene: Scene) -> None:
-    """Draw the shadows of the terrain, where there is one, as an image that shades the cells."""
-    shadow = hillshade(scene.workspace, exaggerate=1.0, most=500)
-    if shadow is None:
-        return
-    left, right, bottom, top = extent_of(scene.workspace.grid)
-    kind = "WEBP" if features.check("webp") else "PNG"
-    file = io.BytesIO()
-    pixels = np.zeros((*shadow.shape, 4), dtype=np.uint8)
-    pixels[..., 3] = np.round(255.0 * shadow)
-    Image.fromarray(pixels).save(file, kind, quality=80)
-    uri = f"data:image/{kind.lower()};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
-    plot.image_url(
-        [uri], x=left, y=top, w=right - left, h=top - bottom, anchor="top_left", name="hillshade"
-    )
+def _draw_relief(plot: Any, scene: Scene) -> None:
+    """Draw the contour lines of the terrain, where there is one."""
+    lines = contours(scene.workspace)
+    if lines:
+        xs, ys = ([line[:, axis].round(1).tolist() for line in lines] for axis in (0, 1))
+        plot.multi_line(
+            xs, ys, line_color="#000000", line_alpha=0.25, line_width=0.7, name="relief"
+        )
 
 
 def _source(name: str, **columns: Any) -> Any:

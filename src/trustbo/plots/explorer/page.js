@@ -219,9 +219,9 @@ async function start() {
     const drawn = part(name)
     if (drawn !== null) drawn.visible = event.target.checked
   })
-  toggle("shade", "hillshade")
+  toggle("relief", "relief")
   toggle("posts", "post marks")
-  if (part("hillshade") === null) at("shade").parentElement.remove()
+  if (part("relief") === null) at("relief").parentElement.remove()
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint)
   const shape = Math.min((rows * cellHeight) / (cols * cellWidth), 1.35)
   const fitMap = () => { // 62 and 128 pixels are of axes, tools and the colour bar

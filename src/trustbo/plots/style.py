@@ -1,0 +1,171 @@
+"""Appearance that all figures share: colours on light and dark paper, and the options of a user."""
+
+import difflib
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple, Self, TypedDict
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, to_hex, to_rgb
+
+from trustbo.errors import TrustboError, require_positive, require_whole
+
+SMALL, MEDIUM = 8.0, 9.0
+"""Sizes of text, points: of numbers and keys, and of labels and titles."""
+
+
+class Theme(NamedTuple):
+    """Colours of all that is no value: hexadecimal, each once, so that one can replace another."""
+
+    ink: str
+    """Text, frames, and what was measured."""
+    paper: str
+    """Background."""
+    quiet: str
+    """References, such as a prior or a line at 0."""
+    band: str
+    """Area where a sound model stays."""
+    line: str
+    """Middle of a posterior."""
+    inner: str
+    """Half of a posterior."""
+    outer: str
+    """Nine tenths of a posterior."""
+    odd: str
+    """Points outside their band."""
+    ground: str
+    """Bare ground under robots."""
+    contour: str
+    """Lines of equal height on it."""
+    closed: str
+    """Cells and pixels that cannot be entered."""
+
+    def settings(self) -> dict[Any, Any]:
+        """Settings for `matplotlib.rc_context` or `plt.style.use`."""
+        inked = (
+            "text.color", "axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "xtick.color",
+            "ytick.color", "xtick.labelcolor", "ytick.labelcolor", "hatch.color",
+        )  # fmt: skip
+        papers = "figure.facecolor", "axes.facecolor", "savefig.facecolor", "legend.facecolor"
+        return {name: self.ink for name in inked} | {name: self.paper for name in papers}
+
+
+LIGHT = Theme(
+    "#1c1f22", "#fcfcfa", "#8c9196", "#dfe2e4", "#00416b", "#7fb2d6", "#c6dcec", "#c1272d",
+    "#f1f0ec", "#a9aaa4", "#bcbfc2",
+)  # fmt: skip
+DARK = Theme(
+    "#e6e7e8", "#16181a", "#8f959b", "#34393e", "#d8ecfb", "#4c86b0", "#23455e", "#ff6b5e",
+    "#26282a", "#57595a", "#5b6066",
+)  # fmt: skip
+
+
+def theme() -> Theme:
+    """Theme of the figure to be drawn: that of the background in matplotlib's settings.
+
+    Text and frames follow the settings themselves, such as those of `plt.style.use`.
+    """
+    paper = to_rgb(mpl.rcParams["axes.facecolor"])
+    ours = LIGHT if luminance(paper) > 0.5 else DARK
+    return ours._replace(ink=to_hex(mpl.rcParams["text.color"]), paper=to_hex(paper))
+
+
+def luminance(colour: Any) -> float:
+    """Luma of a colour, 0 black to 1 white (ITU-R BT.601)."""
+    return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
+
+
+class StyleOptions(TypedDict, total=False):
+    """Keyword arguments of every figure; see `Style`."""
+
+    ax: Any
+    n_columns: int | None
+    width: float | None
+    cmap: str | Colormap | None
+    title: str | None
+    legend: bool
+    relief: bool
+
+
+@dataclass(frozen=True)
+class Style:
+    """Options that every figure takes as keyword arguments.
+
+    Attributes:
+        ax: Axes to draw on, one for each panel, in an array or a list; by default a new figure.
+        n_columns: Panels per row of a new figure.
+        width: Width of a new figure, inches: 3.5 is a column of a journal's page. Text stays of 8
+            points or more, and there are fewer panels per row.
+        cmap: Colours of values or curves, a name or a `Colormap` of matplotlib.
+        title: Title of a figure of one panel, or above all panels of a new figure; `""` for none.
+        legend: Whether to draw the legend or the colour bar.
+        relief: Whether to draw contour lines of the terrain on maps.
+
+    Raises:
+        TrustboError: An option is unknown, or its value cannot be.
+    """
+
+    ax: Any = None
+    n_columns: int | None = None
+    width: float | None = None
+    cmap: str | Colormap | None = None
+    title: str | None = None
+    legend: bool = True
+    relief: bool = True
+
+    def __post_init__(self) -> None:
+        if self.n_columns is not None:
+            require_whole("n_columns", self.n_columns, 1)
+        if self.width is not None:
+            require_positive("width", self.width)
+        for name in ("legend", "relief"):
+            if not isinstance(getattr(self, name), bool | np.bool_):
+                raise TrustboError(f"{name} must be True or False; got {getattr(self, name)!r}.")
+        if self.title is not None and not isinstance(self.title, str):
+            raise TrustboError(f"title must be text; got {self.title!r}.")
+        self.colours("viridis")
+
+    @classmethod
+    def of(cls, options: StyleOptions) -> Self:
+        """Check the keyword arguments of a figure."""
+        known = [f.name for f in fields(cls)]
+        for name in options:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"did you mean {near[0]}=?" if near else f"choose of {', '.join(known)}."
+                raise TrustboError(f"unknown option {name}=; {hint}")
+        return cls(**options)
+
+    def colours(self, default: str | Colormap) -> Colormap:
+        """Colour map of the user, or a default one."""
+        chosen = default if self.cmap is None else self.cmap
+        try:
+            return colormaps.get_cmap(chosen)
+        except (ValueError, TypeError):
+            raise TrustboError(
+                f"unknown cmap {chosen!r}; give a name of matplotlib.colormaps, such as 'viridis', "
+                "or a Colormap."
+            ) from None
+
+    def axes(self, n: int) -> np.ndarray:
+        """Axes of the user, shape (n,)."""
+        given = np.atleast_1d(np.asarray(self.ax, dtype=object)).ravel()
+        if not all(isinstance(ax, Axes) for ax in given):
+            raise TrustboError(f"ax must be matplotlib Axes; got a {type(self.ax).__name__}.")
+        if len(given) < n:
+            raise TrustboError(f"this figure has {n} panels, and ax {len(given)}; give {n} Axes.")
+        return given[:n]
+
+
+def curve_colours(n: int, style: Style) -> np.ndarray:
+    """Colours of n curves that can be told from the paper, also in grey; shape (n, 4)."""
+    dark = theme().paper != LIGHT.paper and luminance(theme().paper) < 0.5
+    return style.colours("viridis")(np.linspace(*((0.35, 1.0) if dark else (0.0, 0.8)), max(n, 1)))
+
+
+def require_kind(function: str, value: object, kinds: type | tuple[type, ...], such: str) -> None:
+    """Refuse another kind of object than a figure draws; `such` names one, for the TrustboError."""
+    if not isinstance(value, kinds):
+        raise TrustboError(f"plots.{function} takes {such}; got a {type(value).__name__}.")

@@ -1,0 +1,169 @@
+"""Options that every figure takes, and colours that follow the paper."""
+
+import re
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.text import Text
+
+import trustbo as tb
+from trustbo import plots
+from trustbo.plots.style import luminance, theme
+
+
+@pytest.fixture(scope="module")
+def figures(result):
+    """Every figure of a result as a function of its options, and its number of panels."""
+    workspace, posterior = result.workspace, result.posterior
+    mean = tb.models.params_of(posterior).mean()
+    cost = result.planner.cost_map(mean, per_robot=True)
+    share = result.planner.path_posterior(posterior, n_draws=100)
+    p_fail = result.planner.problem.risk.p_fail
+    found = tb.models.criticise(posterior, result.missions, compare=False)
+    ranks = tb.models.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
+    names = workspace.team.names
+    drawn = {
+        "trust_maps": (lambda **o: result.plot_maps(**o), 3),
+        "robot_maps": (lambda **o: plots.robot_maps(cost, workspace, result.path, **o), 3),
+        "path_posterior": (lambda **o: plots.path_posterior(share, workspace, **o), 1),
+        "hazard_map": (lambda **o: plots.hazard_map(p_fail, workspace, **o), 1),
+        "terrain_maps": (lambda **o: plots.terrain_maps(workspace, **o), 4),
+        "loadings": (lambda **o: plots.loadings(workspace.composites, **o), 2),
+        "place_map": (lambda **o: plots.place_map(posterior, workspace, **o), 2),
+        "plan_map": (lambda **o: plots.plan_map(result.plan, bounds=[1], **o), 2),
+        "plan_trust": (lambda **o: plots.plan_trust(result.plan, names, **o), 3),
+        "mission_trust": (lambda **o: plots.mission_trust(posterior, **o), 3),
+        "parameter_history": (lambda **o: plots.parameter_history(result.posteriors, **o), 10),
+        "campaign_history": (lambda **o: plots.campaign_history(result.history, **o), 2),
+        "criticism": (lambda **o: plots.criticism(found, **o), 9),
+        "calibration": (lambda **o: plots.calibration(ranks, **o), 2),
+    }
+    return drawn
+
+
+NAMES = (
+    "trust_maps", "robot_maps", "path_posterior", "hazard_map", "terrain_maps", "loadings",
+    "place_map", "plan_map", "plan_trust", "mission_trust", "parameter_history",
+    "campaign_history", "criticism", "calibration",
+)  # fmt: skip
+MAPS = NAMES[:5]
+
+
+def keys_of(figure):
+    """Legends and colour bars."""
+    bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
+    inside = [ax.get_legend() for ax in figure.axes if ax.get_legend() is not None]
+    return [*figure.legends, *bars, *inside]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_figure_is_drawn_on_the_axes_that_it_is_given(figures, name):
+    draw, n = figures[name]
+    figure, axes = plt.subplots(1, n + 1, figsize=(2.0 * n, 2.0))
+    returned = np.ravel(draw(ax=list(axes[:n]), legend=False))
+    assert [ax is given for ax, given in zip(returned, axes[:n], strict=True)] == [True] * n
+    assert plt.get_fignums() == [figure.number]
+    assert not axes[n].has_data()
+    assert len(figure.axes) == n + 1  # no colour bar
+    with pytest.raises(tb.TrustboError, match=rf"this figure has {n} panels, and ax 0; give {n}"):
+        draw(ax=[])
+    with pytest.raises(tb.TrustboError, match="ax must be matplotlib Axes; got a Figure"):
+        draw(ax=figure)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_legend_can_be_left_out_and_a_title_written(figures, name):
+    draw, n = figures[name]
+    with_keys = np.ravel(draw())[0].figure
+    assert keys_of(with_keys) or name == "loadings"  # whose bars all agree here
+    axes = np.ravel(draw(legend=False, title="costs $1"))
+    assert keys_of(axes[0].figure) == []
+    suptitle = axes[0].figure.get_suptitle()
+    assert (axes[0].get_title() if n == 1 else suptitle) == r"costs \$1"
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_colours_of_maps_are_the_user_s(figures, name):
+    ax = np.ravel(figures[name][0](cmap="magma"))[-1]
+    assert ax.images[0].get_cmap().name == "magma"
+    with pytest.raises(tb.TrustboError, match="unknown cmap 'magmaa'; give a name"):
+        figures[name][0](cmap="magmaa")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_text_can_be_read_in_a_column_of_3_5_inches(figures, name):
+    figure = np.ravel(figures[name][0](width=3.5))[0].figure
+    assert figure.get_figwidth() == 3.5
+    texts = [t for t in figure.findobj(Text) if t.get_text() and t.get_visible()]
+    signs = {"+", "\N{MINUS SIGN}"}  # of places, as large as their cells
+    assert min(t.get_fontsize() for t in texts if t.get_text() not in signs) >= 8.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_on_dark_paper_text_and_lines_are_light(figures, name):
+    with plt.rc_context(plots.DARK.settings()):
+        figure = np.ravel(figures[name][0]())[0].figure
+        figure.canvas.draw()
+    assert to_hex(figure.get_facecolor()) == plots.DARK.paper
+    for ax in figure.axes:
+        for text in (ax.title, ax.xaxis.label, ax.yaxis.label, *ax.get_xticklabels()):
+            if text.get_text() and not text.get_path_effects():
+                assert luminance(text.get_color()) > 0.5, text
+
+
+def test_the_theme_is_that_of_the_user_s_paper():
+    with plt.style.context("dark_background"):
+        assert (theme().line, theme().ink, theme().paper) == (
+            plots.DARK.line, "#ffffff", "#000000",
+        )  # fmt: skip
+    with plt.style.context("default"):
+        assert (theme().line, theme().ink, theme().paper) == (
+            plots.LIGHT.line, "#000000", "#ffffff",
+        )  # fmt: skip
+
+
+def test_no_two_colours_of_a_theme_are_alike():
+    """The report replaces each by the other theme's: it must be known which it is."""
+    for colours in (plots.LIGHT, plots.DARK):
+        assert len(set(colours)) == len(colours)
+        assert all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in colours)
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ({"titel": "a"}, r"unknown option titel=; did you mean title=\?"),
+        ({"colour": "a"}, "unknown option colour=; choose of ax, n_columns"),
+        ({"width": -1.0}, "width must be positive and finite; got -1.0"),
+        ({"legend": "no"}, "legend must be True or False; got 'no'"),
+        ({"title": 3}, "title must be text; got 3"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_in_a_line(result, option, message):
+    with pytest.raises(tb.TrustboError, match=message):
+        plots.mission_trust(result.posterior, **option)
+
+
+def test_a_wrong_argument_is_said_in_a_line(result):
+    wrong = {
+        "mission_trust": (result.missions[0],),
+        "plan_map": (result.workspace,),
+        "plan_trust": (result, ["r1"]),
+        "place_map": (result, result.workspace),
+        "trust_maps": (result, result.trust_map, result.path, result.workspace),
+        "robot_maps": (result.posterior, result.workspace),
+        "path_posterior": (result.posterior, result.workspace),
+        "parameter_history": (result.posterior,),
+        "campaign_history": (result,),
+        "terrain_maps": (result,),
+        "loadings": (result.workspace,),
+        "criticism": (result,),
+        "calibration": (result,),
+        "animate_mission": (result.workspace, result.missions[0]),
+    }
+    for name, arguments in wrong.items():
+        said = rf"plots\.{name} takes .*; got a {type(arguments[0]).__name__}\.$"
+        with pytest.raises(tb.TrustboError, match=said):
+            getattr(plots, name)(*arguments)
