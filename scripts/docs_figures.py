@@ -1,4 +1,6 @@
-"""Draw the figures of the documentation on light and dark paper: those of docs/gallery.md, and more.
+"""Draw the figures of the documentation on light and dark paper.
+
+They are those of docs/gallery.md by its own code, and a few more.
 
 The figures of long campaigns and of reliability are of the tables that `benchmarks/campaigns.py
 --csv` and `benchmarks/failures.py --csv` wrote. Run: python scripts/docs_figures.py [name ...]

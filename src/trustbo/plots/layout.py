@@ -130,7 +130,7 @@ def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
 
 
 def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: Any) -> None:
-    """Add a colour bar, unless left out; a label longer than the figure is high is broken.
+    """Add a colour bar, unless left out; a label longer than the bar beside it is broken.
 
     `axes=` are those it belongs to, by default all panels.
     """
@@ -140,8 +140,11 @@ def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: An
     rows = -(-len(axes) // made.columns)
     shape = {"aspect": 14 * min(rows, 3), "shrink": 0.95, "pad": 0.02}
     bar = made.figure.colorbar(image, ax=axes, **shape | options)
-    height = sum(ax.get_position().height for ax in axes[:: made.columns]) * _inches(made.figure)
-    bar.set_label(textwrap.fill(label, max(18, int(_LETTERS * height))), fontsize=SMALL)
+    if "location" not in options:
+        shares = [ax.get_position().height for ax in axes[:: made.columns]]
+        letters = int(_LETTERS * sum(shares) * _inches(made.figure))
+        label = textwrap.fill(label, max(18, letters))
+    bar.set_label(label, fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
 
 
