@@ -118,6 +118,13 @@ def test_the_program_names_its_commands_and_its_version(invoke):
     assert invoke("--version").output.startswith("trustbo 0.")
 
 
+@pytest.mark.parametrize("command", [(), *((command,) for command in COMMANDS)])
+def test_help_gives_flags_without_a_value_no_type(command, invoke):
+    shown = invoke(*command, "--help").output
+    assert "--help" in shown
+    assert "bool" not in shown.lower()
+
+
 def test_help_of_export_names_every_format(invoke):
     shown = invoke("export", "--help").output
     assert all(re.search(rf"\b{name}\b", shown) for name in FORMATS)
@@ -135,6 +142,13 @@ def test_help_of_export_names_every_format(invoke):
         (["export"], 2, "error: missing arguments FOLDER, --format.\nhint: trustbo export "),
         (["report"], 2, "error: missing argument FOLDER.\nhint: trustbo report --help "),
         (["run", "--robots", "two"], 2, "error: Invalid value for '--robots': "),
+        (
+            ["run", "--itertions", "3"],
+            2,
+            "error: unknown option --itertions; did you mean --iterations?\nhint: trustbo run ",
+        ),
+        (["run", "--dme", "x"], 2, "error: unknown option --dme; did you mean --dem?\n"),
+        (["run", "--zz"], 2, "error: unknown option --zz.\nhint: trustbo run --help "),
         (["fly"], 2, "error: No such command 'fly'.\nhint: trustbo --help "),
         (["report", "nowhere"], 2, "error: 'nowhere' holds no result;"),
         (["--version"], 0, ""),

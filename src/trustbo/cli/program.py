@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from trustbo.cli.campaigns import demo, resume, run
 from trustbo.cli.errors import BAD_INPUT, complain
@@ -26,7 +27,28 @@ _PANELS = (
     ("Studies", (study, worlds)),
 )
 
+
+class _PlainFlags:
+    """Help of a command without the type of flags that take no value, which Typer calls <bool>."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        params = super().get_params(ctx)  # pyright: ignore[reportAttributeAccessIssue]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+        return params
+
+
+class _Command(_PlainFlags, TyperCommand):
+    pass
+
+
+class _Program(_PlainFlags, TyperGroup):
+    pass
+
+
 app = typer.Typer(
+    cls=_Program,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -35,7 +57,8 @@ app = typer.Typer(
 )
 for panel, commands in _PANELS:
     for command in commands:
-        app.command(rich_help_panel=panel, epilog=EPILOG.strip())(with_flags(command))
+        kept = {"cls": _Command, "rich_help_panel": panel, "epilog": EPILOG.strip()}
+        app.command(**kept)(with_flags(command))
 
 
 def _show_version(asked: bool) -> None:
@@ -73,8 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        said = _missing(error) or _of_file(error) or str(error.format_message())
-        complain(said, f"{name} --help lists commands and flags.")
+        said = _missing(error) or _of_file(error) or _unknown_option(error)
+        complain(said or str(error.format_message()), f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)
 
@@ -91,6 +114,17 @@ def _missing(error: Any) -> str:
     ]
     kind = "argument" if any(not name.startswith("-") for name in lacking) else "option"
     return f"missing {kind}{'s' * (len(lacking) > 1)} {', '.join(lacking)}."
+
+
+def _unknown_option(error: Any) -> str:
+    """Name the option nearest to an unknown one; for other errors, nothing."""
+    near = getattr(error, "possibilities", None)  # the nearest first
+    if near is None or not hasattr(error, "option_name"):
+        return ""
+    typed = error.option_name
+    swapped = [name for name in near if sorted(name) == sorted(typed)]  # the usual slip
+    advice = f"; did you mean {(swapped or near)[0]}?" if near else "."
+    return f"unknown option {typed}{advice}"
 
 
 def _of_file(error: Any) -> str:
