@@ -1,14 +1,20 @@
 """What importing trustbo costs and touches."""
 
+import re
 import subprocess
 import sys
 import tomllib
-from importlib import resources
+from importlib import import_module, resources
 from pathlib import Path
 
 import pytest
 
 import trustbo
+from trustbo.errors import pip_install
+
+ROOT = Path(__file__).resolve().parents[1]
+PARTS = ("export", "logs", "models", "planning", "plots", "report", "simulation", "study",
+         "terrain", "workspace")  # fmt: skip
 
 
 def printed(program):
@@ -29,8 +35,7 @@ def test_importing_loads_nothing_heavy():
 
 def test_type_checkers_are_told_that_it_is_typed():
     assert resources.files("trustbo").joinpath("py.typed").is_file()
-    root = Path(__file__).resolve().parents[1]
-    build = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
+    build = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]
     assert build["targets"]["wheel"] == {"packages": ["src/trustbo"]}  # all files in it
 
 
@@ -61,3 +66,39 @@ def test_numpyro_works_whatever_was_imported_first(before):
         "import numpyro; numpyro.factor; numpyro.distributions.distribution.Unit\n"
     )
     assert printed(program) == "False float32\n(1, 3, 2)"
+
+
+@pytest.mark.parametrize("name", ["trustbo", *(f"trustbo.{part}" for part in PARTS)])
+def test_completion_lists_public_names_alone(name):
+    module = import_module(name)
+    for public in module.__all__:
+        assert getattr(module, public) is not None  # loads what is loaded lazily
+    assert sorted(dir(module)) == sorted(module.__all__)
+
+
+def test_a_missing_package_is_named_itself_and_is_one_of_an_extra():
+    """pip finds `trustbo[ros]` only where trustbo is on an index."""
+    sources = [file.read_text() for file in (ROOT / "src" / "trustbo").rglob("*.py")]
+    assert [text for text in sources if re.search(r"pip install \S*trustbo\[", text)] == []
+    named = set(re.findall(r"pip_install\('([\w-]+)", "".join(sources)))
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    offered = {
+        re.match(r"[\w-]+", requirement)[0]
+        for packages in extras["optional-dependencies"].values()
+        for requirement in packages
+    }
+    assert named >= {"rosbags", "laspy", "mujoco"}
+    assert named <= offered
+
+
+def test_the_command_that_installs_a_package_names_the_python_that_runs(tmp_path, monkeypatch):
+    python = tmp_path / "clone" / ".venv" / "bin" / "python"
+    python.parent.mkdir(parents=True)
+    python.touch(mode=0o755)
+    monkeypatch.setattr(sys, "executable", str(python))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert pip_install("rosbags") == f"{python} -m pip install rosbags"
+    monkeypatch.chdir(tmp_path / "clone")
+    assert pip_install("laspy[lazrs]") == ".venv/bin/python -m pip install 'laspy[lazrs]'"
+    monkeypatch.setenv("PATH", str(python.parent))  # as an activated environment does
+    assert pip_install("rosbags") == "python -m pip install rosbags"

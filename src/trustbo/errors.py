@@ -2,7 +2,12 @@
 
 import math
 import operator
+import os
+import shlex
+import shutil
+import sys
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class TrustboError(ValueError):
@@ -32,6 +37,20 @@ class PosteriorError(TrustboError):
     def __init__(self, reason: str, posterior: object = None, remedy: str = "") -> None:
         super().__init__(f"{reason} {remedy}".rstrip())
         self.posterior, self.reason = posterior, reason.rstrip(".")
+
+
+def pip_install(*packages: str) -> str:
+    """Command that installs packages of the registry for the running Python.
+
+    Packages are named themselves, as `trustbo[ros]` is unknown to pip where trustbo was installed
+    from a clone; and Python by its path, if the shell's `python` is another.
+    """
+    python, of_shell = Path(sys.executable), shutil.which("python")
+    if of_shell is not None and Path(of_shell).parent == python.parent:
+        python = "python"
+    elif python.is_relative_to(Path.cwd()):
+        python = python.relative_to(Path.cwd())
+    return shlex.join([os.fspath(python), "-m", "pip", "install", *packages])
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:

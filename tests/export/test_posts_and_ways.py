@@ -186,7 +186,7 @@ def test_a_post_says_what_it_watches(plan, workspace):
 def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
     plan, planner, params, workspace, tmp_path
 ):
-    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+    pytest.importorskip("rosbags", reason="needs the extra ros")
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 

@@ -14,7 +14,7 @@ from trustbo.errors import TrustboError
 from trustbo.export import write_ros_bag
 from trustbo.export.ros import occupancy
 
-rosbags = pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+rosbags = pytest.importorskip("rosbags", reason="needs the extra ros")
 
 
 class Bytes:
@@ -199,6 +199,6 @@ def test_what_makes_no_bag_is_refused(result, maps, tmp_path):
 
 def test_without_rosbags_the_extra_is_named(result, maps, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(TrustboError, match=r'ROS bags need rosbags: pip install "trustbo\[ros\]"'):
+    with pytest.raises(TrustboError, match=r"ROS bags need rosbags: .* pip install rosbags$"):
         write_ros_bag(tmp_path / "path", result.plan, maps["cost"], result.workspace)
     assert list(tmp_path.iterdir()) == []

@@ -20,7 +20,7 @@ from trustbo.logs.bag import Topics, read_bag, write_bag
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replay import ReplaySimulator
 
-rosbags = pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+rosbags = pytest.importorskip("rosbags", reason="needs the extra ros")
 PATH = ((2, 0), (1, 1), (0, 2))
 FORMATS = [("log.bag", {}), ("log", {}), ("log", {"storage": "mcap"})]
 S = 1_000_000_000  # ns
@@ -301,7 +301,7 @@ def test_stamps_begin_now_or_when_they_are_told_to(tmp_path):
 def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    message = r'ROS bags need rosbags: pip install "trustbo\[ros\]"'
+    message = r"ROS bags need rosbags: .* pip install rosbags$"
     with pytest.raises(TrustboError, match=message):
         read_bag(tmp_path / "log")
     with pytest.raises(TrustboError, match=message):

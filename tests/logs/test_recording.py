@@ -9,7 +9,7 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.logs.bag import Topics, read_bag
 
-rosbags = pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+rosbags = pytest.importorskip("rosbags", reason="needs the extra ros")
 S = 1_000_000_000  # ns
 
 

@@ -99,7 +99,7 @@ def test_without_poses_there_is_nothing_to_show(result, tmp_path):
 def test_an_mp4_without_ffmpeg_says_what_to_do(result, mission, tmp_path, monkeypatch):
     monkeypatch.setattr(writers, "is_available", lambda name: False)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    message = r'an \.mp4 needs ffmpeg: .* pip install "trustbo\[video\]"; a \.gif does not'
+    message = r"an \.mp4 needs ffmpeg: .*-m pip install imageio-ffmpeg; a \.gif does not"
     with pytest.raises(tb.TrustboError, match=message):
         tb.plots.animate_mission(mission, result.workspace, tmp_path / "mission.mp4")
     animation = tb.plots.animate_mission(mission, result.workspace, fps=1)

@@ -3,7 +3,6 @@
 import html
 import json
 import re
-import sys
 import time
 
 import numpy as np
@@ -119,14 +118,6 @@ def test_a_notebook_shows_the_page_in_a_frame_and_a_terminal_a_line(explorer, tm
     assert (tmp_path / "page.html").read_text(encoding="utf-8") == explorer.html
     with pytest.raises(tb.TrustboError, match=r"'.*page.txt' must end in \.html"):
         explorer.save(tmp_path / "page.txt")
-
-
-def test_without_bokeh_one_line_says_how_to_install_it(result, monkeypatch):
-    monkeypatch.setitem(sys.modules, "bokeh", None)
-    with pytest.raises(
-        tb.TrustboError, match=r'^explore needs Bokeh: pip install "trustbo\[notebook\]"\.$'
-    ):
-        result.explore()
 
 
 def test_layers_that_do_not_fit_are_left_out_and_named(result, monkeypatch):

@@ -5,7 +5,6 @@ import dataclasses
 import html
 import html.parser
 import re
-import sys
 
 import numpy as np
 import pytest
@@ -142,20 +141,13 @@ def test_the_page_is_whole_and_needs_nothing_else(page, text):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_the_interactive_page_is_a_file_beside_it_where_bokeh_is_installed(
-    result, tmp_path, monkeypatch
-):
+def test_the_interactive_page_is_a_file_beside_it(result, tmp_path):
     text = write(result, tmp_path)
     assert '<a href="explore.html">' in text
     assert (tmp_path / "explore.html").stat().st_size < 5e6
     write_report(tmp_path / "north.html", result)
     assert '<a href="north-explore.html">' in (tmp_path / "north.html").read_text()
     assert (tmp_path / "north-explore.html").exists()
-    monkeypatch.setitem(sys.modules, "bokeh", None)
-    (tmp_path / "without").mkdir()
-    without = write(result, tmp_path / "without")
-    assert 'pip install "trustbo[notebook]"' in html.unescape(without)
-    assert [file.name for file in (tmp_path / "without").iterdir()] == ["report.html"]
 
 
 def test_figures_have_text_as_outlines_and_need_no_other_file(page):

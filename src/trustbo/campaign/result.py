@@ -224,12 +224,11 @@ class Result(Displayed):
         it as one HTML file that needs no network.
 
         Raises:
-            TrustboError: Bokeh is not installed, or nothing could be learned yet.
+            TrustboError: Nothing could be learned yet.
         """
         from trustbo.campaign.exploring import scene_of  # imports matplotlib
-        from trustbo.plots.explorer import draw_explorer, require_bokeh
+        from trustbo.plots.explorer import draw_explorer
 
-        require_bokeh()  # before the maps, which take a while
         return draw_explorer(scene_of(self, self.maps()))
 
     def save(self, directory: FilePath) -> None:

@@ -51,12 +51,12 @@ def run(
     Example: trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
     The same, with flags in a file: trustbo run --config mission.yaml --seed 2 --out out/second
 
-    The folder gets report.html (read this first), maps.png, terrain.png, maps.tif
-    with its style maps.qml and path.geojson (for QGIS; with each robot's posts and
-    ways), posterior.nc (for ArviZ), history.csv, and the other files that
-    trustbo.load_result reads in Python. After Ctrl-C or a power cut, trustbo
-    resume goes on. A campaign in the folder is not replaced: give another --out,
-    or --overwrite.
+    The folder gets report.html (read this first), explore.html (interactive),
+    maps.png, terrain.png, maps.tif with its style maps.qml and path.geojson (for
+    QGIS; with each robot's posts and ways), posterior.nc (for ArviZ), history.csv,
+    and the other files that trustbo.load_result reads in Python. After Ctrl-C or
+    a power cut, trustbo resume goes on. A campaign in the folder is not replaced:
+    give another --out, or --overwrite.
     """
     with one_line_errors(debug, campaign=out):
         _require_names(policy, objective, model, sampler, sight, iterations=iterations, seed=seed)
@@ -112,9 +112,9 @@ def demo(
 
     Example: trustbo demo --sampler exact --iterations 4 --out out/demo
 
-    Then open out/demo/report.html. The objective is the contact lost on the way,
-    which every bound changes; the paper's, terminal, is trust at the goal, which
-    depends on the last few bounds.
+    Then open out/demo/report.html, which links to explore.html, interactive. The
+    objective is the contact lost on the way, which every bound changes; the
+    paper's, terminal, is trust at the goal, which depends on the last few bounds.
     """
     from trustbo.files import write_file
     from trustbo.terrain.example import example_files

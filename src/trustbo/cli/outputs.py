@@ -51,7 +51,7 @@ def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
     from trustbo import plots
     from trustbo.report import write_report
 
-    written = ["report.html", "maps.png"]
+    written = ["report.html", "explore.html", "maps.png"]
     write_figure(out / "maps.png", result.plot_maps())
     on_terrain = result.workspace.terrain is not None
     if on_terrain and result.workspace.pixels is not None:
@@ -61,8 +61,7 @@ def write_outputs(result: "Result", out: Path, *, table: bool) -> None:
         from trustbo.export import export_result
 
         written += [file.name for file in export_result(result, out, ("geotiff", "geojson"))]
-    _, *others = write_report(out / "report.html", result)
-    written += [file.name for file in others]
+    write_report(out / "report.html", result)
     if table:
         _print_table(result)
     print(f"results are in {out}/: {', '.join(written)},")

@@ -16,8 +16,8 @@ def report(
     Example: trustbo report out/demo --out demo.html
 
     The page needs no network and no other file. For a campaign that was
-    interrupted, it shows the missions learned from until then. With Bokeh,
-    pip install "trustbo[notebook]", an interactive page is written beside it.
+    interrupted, it shows the missions learned from until then. It links to an
+    interactive page beside it, explore.html (demo-explore.html for demo.html).
     """
     with one_line_errors(debug):
         from trustbo.campaign.result import load_result
@@ -27,10 +27,9 @@ def report(
         from trustbo.report import write_report
 
         file = folder / "report.html" if out is None else Path(out)
-        _, *others = write_report(file, result, title=title)
+        _, explorer = write_report(file, result, title=title)
         print(f"the report is {file}")
-        for other in others:
-            print(f"the interactive page is {other}")
+        print(f"the interactive page is {explorer}")
 
 
 def export(

@@ -10,3 +10,4 @@ __all__ = [
     "FORMATS", "export_result", "path_frame", "write_csv", "write_geotiff", "write_netcdf",
     "write_path", "write_ros_bag", "write_ros_map",
 ]  # fmt: skip
+__dir__ = __all__.copy  # completion lists public names alone

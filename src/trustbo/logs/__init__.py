@@ -15,3 +15,4 @@ __all__ = [
     "write_missions",
     "write_table",
 ]
+__dir__ = __all__.copy  # completion lists public names alone

@@ -1,6 +1,6 @@
 """Missions in ROS bags: `.bag` files of ROS 1, folders of ROS 2 (sqlite3 or mcap).
 
-Needs `pip install "trustbo[ros]"`, not ROS itself. All types are standard; topics, their types and
+Needs `pip install rosbags`, not ROS itself. All types are standard; topics, their types and
 times of publication are tabulated in docs/howto/your-own-robots.md, and can be renamed (`Topics`).
 
 All times are those of recording, whole nanoseconds. A bound lasts from its marker to its status,

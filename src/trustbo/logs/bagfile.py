@@ -11,13 +11,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, pip_install
 from trustbo.files import naming_refusal
 from trustbo.logs.messages import CONTACT_TYPES, POSE_TYPES, READERS, Messages, stamp_of
 from trustbo.logs.recording import Series
 
 STORAGES = ("sqlite3", "mcap")
-_NO_ROSBAGS = 'ROS bags need rosbags: pip install "trustbo[ros]".'
+
+
+def _no_rosbags() -> TrustboError:
+    return TrustboError(f"ROS bags need rosbags: {pip_install('rosbags')}")
 
 
 class Record(NamedTuple):
@@ -107,7 +110,7 @@ def opened(path: Path) -> Iterator[Bag]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise TrustboError(_NO_ROSBAGS) from None
+        raise _no_rosbags() from None
     if not path.exists():
         raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
     try:
@@ -128,7 +131,7 @@ def require_new_bag(path: Path, version: int | None) -> int:
     TrustboError: no rosbags; another version asked for; the path exists.
     """
     if importlib.util.find_spec("rosbags") is None:
-        raise TrustboError(_NO_ROSBAGS)
+        raise _no_rosbags()
     of_path = 1 if path.suffix == ".bag" else 2
     if version not in (None, of_path):
         raise TrustboError(
@@ -160,7 +163,7 @@ def write_messages(
         from rosbags import rosbag1, rosbag2
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise TrustboError(_NO_ROSBAGS) from None
+        raise _no_rosbags() from None
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     serialize = store.serialize_ros1 if version == 1 else store.serialize_cdr
     with naming_refusal(path.parent):

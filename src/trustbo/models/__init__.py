@@ -74,3 +74,4 @@ __all__ = [
     "sample_statistics",
     "sbc",
 ]
+__dir__ = __all__.copy  # completion lists public names alone

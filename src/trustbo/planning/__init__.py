@@ -14,3 +14,4 @@ __all__ = [
     "OBJECTIVES", "POLICIES", "QUANTILES", "DrawnPaths", "Dynamics", "InfeasibleError",
     "NoPathError", "PathRisk", "Plan", "Planner", "Policy", "policies", "roll_trust",
 ]  # fmt: skip
+__dir__ = __all__.copy  # completion lists public names alone

@@ -28,3 +28,4 @@ __all__ = [
     "path_posterior", "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps",
     "terrain_maps", "trust_maps",
 ]  # fmt: skip
+__dir__ = __all__.copy  # completion lists public names alone

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch, Rectangle
 from scipy.ndimage import uniform_filter1d
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.errors import TrustboError, pip_install, require_choice, require_positive
 from trustbo.files import FilePath, write_file
 from trustbo.plots.layout import as_text, extent_of, plain
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
@@ -244,13 +244,13 @@ def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
 
 
 def _ffmpeg() -> str:
-    """Return the path of ffmpeg: on the PATH, or in the package of the extra `video`."""
+    """Return the path of ffmpeg: on the PATH, or in the package imageio-ffmpeg."""
     if writers.is_available("ffmpeg"):
         return str(mpl.rcParams["animation.ffmpeg_path"])
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError:
         raise TrustboError(
-            'an .mp4 needs ffmpeg: install it, or pip install "trustbo[video]"; a .gif does not.'
+            f"an .mp4 needs ffmpeg: {pip_install('imageio-ffmpeg')}; a .gif does not."
         ) from None
     return get_ffmpeg_exe()

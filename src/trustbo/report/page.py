@@ -1,7 +1,6 @@
 """Page of a result: one HTML file that needs no other."""
 
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import jinja2
@@ -20,10 +19,9 @@ from trustbo.report.summary import facts_of
 def write_report(path: FilePath, result: Result, *, title: str | None = None) -> list[Path]:
     """Write a result as one HTML page with its figures; equal results give equal bytes.
 
-    Where Bokeh is installed (`pip install "trustbo[notebook]"`), the interactive page of
-    `Result.explore` is written beside it, and linked to: `explore.html` beside `report.html`,
-    `north-explore.html` beside `north.html`. It is a second file because Bokeh's library, 1.4 MB,
-    would take the page beyond the 3 MB that it may have.
+    The interactive page of `Result.explore` is written to the same folder, and linked to:
+    `explore.html` for `report.html`, `north-explore.html` for `north.html`. It is a second file
+    because Bokeh's library, 1.4 MB, would take the page beyond the 3 MB that it may have.
 
     Args:
         path: HTML file to write, or to replace; ends in .html or .htm.
@@ -31,7 +29,7 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
         title: Title of the page; by default it has the number of missions.
 
     Returns:
-        Files written, the page first.
+        The two files written, the page first.
 
     Raises:
         TrustboError: The result has no mission, or the file cannot be written.
@@ -39,11 +37,9 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     target = require_file(path, ".html", ".htm")
     if not result.missions:
         raise TrustboError("the result has no mission; run one first.")
-    explorer = None
-    if find_spec("bokeh") is not None:
-        own = "explore.html" if target.name == "report.html" else f"{target.stem}-explore.html"
-        explorer = require_file(target.with_name(own))
-        result.explore().save(explorer)
+    own = "explore.html" if target.name == "report.html" else f"{target.stem}-explore.html"
+    explorer = require_file(target.with_name(own))
+    result.explore().save(explorer)
     name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("trustbo.report", "."),
@@ -56,11 +52,11 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
         title=name,
         facts=facts_of(result),
         sections=list(_sections(result)),
-        explorer=explorer and explorer.name,
+        explorer=explorer.name,
         version=result.settings.get("trustbo_version", VERSIONS["trustbo"]),
     )
     write_text(target, page)
-    return [target] if explorer is None else [target, explorer]
+    return [target, explorer]
 
 
 def _sections(result: Result) -> Iterator[Section]:

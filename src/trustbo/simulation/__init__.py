@@ -12,3 +12,4 @@ __all__ = [
     "BoundSimulator", "Degradation", "KinematicSimulator", "ModelSimulator", "MujocoSimulator",
     "ReplaySimulator", "Simulator", "Threat", "Truth",
 ]  # fmt: skip
+__dir__ = __all__.copy  # completion lists public names alone

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, pip_install
 from trustbo.team import Robot
 from trustbo.workspace.surface import Surface, filled
 
@@ -210,7 +210,7 @@ def require_mujoco() -> ModuleType:
     try:
         import mujoco
     except ImportError:
-        raise TrustboError('MujocoSimulator needs MuJoCo: pip install "trustbo[mujoco]".') from None
+        raise TrustboError(f"MujocoSimulator needs MuJoCo: {pip_install('mujoco')}") from None
     return mujoco
 
 

@@ -11,3 +11,4 @@ __all__ = [
     "Study", "World", "failures", "load_study", "read_study", "run_study", "run_worlds",
     "summary", "worlds", "worlds_table",
 ]  # fmt: skip
+__dir__ = __all__.copy  # completion lists public names alone

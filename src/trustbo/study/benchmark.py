@@ -11,7 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, pip_install, require_choice, require_whole
 from trustbo.files import FilePath
 from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.study.conduct import run_runs
@@ -166,8 +166,7 @@ def _available(baselines: Sequence[str]) -> list[str]:
     left_out = [name for name in baselines if name == "botorch" and find_spec(name) is None]
     if left_out:
         warnings.warn(
-            "the baseline botorch is left out: BoTorch is not installed; pip install "
-            '"trustbo[bench]".',
+            f"the baseline botorch is left out: BoTorch is not installed; {pip_install('botorch')}",
             stacklevel=3,
         )
     return [name for name in baselines if name not in left_out]

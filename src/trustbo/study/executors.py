@@ -7,7 +7,7 @@ from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExec
 from contextlib import contextmanager
 from typing import Any
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, pip_install, require_choice
 from trustbo.parallel import n_cores
 from trustbo.study import workers
 from trustbo.study.run import Run, execute
@@ -90,8 +90,7 @@ def require_executor(executor: object) -> None:
         package = executor if executor in ("serial", "loky") else "distributed"
         if package != "serial" and importlib.util.find_spec(package) is None:
             raise TrustboError(
-                f'executor {executor!r} needs {package}: pip install "trustbo[study]", or take '
-                '"serial".'
+                f'executor {executor!r} needs {package}: {pip_install(package)}; or take "serial".'
             )
     elif isinstance(executor, ProcessPoolExecutor):
         context: Any = getattr(executor, "_mp_context", None)

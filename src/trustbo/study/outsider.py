@@ -12,7 +12,7 @@ from jax import Array
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, pip_install
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
@@ -35,7 +35,7 @@ class PathBandit:
             import botorch  # noqa: F401  # pyright: ignore[reportMissingImports]
         except ImportError:
             raise TrustboError(
-                'the baseline botorch needs BoTorch: pip install "trustbo[bench]", or leave it out.'
+                f"the baseline botorch needs BoTorch: {pip_install('botorch')}; or leave it out."
             ) from None
         self._paths: list[tuple[Cell, ...]] = []
         self._features = np.empty((0, 0))

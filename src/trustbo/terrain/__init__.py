@@ -26,3 +26,4 @@ __all__ = [
     "exposure", "openness", "pixel_features", "pixel_size", "read_lidar", "read_terrain",
     "register_feature", "slope", "synthetic_terrain", "vegetation_density",
 ]  # fmt: skip
+__dir__ = __all__.copy  # completion lists public names alone

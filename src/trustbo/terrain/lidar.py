@@ -15,7 +15,7 @@ from rioxarray.exceptions import RioXarrayError
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree, QhullError
 
-from trustbo.errors import TerrainError, require_positive
+from trustbo.errors import TerrainError, pip_install, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.dataset import CLIP_WARNING_SHARE, assemble_terrain
 from trustbo.terrain.georeference import require_regular
@@ -145,7 +145,7 @@ def _read_tile(path: Path, crs: object) -> tuple[np.ndarray, np.ndarray, CRS]:
     try:
         import laspy
     except ImportError:
-        raise TerrainError('lidar needs laspy: pip install "trustbo[lidar]".') from None
+        raise TerrainError(f"lidar needs laspy: {pip_install('laspy[lazrs]')}") from None
     if not path.is_file():
         raise TerrainError(f"there is no lidar file {str(path)!r}; check its path.")
     xyz, label, read = [np.empty((0, 3))], [np.empty(0, np.uint8)], 0
@@ -164,7 +164,7 @@ def _read_tile(path: Path, crs: object) -> tuple[np.ndarray, np.ndarray, CRS]:
     except (laspy.errors.LaspyException, OSError, RuntimeError, ValueError) as error:
         raise TerrainError(
             f"{str(path)!r} cannot be read as LAS or LAZ ({error}); give a whole file, and for LAZ "
-            'pip install "trustbo[lidar]".'
+            f"{pip_install('laspy[lazrs]')}"
         ) from None
     return np.concatenate(xyz), np.concatenate(label), _crs_of(header, str(path), crs)
 

@@ -6,3 +6,4 @@ from trustbo.workspace.sight import SIGHT_MODES, Sight
 from trustbo.workspace.workspace import Workspace
 
 __all__ = ["SIGHT_MODES", "AwarenessBelief", "Grid", "Sight", "Workspace"]
+__dir__ = __all__.copy  # completion lists public names alone

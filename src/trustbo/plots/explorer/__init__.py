@@ -1,7 +1,6 @@
 """Interactive page of a campaign: layers of the map, missions on a slider, numbers of places."""
 
-from trustbo.plots.explorer.canvas import require_bokeh
 from trustbo.plots.explorer.page import Explorer, draw_explorer
 from trustbo.plots.explorer.scene import Layer, Scene, Step
 
-__all__ = ["Explorer", "Layer", "Scene", "Step", "draw_explorer", "require_bokeh"]
+__all__ = ["Explorer", "Layer", "Scene", "Step", "draw_explorer"]

@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex
 
-from trustbo.errors import TrustboError
 from trustbo.planning import QUANTILES
 from trustbo.plots.explorer.scene import Scene
 from trustbo.plots.maps import COLOURS, contours
@@ -21,13 +20,11 @@ SHADES = 64
 _TOOLS = "pan,wheel_zoom,box_zoom,reset,save"
 
 
-def require_bokeh() -> tuple[Any, Any]:
-    """Return Bokeh's models and its `figure`; TrustboError if Bokeh is not installed."""
-    try:
-        from bokeh import models
-        from bokeh.plotting import figure
-    except ImportError:
-        raise TrustboError('explore needs Bokeh: pip install "trustbo[notebook]".') from None
+def load_bokeh() -> tuple[Any, Any]:
+    """Import Bokeh, which takes half a second, and return its models and its `figure`."""
+    from bokeh import models
+    from bokeh.plotting import figure
+
     return models, figure
 
 
@@ -50,7 +47,7 @@ def draw_map(scene: Scene) -> Any:
     marker, size), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
     `sight` (the same, colour); its colours `colours` and `contact`.
     """
-    models, figure = require_bokeh()
+    models, figure = load_bokeh()
     grid = scene.workspace.grid
     size = {"width": grid.cell_width, "height": grid.cell_height}
     plot = figure(
@@ -80,7 +77,7 @@ def draw_map(scene: Scene) -> Any:
 
 def _draw_path(plot: Any) -> None:
     """Draw the bounds in the colours of contact, the posts, and the chosen bound's sight lines."""
-    models, _ = require_bokeh()
+    models, _ = load_bokeh()
     ends = {"x0": "x0", "y0": "y0", "x1": "x1", "y1": "y1"}
     bounds, bound, sight = (
         _source(name, **{axis: [] for axis in ends}, **more)
@@ -112,7 +109,7 @@ def draw_chart(scene: Scene) -> Any:
     Its sources are named `trust` (bound, q0, ..., q4), `rates` (bound, rate, marker, colour) and
     `chosen` (bound).
     """
-    models, figure = require_bokeh()
+    models, figure = load_bokeh()
     seen = np.concatenate([np.r_[s.trust.ravel(), s.contact.ravel()] for s in scene.steps])
     low, high = float(np.nanmin(seen)), float(np.nanmax(seen))
     margin = 0.06 * max(high - low, 0.05)
@@ -150,7 +147,7 @@ def _draw_relief(plot: Any, scene: Scene) -> None:
 
 
 def _source(name: str, **columns: Any) -> Any:
-    return require_bokeh()[0].ColumnDataSource(columns, name=name)
+    return load_bokeh()[0].ColumnDataSource(columns, name=name)
 
 
 def _plain(plot: Any) -> Any:

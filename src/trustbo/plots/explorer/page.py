@@ -47,12 +47,7 @@ class Explorer:
 
 
 def draw_explorer(scene: Scene) -> Explorer:
-    """Draw the interactive page of a scene.
-
-    Raises:
-        TrustboError: Bokeh is not installed.
-    """
-    canvas.require_bokeh()
+    """Draw the interactive page of a scene."""
     from bokeh.embed import json_item
     from bokeh.resources import Resources
 
