@@ -1,4 +1,7 @@
-"""How Sphinx builds the site (`make docs`); neither it nor a reader needs the network."""
+"""How Sphinx builds the site (`make docs`); neither it nor a reader needs the network.
+
+With a network, signatures also link to the pages of other projects.
+"""
 
 import re
 import shutil
@@ -22,6 +25,7 @@ version = release = installed_version("trustbo")
 extensions = [
     "mathml",
     "myst_nb",
+    "other_projects",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
@@ -47,6 +51,19 @@ autoclass_content = "both"  # what a class takes is often said by its `__init__`
 add_module_names = False
 python_maximum_signature_line_length = 120
 python_display_short_literal_types = True
+
+other_projects = {
+    "arviz": "https://python.arviz.org/en/stable/",
+    "geopandas": "https://geopandas.org/en/stable/",
+    "jax": "https://docs.jax.dev/en/latest/",
+    "matplotlib": "https://matplotlib.org/stable/",
+    "networkx": "https://networkx.org/documentation/stable/",
+    "numpy": "https://numpy.org/doc/stable/",
+    "numpyro": "https://num.pyro.ai/en/stable/",
+    "pandas": "https://pandas.pydata.org/docs/",
+    "python": "https://docs.python.org/3/",
+    "xarray": "https://docs.xarray.dev/en/stable/",
+}
 
 html_theme = "furo"
 html_title = f"trustbo {version}"

@@ -3,8 +3,14 @@
 import ast
 import io
 import re
+import subprocess
+import sys
+import threading
+import zlib
 from contextlib import redirect_stdout
 from decimal import Decimal
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from importlib import import_module
 from itertools import zip_longest
 from pathlib import Path
@@ -231,3 +237,61 @@ def test_the_page_on_planning_says_which_path_every_objective_prefers():
     table = text.split("| objective | prefers | take it when |")[1].split("\n\n")[0]
     rows = re.findall(r"^\| `(\w+)` \| (.{20,}) \| (.{20,}) \|$", table, flags=re.M)
     assert [name for name, *_ in rows] == list(trustbo.planning.OBJECTIVES)
+
+
+def inventory(*names):
+    """An inventory as Sphinx writes it, of classes."""
+    lines = "".join(f"{name} py:class 1 api.html#$ -\n" for name in names)
+    head = "# Sphinx inventory version 2\n# Project: other\n# Version: 1\n# zlib-compressed.\n"
+    return head.encode() + zlib.compress(lines.encode())
+
+
+def built(folder, projects, page):
+    """HTML of a page, built with warnings as errors; Sphinx cannot be asked twice in a process."""
+    (folder / "docs").mkdir()
+    (folder / "docs" / "index.rst").write_text(page)
+    (folder / "docs" / "conf.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(ROOT / 'docs' / 'extensions')!r})\n"
+        "extensions = ['other_projects', 'sphinx.ext.autodoc']\n"
+        f"autodoc_typehints_format = 'short'\nother_projects = {projects!r}\n"
+    )
+    command = [sys.executable, "-m", "sphinx", "-W", "-q", "docs", "site"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return (folder / "site" / "index.html").read_text()
+
+
+def test_signatures_link_to_other_projects_where_these_can_be_reached(tmp_path):
+    pytest.importorskip("sphinx", reason="needs the extra docs")
+    (tmp_path / "objects.inv").write_bytes(inventory("xarray.DataTree"))
+    page = "Title\n=====\n\n.. autofunction:: trustbo.models.complete\n"
+    files = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    with ThreadingHTTPServer(("127.0.0.1", 0), files) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        here = f"http://127.0.0.1:{server.server_port}/"
+        html = built(tmp_path, {"xarray": here, "none": f"{here}none/"}, page)
+        server.shutdown()
+    # The annotation's name is xarray.core.datatree.DataTree.
+    assert f'href="{here}api.html#xarray.DataTree"' in html
+
+
+def test_without_a_network_signatures_have_no_links_and_the_build_no_warning(tmp_path):
+    pytest.importorskip("sphinx", reason="needs the extra docs")
+    page = "Title\n=====\n\n.. autofunction:: trustbo.models.complete\n"
+    html = built(tmp_path, {"xarray": "http://127.0.0.1:9/"}, page)
+    assert "DataTree" in html
+    assert "127.0.0.1" not in html
+
+
+@pytest.mark.parametrize("namespace", NAMESPACES)
+def test_a_page_of_the_api_opens_with_calls_to_make(namespace):
+    """Verbs, such as `fit`, before classes and the fields of their parameters."""
+    head = page_of(namespace).read_text().partition("\n```")[0]
+    calls = re.findall(r"^\| \{py:obj\}`tb\.?\S* <([\w.]+)>` \| [a-z].* \|$", head, flags=re.M)
+    assert head.count("\n|") == len(calls) + 2, "a row is not as the others"
+    for call in calls:
+        thing = import_module(namespace)
+        for part in call.removeprefix(f"{namespace}.").split("."):
+            thing = getattr(thing, part)
+        assert callable(thing)
+        assert not isinstance(thing, type), f"{call} is a class"

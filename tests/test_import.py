@@ -45,6 +45,22 @@ def test_every_public_name_is_there():
     assert trustbo.__version__.count(".") == 2
 
 
+def test_a_kernel_without_ipywidgets_is_not_warned_of_progress_bars():
+    program = (
+        "import sys, warnings\n"
+        "import ipykernel.zmqshell\n"  # as in a kernel of Jupyter
+        "sys.modules['ipywidgets'] = None\n"
+        "with warnings.catch_warnings(record=True) as said:\n"
+        "    warnings.simplefilter('always')\n"
+        "    import trustbo.models, trustbo.campaign\n"
+        "    import numpyro.util\n"
+        "print([str(w.message) for w in said if 'IProgress' in str(w.message)])\n"
+        "import tqdm.auto\n"
+        "print('tqdm.autonotebook' in sys.modules)\n"
+    )
+    assert printed(program) == "[]\nTrue"
+
+
 # Nothing before it is how all other processes of these tests import it.
 @pytest.mark.slow  # processes start for long
 @pytest.mark.parametrize(

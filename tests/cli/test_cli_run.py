@@ -28,8 +28,9 @@ def test_run_writes_every_file_and_says_where(finished):
         "campaign.json",
     }
     assert "trust_map.tif" not in names
-    assert f"results are in {out}/: report.html, maps.png, terrain.png, maps.tif" in done.output
-    assert "path.geojson, explore.html,\n" in done.output
+    first = "report.html, explore.html, maps.png, terrain.png, maps.tif"
+    assert f"results are in {out}/: {first}" in done.output
+    assert "path.geojson,\n" in done.output
     assert "mission  status  contact  objective  k-hat  path" in done.output
     assert "stopped: n_iterations" in done.output
     assert "recommended: 2,0 " in done.output

@@ -12,7 +12,14 @@ from PIL import Image
 import trustbo as tb
 from trustbo.display.card import Card
 from trustbo.display.svg import curve_picture, map_picture
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, TrustParams
+from trustbo.models import (
+    CoupledTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    Priors,
+    TrustParams,
+)
 from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
 
 
@@ -56,6 +63,16 @@ def test_numbers_have_their_units(shown):
     assert "slope limit  45 degrees" in repr(shown["Robot"])
     assert "range 100 m, 45 degrees vertically" in repr(shown["Robot"])
     assert re.search(r"contact rate +0\.\d{3} on average; 0 of \d+ missing", repr(shown["Mission"]))
+
+
+def test_the_model_of_a_campaign_is_a_few_words(shown):
+    row = re.search(r"^  model +(.*)$", repr(shown["Campaign"]), re.M)[1]
+    assert row == "PooledTrust, places, gaussian"
+    assert CoupledTrust(inter_robot="none").in_short() == "CoupledTrust, gaussian, inter_robot none"
+    placed = PooledTrust(observation="censored", place=PlaceEffect(bounds=False, shared=False))
+    assert placed.in_short() == "PooledTrust, places, censored"
+    assert re.search(r"^  places +of cells, by robot$", repr(placed), re.M)
+    assert all("PlaceEffect(" not in one._repr_html_() for one in shown.values())
 
 
 def test_params_show_each_coefficient_with_its_spread():
@@ -145,16 +162,22 @@ tb.iterate(workspace, (3, 0), (0, 3), n_iterations=2, simulator=simulator, progr
 
 
 @pytest.mark.slow  # a kernel of Jupyter
-def test_a_notebook_shows_the_campaign_while_it_runs():
+def test_a_notebook_shows_the_campaign_while_it_runs_and_the_result_alone_at_the_end():
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     notebook = nbformat.v4.new_notebook()
     notebook.cells = [nbformat.v4.new_code_cell(CELL.format(progress=p)) for p in ("True", "'bar'")]
-    nbclient.NotebookClient(notebook).execute()
-    live, bar = (
-        ["".join(o.data.get("text/html", "")) for o in cell.outputs if "data" in o]
-        for cell in notebook.cells
-    )
-    assert any("Campaign: 2 missions" in html for html in live)  # the same output, renewed
-    assert not any("Campaign: 0 missions" in html for html in live)
-    assert any("Result: 2 missions" in html for html in live + bar)
-    assert not any("Campaign" in html for html in bar)
+    shown = [], []
+
+    class Watching(nbclient.NotebookClient):
+        def process_message(self, msg, cell, cell_index):
+            if html := msg["content"].get("data", {}).get("text/html"):
+                shown[cell_index].append(re.search(r"<b>(\w+: \d+ missions)</b>", html)[1])
+            return super().process_message(msg, cell, cell_index)
+
+    Watching(notebook).execute()
+    live, bar = shown
+    assert live == [*(f"Campaign: {n} missions" for n in range(3)), "Result: 2 missions"]
+    assert bar == ["Result: 2 missions"]
+    for cell in notebook.cells:  # what is left of them
+        html = ["".join(o.data.get("text/html", "")) for o in cell.outputs if "data" in o]
+        assert sum("tb-card" in each for each in html) == 1

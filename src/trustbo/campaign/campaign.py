@@ -136,7 +136,7 @@ class Campaign(LearnedMissions, Displayed):
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
             ("missions", f"{told} told, {len(self.waiting)} not learned from yet{also}"),
-            ("model", self.model.describe()),
+            ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
         return campaign_card(

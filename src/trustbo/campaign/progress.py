@@ -18,11 +18,21 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
+class _Nothing:
+    """Empty output of a cell."""
+
+    def __repr__(self) -> str:
+        return ""
+
+    def _repr_html_(self) -> str:
+        return ""
+
+
 class Progress:
     """Shows the missions of a campaign while they are run.
 
     Under `progress=True` a notebook also shows the campaign itself, its map of trust and the
-    contact of its missions, renewed after each; `"bar"` leaves it out.
+    contact of its missions, renewed after each and gone at the end; `"bar"` leaves it out.
     """
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
@@ -50,6 +60,8 @@ class Progress:
         at: TracebackType | None,
     ) -> None:
         self._bar.close()
+        if self._map is not None and kind is None:  # the result is what a cell shows afterwards
+            self._map.update(_Nothing())
 
     def step(self) -> None:
         """Show the last mission."""

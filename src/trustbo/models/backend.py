@@ -1,5 +1,8 @@
 """numpyro, whole; and the JAX settings that results are computed under.
 
+Without ipywidgets, a kernel of Jupyter is warned of it when numpyro is imported ("IProgress not
+found"), which is of no use: bars of text are as good.
+
 arviz_base leaves a lazy numpyro in `sys.modules`. Whoever then imports a submodule of it first, as
 in `import arviz; import numpyro.distributions`, gets packages that miss their own submodules, and
 numpyro fails ("numpyro.distributions has no attribute 'distribution'"). To ask the package for
@@ -7,6 +10,7 @@ something first avoids it; where it has happened already, the submodules are put
 """
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -14,7 +18,10 @@ from importlib.metadata import version
 from typing import Any
 
 import jax
-import numpyro
+
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", "IProgress not found")
+    import numpyro
 
 VERSIONS: dict[str, str] = {
     "trustbo": version("trustbo"),

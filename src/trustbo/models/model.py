@@ -427,11 +427,22 @@ class TrustModel(Displayed, ABC):
                 for n, v in self.options().items()
                 if n not in ("observation", "response")
             ),
-            ("places", "no effects" if self.place is None else f"{self.place}"),
+            ("places", "no effects" if self.place is None else self.place.in_short()),
             ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),
         ]
         priors = () if self.priors is None else self.priors._card().rows
         return Card(type(self).__name__, rows, (), {"priors": priors})
+
+    def in_short(self) -> str:
+        """Name, effects of places, family, and the options that differ from their defaults."""
+        usual = {f.name: f.default for f in fields(self)}
+        others = [
+            f"{name} {value}"
+            for name, value in self.options().items()
+            if name not in ("observation", "parameters") and value != usual.get(name)
+        ]
+        places = ["places"] * (self.place is not None)
+        return ", ".join([type(self).__name__, *places, self.observation, *others])
 
     def describe(self) -> str:
         """The model's name and options."""

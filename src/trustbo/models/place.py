@@ -81,6 +81,11 @@ class PlaceEffect:
             }
         return {name: log_prob(priors[name], sites[name]) for name in self.names}
 
+    def in_short(self) -> str:
+        """Places that have effects, and whether robots share them."""
+        places = " and ".join(["cells"] * self.cells + ["bounds"] * self.bounds)
+        return f"of {places}, {'shared by robots' if self.shared else 'by robot'}"
+
     def to_record(self) -> dict[str, Any]:
         """Fields by name, for JSON."""
         return asdict(self)
