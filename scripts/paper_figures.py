@@ -15,6 +15,7 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
 import trustbo as tb
 from trustbo.plots.layout import MARKERS
+from trustbo.plots.maps import draw_scale_of
 from trustbo.plots.plan import COLOURS
 
 mpl.use("Agg")
@@ -72,18 +73,18 @@ BOXES = {
     "terrain": ((0.0, 1.5), "terrain: DEM and DSM,\nor a point cloud", "terrain.read_terrain"),
     "awareness": ((3.4, 1.5), "awareness $Z$\nof cells, or of bounds", "Workspace.from_terrain"),
     "plan": ((6.8, 1.5), "most trustworthy path\nunder the belief, by (6)", "Campaign.ask"),
-    "mission": ((6.8, 0.0), "mission, bound by bound:\ncontact rates $Y$", "robots, or simulator.run"),
+    "mission": ((6.8, 0.0), "mission, bound by bound:\ncontact rates $Y$", "simulator.run"),
     "belief": ((3.4, 0.0), r"belief $p(\theta \mid Y, Z)$" + "\nby (3), (4), (5)", "Campaign.tell"),
     "prior": ((0.0, 0.0), r"prior $p(\theta)$" + "\nbefore any mission", "models.Priors"),
 }  # fmt: skip
 ARROWS = [
-    ("terrain", "awareness", "arc3"),
-    ("awareness", "plan", "arc3"),
-    ("plan", "mission", "arc3"),
-    ("mission", "belief", "arc3"),
-    ("prior", "belief", "arc3"),
-    ("belief", "plan", "arc3"),
-    ("awareness", "belief", "arc3"),
+    ("terrain", "awareness"),
+    ("awareness", "plan"),
+    ("plan", "mission"),
+    ("mission", "belief"),
+    ("prior", "belief"),
+    ("belief", "plan"),
+    ("awareness", "belief"),
 ]
 WIDTH, HEIGHT = 2.7, 0.95
 
@@ -99,12 +100,12 @@ def loop() -> Figure:
         ax.add_patch(box)
         ax.text(x + WIDTH / 2, y + 0.62, text, **WIDE)
         ax.text(x + WIDTH / 2, y + 0.15, name, **{**WIDE, "fontsize": 9.5}, family="monospace")
-    for start, end, style in ARROWS:
+    for start, end in ARROWS:
         tail, head = _sides(start, end)
         ax.add_patch(
             FancyArrowPatch(
                 tail, head, arrowstyle="-|>", mutation_scale=13, color="0.25",
-                connectionstyle=style, shrinkA=3, shrinkB=3,
+                shrinkA=3, shrinkB=3,
             )
         )  # fmt: skip
     ax.set(xlim=(-0.1, 9.6), ylim=(-0.1, 2.55), aspect="equal")
@@ -162,7 +163,7 @@ def _ground(ax: Axes, plan: tb.planning.Plan, seen: np.ndarray) -> None:
     y = terrain["y"].values - grid.corner[1]
     grown = (terrain["dsm"] - terrain["dem"]).values
     ax.contourf(x, y, grown, levels=[3.0, 15.0, 60.0], colors=["0.92", "0.84"])
-    ax.contour(x, y, terrain["dem"].values, levels=np.arange(0, 500, 2.0), colors="0.7",
+    ax.contour(x, y, terrain["dem"].values, levels=np.arange(0, 1000, 1.0), colors="0.7",
                linewidths=0.5)  # fmt: skip
     for col in range(grid.shape[1] + 1):
         ax.axvline(col * grid.cell_width, color="0.45", linewidth=0.8, linestyle=":")
@@ -172,26 +173,25 @@ def _ground(ax: Axes, plan: tb.planning.Plan, seen: np.ndarray) -> None:
     half, middle = 0.58 * (high - low).max() + 2.0, (low + high) / 2.0
     ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
     ax.set(aspect="equal", xticks=[], yticks=[])
-    tb.plots.draw_scale(ax, grid)
+    draw_scale_of(ax, 2.0 * half)
 
 
 def cloud(terrain) -> Figure:
     """Highest points of a survey by lidar, one a square metre: Fig. 4a."""
     figure = plt.figure(figsize=(6.4, 4.0))
-    ax = figure.add_axes((0.0, 0.02, 0.84, 1.1), projection="3d")
+    ax = figure.add_axes((0.0, 0.0, 0.84, 1.0), projection="3d")
     top, ground = terrain["dsm"].values, terrain["dem"].values
     x, y = np.meshgrid(terrain["x"].values, terrain["y"].values)
     known = np.isfinite(top)
     x, y = (a[known] - a[known].min() for a in (x, y))
     points = ax.scatter(
-        x, y, top[known], c=(top - ground)[known], s=0.6, cmap="viridis", linewidths=0, vmax=30
+        x, y, top[known], c=(top - ground)[known], s=1.2, cmap="viridis", linewidths=0, vmax=30
     )
-    ax.set_box_aspect((np.ptp(x), np.ptp(y), np.ptp(top[known])))
+    ax.set_box_aspect((np.ptp(x), np.ptp(y), np.ptp(top[known])), zoom=0.92)
     ax.view_init(28, -62)
-    ax.set_xlabel("east (m)", fontsize=8)
-    ax.set_ylabel("north (m)", fontsize=8)
-    ax.set_zlabel("height (m)", fontsize=8)
-    ax.tick_params(labelsize=8)
+    ax.set(xlabel="east (m)", ylabel="north (m)", zlabel="height (m)")
+    ax.set(xticks=[0, 100, 200], yticks=[0, 100], zticks=[450, 550, 650])
+    ax.tick_params(labelsize=9, pad=0)
     bar = figure.colorbar(points, cax=figure.add_axes((0.88, 0.2, 0.022, 0.6)), extend="max")
     bar.set_label("height above the ground (m)", fontsize=9)
     return figure

@@ -164,6 +164,27 @@ def test_each_rate_is_predicted_by_dense_conditioning_on_those_before(missions, 
     np.testing.assert_allclose(pieces.values[own, 7], expected, rtol=1e-9, atol=1e-9)
 
 
+def test_the_view_by_rate_has_the_priors_and_of_weighted_missions_no_likelihood_for_loo(
+    missions, posterior
+):
+    sensitivity = az.psense_summary(tb.models.by_rate(posterior), var_names=["b"])
+    expected = az.psense_summary(posterior, var_names=["b"])
+    columns = ["prior", "likelihood"]
+    np.testing.assert_allclose(sensitivity[columns], expected[columns], atol=2e-3)  # rounded
+    within = float(posterior["posterior"]["b"].median())
+    factor, same = (
+        az.bayes_factor(tree, var_names=["b"], ref_vals=within)["b"]
+        for tree in (tb.models.by_rate(posterior), posterior)
+    )
+    np.testing.assert_allclose(factor, same)
+    weighted = tb.models.fit(missions, PooledTrust(), weights=[0.5, 0.6, 0.7, 0.8, 0.9])
+    view = tb.models.by_rate(weighted)
+    assert "log_likelihood" not in view.children
+    assert view["rate_log_likelihood"]["contact_rate"].dims == ("chain", "draw", "rate")
+    with pytest.raises(TypeError, match="log likelihood not found"):
+        az.loo(view)
+
+
 def test_predictions_by_rate_are_calibrated_under_the_model():
     """Under the model PIT values are uniform; the mean of 60 missions' is 1/2 within 4 sd."""
     rng, z = np.random.default_rng(0), np.random.default_rng(1).uniform(size=(60, 6, 2, 2))

@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.models.likelihood import kalman_numpy
 from trustbo.models.params import params_of
 from trustbo.models.place import bounds_of
-from trustbo.models.posterior_groups import Law, complete
+from trustbo.models.posterior_groups import Law, complete, is_weighted
 from trustbo.models.posterior_tree import missions_of
 from trustbo.stacking import stack_missions
 
@@ -29,9 +29,11 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
         missions: Missions that it was fitted to; needed where it holds no data.
 
     Returns:
-        DataTree with `posterior`, `sample_stats`, `observed_data`, `posterior_predictive` and
-        `log_likelihood` of `contact_rate`, over (chain, draw, rate), with the mission, bound and
-        robot of each rate as coordinates. Rates that were not measured are left out.
+        DataTree with `posterior`, `sample_stats`, `prior` and `log_prior` as they were, and
+        `observed_data`, `posterior_predictive` and `log_likelihood` of `contact_rate`, over (chain,
+        draw, rate), with the mission, bound and robot of each rate as coordinates. Rates that were
+        not measured are left out. Where missions have weights, the last is called
+        `rate_log_likelihood`, as `az.loo` would take it for that of an unweighted posterior.
 
     Raises:
         TrustboError: Trust does not integrate out under its observations, or robots influence each
@@ -70,12 +72,12 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
     }
     index = coords | {"chain": draws["chain"], "draw": draws["draw"]}
     dims = ("chain", "draw", "rate")
-    groups = {
-        "posterior": draws,
-        "sample_stats": posterior["sample_stats"].to_dataset(),
+    likelihood = "rate_log_likelihood" if is_weighted(posterior) else "log_likelihood"
+    kept = ("posterior", "sample_stats", "prior", "log_prior")
+    groups = {name: posterior[name].to_dataset() for name in kept if name in posterior.children} | {
         "observed_data": xr.Dataset({"contact_rate": ("rate", y)}, coords),
         "posterior_predictive": xr.Dataset({"contact_rate": (dims, drawn.reshape(shape))}, index),
-        "log_likelihood": xr.Dataset({"contact_rate": (dims, density.reshape(shape))}, index),
+        likelihood: xr.Dataset({"contact_rate": (dims, density.reshape(shape))}, index),
     }
     view = xr.DataTree.from_dict(groups)
     view.attrs = posterior.attrs

@@ -168,7 +168,12 @@ def _groups(
 
 def _likelihood_name(posterior: xr.DataTree) -> str:
     """The name that `az.loo` reads, unless missions have weights, which it would not know of."""
-    return LIKELIHOODS[bool((np.asarray(posterior.attrs.get("weights", 1.0)) != 1.0).any())]
+    return LIKELIHOODS[is_weighted(posterior)]
+
+
+def is_weighted(posterior: xr.DataTree) -> bool:
+    """Whether missions have weights other than 1."""
+    return bool((np.asarray(posterior.attrs.get("weights", 1.0)) != 1.0).any())
 
 
 def _prior_of(posterior: xr.DataTree) -> Params:
