@@ -1,6 +1,9 @@
 """Groups of a posterior that ArviZ's functions read, against numpyro and dense normals."""
 
+import re
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import arviz as az
 import jax
@@ -16,6 +19,7 @@ from trustbo.models.backend import call, own_settings
 from trustbo.models.log_prior import log_prior
 
 FEATURES = ("traversability", "line_of_sight")
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def campaign(n_missions=5, seed=0):
@@ -213,3 +217,29 @@ def test_what_has_no_single_predictions_is_named(missions):
     counted.attrs = {"observation": "censored", "inter_robot": "none", "response": "level"}
     with pytest.raises(tb.TrustboError, match='observation "censored" and inter_robot="none"'):
         tb.models.by_rate(counted)
+
+
+@pytest.mark.slow  # 200 calls, most of them figures
+def test_the_page_names_every_call_that_fails(missions, posterior):
+    script = runpy.run_path(str(ROOT / "benchmarks" / "arviz_calls.py"))
+    page = (ROOT / "docs" / "howto" / "use-arviz.md").read_text()
+    table = page.partition("| fail | on |")[2].partition("\n\n")[0]
+    named = set(
+        re.findall(r"`(\w+)[`(]", "\n".join(r.split("|")[1] for r in table.splitlines()[2:]))
+    )
+    assert {"plot_energy", "plot_loo_pit"} <= named
+    assert all(hasattr(az, name) for name in named)
+    given = {name: script[name] for name in ("written", "density")}
+    given |= {"az": az, "np": np, "tb": tb, "names": ["beta0", "beta", "b"]}
+    given |= {"other": tb.models.fit(missions, CoupledTrust(inter_robot="none"))}
+    given |= {"half": tb.models.fit(missions[::2], PooledTrust())}
+    calls = script["CALLS"].split("\n")[1:-1]
+    failed = {
+        call: said for call in calls if (said := script["failure"](call, given | {"dt": posterior}))
+    }
+    assert {re.search(r"az\.(\w+)", call)[1] for call in failed} <= named, failed
+    assert "az.plot_energy(dt)" in failed
+    assert "az.plot_loo_pit(dt)" in failed
+    assert (
+        script["failure"]("az.plot_loo_pit(dt)", given | {"dt": tb.models.by_rate(posterior)}) == ""
+    )
