@@ -187,6 +187,8 @@ def test_the_view_by_rate_has_the_priors_and_of_weighted_missions_no_likelihood_
     assert view["rate_log_likelihood"]["contact_rate"].dims == ("chain", "draw", "rate")
     with pytest.raises(TypeError, match="log likelihood not found"):
         az.loo(view)
+    with pytest.raises(tb.TrustboError, match=r"of a view by rate, give the posterior itself\.$"):
+        tb.models.loo(view)
 
 
 def test_predictions_by_rate_are_calibrated_under_the_model():

@@ -27,13 +27,15 @@ def loo(posterior: xr.DataTree) -> ELPDData:
         ArviZ's `ELPDData`, pointwise, for `az.compare({name: loo(posterior), ...})`.
 
     Raises:
-        TrustboError: Fewer than two missions have rates; or see `complete`.
+        TrustboError: Fewer than two missions have rates, a view `by_rate`; or see `complete`.
     """
     if not isinstance(posterior, xr.DataTree):
         remedy = " Give its .posterior." if hasattr(posterior, "posterior") else ""
         raise TrustboError(
             f"loo takes a posterior from fit; got a {type(posterior).__name__}.{remedy}"
         )
+    if "observed_data" in posterior.children and "rate" in posterior["observed_data"].dims:
+        raise TrustboError("loo leaves out missions; of a view by rate, give the posterior itself.")
     posterior = complete(posterior)
     (group,) = (name for name in LIKELIHOODS if name in posterior.children)
     each = posterior[group].to_dataset()["contact_rate"]
