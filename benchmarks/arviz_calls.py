@@ -2,7 +2,7 @@
 
 python benchmarks/arviz_calls.py [quick]
 
-Every public function of ArviZ that takes a posterior is called, some of them on several groups.
+Nearly every public function of ArviZ that takes a posterior is called, some on several groups.
 `dt` is a posterior, `other` one of another model, `half` one of half of the missions. `quick`
 leaves out NUTS.
 """
