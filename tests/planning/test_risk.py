@@ -338,3 +338,42 @@ def test_a_search_that_is_cut_short_keeps_the_limit_and_its_bound_holds(
         assert plan.value <= whole.value + 1e-9 <= plan.bound + 2e-9
         cut += not plan.exact
     assert cut > 0
+
+
+def test_the_reference_lets_revisit_concern_only_objectives_of_the_whole_history():
+    """Walks of the others may enter cells twice with either engine, with a risk or without."""
+    params = TrustParams(0.9, np.array([0.1, 0.1]), 0.3, 0.1, 0.1)
+    workspace = Workspace.from_awareness(np.random.default_rng(0).uniform(size=(1, 8, 3, 3, 2)))
+    for objective in ("terminal", "mean"):
+        options = {"max_bounds": "shortest+4", "revisit": False, "objective": objective}
+        bare = Planner(workspace, (2, 0), (0, 2), engine="numba", **options).plan(params)
+        assert bare.revisits > 0
+        for engine in ("numba", "networkx"):
+            planner = Planner(
+                workspace, (2, 0), (0, 2), engine=engine, max_failure=0.9, **options
+            ).with_risk(np.full((8, 3, 3), 0.01))
+            np.testing.assert_allclose(planner.plan(params).value, bare.value, rtol=1e-12)
+
+
+@pytest.mark.parametrize("objective", ["success", "stationary"])
+def test_paths_are_told_apart_where_their_probabilities_round_to_0(objective):
+    """By the sum of log probabilities: its exp is 0 below -745."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        z, p_fail = rng.uniform(size=(1, 8, 3, 3, 2)), rng.uniform(0.0, 0.05, (8, 3, 3))
+        params = TrustParams(0.5, 2000.0 * rng.normal(size=2), -500.0, 0.1, 0.1)
+        workspace, scores = Workspace.from_awareness(z), []
+        for engine in ("numba", "networkx"):
+            options = {"max_bounds": 4} if objective == "success" else {}
+            planner = Planner(
+                workspace, (2, 0), (0, 2), objective, engine=engine, max_failure=0.9, **options
+            ).with_risk(p_fail)
+            path = planner.plan(params).path
+            u = planner.dynamics(params).along(path).drift.ravel()
+            x, total = params.x0_mean, 0.0
+            for drift in u:
+                x = 0.5 * x + drift
+                trust = x if objective == "success" else drift / 0.5
+                total += np.logaddexp(0.0, -trust)
+            scores.append(total)
+        np.testing.assert_allclose(*scores, rtol=1e-9)

@@ -72,13 +72,23 @@ def softplus(x: ArrayLike) -> np.ndarray:
     return np.logaddexp(0.0, x)
 
 
-OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = {
+SCORES: dict[str, Callable[[PathTrust], np.ndarray]] = {
     "lost_contact": lambda path: -np.sum(path.contact_lost, axis=-1) - path.length_cost,
-    "terminal": lambda path: expit(path.trust[..., -1] - path.length_cost),
+    "terminal": lambda path: path.trust[..., -1] - path.length_cost,
     "mean": lambda path: path.trust.mean(-1) - path.length_cost,
-    "success": lambda path: np.exp(-softplus(-path.trust).sum(-1)),
+    "success": lambda path: -softplus(-path.trust).sum(-1),
     "bottleneck": lambda path: path.trust.min(-1),
-    "stationary": lambda path: np.exp(-softplus(-path.steady_state).sum(-1) - path.length_cost),
+    "stationary": lambda path: -softplus(-path.steady_state).sum(-1) - path.length_cost,
+}
+"""Score of a path, to compare it by: the larger, the better.
+
+The value is this, its sigma (terminal) or its exp (success, stationary): these round to 1 beyond
+40, and to 0 below -745, where paths still differ.
+"""
+OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = SCORES | {
+    "terminal": lambda path: expit(SCORES["terminal"](path)),
+    "success": lambda path: np.exp(SCORES["success"](path)),
+    "stationary": lambda path: np.exp(SCORES["stationary"](path)),
 }
 """Value of a path, to be maximised; the length cost is the path's metres times `length_weight`.
 

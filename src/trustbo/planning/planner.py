@@ -84,7 +84,8 @@ class Planner(Displayed):
                 entered again beyond. An int: walks of at most that many bounds (default for
                 success and bottleneck: shortest + 8). Without effect on stationary, whose
                 admissible paths are all simple paths.
-            revisit: True if walks of success and bottleneck may enter a cell twice.
+            revisit: True if walks of success, bottleneck, and lost_contact of other than Gaussian
+                rates may enter a cell twice; without effect on the other objectives.
             team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
             length_weight: Cost of a metre of the path, for lost_contact (in bounds), terminal and
                 mean (in units of trust) and stationary (in units of log probability).

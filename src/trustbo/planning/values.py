@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics, as_map, roll, roll_trust, trust_dynamics
-from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
+from trustbo.planning.objectives import OBJECTIVES, SCORES, Objective, PathTrust, softplus
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import PlanningProblem
@@ -22,12 +22,25 @@ def path_value(
     dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
 ) -> np.ndarray:
     """Value of one path, shape (...,) as the leading axes of `dynamics`."""
+    return OBJECTIVES[objective.name](_of_path(dynamics, objective, admissible, path))
+
+
+def path_score(
+    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
+) -> np.ndarray:
+    """Score of one path, by which to compare it; see `SCORES`, shape (...,)."""
+    return SCORES[objective.name](_of_path(dynamics, objective, admissible, path))
+
+
+def _of_path(
+    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
+) -> PathTrust:
     length_cost = objective.length_weight * path_length(admissible, path)
-    return _value(objective.capped(dynamics.along(path)), objective, length_cost)
+    return _path_trust(objective.capped(dynamics.along(path)), objective, length_cost)
 
 
-def _value(along: Dynamics, objective: Objective, length_cost: float) -> np.ndarray:
-    """Value (...,) of the path whose bounds `along` has."""
+def _path_trust(along: Dynamics, objective: Objective, length_cost: float) -> PathTrust:
+    """Trust (..., bound) on the path whose bounds `along` has, and what the objective needs."""
     trust = team_trust(along)
     steady_state = lost = np.full(trust.shape, np.nan)
     if objective.name == "stationary":
@@ -35,7 +48,7 @@ def _value(along: Dynamics, objective: Objective, length_cost: float) -> np.ndar
     if objective.name == "lost_contact":
         before = (along.start @ along.views.T).min(-1)
         lost = objective.contact_lost(trust, before, along.noise_sd)
-    return OBJECTIVES[objective.name](PathTrust(trust, steady_state, length_cost, lost))
+    return PathTrust(trust, steady_state, length_cost, lost)
 
 
 def team_trust(along: Dynamics) -> np.ndarray:
@@ -77,7 +90,8 @@ def evaluate(
     cost = objective.length_weight * length
     if objective.name in ("stationary", "lost_contact"):
         dynamics = trust_dynamics(along, as_map(z), problem.team, x0)
-        value = _value(objective.capped(dynamics) if cap else dynamics, objective, cost).mean()
+        dynamics = objective.capped(dynamics) if cap else dynamics
+        value = OBJECTIVES[objective.name](_path_trust(dynamics, objective, cost)).mean()
     else:
         value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
     risk = None if problem.risk is None else problem.risk.along(cells)

@@ -50,6 +50,7 @@ from trustbo.planning.engines.costs_to_go import (
 )
 from trustbo.planning.engines.lagrangian import Best, failure, lagrangian
 from trustbo.planning.engines.layers import Layers
+from trustbo.planning.engines.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
@@ -111,6 +112,7 @@ def _search(layers, bounds, risk, ahead, need, cheap, priced, offset, best, max_
     for length in range(len(layers.starts)):
         node = layers.starts[length]
         if node >= 0 and bounds.start_cost[length] < np.inf:
+            labels = _with_room(labels, n + 1)
             first = -np.inf if law == LEAST else bounds.start_cost[length]
             link, state = labels.link[n], labels.state[n]
             link[0], link[1], link[2], link[3] = node, -1, -1, -1
@@ -129,17 +131,19 @@ def _search(layers, bounds, risk, ahead, need, cheap, priced, offset, best, max_
                 if n + layers.n_moves > len(labels.state):
                     if n >= max_labels:
                         return _path_of(layers, labels, found), best, False
-                    labels = _Labels(
-                        np.concatenate((labels.link, labels.link)),
-                        np.concatenate((labels.state, labels.state)),
-                        np.concatenate((labels.risk, labels.risk)),
-                    )
+                    labels = _with_room(labels, n + layers.n_moves)
                 n = _extend(
                     layers, bounds, risk, ahead, need, cheap, priced, of_risk, offset, best, label,
                     labels, heads, n,
                 )  # fmt: skip
             label = labels.link[label, 3]
     return _path_of(layers, labels, found), best, True
+
+
+@_part
+def _with_room(labels, n):
+    """Labels with room for `n` of them."""
+    return _Labels(with_room(labels.link, n), with_room(labels.state, n), with_room(labels.risk, n))
 
 
 @_part

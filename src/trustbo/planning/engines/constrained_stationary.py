@@ -21,6 +21,7 @@ from numba import njit
 
 from trustbo.parallel import PART
 from trustbo.planning.engines.lagrangian import PRICES, Best, next_price
+from trustbo.planning.engines.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
@@ -164,11 +165,12 @@ def _search(network, cheap, priced, price, root, known, max_labels):
         if _is_dominated(network, link, state, risks, heads[cell], label):
             continue
         link[label, 2], heads[cell] = heads[cell], label
-        if n + network.neighbours.shape[1] > len(link):
+        most = n + network.neighbours.shape[1]
+        if most > len(link):
             if n >= max_labels:
                 return Best(known.path, known.cost, min(estimate, known.cost))
-            link = np.concatenate((link, link))
-            state, risks = np.concatenate((state, state)), np.concatenate((risks, risks))
+            link, state = with_room(link, most), with_room(state, most)
+            risks = with_room(risks, most)
         for m in range(network.neighbours.shape[1]):
             reach = _extend(network, cheap, priced, price, link, state, risks, label, m, n)
             if reach < known.cost:

@@ -34,6 +34,7 @@ from numba import njit
 
 from trustbo.parallel import PART, over_rows
 from trustbo.planning.engines.layers import Layers
+from trustbo.planning.engines.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
@@ -138,6 +139,7 @@ def _search(layers, u, beta0, x0, hi, W, t, length_cost, law, sd, best, max_labe
     n, found = np.int64(0), np.int64(-1)  # not literals, for which callees are compiled again
     for start in layers.starts:
         if start >= 0:
+            labels, state = with_room(labels, n + 1), with_room(state, n + 1)
             labels[n, 0], labels[n, 1], labels[n, 2], labels[n, 3] = start, -1, -1, -1
             state[n, 0], state[n, 1], heads[start] = x0, 0.0, n
             n += 1
@@ -150,8 +152,8 @@ def _search(layers, u, beta0, x0, hi, W, t, length_cost, law, sd, best, max_labe
                 if n + layers.n_moves > len(state):
                     if len(state) >= max_labels:
                         return labels, -1, np.nan
-                    labels = np.concatenate((labels, labels))
-                    state = np.concatenate((state, state))
+                    labels = with_room(labels, n + layers.n_moves)
+                    state = with_room(state, n + layers.n_moves)
                 n = _extend(
                     layers, u, beta0, hi, W, t, length_cost, law, sd, best, label, labels, state,
                     heads, n,

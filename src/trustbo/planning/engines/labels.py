@@ -33,6 +33,7 @@ from numba import njit
 from trustbo.parallel import PART
 from trustbo.planning.engines.contact_loss import CLIPPED, LOGISTIC, expected_loss
 from trustbo.planning.engines.dominance import Heuristic
+from trustbo.planning.engines.room import with_room
 from trustbo.planning.objectives import Objective
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
@@ -138,7 +139,9 @@ def _search(problem, tolerance, max_labels):
             if n == len(cost):
                 if n >= max_labels:
                     return np.empty(0, np.int64), np.inf, -np.inf, False
-                labels, cost, state, tested, seen = _double(labels, cost, state, tested, seen)
+                labels, cost = with_room(labels, n + 1), with_room(cost, n + 1)
+                state, tested = with_room(state, n + 1), with_room(tested, n + 1)
+                seen = with_room(seen, n + 1)
             if n_risks > 0 and not _spend(
                 problem.risk, tested, n, label, m * n_cells + other, other
             ):
@@ -168,18 +171,6 @@ def _copy(source, target):
     """Copy numbers; the assignment of slices takes two seconds to compile, for its messages."""
     for i in range(len(source)):
         target[i] = source[i]
-
-
-@_part
-def _double(labels, cost, state, tested, seen):
-    """Make room for as many labels again."""
-    return (
-        np.concatenate((labels, labels)),
-        np.concatenate((cost, cost)),
-        np.concatenate((state, state)),
-        np.concatenate((tested, tested)),
-        np.concatenate((seen, seen)),
-    )
 
 
 @_part

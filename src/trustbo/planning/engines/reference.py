@@ -21,7 +21,7 @@ from trustbo.planning.engines.reference_risk import feasible_paths
 from trustbo.planning.objectives import Objective, softplus
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import RiskTable
-from trustbo.planning.values import entry_cost, path_length, path_value, team_trust
+from trustbo.planning.values import entry_cost, path_score
 from trustbo.workspace.moves import MOVES
 
 Path = tuple[Cell, ...]
@@ -42,7 +42,7 @@ def plan_networkx(
     if risk is not None:
         feasible = feasible_paths(admissible, dynamics, objective, risk)
         cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
-        scores = [_score(dynamics, objective, admissible, path) for path in feasible]
+        scores = [path_score(dynamics, objective, admissible, path) for path in feasible]
         return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
     if objective.name == "stationary":
         cost = entry_cost(admissible.passable, dynamics)
@@ -63,7 +63,7 @@ def plan_networkx(
             path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
         if path is not None:
             paths.append(path)
-    return max(paths, key=lambda path: _score(dynamics, objective, admissible, path))
+    return max(paths, key=lambda path: float(path_score(dynamics, objective, admissible, path)))
 
 
 def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:
@@ -71,16 +71,6 @@ def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:
     n_moves = values.shape[-3]
     step = cell[0] - before[0], cell[1] - before[1]
     return values[..., MOVES[n_moves].index(step) if n_moves > 1 else 0, *cell]
-
-
-def _score(
-    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
-) -> float:
-    """Value of a path; for `terminal` trust, as its sigma rounds to 1 beyond 40."""
-    if objective.name != "terminal":
-        return float(path_value(dynamics, objective, admissible, path))
-    last = float(team_trust(dynamics.along(path))[-1])
-    return last - objective.length_weight * path_length(admissible, path)
 
 
 def best_additive(

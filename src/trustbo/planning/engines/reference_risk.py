@@ -36,6 +36,8 @@ def feasible_paths(
         dynamics = dynamics._replace(transition=np.zeros((1, 1)), start=np.zeros(1), views=_ONE)
     else:
         tests = dominance_tests(dynamics, longest)
+    # As in every engine, `revisit` concerns the objectives that depend on the whole history.
+    simple = objective.has_labels and not admissible.revisit
     first = np.inf if objective.name == "bottleneck" else 0.0
     start = np.concatenate([[first, 0.0], np.zeros(len(risk.limits)), tests @ dynamics.start])
     labels = {(None, admissible.start): [_Label(start, dynamics.start, (admissible.start,))]}
@@ -50,7 +52,7 @@ def feasible_paths(
                 step, risks = drift[:, by_move, *other], risk.of_bounds[:, m, flat]
                 metres = objective.length_weight * admissible.lengths[m]
                 for label in here:
-                    if _excluded(admissible, label.path, other):
+                    if _excluded(admissible, label.path, other, simple=simple):
                         continue
                     x = dynamics.transition @ label.x + step
                     trust = float((dynamics.views @ x).min())
@@ -65,7 +67,7 @@ def feasible_paths(
                         found.append(new.path)
                     else:
                         at = layer.setdefault((None if admissible.u_turns else cell, other), [])
-                        _keep(at, new, simple=not admissible.revisit)
+                        _keep(at, new, simple=simple)
         labels = layer
     return found
 
@@ -79,10 +81,10 @@ def _successors(admissible: AdmissiblePaths, cell: Cell) -> list[tuple[int, Cell
     return [(m, other) for m, other in enumerate(steps) if admissible.graph.has_edge(cell, other)]
 
 
-def _excluded(admissible: AdmissiblePaths, path: Path, other: Cell) -> bool:
+def _excluded(admissible: AdmissiblePaths, path: Path, other: Cell, *, simple: bool) -> bool:
     """Whether a path may not go on to a cell, because of a U-turn or a revisit."""
     u_turn = not admissible.u_turns and len(path) > 1 and path[-2] == other
-    return u_turn or (not admissible.revisit and other in path)
+    return u_turn or (simple and other in path)
 
 
 def _score(objective: Objective, score: float, trust: float, noise_sd: np.ndarray) -> float:

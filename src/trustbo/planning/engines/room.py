@@ -1,0 +1,18 @@
+"""Room for labels: arrays that grow before a label is written.
+
+Kernels do not check indices, and a label beyond the end of its array overwrites other memory. Each
+array of labels therefore passes `with_room` before it takes labels, however few or many.
+"""
+
+import numpy as np
+from numba import njit
+
+from trustbo.parallel import PART
+
+
+@njit(nogil=True, error_model="numpy", **PART)
+def with_room(rows: np.ndarray, n: int) -> np.ndarray:
+    """Array for at least `n` rows: the same one, or one doubled as often as need be."""
+    while len(rows) < n:
+        rows = np.concatenate((rows, rows))
+    return rows
