@@ -135,6 +135,17 @@ def test_missing_ground_and_the_raster_s_edge_block():
     assert cast(ground, ground, (2.0, 1.0, 1.0), (2.0, 8.0, 1.0)) == 1.0
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_ray_from_or_to_an_unknown_place_is_blocked(axis):
+    """No pixel is read for it: NaN is no index."""
+    ground = np.zeros((10, 10))
+    unknown = [5.0, 5.0, 1.0]
+    unknown[axis] = np.nan
+    assert cast(ground, ground, tuple(unknown), (5.0, 8.0, 1.0)) == 0.0
+    assert cast(ground, ground, (5.0, 8.0, 1.0), tuple(unknown)) == 0.0
+    assert np.isnan(rays.ground_height(ground, *unknown[:2]))
+
+
 def test_a_ray_of_no_length_is_clear():
     ground = np.zeros((10, 10))
     assert cast(ground, ground, (5.0, 5.0, 1.0), (5.0, 5.0, 0.5)) == 1.0

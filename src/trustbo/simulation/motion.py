@@ -99,7 +99,7 @@ def _within_a_turn(angle):
 def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip):
     speed, turn_rate, max_slope = limits
     rows, cols = gradient.shape[1:]
-    x, y, aim = route[0, 0], route[0, 1], 1
+    x, y, aim = route[0, 0], route[0, 1], min(1, len(route) - 1)
     poses = np.empty((len(slip), 3))
     dt, steepest = tick / n_steps, math.tan(max_slope)
     for k in range(len(slip)):

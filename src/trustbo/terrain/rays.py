@@ -44,9 +44,10 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
     r0, c0, z0 = start
     r1, c1, z1 = end
     n_rows, n_cols = ground.shape
-    if min(r0, r1) < 0.0 or min(c0, c1) < 0.0:
+    # Not the reverse: comparisons with NaN are false.
+    if not (r0 >= 0.0 and r1 >= 0.0 and c0 >= 0.0 and c1 >= 0.0):
         return 0.0
-    if max(r0, r1) > n_rows - 1 or max(c0, c1) > n_cols - 1:
+    if not (max(r0, r1) <= n_rows - 1 and max(c0, c1) <= n_cols - 1):
         return 0.0
     dz = z1 - z0
     rows = (n_cols, 1, r0, r1 - r0, c0, c1 - c0)  # strides across and along, and the ray there
@@ -255,7 +256,7 @@ def _exposure(ground, surface, pixel, observers, reach, heights, canopy, result,
 
 @_compiled
 def ground_height(ground, r, c):
-    """Bilinear ground height at a position in pixel coordinates; NaN off the raster."""
-    if r < 0.0 or c < 0.0 or r > ground.shape[0] - 1 or c > ground.shape[1] - 1:
+    """Bilinear ground height at a position in pixel coordinates; NaN off the raster, or of NaN."""
+    if not (0.0 <= r <= ground.shape[0] - 1 and 0.0 <= c <= ground.shape[1] - 1):
         return math.nan
     return _heights(ground, ground, r, c)[0]

@@ -139,9 +139,9 @@ def _search(problem, tolerance, max_labels):
             if n == len(cost):
                 if n >= max_labels:
                     return np.empty(0, np.int64), np.inf, -np.inf, False
-                labels, cost = with_room(labels, n + 1), with_room(cost, n + 1)
-                state, tested = with_room(state, n + 1), with_room(tested, n + 1)
-                seen = with_room(seen, n + 1)
+                labels, cost, state, tested, seen = _with_room(
+                    labels, cost, state, tested, seen, n + 1
+                )
             if n_risks > 0 and not _spend(
                 problem.risk, tested, n, label, m * n_cells + other, other
             ):
@@ -171,6 +171,13 @@ def _copy(source, target):
     """Copy numbers; the assignment of slices takes two seconds to compile, for its messages."""
     for i in range(len(source)):
         target[i] = source[i]
+
+
+@_part
+def _with_room(labels, cost, state, tested, seen, n):
+    """Labels with room for `n` of them."""
+    labels, cost, state = with_room(labels, n), with_room(cost, n), with_room(state, n)
+    return labels, cost, state, with_room(tested, n), with_room(seen, n)
 
 
 @_part

@@ -86,7 +86,8 @@ def _reach(u, beta0, x0, best, fewest, offsets, order, place, first, extra):
                         for m in range(n_moves):
                             before = place[n] - offsets[m]
                             e = k - 1 - fewest[before]
-                            if e < 0:
+                            # More extra bounds than here: the bound from there is closed.
+                            if e < 0 or e > s:
                                 continue
                             known = top[source, e, before]
                             if by[source, e, before] == n_moves - 1 - m:

@@ -11,7 +11,7 @@ from trustbo.parallel import PART
 
 
 @njit(nogil=True, error_model="numpy", **PART)
-def with_room(rows: np.ndarray, n: int) -> np.ndarray:
+def with_room(rows, n) -> np.ndarray:
     """Array for at least `n` rows: the same one, or one doubled as often as need be."""
     while len(rows) < n:
         rows = np.concatenate((rows, rows))

@@ -22,13 +22,13 @@ from trustbo.models.likelihood.ep.terms import (
     COUNT,
     GAUSSIAN,
     LOG_2PI,
-    N_X,
     OPTIONS,
     PART_OPTIONS,
     concentration,
     constants,
     draw_censored,
     draw_count,
+    new_table,
     table_at,
 )
 
@@ -106,7 +106,7 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
     """
     n, D = gamma.shape
     K, last = chains.y.shape[1], chains.of.shape[1]
-    table, sites = np.zeros((chains.tables.shape[1], N_X)), np.empty(kept.shape)
+    table, sites = new_table(chains.tables), np.empty(kept.shape)
     table_at(chains.tables, delta_v, table)
     start_sites(chains, delta_v, kept, sites[0], sites[1])
     mean, L = np.empty((2, D)), np.zeros((2, D, D))

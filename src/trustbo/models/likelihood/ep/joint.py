@@ -26,10 +26,10 @@ from trustbo.models.likelihood.ep.terms import (
     AT_ONE,
     GAUSSIAN,
     LOG_2PI,
-    N_X,
     OPTIONS,
     PART_OPTIONS,
     match,
+    new_table,
     table_at,
 )
 
@@ -297,7 +297,7 @@ def log_evidence(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps):
     n, D = g.shape
     out = np.empty(n)
     lam, eta = np.empty(chains.y.shape), np.empty(chains.y.shape)
-    table = np.zeros((chains.tables.shape[1], N_X))
+    table = new_table(chains.tables)
     mean, L = np.empty(D), np.zeros((D, D))
     for t in range(n):
         table_at(chains.tables, delta_v[t], table)
@@ -313,7 +313,7 @@ def log_evidence(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps):
 def settle(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps):
     """Sites after damped sweeps at one value of the hyperparameters, (2, chain, bound)."""
     sites = np.empty(kept.shape)
-    table = np.zeros((chains.tables.shape[1], N_X))
+    table = new_table(chains.tables)
     table_at(chains.tables, delta_v, table)
     start_sites(chains, delta_v, kept, sites[0], sites[1])
     propagate(

@@ -123,11 +123,17 @@ def _lagrange(s):
     )
 
 
+@njit(**PART_OPTIONS)
+def new_table(tables):
+    """Room for `table_at`, one row at least: rates that are no counts have the index 0 too."""
+    return np.zeros((max(1, tables.shape[1]), N_X))
+
+
 @njit(**OPTIONS)
 def table_at(tables, delta_v, out):
     """Tables at one concentration, into out (case, x)."""
     at = (math.log(concentration(delta_v)) - _PHI_LOW) / _PHI_STEP
-    at = min(max(at, 1.0), _N_PHI - 2.001)
+    at = min(at, _N_PHI - 2.001) if at >= 1.0 else 1.0  # of NaN too, which is no index
     i = int(at)
     a, b, c, d = _lagrange(at - i)
     for j in range(tables.shape[1]):
@@ -146,7 +152,7 @@ def _read(row, x):
     at = (x - _X_LOW) / _X_STEP
     if at < 1.0:
         return row[1] + (at - 1.0) * (row[1] - row[0])
-    if at > N_X - 2.001:
+    if not at <= N_X - 2.001:  # NaN too, which is no index
         return row[N_X - 2] + (at - (N_X - 2.0)) * (row[N_X - 1] - row[N_X - 2])
     i = int(at)
     a, b, c, d = _lagrange(at - i)

@@ -14,7 +14,13 @@ from numba import njit
 from trustbo.models.likelihood.ep.chains import gather_chains
 from trustbo.models.likelihood.ep.draws import N_CANDIDATES, draw_chain
 from trustbo.models.likelihood.ep.joint import Chains, copy, propagate, start_sites
-from trustbo.models.likelihood.ep.terms import N_X, OPTIONS, concentration, constants, table_at
+from trustbo.models.likelihood.ep.terms import (
+    OPTIONS,
+    concentration,
+    constants,
+    new_table,
+    table_at,
+)
 from trustbo.models.likelihood.families import Family
 from trustbo.models.likelihood.kalman_numpy import TrustSummary
 from trustbo.models.params import Params
@@ -153,7 +159,7 @@ def _chunks(group: _Group, n: int) -> Iterator[slice]:
 @njit(**OPTIONS)
 def _trajectories(theta, drift, chains, kept, x, log_weight, rng):
     """Fill in trust x (draw, n, chain, bound) and log weights (draw, n, chain)."""
-    table, sites = np.zeros((chains.tables.shape[1], N_X)), np.empty(kept.shape)
+    table, sites = new_table(chains.tables), np.empty(kept.shape)
     ahead, choice = np.empty((kept.shape[2], 2)), np.empty((2, N_CANDIDATES))
     nothing, empty = np.empty(0), np.empty((0, 0))
     for t in range(len(theta)):
