@@ -1,0 +1,72 @@
+"""Kernels do not check indices where users run them: here all of them run with checks."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+REACH_EVERY_KERNEL = (
+    "planning/engines",
+    "planning/test_closed_bounds.py",
+    "planning/test_risk.py",
+    "models/likelihood/test_ep.py",
+    "models/likelihood/test_families.py",
+    "models/samplers/test_coupled_target.py",
+    "models/test_places.py",
+    "models/test_filter.py",
+    "terrain/test_rays.py",
+    "terrain/test_features.py",
+    "terrain/test_composite.py",
+    "workspace/test_sight.py",
+    "workspace/test_routes.py",
+    "workspace/test_passable_bounds.py",
+    "workspace/test_line_of_sight.py",
+    "simulation/test_motion.py",
+    "simulation/test_sensing.py",
+    "simulation/test_truth.py",
+)
+"""Tests that call all kernels between them; a new kernel needs one of its own here."""
+
+
+def run(words, **environment):
+    """Run Python in the repository's root."""
+    return subprocess.run(
+        [sys.executable, *words], cwd=ROOT, env=os.environ | environment, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+
+
+def checked(cache):
+    """Settings under which kernels check indices; what is compiled so needs a place of its own."""
+    return {"NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(cache)}
+
+
+@pytest.mark.slow
+def test_every_kernel_keeps_within_its_arrays(tmp_path):
+    """Compiled anew with checks, in tests that reach all of them."""
+    tests = [f"tests/{name}" for name in REACH_EVERY_KERNEL]
+    ended = run(["tests/checked_kernels.py", "-m", "not slow", *tests], **checked(tmp_path))
+    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
+    found = json.loads(ended.stdout.splitlines()[-1])
+    assert found["kernels"] > 100
+    assert found["never compiled"] == []
+
+
+def test_random_plans_are_the_best_of_all_paths():
+    """Problem by problem against enumeration; `benchmarks/fuzz_plans.py` says how."""
+    ended = run(["benchmarks/fuzz_plans.py", "100"])
+    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
+    assert ended.stdout.splitlines()[-1] == "100 problems, 0 wrong, 0 crashes"
+
+
+@pytest.mark.slow
+def test_two_thousand_random_plans_keep_within_their_arrays(tmp_path):
+    """Other problems than the hundred above, with kernels that check their indices."""
+    words = ["benchmarks/fuzz_plans.py", "2000", "--first", "100"]
+    ended = run(words, **checked(tmp_path))
+    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
+    assert ended.stdout.splitlines()[-1] == "2000 problems, 0 wrong, 0 crashes"
