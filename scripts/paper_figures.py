@@ -3,37 +3,37 @@
 The bound and the cloud are of the hillside in the package; overwatch and loop are diagrams.
 """
 
-from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from docs_figures import save
+from docs_figures import draw
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
 import trustbo as tb
 from trustbo.plots.layout import MARKERS
-from trustbo.plots.maps import draw_scale_of
+from trustbo.plots.maps import VEGETATION, draw_relief, draw_scale_of
 from trustbo.plots.plan import COLOURS
+from trustbo.plots.style import theme
 
 mpl.use("Agg")
-FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 PATH = [(5, 0), (4, 0), (3, 1), (3, 2), (2, 3), (1, 3), (0, 4), (0, 5)]
 WIDE = {"fontsize": 10.5, "ha": "center", "va": "center"}
 
 
 def main() -> None:
     """Draw them all."""
-    save(overwatch(), "paper_overwatch")
-    save(loop(), "paper_loop")
+    draw("paper_overwatch", [], overwatch)
+    draw("paper_loop", [], loop)
     terrain = tb.terrain.example()
     team = tb.Team(n_robots=3)
     workspace = tb.Workspace.from_terrain(terrain, (10, 10), team)
     plan = tb.Campaign(workspace, (9, 0), (0, 9)).ask()
-    save(bound(plan, 5), "paper_bound")
-    save(cloud(terrain), "paper_cloud")
+    draw("paper_bound", [], lambda: bound(plan, 5))
+    draw("paper_cloud", [], lambda: cloud(terrain))
 
 
 def overwatch() -> Figure:
@@ -41,34 +41,45 @@ def overwatch() -> Figure:
     figure, ax = plt.subplots(figsize=(5.4, 3.9), layout="constrained")
     for row in range(6):
         for col in range(6):
-            ax.add_patch(Rectangle((col, row), 1, 1, facecolor="none", edgecolor="0.8"))
+            ax.add_patch(
+                Rectangle((col, row), 1, 1, facecolor="none", edgecolor=theme().quiet, alpha=0.6)
+            )
     x, y = (np.array(PATH)[:, ::-1] + 0.5).T
-    ax.plot(x[:4], y[:4], color="0.35", linewidth=2)
-    ax.plot(x[3:], y[3:], color="0.35", linewidth=2, linestyle=(0, (3, 2)))
+    ax.plot(x[:4], y[:4], color=theme().quiet, linewidth=2)
+    ax.plot(x[3:], y[3:], color=theme().quiet, linewidth=2, linestyle=(0, (3, 2)))
     (lead_x, lead_y), (own_x, own_y) = (x[4], y[4]), (x[3], y[3])
     for (dx, dy), colour, marker in zip(
         [(-0.28, 0.22), (0.0, -0.3), (0.27, 0.25)], COLOURS, MARKERS, strict=False
     ):
         ax.plot([own_x + dx, lead_x], [own_y + dy, lead_y], color=colour, linewidth=1)
-        ax.plot(own_x + dx, own_y + dy, marker, color=colour, markersize=9, markeredgecolor="w")
-    ax.plot(lead_x, lead_y, "*", color="black", markersize=17, markeredgecolor="white")
-    ax.annotate("subteam T2 stands\nand watches", (own_x + 0.1, own_y + 0.42), (2.2, 5.0), **ARROW)
-    ax.annotate("lead T1 bounds\nto the next cell", (lead_x + 0.2, lead_y), (5.3, 2.5), **ARROW)
+        ax.plot(
+            own_x + dx,
+            own_y + dy,
+            marker,
+            color=colour,
+            markersize=9,
+            markeredgecolor=theme().paper,
+        )
+    ax.plot(lead_x, lead_y, "*", color=theme().ink, markersize=17, markeredgecolor=theme().paper)
+    ax.annotate("subteam T2 stands\nand watches", (own_x + 0.1, own_y + 0.42), (2.2, 5.0), **note())
+    ax.annotate("lead T1 bounds\nto the next cell", (lead_x + 0.2, lead_y), (5.3, 2.5), **note())
     ax.text(x[0], y[0] + 0.32, "start", **WIDE)
     ax.text(x[-1], y[-1] - 0.3, "goal", **WIDE)
-    ax.plot(x[[0, -1]], y[[0, -1]], "o", color="0.35", markersize=7)
+    ax.plot(x[[0, -1]], y[[0, -1]], "o", color=theme().quiet, markersize=7)
     ax.set(xlim=(-0.05, 6.05), ylim=(6.05, -0.05), aspect="equal")
     ax.axis("off")
     return figure
 
 
-ARROW = {
-    "fontsize": 10,
-    "ha": "center",
-    "va": "center",
-    "bbox": {"facecolor": "white", "edgecolor": "0.8", "boxstyle": "round,pad=0.3"},
-    "arrowprops": {"arrowstyle": "-", "color": "0.4"},
-}
+def note() -> dict[str, Any]:
+    """Style of a note with a line to what it names."""
+    box = {"facecolor": theme().paper, "edgecolor": theme().quiet, "boxstyle": "round,pad=0.3"}
+    return {
+        "fontsize": 10, "ha": "center", "va": "center", "bbox": box,
+        "arrowprops": {"arrowstyle": "-", "color": theme().quiet},
+    }  # fmt: skip
+
+
 BOXES = {
     "terrain": ((0.0, 1.5), "terrain: DEM and DSM,\nor a point cloud", "terrain.read_terrain"),
     "awareness": ((3.4, 1.5), "awareness $Z$\nof cells, or of bounds", "Workspace.from_terrain"),
@@ -95,7 +106,7 @@ def loop() -> Figure:
     for (x, y), text, name in BOXES.values():
         box = FancyBboxPatch(
             (x, y), WIDTH, HEIGHT, boxstyle="round,pad=0.02,rounding_size=0.08",
-            facecolor="#eef4f9", edgecolor=COLOURS[0],
+            facecolor=theme().band, edgecolor=COLOURS[0],
         )  # fmt: skip
         ax.add_patch(box)
         ax.text(x + WIDTH / 2, y + 0.62, text, **WIDE)
@@ -104,7 +115,7 @@ def loop() -> Figure:
         tail, head = _sides(start, end)
         ax.add_patch(
             FancyArrowPatch(
-                tail, head, arrowstyle="-|>", mutation_scale=13, color="0.25",
+                tail, head, arrowstyle="-|>", mutation_scale=13, color=theme().ink,
                 shrinkA=3, shrinkB=3,
             )
         )  # fmt: skip
@@ -138,37 +149,38 @@ def bound(plan: tb.planning.Plan, k: int) -> Figure:
         _ground(ax, plan, np.concatenate([stops, posts, after, lead]))
         ax.set_title(title, fontsize=10)
     first, second = axes
-    first.plot(*lead.T, color="black", linewidth=2.5)
-    first.plot(*stops[0], "*", color="white", markersize=15, markeredgecolor="black")
+    ink, paper = theme().ink, theme().paper
+    first.plot(*lead.T, color=ink, linewidth=2.5)
+    first.plot(*stops[0], "*", color=paper, markersize=15, markeredgecolor=ink)
     for ax, lead_at in ((first, stops[1]), (second, stops[1])):
-        ax.plot(*lead_at, "*", color="black", markersize=16, markeredgecolor="white", zorder=6)
+        ax.plot(*lead_at, "*", color=ink, markersize=16, markeredgecolor=paper, zorder=6)
     for i, (post, way, then) in enumerate(zip(posts, closing, after, strict=True)):
         colour, marker = COLOURS[i], MARKERS[i]
-        here = {"color": colour, "markersize": 9, "markeredgecolor": "white", "zorder": 7}
+        here = {"color": colour, "markersize": 9, "markeredgecolor": paper, "zorder": 7}
         first.plot(*np.stack([post, stops[1]]).T, color=colour, linewidth=1)
         first.plot(*post, marker, **here)
         second.plot(*way.T, color=colour, linewidth=1.8, linestyle=(0, (3, 1.5)))
         second.plot(*np.stack([then, stops[1]]).T, color=colour, linewidth=0.8)
-        second.plot(*post, marker, **{**here, "color": "white", "markeredgecolor": colour})
+        second.plot(*post, marker, **{**here, "color": paper, "markeredgecolor": colour})
         second.plot(*then, marker, **here, label=f"{plan.workspace.team.names[i]}")
-    second.plot([], [], "*", color="black", markersize=12, label="lead")
+    second.plot([], [], "*", color=ink, markersize=12, label="lead")
     figure.legend(loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
 
 
 def _ground(ax: Axes, plan: tb.planning.Plan, seen: np.ndarray) -> None:
-    """Contour lines of the ground, vegetation in grey and the borders of cells around points."""
+    """Draw contour lines, tall vegetation and the borders of cells around points."""
     terrain, grid = plan.workspace.terrain, plan.workspace.grid
     x = terrain["x"].values - grid.corner[0]
     y = terrain["y"].values - grid.corner[1]
     grown = (terrain["dsm"] - terrain["dem"]).values
-    ax.contourf(x, y, grown, levels=[3.0, 15.0, 60.0], colors=["0.92", "0.84"])
-    ax.contour(x, y, terrain["dem"].values, levels=np.arange(0, 1000, 1.0), colors="0.7",
-               linewidths=0.5)  # fmt: skip
+    ax.set_facecolor(theme().ground)
+    ax.contourf(x, y, grown, levels=[3.0, 60.0], colors=[VEGETATION])
+    draw_relief(ax, plan.workspace, colour=theme().contour, opacity=1.0)
     for col in range(grid.shape[1] + 1):
-        ax.axvline(col * grid.cell_width, color="0.45", linewidth=0.8, linestyle=":")
+        ax.axvline(col * grid.cell_width, color=theme().quiet, linewidth=0.8, linestyle=":")
     for row in range(grid.shape[0] + 1):
-        ax.axhline(row * grid.cell_height, color="0.45", linewidth=0.8, linestyle=":")
+        ax.axhline(row * grid.cell_height, color=theme().quiet, linewidth=0.8, linestyle=":")
     low, high = seen.min(0), seen.max(0)
     half, middle = 0.58 * (high - low).max() + 2.0, (low + high) / 2.0
     ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
@@ -189,6 +201,8 @@ def cloud(terrain) -> Figure:
     )
     ax.set_box_aspect((np.ptp(x), np.ptp(y), np.ptp(top[known])), zoom=0.92)
     ax.view_init(28, -62)
+    for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
+        axis.set_pane_color(theme().ground)
     ax.set(xlabel="east (m)", ylabel="north (m)", zlabel="height (m)")
     ax.set(xticks=[0, 100, 200], yticks=[0, 100], zticks=[450, 550, 650])
     ax.tick_params(labelsize=9, pad=0)
