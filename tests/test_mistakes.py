@@ -82,7 +82,9 @@ MISTAKES = {
     # places
     "start off the grid": (lambda c: c.iterate((6, 0), (0, 5)), "rows are 0..5 from the top"),
     "start of floats": (lambda c: c.iterate((5.0, 0.5), (0, 5)), "two whole numbers .row, col."),
-    "start as text": (lambda c: c.iterate("5,0", (0, 5)), "row, col.; got '5,0'"),
+    "start without names": (
+        lambda c: c.iterate("25.5,25.5", (0, 5)), "got '25.5,25.5'.* x=25.5,y=25.5 is in cell"
+    ),
     "start is goal": (lambda c: c.iterate((5, 0), (5, 0)), "same cell .5, 0.; choose two"),
     # workspaces
     "awareness without robots": (

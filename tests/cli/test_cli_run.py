@@ -130,9 +130,15 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--start", "9,9"), "start (9, 9) is outside the grid of 3 rows and 3 columns"),
+        (
+            ("--start", "9,9"),
+            "start '9,9' (row 9, column 9) is outside the grid of 3 rows and 3 columns",
+        ),
         (("--goal", "2,0"), "start and goal are the same cell (2, 0)"),
-        (("--start", "2;0"), "--start must be two whole numbers as 9,0; got '2;0'"),
+        (
+            ("--start", "2;0"),
+            "start must be two whole numbers (row, col), or a position with names; got '2;0'",
+        ),
         (("--policy", "bold"), "unknown policy 'bold'; choose one of greedy, optimistic, thompson"),
         (("--objective", "best"), "unknown objective 'best'; choose one of lost_contact, terminal"),
         (

@@ -22,7 +22,7 @@ def test_a_grid_covers_the_terrain(terrain):
     assert grid.cell_width == pytest.approx((right - left) / 3)
     for cell in ((0, 0), (3, 2), (1, 2)):
         assert grid.cell_at(*grid.center(cell)) == cell
-    with pytest.raises(TrustboError, match="is off the grid"):
+    with pytest.raises(TrustboError, match="is outside the grid of 4 rows and 3"):
         grid.cell_at(left - 1.0, top)
 
 
@@ -161,5 +161,7 @@ def test_cells_off_the_grid_or_impassable_are_named():
         TrustboError, match=r"start \(1, 1\) is impassable; the nearest passable cell is \(0, 1\)"
     ):
         workspace.require_cell("start", (1, 1))
-    with pytest.raises(TrustboError, match=r"start must be two whole numbers \(row, col\); got 7"):
+    with pytest.raises(
+        TrustboError, match=r"start must be two whole numbers \(row, col\), or .* got 7"
+    ):
         workspace.require_cell("start", 7)

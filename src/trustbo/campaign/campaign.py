@@ -31,7 +31,7 @@ from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import resolve_policy
 from trustbo.stacking import fill_awareness
-from trustbo.workspace import Workspace
+from trustbo.workspace import Location, Workspace
 from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 _N_MAPS = 500
@@ -61,8 +61,8 @@ class Campaign(LearnedMissions, Displayed):
     def __init__(
         self,
         workspace: Workspace,
-        start: Cell,
-        goal: Cell,
+        start: Location,
+        goal: Location,
         *,
         model: TrustModel | None = None,
         policy: str | Policy = POLICY,
@@ -76,8 +76,8 @@ class Campaign(LearnedMissions, Displayed):
 
         Args:
             workspace: Workspace of the paths.
-            start: First cell of every path.
-            goal: Last cell of every path.
+            start: First cell of every path, or a position in it; see `Workspace.locate`.
+            goal: Last cell of every path, or a position in it.
             model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
             policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
             objective: Objective of the paths; see `Planner`.

@@ -16,20 +16,20 @@ from trustbo.campaign.stopping import (
     rules_of,
     rules_to_record,
 )
-from trustbo.data import Cell, Mission
+from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
 from trustbo.simulation.protocol import require_bounds, require_call, takes
-from trustbo.workspace import Workspace
+from trustbo.workspace import Location, Workspace
 
 
 def iterate(
     workspace: Workspace,
-    start: Cell,
-    goal: Cell,
+    start: Location,
+    goal: Location,
     *,
     n_iterations: int = 8,
     model: TrustModel | None = None,
@@ -48,8 +48,10 @@ def iterate(
 
     Args:
         workspace: Workspace of the paths.
-        start: First cell, (row, col); row 0 is the top.
-        goal: Last cell.
+        start: First cell, (row, col) with row 0 at the top; or a position in it, in metres of the
+            CRS, `"x=1748000,y=5427000"`, or in degrees, `"lon=174.7,lat=-41.3"`, or mappings of
+            these names; see `Workspace.locate`.
+        goal: Last cell, or a position in it.
         n_iterations: Largest number of missions.
         model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
         policy: Name in `planning.POLICIES`, or a callable `policy(key, draws, planner) -> Plan`.

@@ -13,10 +13,10 @@ from trustbo.errors import TrustboError, require_choice
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
     from trustbo.campaign.learning import Learning
-    from trustbo.data import Cell, Mission
+    from trustbo.data import Mission
     from trustbo.models import Hazard, TrustModel
     from trustbo.planning import Planner
-    from trustbo.workspace import AwarenessBelief, Workspace
+    from trustbo.workspace import AwarenessBelief, Location, Workspace
 
     Callback = Callable[[Campaign, Mission], None]
 
@@ -143,8 +143,8 @@ class CampaignOptions:
     def planner(
         self,
         workspace: "Workspace",
-        start: "Cell",
-        goal: "Cell",
+        start: "Location",
+        goal: "Location",
         objective: str,
         observation: str,
         response: str,

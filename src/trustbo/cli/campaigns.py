@@ -8,14 +8,11 @@ from typing import TYPE_CHECKING, Any
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import require_outputs, write_outputs
+from trustbo.cli.terrains import Rasters, pair, team_of
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
     from trustbo.simulation import KinematicSimulator
-    from trustbo.team import Team
-
-_MOST_PIXELS = 9e6
-"""Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
 
 
 def run(
@@ -50,6 +47,7 @@ def run(
 
     Example: trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
     The same, with flags in a file: trustbo run --config mission.yaml --seed 2 --out out/second
+    Ends where a map has them: --start lon=175.4007,lat=-40.9204 --goal x=1802403,y=5467480
 
     The folder gets report.html (read this first), explore.html (interactive),
     maps.png, terrain.png, maps.tif with its style maps.qml and path.geojson (for
@@ -63,23 +61,19 @@ def run(
         chosen = CampaignOptions(**options)
         require_outputs(out, overwrite=overwrite)
         trust_model = _models()[model](observation=observation).model()
-        team = _team(robots, max_slope, lidar_range)
-        cells = _pair("start", start), _pair("goal", goal)
-        rows_cols = _pair("shape", shape)
-        from trustbo import simulation, terrain
+        team = team_of(max_slope, robots, lidar_range)
+        from trustbo import simulation
         from trustbo.campaign.loop import iterate
         from trustbo.campaign.stopping import RegretBound
         from trustbo.workspace import Workspace
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
-        place = {"crs": crs, "resolution": resolution, "nodata": nodata}
-        ground = terrain.read_terrain(
-            dem, dsm, **place, max_pixels=_MOST_PIXELS, progress=not quiet
-        )
-        workspace = Workspace.from_terrain(ground, rows_cols, team, sight=sight)
+        rasters = Rasters(dem, dsm, crs, resolution, nodata)
+        found = rasters.found((start, goal), pair("shape", shape), team, progress=not quiet)
+        workspace = Workspace.from_terrain(found.ground, found.grid.shape, team, sight=sight)
         result = iterate(
             workspace,
-            *cells,
+            *found.ends,
             n_iterations=iterations,
             model=trust_model,
             policy=policy,
@@ -211,27 +205,6 @@ def _models() -> dict[str, Any]:
     from trustbo.study.parts import NAMED_MODELS
 
     return {model.kind: model for model in NAMED_MODELS}
-
-
-def _team(n_robots: int, max_slope: float, lidar_range: float) -> "Team":
-    """Make a team of equal robots; the slope is in degrees."""
-    from math import radians
-
-    from trustbo.team import Robot, Team
-
-    if not 0.0 < max_slope < 90.0:
-        raise TrustboError(f"--max-slope must be between 0 and 90 degrees; got {max_slope:g}.")
-    require_whole("n_robots", n_robots, 1)
-    robot = Robot(max_slope=radians(max_slope), lidar_range=lidar_range)
-    return Team(robots=(robot,) * n_robots, lead=robot)
-
-
-def _pair(what: str, text: str) -> tuple[int, int]:
-    try:
-        first, second = (int(part) for part in text.split(","))
-    except ValueError:
-        raise TrustboError(f"--{what} must be two whole numbers as 9,0; got {text!r}.") from None
-    return first, second
 
 
 def _state(folder: Path) -> dict[str, Any]:

@@ -12,6 +12,8 @@ from trustbo.errors import TrustboError
 
 _FILES = ("dem", "dsm")
 """Flags whose paths are relative to the file, not to the working directory."""
+_LOCATIONS = ("start", "goal")
+"""Flags that may be mappings such as {lon: 174.7, lat: -41.3}."""
 _NOT_IN_FILE = ("config",)
 
 
@@ -61,8 +63,10 @@ def _read(path: Path) -> Mapping[Any, Any]:
 
 def _typed(path: Path, name: str, value: object) -> str | None:
     """Write a value as it would be typed; None leaves the flag at its default."""
-    if isinstance(value, list | tuple) and all(type(item) is int for item in value):
+    if isinstance(value, list | tuple) and all(type(item) in (int, float) for item in value):
         return ",".join(str(item) for item in value)  # a cell as YAML writes pairs
+    if isinstance(value, Mapping) and name in _LOCATIONS:
+        return ",".join(f"{axis}={number}" for axis, number in value.items())
     if value is None or isinstance(value, str | int | float):  # bool is an int
         return None if value is None else str(value)
     raise TrustboError(

@@ -15,8 +15,9 @@ _HELP = """
 Terrain and grid
   dem FILE: Heights of the ground (DEM), e.g. a GeoTIFF.
   dsm FILE: Heights of the canopy (DSM) of the same place; without one, no canopy is known.
-  start ROW,COL: First cell; row 0 is in the north.
-  goal ROW,COL: Last cell.
+  start PLACE: First cell, as row,col with row 0 in the north; or a position in it, as
+    x=1748000,y=5427000 in metres of the terrain's CRS, or lon=174.7,lat=-41.3.
+  goal PLACE: Last cell, or a position in it.
   shape ROWS,COLS: Planning grid.
   crs CRS: CRS of rasters that carry none, e.g. EPSG:32633.
   resolution M: Pixel size of rasters that carry none; others are averaged to about it. Rasters of
@@ -71,6 +72,7 @@ Program
   worlds.out FOLDER: Folder for the results, made if need be.
   report.out FILE: File of the page; by default report.html in the folder.
   export.out FOLDER: Folder for the files; by default the result's.
+  info.out FILE: Picture of the grid, a .png.
   overwrite: Replace the campaign that the folder holds.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
@@ -86,6 +88,8 @@ Options
   workers N: Number of processes of loky or dask; by default one for each core.
 Arguments
   folder FOLDER: Folder of the campaign's results.
+  info.dem DEM: Heights of the ground (DEM), e.g. a GeoTIFF.
+  info.dsm DSM: Heights of the canopy (DSM) of the same place, if known.
   study.config CONFIG: Study in YAML; see docs/studies.md.
 """
 """Flags by panel: name, placeholder and help; `command.name` where it differs by command."""

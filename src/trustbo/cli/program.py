@@ -13,6 +13,7 @@ from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.options import with_flags
 from trustbo.cli.results import export, report
 from trustbo.cli.study import study
+from trustbo.cli.terrains import info
 from trustbo.cli.worlds import worlds
 
 EPILOG = """
@@ -22,7 +23,7 @@ measured missions are kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
 _PANELS = (
-    ("Campaigns", (demo, run, resume)),
+    ("Campaigns", (demo, info, run, resume)),
     ("Results", (report, export)),
     ("Studies", (study, worlds)),
 )
@@ -79,6 +80,7 @@ def _program(
     """Learn the trust in robots on a terrain, and plan the most trustworthy path.
 
     On a real hillside:  trustbo demo
+    The grid of your own:    trustbo info dem.tif dsm.tif
     On your own:             trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
     All flags:               trustbo run --help
     """

@@ -20,7 +20,7 @@ from trustbo.planning.graph import (
     move_lengths,
     require_way,
 )
-from trustbo.workspace import Workspace
+from trustbo.workspace import Location, Workspace
 from trustbo.workspace.moves import (
     MOVES,
     existing_bounds,
@@ -51,8 +51,8 @@ class AdmissiblePaths:
     def __init__(
         self,
         workspace: Workspace,
-        start: Cell,
-        goal: Cell,
+        start: Location,
+        goal: Location,
         connectivity: int,
         max_bounds: int | str | None,
         revisit: bool,

@@ -27,7 +27,7 @@ from trustbo.planning.problem import PlanningProblem, draws_of
 from trustbo.planning.risk import FailureRule, Risk
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.planning.values import evaluate
-from trustbo.workspace import Workspace
+from trustbo.workspace import Location, Workspace
 
 
 class Planner(Displayed):
@@ -51,8 +51,8 @@ class Planner(Displayed):
     def __init__(
         self,
         workspace: Workspace,
-        start: Cell,
-        goal: Cell,
+        start: Location,
+        goal: Location,
         objective: str = "lost_contact",
         *,
         connectivity: int = 8,
@@ -73,8 +73,8 @@ class Planner(Displayed):
 
         Args:
             workspace: Planning grid with awareness and passability.
-            start: First cell.
-            goal: Last cell.
+            start: First cell, or a position in it; see `Workspace.locate`.
+            goal: Last cell, or a position in it.
             objective: `"lost_contact"`, `"terminal"`, `"mean"`, `"success"`, `"bottleneck"` or
                 `"stationary"`; see `OBJECTIVES`.
             connectivity: 4, or 8 to allow diagonal bounds too.

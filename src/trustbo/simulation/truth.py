@@ -31,7 +31,7 @@ from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import takes
 from trustbo.simulation.replicates import KinematicReplicates, PlainReplicates
 from trustbo.terrain.dataset import digest_of
-from trustbo.workspace import Workspace
+from trustbo.workspace import Location, Workspace
 
 OBJECTIVES = ("lost_contact", "mean")
 """Objectives that a truth has a best path for."""
@@ -159,8 +159,8 @@ class Truth(Displayed):
 
     def best(
         self,
-        start: Cell,
-        goal: Cell,
+        start: Location,
+        goal: Location,
         objective: str = "lost_contact",
         max_bounds: int | str = "shortest+4",
         *,
@@ -169,8 +169,8 @@ class Truth(Displayed):
         """Find the best admissible path, exactly.
 
         Args:
-            start: First cell.
-            goal: Last cell.
+            start: First cell, or a position in it; see `Workspace.locate`.
+            goal: Last cell, or a position in it.
             objective: `"lost_contact"`, the least contact lost, or `"mean"`, the largest mean rate.
             max_bounds: Admissible paths, and
             connectivity: moves, both as for `Planner`.
@@ -180,9 +180,10 @@ class Truth(Displayed):
             NoPathError: The goal cannot be reached.
         """
         require_choice("objective of a truth", objective, OBJECTIVES)
-        key = tuple(start), tuple(goal), objective, max_bounds, connectivity
+        a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
+        key = a, b, objective, max_bounds, connectivity
         if key not in self._best:
-            paths = AdmissiblePaths(self.workspace, start, goal, connectivity, max_bounds, True)
+            paths = AdmissiblePaths(self.workspace, a, b, connectivity, max_bounds, True)
             self._best[key] = self.bounds.best(paths, objective)
         return self._best[key]
 

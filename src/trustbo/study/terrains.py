@@ -11,12 +11,12 @@ import numpy as np
 
 from trustbo import terrain
 from trustbo.campaign.loop import path_class
-from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.planning import Planner
 from trustbo.study.parts import Part
 from trustbo.team import Team
-from trustbo.workspace import Workspace
+from trustbo.workspace import Location, Workspace, survey
+from trustbo.workspace.location import CELL, named
 
 EACH_RUN = "run"
 """Seed of a terrain that differs between runs: it takes the run's seed."""
@@ -27,22 +27,24 @@ class Terrain(Part, ABC):
     """Planning grid of a run, with start and goal; by default from bottom left to top right."""
 
     shape: tuple[int, int] = (10, 10)
-    start: Cell | None = None
-    goal: Cell | None = None
+    start: Location | None = None
+    goal: Location | None = None
     n_robots: int = 3
 
     def __post_init__(self) -> None:
         rows, cols = require_pair("shape", self.shape)
         for name, corner in (("start", (rows - 1, 0)), ("goal", (0, cols - 1))):
             cell = corner if getattr(self, name) is None else getattr(self, name)
-            object.__setattr__(self, name, require_pair(name, cell))
+            found = named(name, cell)
+            # As JSON and hashes can hold it.
+            object.__setattr__(self, name, found.values if found.names == CELL else found.text)
         object.__setattr__(self, "shape", (rows, cols))
         require_whole("n_robots", self.n_robots, 1)
 
     @property
-    def ends(self) -> tuple[Cell, Cell]:
+    def ends(self) -> tuple[Location, Location]:
         """Start and goal."""
-        return cast(Cell, self.start), cast(Cell, self.goal)
+        return cast(Location, self.start), cast(Location, self.goal)
 
     def at(self, seed: int) -> "Terrain":
         """Terrain of the run with this seed."""
@@ -114,7 +116,11 @@ class FileTerrain(Terrain):
     def make(self) -> Workspace:
         """Make the workspace anew."""
         ground = terrain.read_terrain(self.dem, self.dsm, crs=self.crs, resolution=self.resolution)
-        return Workspace.from_terrain(ground, self.shape, Team(n_robots=self.n_robots))
+        team = Team(n_robots=self.n_robots)
+        found = survey(ground, self.shape, team)
+        for name, end in zip(("start", "goal"), self.ends, strict=True):
+            found.require_cell(name, end)  # before awareness is computed
+        return Workspace.from_terrain(ground, self.shape, team)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -37,7 +37,7 @@ def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
     around = _halo_rows(terrain, halo)
     step = max(_PIXELS // n_cols, around // 2, 1)
     for first in range(0, n_rows, step):
-        yield _strip(terrain, first, min(first + step, n_rows), around)
+        yield strip_of(terrain, first, min(first + step, n_rows), around)
 
 
 def sample_strips(terrain: xr.Dataset, halo: float, n_pixels: int) -> Iterator[Strip]:
@@ -51,7 +51,7 @@ def sample_strips(terrain: xr.Dataset, halo: float, n_pixels: int) -> Iterator[S
     n_strips = min(_N_SAMPLED, wanted)
     height = wanted // n_strips
     for first in np.linspace(0, n_rows - height, n_strips).astype(int):
-        yield _strip(terrain, int(first), int(first) + height, around)
+        yield strip_of(terrain, int(first), int(first) + height, around)
 
 
 def _halo_rows(terrain: xr.Dataset, halo: float) -> int:
@@ -61,7 +61,8 @@ def _halo_rows(terrain: xr.Dataset, halo: float) -> int:
     return min(n_rows, int(np.ceil(halo / pixel_size(terrain)[0])) + 2)
 
 
-def _strip(terrain: xr.Dataset, first: int, last: int, around: int) -> Strip:
+def strip_of(terrain: xr.Dataset, first: int, last: int, around: int) -> Strip:
+    """Read the rows from `first` up to `last`, and `around` more on both sides, as a strip."""
     top, bottom = max(0, first - around), min(terrain["dem"].shape[0], last + around)
     window, n_clipped, n_valid = terrain.isel(y=slice(top, bottom)), 0, 0
     if is_lazy(terrain):

@@ -7,15 +7,16 @@ import xarray as xr
 from numba import njit
 from numpy.typing import ArrayLike
 from rasterio.crs import CRS
+from rasterio.transform import from_origin
 from rasterio.warp import transform as transform_points
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TerrainError, TrustboError, require_pair
+from trustbo.workspace.location import WGS84, Location, cell_of, crs_name
 
 Sums = tuple[np.ndarray, np.ndarray]
 """Sum over each cell's pixels with data, and their number, each of shape (row, col)."""
-WGS84 = CRS.from_epsg(4326)
 
 
 @dataclass(frozen=True, repr=False)
@@ -74,7 +75,7 @@ class Grid(Displayed):
                 f"{self.cell_height:.4g} m (north-south) x {self.cell_width:.4g} m (east-west)",
             ),
             ("corner", f"x {left:.10g}, y {bottom:.10g} m, lower left"),
-            ("CRS", "none" if self.crs is None else CRS.from_wkt(self.crs).to_string()),
+            ("CRS", "none" if self.crs is None else crs_name(self)),
         ]
         return Card(f"Grid: {self.shape[0]} x {self.shape[1]} cells", rows)
 
@@ -90,6 +91,12 @@ class Grid(Displayed):
         return self.left, self.top - self.shape[0] * self.cell_height
 
     @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Left, bottom, right and top, CRS metres."""
+        left, bottom = self.corner
+        return left, bottom, left + self.shape[1] * self.cell_width, self.top
+
+    @property
     def x(self) -> np.ndarray:
         """X of the columns' centres, CRS metres, shape (col,)."""
         return self.left + (np.arange(self.shape[1]) + 0.5) * self.cell_width
@@ -99,17 +106,37 @@ class Grid(Displayed):
         """Y of the rows' centres, CRS metres, shape (row,)."""
         return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
 
+    def locate(self, location: Location | None = None, **named: float) -> Cell:
+        """Cell of a location, known from the georeference alone; it may be impassable.
+
+        Args:
+            location: Cell (row, col), or a position with names: `"lon=174.7,lat=-41.3"`,
+                `"x=1748000,y=5427000"`, or a mapping of these names to numbers.
+            **named: The same names, in place of a location: `locate(lon=174.7, lat=-41.3)`.
+
+        Raises:
+            TrustboError: The location is off the grid, or none; or in degrees, without a CRS.
+        """
+        return cell_of("location", named if location is None else location, self)
+
     def cell_at(self, x: float, y: float) -> Cell:
         """Cell at a position in CRS metres.
 
         Raises:
             TrustboError: The position is off the grid.
         """
-        row = int(np.floor((self.top - y) / self.cell_height))
-        col = int(np.floor((x - self.left) / self.cell_width))
-        if not (0 <= row < self.shape[0] and 0 <= col < self.shape[1]):
-            raise TrustboError(f"position ({x:g}, {y:g}) is off the grid.")
-        return row, col
+        return cell_of("position", {"x": x, "y": y}, self)
+
+    def place(self, maps: xr.Dataset) -> xr.Dataset:
+        """Maps of the cells (row, col) on their place: dims (y, x), with the transform and CRS."""
+        placed = maps.drop_vars(["row", "col", "y", "x"], errors="ignore").rename(row="y", col="x")
+        placed = placed.assign_coords(y=self.y, x=self.x)
+        for axis in ("y", "x"):
+            placed[axis].attrs = {"axis": axis.upper(), "units": "m"}
+        if self.crs is not None:
+            placed = placed.rio.write_crs(self.require_crs())
+        step = self.cell_width, self.cell_height
+        return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
     def lonlat(self, cell: Cell) -> tuple[float, float]:
         """Longitude and latitude of a cell's centre, degrees (WGS 84).
@@ -118,7 +145,7 @@ class Grid(Displayed):
             TrustboError: The grid has no CRS.
         """
         x, y = self.center(cell)
-        lon, lat = transform_points(self._crs(), WGS84, [x], [y])[:2]
+        lon, lat = transform_points(self.require_crs(), WGS84, [x], [y])[:2]
         return lon[0], lat[0]
 
     def cell_at_lonlat(self, lon: float, lat: float) -> Cell:
@@ -127,8 +154,7 @@ class Grid(Displayed):
         Raises:
             TrustboError: The position is off the grid, or the grid has no CRS.
         """
-        x, y = transform_points(WGS84, self._crs(), [lon], [lat])[:2]
-        return self.cell_at(x[0], y[0])
+        return cell_of("position", {"lon": lon, "lat": lat}, self)
 
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
         """Mean over each cell's pixels with data.
@@ -154,13 +180,21 @@ class Grid(Displayed):
         col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
         return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
 
-    def _crs(self) -> CRS:
+    def require_crs(self) -> CRS:
+        """CRS of the grid; TrustboError without one."""
         if self.crs is None:
             raise TrustboError(
                 "this grid has no coordinate reference system: its workspace was not made from a "
                 "terrain. Use cell_at and center, in metres."
             )
         return CRS.from_user_input(self.crs)
+
+
+def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
+    """Maps with the dims row and col, also of those with (y, x), as `Result.maps` has them."""
+    if not {"y", "x"} <= set(maps.dims):
+        return maps
+    return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")
 
 
 class CellMeans:

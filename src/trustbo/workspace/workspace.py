@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, Mission, default_features, is_line_of_sight
+from trustbo.data import FEATURES, Cell, Mission, default_features, is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
-from trustbo.errors import ShapeError, TrustboError, require_pair, require_positive
+from trustbo.errors import ShapeError, TrustboError, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -36,14 +36,13 @@ from trustbo.workspace.bound_awareness import (
 from trustbo.workspace.cells import of_cells
 from trustbo.workspace.difficulty import MEASURES, bound_difficulty
 from trustbo.workspace.grid import Grid
+from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds, moves_along
 from trustbo.workspace.posts import FORMATION_RADIUS, Posts, require_formation
 from trustbo.workspace.sight import Sight, sights_of
 from trustbo.workspace.surface import Surface, surface_of
+from trustbo.workspace.survey import MAX_MISSING, reason_impassable
 from trustbo.workspace.ways import Ways
-
-MAX_MISSING = 0.5
-"""Largest share of missing or too steep pixels in a passable cell."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -388,10 +387,19 @@ class Workspace(Displayed):
         """Return a mission with its robots and features in the order of the workspace's.
 
         A mission need not have a line of sight, which is predicted, not measured: it is NaN then.
+        Features without names of their own, z3, z4, ..., have those of the workspace's in the same
+        places.
 
         Raises:
             ShapeError: It has other robots or features.
         """
+        unnamed = default_features(len(mission.features))
+        if mission.features == unnamed and len(unnamed) == len(self.features):
+            named = tuple(
+                own if name not in FEATURES else name
+                for name, own in zip(unnamed, self.features, strict=True)
+            )
+            mission = dataclasses.replace(mission, features=named)
         predicted = [name for name in self.features if is_line_of_sight(name)]
         return mission.in_order(self.team.names, self.features, predicted)
 
@@ -403,7 +411,10 @@ class Workspace(Displayed):
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
         """
-        return fill_awareness(self.in_order(mission), self.along(mission.path))
+        own = self.in_order(mission)
+        if not np.isnan(own.awareness).any():
+            return own
+        return fill_awareness(own, self.along(own.path))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""
@@ -430,41 +441,33 @@ class Workspace(Displayed):
         values = self.awareness.values[:, None]
         return values if self.of_bounds is None else self.of_bounds.values
 
-    def require_cell(self, what: str, cell: Cell) -> Cell:
-        """Check that a cell is passable, and return it as a pair of ints.
+    def locate(self, location: Location | None = None, **named: float) -> Cell:
+        """Cell of a location.
+
+        Args:
+            location: Cell (row, col), or a position with names: `"lon=174.7,lat=-41.3"`,
+                `"x=1748000,y=5427000"`, or a mapping of these names to numbers.
+            **named: The same names, in place of a location: `locate(lon=174.7, lat=-41.3)`.
 
         Raises:
-            TrustboError: It is no pair, off the grid, without data, or impassable.
+            TrustboError: The location is off the grid, without data, impassable, or none.
         """
-        row, col = require_pair(what, cell)
-        rows, cols = self.grid.shape
-        if not (0 <= row < rows and 0 <= col < cols):
-            raise TrustboError(
-                f"{what} {(row, col)} is outside the grid of {rows} rows and {cols} columns; rows "
-                f"are 0..{rows - 1} from the top, columns 0..{cols - 1}."
-            )
-        if not self.passable.values[row, col]:
-            raise TrustboError(
-                f"{what} {(row, col)} is impassable{self._why_impassable(row, col)}; the nearest "
-                f"passable cell is {self._nearest_passable(row, col)}."
-            )
-        return row, col
+        return self.require_cell("location", named if location is None else location)
+
+    def require_cell(self, what: str, cell: Location) -> Cell:
+        """Check that a location is in a passable cell, and return the cell as a pair of ints.
+
+        Raises:
+            TrustboError: It is no location, off the grid, without data, or impassable.
+        """
+        free = self.passable.values
+        return cell_of(what, cell, self.grid, free, self._why_impassable)
 
     def _why_impassable(self, row: int, col: int) -> str:
         if self.terrain is None:
             return ""
         missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
-        if missing > MAX_MISSING:
-            return f": {missing:.0%} of it has no data"
-        steep = np.rad2deg(self.team.max_slope)
-        return (
-            f": over half of it is missing or steeper than the {steep:.0f} degrees the team stands"
-        )
-
-    def _nearest_passable(self, row: int, col: int) -> Cell:
-        free = np.argwhere(self.passable.values)
-        nearest = free[np.argmin(((free - (row, col)) ** 2).sum(1))]
-        return int(nearest[0]), int(nearest[1])
+        return reason_impassable(missing, self.team)
 
 
 def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:

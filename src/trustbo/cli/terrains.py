@@ -1,0 +1,134 @@
+"""`trustbo info`, and rasters with a start and a goal on them, checked before awareness."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from trustbo.cli.errors import one_line_errors
+from trustbo.errors import TrustboError, require_whole
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from trustbo.data import Cell
+    from trustbo.team import Team
+    from trustbo.workspace import Grid
+
+_MOST_PIXELS = 9e6
+"""Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
+
+
+def info(
+    dem: Path,
+    dsm: Path | None = None,
+    shape: str = "10,10",
+    crs: str | None = None,
+    resolution: float | None = None,
+    nodata: float | None = None,
+    max_slope: float = 45.0,
+    out: Path = Path("out/grid.png"),
+    debug: bool = False,
+) -> None:
+    """Print and draw the planning grid of a terrain, before anything is computed on it.
+
+    Example: trustbo info dem.tif dsm.tif --shape 12,12 --out grid.png
+
+    It takes seconds: of large rasters, some rows are read. Printed are the CRS, the
+    extent, pixels and cells, heights, the share without data and of impassable
+    cells, and a start and a goal in each spelling of --start and --goal.
+    """
+    with one_line_errors(debug):
+        from trustbo.cli.outputs import use_no_screen, write_figure
+        from trustbo.files import require_file
+        from trustbo.workspace import survey
+
+        require_file(out, ".png")
+        team, cells = team_of(max_slope), pair("shape", shape)
+        ground = Rasters(dem, dsm, crs, resolution, nodata).read(lazy=True)
+        found = survey(ground, cells, team)
+        ground.close()
+        print(found)
+        use_no_screen()
+        from trustbo.plots.grid import grid_map
+
+        write_figure(out, [grid_map(found)])
+        print(f"the grid, with the names of its cells, is drawn in {out}")
+
+
+class Ends(NamedTuple):
+    """Terrain in memory, its grid, and the cells of start and goal."""
+
+    ground: "xr.Dataset"
+    grid: "Grid"
+    ends: "tuple[Cell, Cell]"
+
+
+class Rasters(NamedTuple):
+    """Rasters of a terrain, as flags give them."""
+
+    dem: Path
+    dsm: Path | None
+    crs: str | None
+    resolution: float | None
+    nodata: float | None
+
+    def read(
+        self, *, lazy: bool = False, max_pixels: float | None = None, progress: bool = False
+    ) -> "xr.Dataset":
+        """Read the terrain, or its headers alone."""
+        from trustbo.terrain import read_terrain
+
+        return read_terrain(
+            self.dem, self.dsm, crs=self.crs, resolution=self.resolution, nodata=self.nodata,
+            lazy=lazy, max_pixels=max_pixels, progress=progress,
+        )  # fmt: skip
+
+    def found(
+        self,
+        ends: tuple[str, str],
+        shape: tuple[int, int],
+        team: "Team",
+        *,
+        progress: bool,
+    ) -> Ends:
+        """Read the terrain, and find start and goal: by the headers, then by the heights.
+
+        TrustboError: one is off the grid, without data or too steep; no awareness was computed.
+        """
+        from trustbo.workspace import Grid, survey
+        from trustbo.workspace.location import cell_of
+
+        named = dict(zip(("start", "goal"), ends, strict=True))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they come again with the heights
+            headers = self.read(lazy=True, max_pixels=_MOST_PIXELS)
+        with headers:
+            grid = Grid.over(headers, shape)
+            for name, end in named.items():
+                cell_of(name, end, grid)
+        ground = self.read(max_pixels=_MOST_PIXELS, progress=progress)
+        known = survey(ground, shape, team)
+        start, goal = (known.require_cell(name, end) for name, end in named.items())
+        return Ends(ground, grid, (start, goal))
+
+
+def pair(what: str, text: str) -> tuple[int, int]:
+    """Two whole numbers of a flag; TrustboError: the text is none."""
+    try:
+        first, second = (int(part) for part in text.split(","))
+    except ValueError:
+        raise TrustboError(f"--{what} must be two whole numbers as 9,0; got {text!r}.") from None
+    return first, second
+
+
+def team_of(max_slope: float, n_robots: int = 3, lidar_range: float = 100.0) -> "Team":
+    """Make a team of equal robots; the slope is in degrees."""
+    from math import radians
+
+    from trustbo.team import Robot, Team
+
+    if not 0.0 < max_slope < 90.0:
+        raise TrustboError(f"--max-slope must be between 0 and 90 degrees; got {max_slope:g}.")
+    require_whole("n_robots", n_robots, 1)
+    robot = Robot(max_slope=radians(max_slope), lidar_range=lidar_range)
+    return Team(robots=(robot,) * n_robots, lead=robot)

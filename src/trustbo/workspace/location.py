@@ -1,0 +1,269 @@
+"""Locations as people have them: cells, positions in metres of a CRS, longitude and latitude."""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from rasterio.crs import CRS
+from rasterio.warp import transform as transform_points
+from rasterio.warp import transform_bounds
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_pair
+
+if TYPE_CHECKING:
+    from trustbo.workspace.grid import Grid
+
+type Location = Cell | str | Mapping[str, float]
+"""A cell (row, col); or a mapping of the names row and col, x and y, or lon and lat to numbers; or
+the same as text, "9,0", "x=1748000,y=5427000", "lon=174.7,lat=-41.3"."""
+
+WGS84 = CRS.from_epsg(4326)
+CELL, METRES, DEGREES = ("row", "col"), ("x", "y"), ("lon", "lat")
+_SPELLINGS = (
+    "A cell is 9,0; a position is x=1748000,y=5427000 in metres of the CRS, or lon=174.7,lat=-41.3 "
+    "in degrees (in Python also a mapping of these names)."
+)
+
+
+class Named(NamedTuple):
+    """Location whose numbers have names.
+
+    Attributes:
+        names: `CELL`, `METRES` or `DEGREES`.
+        values: Number of each name.
+        typed: Location as it was given, for messages.
+    """
+
+    names: tuple[str, str]
+    values: tuple[float, float]
+    typed: str
+
+    @property
+    def text(self) -> str:
+        """Text that `named` reads."""
+        if self.names == CELL:
+            return f"{self.values[0]},{self.values[1]}"
+        return ",".join(f"{n}={v:.12g}" for n, v in zip(self.names, self.values, strict=True))
+
+
+def named(what: str, location: object) -> Named:
+    """Give the numbers of a location their names.
+
+    A bare pair is a cell: positions need names, so that nothing is guessed. TrustboError: neither a
+    pair of whole numbers nor two numbers with the names of one spelling.
+    """
+    given = _of_text(location) if isinstance(location, str) else location
+    if not isinstance(given, Mapping):
+        try:
+            pair = require_pair(what, given)
+        except TrustboError:
+            raise TrustboError(
+                f"{what} must be two whole numbers (row, col), or a position with names; got "
+                f"{location!r}. {_SPELLINGS}"
+            ) from None
+        return Named(CELL, pair, repr(location if isinstance(location, str) else pair))
+    own = {str(name).strip().lower(): value for name, value in given.items()}
+    for names in (CELL, METRES, DEGREES):
+        if own.keys() == set(names) and len(own) == len(given):
+            first, second = (_number(what, name, own[name], names == CELL) for name in names)
+            found = Named(names, (first, second), "")
+            return found._replace(typed=repr(location if isinstance(location, str) else found.text))
+    raise TrustboError(
+        f"{what} must have the names row and col, x and y, or lon and lat; got {location!r}. "
+        f"{_SPELLINGS}"
+    )
+
+
+def cell_of(
+    what: str,
+    location: object,
+    grid: "Grid",
+    passable: np.ndarray | None = None,
+    why: Callable[[int, int], str] = lambda row, col: "",
+) -> Cell:
+    """Cell of a location on a grid; refused if it is impassable, where that is known.
+
+    Args:
+        what: Name of the location, for messages.
+        location: Location, see `Location`.
+        grid: Grid of the cells.
+        passable: Whether each cell is passable, (row, col); None where it is not known yet.
+        why: Function of a row and a column that gives the reason of an impassable cell.
+
+    Raises:
+        TrustboError: The location is none, off the grid, or impassable; degrees on a grid without a
+            CRS. The message has what was typed and understood, the extent, and the nearest cell.
+    """
+    try:
+        found = named(what, location)
+    except TrustboError as error:
+        raise TrustboError(f"{error}{_names_for(location, grid)}") from None
+    cell = _cell(grid, found.names, found.values)
+    shown = _understood(found, grid)
+    if cell is None:
+        rows, cols = grid.shape
+        raise TrustboError(
+            f"{what} {shown} is outside the grid of {rows} rows and {cols} columns; rows are "
+            f"0..{rows - 1} from the top, columns 0..{cols - 1}{extent(grid, ', ')}."
+            f"{_otherwise(found, grid)}{_nearest(found, grid, passable)}"
+        )
+    if passable is not None and not passable[cell]:
+        within = "" if found.names == CELL else f", in cell {cell},"
+        near = _nearest(found, grid, passable).removesuffix(".")
+        near = near.replace(" The", " the", 1).replace(" No", " no", 1)
+        raise TrustboError(
+            f"{what} {shown}{within} is impassable{why(*cell)};{near}"
+            f"{extent(grid, '. The grid has ')}."
+        )
+    return cell
+
+
+def extent(grid: "Grid", before: str = "") -> str:
+    """Text of the extent of a grid in its CRS and in degrees; empty without a CRS."""
+    if grid.crs is None:
+        return ""
+    x, y, lon, lat = spans(grid)
+    return f"{before}{x} and {y} m in {crs_name(grid)}, {lon} and {lat}"
+
+
+def spans(grid: "Grid") -> tuple[str, str, str, str]:
+    """Texts of the extent of a grid with a CRS, along x, y, longitude and latitude."""
+    bounds = grid.bounds
+    degrees = transform_bounds(CRS.from_user_input(grid.crs), WGS84, *bounds)
+    (left, bottom, right, top), (west, south, east, north) = bounds, degrees
+    return (
+        f"x {left:.1f} to {right:.1f}",
+        f"y {bottom:.1f} to {top:.1f}",
+        f"longitude {west:.5f} to {east:.5f}",
+        f"latitude {south:.5f} to {north:.5f}",
+    )
+
+
+def crs_name(grid: "Grid") -> str:
+    """Short name of a grid's CRS, such as EPSG:2193."""
+    if grid.crs is None:
+        return "no CRS"
+    crs = CRS.from_user_input(grid.crs)
+    code = crs.to_epsg()
+    return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
+
+
+def _of_text(text: str) -> object:
+    """Mapping, or list, of the numbers of a text; the text itself where it is neither."""
+    parts = [part for part in re.split(r",\s*|\s+", text.strip()) if part]
+    if all("=" in part for part in parts):
+        return dict(part.split("=", 1) for part in parts)
+    try:
+        return [int(part) for part in parts]
+    except ValueError:
+        return text
+
+
+def _number(what: str, name: str, value: object, whole: bool) -> float:
+    try:
+        number = float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number) or isinstance(value, bool) or (whole and number % 1.0):
+        kind = "a whole number" if whole else "a finite number"
+        raise TrustboError(f"{what}: {name} must be {kind}; got {value!r}.")
+    return int(number) if whole else number
+
+
+def _position(
+    grid: "Grid", names: tuple[str, str], values: Iterable[float]
+) -> tuple[float, float] | None:
+    """X and y of a location, m; None for degrees that are no place of the CRS."""
+    a, b = values
+    if names == METRES:
+        return a, b
+    if names == CELL:
+        return grid.center((a, b))  # pyright: ignore[reportArgumentType]  # beyond the grid, too
+    crs = grid.require_crs()
+    if not (-180.0 <= a <= 360.0 and -90.0 <= b <= 90.0):
+        return None
+    try:
+        x, y = (found[0] for found in transform_points(WGS84, crs, [a], [b])[:2])
+    except Exception:  # PROJ's errors are GDAL's, without a base of their own
+        return None
+    return (x, y) if np.isfinite([x, y]).all() else None
+
+
+def _cell(grid: "Grid", names: tuple[str, str], values: Iterable[float]) -> Cell | None:
+    """Cell of a location; None off the grid."""
+    a, b = values
+    if names == CELL:
+        row, col = a, b
+    elif (position := _position(grid, names, (a, b))) is None:
+        return None
+    else:
+        x, y = position
+        row = np.floor((grid.top - y) / grid.cell_height)
+        col = np.floor((x - grid.left) / grid.cell_width)
+    rows, cols = grid.shape
+    return (int(row), int(col)) if 0 <= row < rows and 0 <= col < cols else None
+
+
+def _understood(found: Named, grid: "Grid") -> str:
+    """Location as it was typed, and as it was understood."""
+    (a, b), names = found.values, found.names
+    if names == CELL:
+        return (
+            found.typed if found.typed.startswith("(") else f"{found.typed} (row {a}, column {b})"
+        )
+    if names == METRES:
+        return f"{found.typed} (x {a:.1f}, y {b:.1f} m in {crs_name(grid)})"
+    position = _position(grid, names, (a, b))
+    there = "no place of the CRS" if position is None else "x {:.1f}, y {:.1f} m".format(*position)
+    return f"{found.typed} (longitude {a:g}, latitude {b:g}, {there})"
+
+
+def _otherwise(found: Named, grid: "Grid") -> str:
+    """Sentence that names the spelling under which the same two numbers are on the grid."""
+    a, b = found.values
+    for names in dict.fromkeys((found.names, CELL, METRES, DEGREES)):
+        if names == DEGREES and grid.crs is None:
+            continue
+        for values in ((a, b), (b, a)):
+            cell = _cell(grid, names, values)
+            if cell is None or (names == CELL and any(v % 1.0 for v in values)):
+                continue
+            swapped = "swapped" if values != (a, b) else ""
+            was = f"Were {found.names[0]} and {found.names[1]} {swapped}? " if swapped else ""
+            return f" {was}{Named(names, values, '').text} is in cell {cell}."
+    return ""
+
+
+def _names_for(location: object, grid: "Grid") -> str:
+    """Sentence that names the spelling under which a bare pair of numbers is on the grid."""
+    parts = re.split(r",\s*|\s+", location.strip()) if isinstance(location, str) else location
+    try:
+        a, b = (float(part) for part in parts)  # pyright: ignore[reportGeneralTypeIssues]
+    except (TypeError, ValueError):
+        return ""
+    return _otherwise(Named(CELL, (a, b), ""), grid) if math.isfinite(a + b) else ""
+
+
+def _nearest(found: Named, grid: "Grid", passable: np.ndarray | None) -> str:
+    """Sentence that names the nearest (passable) cell, and its distance if that is long."""
+    position, turned = _position(grid, found.names, found.values), ""
+    if position is None:
+        position = _position(grid, found.names, found.values[::-1])
+        turned = " of lon and lat swapped"
+    if position is None:
+        return ""
+    cells = np.argwhere(np.ones(grid.shape, bool) if passable is None else passable)
+    if not len(cells):
+        return " No cell is passable: use other cells, or a team with a larger max_slope."
+    x, y = grid.x[cells[:, 1]], grid.y[cells[:, 0]]
+    distance = np.hypot(x - position[0], y - position[1])
+    k = int(np.argmin(distance))
+    row, col = cells[k].tolist()
+    km = distance[k] / 1e3
+    far = f", {km:.0f} km away" if km > 1.0 and found.names != CELL else ""
+    at = "" if grid.crs is None else f" at x={x[k]:.1f},y={y[k]:.1f}"
+    kind = f"{'cell' if passable is None else 'passable cell'}{turned}"
+    return f" The nearest {kind} is {(row, col)}{at}{far}."
