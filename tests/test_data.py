@@ -42,6 +42,39 @@ def test_a_failed_mission_keeps_its_bounds():
         Mission.from_arrays(PATH, z, y)
 
 
+@pytest.mark.parametrize("n_rows", [2, 1, 0])
+def test_a_mission_that_failed_needs_no_bounds_after_that(n_rows):
+    z, y = arrays(n_rows)
+    mission = Mission.from_arrays(PATH, z, y, np.ones(n_rows), failed_at=1, reason="stuck")
+    assert mission.status == mission.bounds[0].status == "stuck"
+    assert mission.path == tuple(PATH)
+    assert mission.contact_rate.shape == (1, 3)
+    assert np.isnan(mission.contact_rate).all() == (n_rows == 0)
+    assert Mission.from_arrays(PATH, z, y, failed_at=1).status == "aborted"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"failed_at": 3}, "failed_at = 3, but the path has 2 bounds"),
+        ({"failed_at": 0}, "failed_at must be a whole number from 1 on; got 0"),
+        ({"reason": "stuck"}, "reason='stuck' needs failed_at="),
+        ({"failed_at": 1, "reason": "bored"}, "unknown reason 'bored'; choose one of stuck"),
+        ({"failed_at": 1, "status": "stuck"}, "give reason= instead"),
+    ],
+)
+def test_a_failure_that_cannot_be_is_refused(options, message):
+    with pytest.raises(TrustboError, match=message):
+        Mission.from_arrays(PATH, *arrays(), **options)
+
+
+def test_bounds_before_the_failure_must_be_there():
+    z, y = arrays(1)
+    path = [*PATH, (0, 3)]
+    with pytest.raises(ShapeError, match="failed_at = 3, but the arrays have 1 bounds"):
+        Mission.from_arrays(path, z, y, failed_at=3)
+
+
 @pytest.mark.parametrize(("value", "shown"), [(1.5, "1.5"), (-0.1, "-0.1")])
 def test_contact_rates_outside_the_unit_interval_are_named(value, shown):
     z, y = arrays()

@@ -15,6 +15,7 @@ from trustbo.errors import (
     TrustboError,
     require_choice,
     require_pair,
+    require_whole,
 )
 
 Cell = tuple[int, int]
@@ -200,11 +201,15 @@ class Mission(Displayed):
         duration: ArrayLike | None = None,
         status: str = "ok",
         *,
+        failed_at: int | None = None,
+        reason: str = "",
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
     ) -> Self:
         """Make a mission from the arrays of a log.
+
+        A mission that ended early is `from_arrays(path, z, y, failed_at=4, reason="stuck")`.
 
         Args:
             path: Planned cells, start first.
@@ -212,16 +217,30 @@ class Mission(Displayed):
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: Outcome of the mission.
+            failed_at: Number of the bound, from 1, that ended the mission. Rows after it are left
+                out; where the arrays end before it, nothing was measured of it.
+            reason: Outcome of that bound, by default "aborted".
             n_ticks: Number of ticks, shape (bound, robot) or (bound,), of which `contact_rate` is
                 the share with contact; None where not recorded.
-            features: Names of the features; by default traversability, visibility, z3, ...
+            features: Names of the features; by default traversability, visibility, z3, ...; a
+                workspace with as many features gives z3, ... their names, see `Workspace.in_order`.
             robots: Names of the robots; by default r1, r2, ...
 
         Raises:
             ShapeError: Axes that do not fit together.
-            TrustboError: A value outside [0, 1], or an unknown status.
+            TrustboError: A value outside [0, 1]; an unknown status or reason; or `failed_at` beyond
+                the path, more than a bound after the arrays, or beside a status.
         """
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
+        if failed_at is not None or reason:
+            status = _reason(failed_at, reason, status, len(path) - 1)
+            z, y, duration, n_ticks = (
+                None if values is None else _until(name, values, failed_at, len(y))
+                for name, values in (
+                    ("awareness", z), ("contact_rate", y), ("duration", duration),
+                    ("n_ticks", n_ticks),
+                )
+            )  # fmt: skip
         if z.ndim == 3 and len(z) == len(y) == 0:
             raise ShapeError(
                 "a mission has at least one bound; got 0. If the robots were stopped before "
@@ -339,6 +358,33 @@ def is_line_of_sight(feature: str) -> bool:
 def default_features(n_features: int) -> tuple[str, ...]:
     """Names of the first features: traversability, visibility, z3, z4, ..."""
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
+
+
+def _reason(failed_at: int | None, reason: str, status: str, n_bounds: int) -> str:
+    """Outcome of a mission that failed in a bound."""
+    if failed_at is None:
+        raise TrustboError(
+            f"reason={reason!r} needs failed_at=, the number of the bound, from 1, that ended the "
+            "mission."
+        )
+    if require_whole("failed_at", failed_at, 1) > n_bounds:
+        raise TrustboError(f"failed_at = {failed_at}, but the path has {n_bounds} bounds.")
+    if status != "ok":
+        raise TrustboError(f"status={status!r} is given beside failed_at=; give reason= instead.")
+    return require_choice("reason", reason or "aborted", STATUSES[1:])
+
+
+def _until(what: str, values: ArrayLike, last: int | None, n_rows: int) -> np.ndarray:
+    """Rows of the first `last` bounds; NaN for the last one where the arrays end before it."""
+    array = as_array(what, values)
+    assert last is not None  # noqa: S101  # `_reason`
+    if array.ndim and n_rows < last - 1:
+        raise ShapeError(
+            f"failed_at = {last}, but the arrays have {n_rows} bounds; give all bounds before it."
+        )
+    if array.ndim and len(array) == last - 1:
+        return np.pad(array, [(0, 1)] + [(0, 0)] * (array.ndim - 1), constant_values=np.nan)
+    return array[:last] if array.ndim else array
 
 
 def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from simulators import Steady
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.data import Mission
+from trustbo.errors import ShapeError, TerrainError, TrustboError
+from trustbo.models import PooledTrust, fit
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.sensing import detections
 from trustbo.team import Robot, Team
@@ -229,6 +231,34 @@ def test_missing_awareness_of_a_mission_is_filled(wooded):
     np.testing.assert_array_equal(filled.awareness[0, :, 2], expected.sel(row=2, col=1))
     np.testing.assert_array_equal(filled.awareness[..., :2], mission.awareness[..., :2])
     np.testing.assert_array_equal(wooded.along(mission.path)[..., 2], filled.awareness[..., 2])
+
+
+def test_arrays_with_a_place_for_line_of_sight_are_those_of_the_workspace(wooded):
+    z, y = np.full((2, 2, 3), 0.4), np.full((2, 2), 0.6)
+    z[..., 2] = np.nan
+    mission = Mission.from_arrays([A, C, NEXT], z, y)
+    assert mission.features[2] == "z3"
+    filled = wooded.fill(mission)
+    assert filled.features == wooded.features
+    np.testing.assert_array_equal(filled.awareness[..., 2], wooded.along([A, C, NEXT])[..., 2])
+    np.testing.assert_array_equal(filled.awareness[..., :2], z[..., :2])
+    own = Mission.from_arrays([A, C, NEXT], np.nan_to_num(z), y, features=("mud", "fog", "sand"))
+    with pytest.raises(ShapeError, match=r"has features \('mud', 'fog', 'sand'\)"):
+        wooded.in_order(own)
+
+
+def test_a_fit_on_a_workspace_fills_the_line_of_sight(wooded):
+    rng = np.random.default_rng(1)
+    short = [
+        Mission.from_arrays([A, C, NEXT], rng.uniform(size=(2, 2, 2)), rng.uniform(size=(2, 2)))
+        for _ in range(3)
+    ]
+    posterior = fit(short, PooledTrust(), workspace=wooded, seed=1)
+    assert posterior["posterior"]["feature"].values.tolist() == list(wooded.features)
+    whole = fit([wooded.fill(mission) for mission in short], PooledTrust(), seed=1)
+    np.testing.assert_array_equal(
+        posterior["posterior"]["beta"].values, whole["posterior"]["beta"].values
+    )
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import Draws, UnevenWeightsError, draw_posterior
 from trustbo.models.samplers.student import Student
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
-from trustbo.stacking import MissionBatch, stack_missions
+from trustbo.stacking import MissionBatch, require_same_team, stack_missions
 from trustbo.workspace import Workspace
 
 _N_PRIOR = 500
@@ -62,8 +62,10 @@ def fit(
             `"nuts"`. Or `"joint"`: NUTS on
             parameters and latent trust together, which `"nuts"` is too where trust does not
             integrate out.
-        workspace: Workspace of the missions. A model with effects of places then knows them over
-            the whole grid, else up to the last row and column that was visited.
+        workspace: Workspace of the missions. Their features and robots are then in its order, and
+            awareness that they lack, such as line of sight, is filled in, see `Workspace.fill`. A
+            model with effects of places knows them over the whole grid, else up to the last row and
+            column that was visited.
         earlier: Posterior of earlier missions, to begin the exact sampler of effects of places or
             coupled robots from; the posterior is the same but for Monte Carlo error.
         weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
@@ -92,7 +94,8 @@ def fit(
     Raises:
         ShapeError: There are no missions, or they disagree on robots or features.
         TrustboError: An awareness value is NaN, the sampler is unknown or does not suit the model,
-            no contact rate was measured, or a number of draws or the seed is no whole number.
+            no contact rate was measured, a path leaves the workspace, or a number of draws or the
+            seed is no whole number.
         PosteriorError: The diagnostics are beyond their limits.
     """
     model = PooledTrust() if model is None else model
@@ -100,6 +103,9 @@ def fit(
     settings = NutsSettings(n_warmup, n_draws, n_chains).checked()
     n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
     seed = require_whole("seed", seed, 0)
+    require_same_team(missions)
+    if workspace is not None:
+        missions = [workspace.fill(mission) for mission in missions]
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
