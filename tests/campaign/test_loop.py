@@ -146,7 +146,7 @@ def test_a_result_is_saved_and_read_back(result, tmp_path):
         assert a.attrs["sampler"] == b.attrs["sampler"]
     lines = (tmp_path / "kept" / "history.csv").read_text().splitlines()
     assert len(lines) == 4
-    assert lines[0].startswith("iteration,objective,path_changed")
+    assert lines[0].startswith("mission,status,state,reason,contact_rate,objective")
     hidden = [f for f in (tmp_path / "kept").rglob(".*") if f.suffix != ".sha256"]
     assert not hidden  # no temporary file is left
 

@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
+import rasterio
 from scipy.special import expit
 
 import trustbo as tb
@@ -68,6 +70,38 @@ def test_its_maps_are_over_the_posterior(result):
     believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
     expected = np.where(PASSABLE, believed.sel(feature="visibility").mean("robot"), np.nan)
     np.testing.assert_allclose(maps["visibility"], expected)
+
+
+def test_its_table_has_a_row_for_each_mission(result, tmp_path):
+    table = result.table()
+    assert len(table) == len(result.missions) == table.index[-1]
+    assert (table.index.name, *table.columns[:2]) == ("mission", "status", "state")
+    for number, mission in enumerate(result.missions, start=1):
+        row = table.loc[number]
+        assert row["path"].split() == [f"{r},{c}" for r, c in mission.path]
+        assert row["n_bounds"] == len(mission.bounds)
+        assert row["contact_rate"] == np.nanmean(mission.contact_rate)
+        assert row["objective"] == float(result.history["objective"].sel(iteration=number))
+    assert {"k_hat", "seconds_fit"} <= set(table)
+    result.save(tmp_path)
+    kept = pd.read_csv(tmp_path / "history.csv", index_col="mission", keep_default_na=False)
+    pd.testing.assert_frame_equal(kept, table, check_dtype=False)
+
+
+def test_maps_on_terrain_are_rasters_of_their_place(tmp_path):
+    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 4))
+    options = {"n_iterations": 1, "sampler": "exact", "progress": False}
+    maps = tb.iterate(workspace, (2, 0), (0, 3), **options).maps(n_draws=20)
+    assert maps.rio.crs == terrain.rio.crs
+    assert maps["cost"].rio.bounds() == terrain.rio.bounds()
+    maps["cost"].rio.to_raster(tmp_path / "cost.tif")
+    with rasterio.open(tmp_path / "cost.tif") as raster:
+        assert raster.crs == terrain.rio.crs
+        x, y = workspace.grid.center((1, 2))
+        assert next(raster.sample([(x, y)])).item() == float(maps["cost"][1, 2])
+        assert maps["cost"].sel(x=x, y=y) == maps["cost"].isel(y=1, x=2)
+    assert maps["cost"].rio.reproject("EPSG:4326").rio.crs == "EPSG:4326"
 
 
 def test_a_loaded_result_plans_alike(result, tmp_path):

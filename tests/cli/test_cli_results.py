@@ -6,8 +6,10 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer
+import yaml
 
 from trustbo.cli import app, main
 from trustbo.export import FORMATS
@@ -52,6 +54,22 @@ def test_report_says_at_once_where_it_cannot_write(target, invoke, finished, tmp
     assert done.stderr.startswith("error: cannot write ")
     assert done.stderr.count("\n") == 1
     assert {file.name for file in tmp_path.rglob("*")} == {"file", "folder"}
+
+
+def test_export_puts_maps_for_ros_into_a_frame(invoke, finished, tmp_path):
+    folder, _ = finished
+    ask = ("export", folder, "--format", "ros_map", "--out", tmp_path)
+    done = invoke(*ask, "--origin", "auto", "--rotation", 90, "--frame", "odom")
+    assert done.exit_code == 0, done.output
+    assert "cost_map_frame.yaml" in done.output
+    frame = yaml.safe_load((tmp_path / "cost_map_frame.yaml").read_text())
+    assert frame["rotation"] == pytest.approx(np.pi / 2)
+    x, y = frame["origin"]
+    done = invoke(*ask, "--origin", f"{x},{y}", "--rotation", 90, "--frame", "odom")
+    assert yaml.safe_load((tmp_path / "cost_map_frame.yaml").read_text()) == frame
+    done = invoke(*ask, "--origin", "there")
+    assert done.exit_code == 2
+    assert "got 'there'" in done.output
 
 
 def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished, tmp_path):

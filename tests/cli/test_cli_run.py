@@ -40,7 +40,7 @@ def test_run_writes_every_file_and_says_where(finished):
 def test_run_s_files_say_the_same(finished):
     out, _ = finished
     history = pd.read_csv(out / "history.csv")
-    assert list(history["iteration"]) == [1, 2]
+    assert list(history["mission"]) == [1, 2]
     record = json.loads((out / "result.json").read_text())
     assert record["settings"]["seed"] == 1
     posterior = xr.open_datatree(out / "posterior.nc")

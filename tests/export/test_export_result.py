@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
+import yaml
 
 import trustbo as tb
 from trustbo.errors import TrustboError
@@ -42,6 +43,24 @@ def test_by_default_it_is_what_a_gis_takes_and_a_second_time_replaces_it(result,
         assert [file.name for file in written] == ["maps.tif", "maps.qml", "path.geojson"]
     assert len(list(tmp_path.iterdir())) == 3
     assert export_result(result, tmp_path, "gpx") == [tmp_path / "path.gpx"]
+
+
+def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
+    lon, lat = result.workspace.grid.lonlat(result.path[0])
+    options = {"rotation": 0.1, "frame": "odom"}
+    written = export_result(result, tmp_path, ["csv", "ros_map"], origin="auto", **options)
+    assert written[-1] == tmp_path / "cost_map_frame.yaml"
+    assert all(file.exists() for file in written)
+    frame = yaml.safe_load(written[-1].read_text())
+    assert frame["origin"] == list(result.workspace.grid.center(result.path[0]))
+    export_result(result, tmp_path / "b", "ros_map", origin=f"lon={lon},lat={lat}", **options)
+    again = yaml.safe_load((tmp_path / "b" / "cost_map_frame.yaml").read_text())
+    np.testing.assert_allclose(again["origin"], frame["origin"], rtol=0.0, atol=1e-3)
+    for name, value in {"origin": "auto", "rotation": 0.1, "frame": "odom"}.items():
+        with pytest.raises(TrustboError, match=f"{name}={value!r} is of maps for ROS; leave it"):
+            export_result(result, tmp_path, "geotiff", **{name: value})
+    with pytest.raises(TrustboError, match=r"origin \(0.0, 0.0\) is 5239 km from the grid, x 380"):
+        export_result(result, tmp_path, "ros_map", origin=(0.0, 0.0))
 
 
 def test_the_assumed_trust_of_the_start_does_not_stretch_the_colours(result, tmp_path):

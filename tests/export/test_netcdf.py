@@ -70,8 +70,8 @@ def test_a_map_s_own_attributes_are_kept(result, maps, tmp_path):
     write_netcdf(tmp_path / "cost.nc", cost, result.workspace)
     with netCDF4.Dataset(tmp_path / "cost.nc") as file:
         assert file["cost"].units == "percent"
-    assert "grid_mapping" not in cost.encoding  # the caller's is left alone
-    assert set(cost.coords) == {"row", "col", "x", "y"}
+    assert cost.encoding == maps["cost"].encoding  # the caller's is left alone
+    assert set(cost.coords) == {"x", "y", "spatial_ref"}
 
 
 def test_what_is_no_map_or_no_file_is_refused(result, maps, tmp_path):

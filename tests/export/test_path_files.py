@@ -217,3 +217,14 @@ def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
     assert table["p_arrive"].iloc[-1] == pytest.approx(result.plan.p_arrive)
     causes = [table[f"p_fail_{cause}"][1:] for cause in tb.models.CAUSES]
     np.testing.assert_allclose(sum(causes), risk.p_fail, rtol=1e-12)
+
+
+def test_a_chance_too_small_to_mean_anything_is_0_in_tables(result, tmp_path):
+    risk = result.plan.risk
+    by_cause = {cause: np.full(len(risk.p_fail), 4.8e-161) for cause in risk.by_cause}
+    plan = replace(result.plan, risk=replace(risk, by_cause=by_cause))
+    write_path(tmp_path / "path.csv", plan)
+    table = pd.read_csv(tmp_path / "path.csv")
+    assert (table[[f"p_fail_{cause}" for cause in by_cause]][1:] == 0.0).all(axis=None)
+    np.testing.assert_array_equal(table["p_fail"][1:], risk.p_fail)
+    assert "e-161" not in (tmp_path / "path.csv").read_text()

@@ -11,6 +11,7 @@ import gpxpy
 import numpy as np
 import pytest
 import shapely
+import yaml
 from pyproj import Transformer
 from references import geometry_of_blob
 from simulators import Steady
@@ -238,6 +239,45 @@ def test_a_bag_has_posts_towards_the_lead_s_stop_and_whole_ways(
     named = replace(workspace, team=tb.Team(3, names=("r 1", "r2", "r3")))
     with pytest.raises(TrustboError, match="robot 'r 1' cannot be in a topic"):
         write_ros_bag(tmp_path / "new", plan, cost, named)
+
+
+def test_a_bag_in_a_frame_of_its_own_keeps_millimetres_in_float32(
+    plan, planner, params, workspace, tmp_path
+):
+    """RViz draws in float32: northings in steps of .5 m; pyproj's affine operation turns back."""
+    pytest.importorskip("rosbags", reason='needs pip install "trustbo[ros]"')
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    cost, options = planner.cost_map(params), {"origin": "auto", "rotation": 0.4, "frame": "odom"}
+    write_ros_bag(tmp_path / "path", plan, cost, workspace, **options)
+    frame = yaml.safe_load((tmp_path / "path_frame.yaml").read_text())
+    c, s, (east, north) = math.cos(0.4), math.sin(0.4), frame["origin"]
+    to_crs = Transformer.from_pipeline(
+        f"+proj=affine +xoff={east!r} +yoff={north!r} +s11={c} +s12={-s} +s21={s} +s22={c}"
+    )
+    with (tmp_path / "path" / "path.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = {c.topic: m for _, c, _, m in reader.iter_decoded_messages()}
+    assert {message.header.frame_id for message in found.values()} == {"odom"}
+    poses = [pose.pose for pose in found["/trustbo/path"].poses]
+    drawn = np.array([(p.position.x, p.position.y) for p in poses], np.float32)
+    assert drawn[0].tolist() == [0.0, 0.0]
+    centers = np.array([workspace.grid.center(cell) for cell in plan.path])
+    back = np.column_stack(to_crs.transform(*drawn.astype(float).T))
+    np.testing.assert_allclose(back, centers, rtol=0.0, atol=1e-3)
+    assert np.spacing(np.float32(centers[0, 1])) == 0.5  # without a frame
+    turns = np.array([2.0 * math.atan2(p.orientation.z, p.orientation.w) for p in poses])
+    x, y = np.diff(centers, axis=0).T
+    np.testing.assert_allclose(np.exp(1j * (turns[:-1] + 0.4)), (x + 1j * y) / np.hypot(x, y))
+    grid = found["/trustbo/cost"]
+    corner = grid.info.origin.position
+    x, y = to_crs.transform(
+        corner.x + 0.5 * grid.info.resolution * grid.info.width,
+        corner.y + 0.5 * grid.info.resolution * grid.info.height,
+    )
+    left, bottom, right, top = workspace.grid.bounds
+    assert (x, y) == pytest.approx(((left + right) / 2, (bottom + top) / 2), abs=3.0)
 
 
 def test_where_a_robot_has_no_way_it_has_no_line_and_its_route_ends(plan, tmp_path):

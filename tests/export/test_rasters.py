@@ -111,7 +111,7 @@ def test_what_is_no_map_of_the_cells_is_refused(result, maps, nowhere, tmp_path)
     with pytest.raises(ShapeError, match=r"map 'awareness' has dims \('robot', .*\(row, col\)"):
         write_geotiff(path, workspace.awareness, workspace)
     with pytest.raises(ShapeError, match=r"map 'trust_mean' has \(3, 3\) cells, .* \(3, 4\)"):
-        write_geotiff(path, maps.isel(col=slice(3)), workspace)
+        write_geotiff(path, maps.isel(x=slice(3)), workspace)
     with pytest.raises(ShapeError, match="there are no maps"):
         write_geotiff(path, xr.Dataset(), workspace)
     with pytest.raises(TrustboError, match="map 'trust' must hold numbers; got <U"):

@@ -110,9 +110,10 @@ def test_a_bag_of_ros_1_is_latched(result, maps, tmp_path):
 
 
 def test_a_database_of_ros_2_is_transient_local(result, maps, tmp_path):
-    options = {"storage": "sqlite3", "version": 2, "resolution": 10.0, "origin": (0, 0)}
+    options = {"storage": "sqlite3", "version": 2, "resolution": 10.0, "origin": (380000, 5224910)}
     write_ros_bag(tmp_path / "path", result, maps["cost"], result.workspace, **options)
     assert {f.name for f in (tmp_path / "path").iterdir()} == {"metadata.yaml", "path.db3"}
+    assert (tmp_path / "path_frame.yaml").exists()
     base = sqlite3.connect(tmp_path / "path" / "path.db3")
     topics = base.execute(
         "SELECT name, type, serialization_format, offered_qos_profiles, id FROM topics"

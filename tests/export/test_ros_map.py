@@ -1,11 +1,13 @@
 """Maps for ROS, read as map_server and Nav2 read them in raw mode."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 import xarray as xr
 import yaml
+from pyproj import Transformer
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
@@ -75,12 +77,15 @@ def test_pixels_are_as_the_cell_at_their_centre(workspace, cost):
     assert occupancy(cost, uneven, resolution=0.3).shape == (8, 11)
 
 
-@pytest.mark.parametrize(("resolution", "origin"), [(None, None), (7.0, None), (10.0, (0, 0))])
+@pytest.mark.parametrize(
+    ("resolution", "origin"), [(None, None), (7.0, None), (10.0, (380000.0, 5224910.0))]
+)
 def test_each_place_has_its_value_in_both_loaders(result, maps, resolution, origin, tmp_path):
     workspace, cost = result.workspace, maps["cost"]
     path = tmp_path / "maps" / "cost.map.yaml"
     write_ros_map(path, cost, workspace, resolution=resolution, origin=origin)
-    assert {file.name for file in path.parent.iterdir()} == {"cost.map.yaml", "cost.map.pgm"}
+    names = {"cost.map.yaml", "cost.map.pgm"} | ({"cost.map_frame.yaml"} if origin else set())
+    assert {file.name for file in path.parent.iterdir()} == names
     values, record = load(path)
     side = record["resolution"]
     assert side == (resolution or 30.0)
@@ -133,6 +138,10 @@ def test_without_a_terrain_the_corner_is_that_of_the_grid(workspace, cost, tmp_p
         ({"resolution": 1e-4}, r"resolution=0\.0001 m gives 2\.4e\+09 pixels; take a coarser one"),
         ({"origin": (0.0,)}, r"origin must be two finite numbers \(x, y\); got \(0\.0,\)"),
         ({"origin": "here"}, "origin must be two finite numbers"),
+        ({"origin": "auto"}, "is the start of a path; a map alone has none"),
+        ({"origin": (0.0, 3e5)}, r"origin \(0.0, 300000.0\) is 300 km from the grid"),
+        ({"rotation": np.nan}, "rotation must be a finite angle; got nan"),
+        ({"frame": "my map"}, "frame must be a name of ROS such as 'map' .* got 'my map'"),
         ({"origin": (0.0, np.inf)}, "origin must be two finite numbers"),
         ({"path": "map.pgm"}, r"map\.pgm' must end in \.yaml or \.yml"),
         ({"path": "busy.yaml"}, r"cannot write '.*busy\.pgm': it is a folder"),
@@ -153,3 +162,40 @@ def test_costs_are_shares(workspace, cost):
         occupancy(cost[:1], workspace)
     hidden = dataclasses.replace(workspace, passable=~workspace.passable)
     assert (occupancy(cost, hidden) == 100).sum() == 5
+
+
+def test_a_map_in_a_turned_frame_has_the_cost_of_the_cell_at_each_centre(result, maps, tmp_path):
+    """By pyproj's affine operation, which is another's."""
+    workspace, cost, angle = result.workspace, maps["cost"], 0.4
+    east, north = 380060.0, 5224950.0
+    path = tmp_path / "turned.yaml"
+    write_ros_map(path, cost, workspace, origin=(east, north), rotation=angle, frame="odom")
+    values, record = load(path)
+    side, (left, bottom, yaw) = record["resolution"], record["origin"]
+    assert (side, yaw) == (3.0, 0.0)
+    c, s = math.cos(angle), math.sin(angle)
+    to_crs = Transformer.from_pipeline(
+        f"+proj=affine +xoff={east} +yoff={north} +s11={c} +s12={-s} +s21={s} +s22={c}"
+    )
+    i, j = np.indices(values.shape)
+    u, v = left + (j.ravel() + 0.5) * side, bottom + (i.ravel() + 0.5) * side
+    x, y = to_crs.transform(u, v)
+    within = (x > 380000.0) & (x < 380120.0) & (y > 5224910.0) & (y < 5225000.0)
+    assert (values.ravel()[~within] == -1).all()
+    for place, value in zip(np.column_stack([x, y])[within], values.ravel()[within], strict=True):
+        row, col = workspace.grid.cell_at(*place)
+        closed = not workspace.passable.values[row, col]
+        assert value == (100 if closed else round(100 * float(cost[row, col])))
+    assert within.sum() * side**2 == pytest.approx(90.0 * 120.0, rel=0.01)  # all cells are there
+    frame = yaml.safe_load((tmp_path / "turned_frame.yaml").read_text())
+    assert (frame["frame"], frame["origin"], frame["rotation"]) == ("odom", [east, north], angle)
+    lon, lat = Transformer.from_crs(frame["crs"], 4326, always_xy=True).transform(east, north)
+    assert (frame["longitude"], frame["latitude"]) == pytest.approx((lon, lat), abs=1e-9)
+
+
+def test_the_side_of_a_pixel_is_a_number_that_one_can_read(cost, tmp_path):
+    z = np.full((1, 2, 3, 2), 0.5)
+    for size, side in ((24.5623880996136, 2.5), (24.56, 24.56)):
+        workspace = tb.Workspace.from_awareness(z, cell_size=size)
+        write_ros_map(tmp_path / "map.yaml", cost, workspace)
+        assert yaml.safe_load((tmp_path / "map.yaml").read_text())["resolution"] == side

@@ -48,7 +48,7 @@ def test_the_layers_are_the_result_s_maps(layers, record, result):
     names += ["place_bounds_mean", *result.workspace.features]
     for name in names:
         (shown,) = as_maps(layers[name], record)
-        close(shown, maps[name].transpose("row", "col").values)
+        close(shown, maps[name].transpose("y", "x").values)
     assert layers["trust_mean"]["sd"] == "trust_sd"
 
 
@@ -239,7 +239,7 @@ def test_the_numbers_under_the_pointer_are_those_of_the_place(width, chromium, f
     place, shown = numbers(seen)
     assert place == f"Cell {row},{col}"
     trust, sd = (float(text) for text in shown["expected trust"].split(" \N{PLUS-MINUS SIGN} "))
-    maps = result.maps().isel(row=row, col=col)
+    maps = result.maps().isel(y=row, x=col)
     np.testing.assert_allclose(trust, maps["trust_mean"], atol=0.51 * 10 ** -digits(shown))
     np.testing.assert_allclose(sd, maps["trust_sd"], atol=0.51 * 10 ** -digits(shown))
     step = scene_of(result, result.maps()).steps[0]

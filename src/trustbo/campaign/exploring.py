@@ -40,7 +40,7 @@ def scene_of(result: Result, maps: xr.Dataset) -> Scene:
 
 def _layers(result: Result, maps: xr.Dataset, of_bounds: _Moments) -> list[Layer]:
     """Layers by group, the most important first."""
-    there = {str(name): maps[name].transpose("row", "col").values for name in maps.data_vars}
+    there = {str(name): maps[name].transpose("y", "x").values for name in maps.data_vars}
     learned = there["trust_mean"].copy()
     learned[result.path[0]] = np.nan  # assumed there, and would set the limits of the colours
 

@@ -11,7 +11,7 @@ import xarray as xr
 
 from trustbo.campaign.damage import naming_what_is_left
 from trustbo.campaign.failures import Failure
-from trustbo.data import Mission
+from trustbo.data import Mission, path_text
 from trustbo.errors import DamagedFileError
 from trustbo.files import checksum
 from trustbo.logs.netcdf import read_tree
@@ -102,6 +102,28 @@ def whole_posterior(
     labelled = xr.DataTree.from_dict(parts)
     labelled.attrs = whole.attrs
     return labelled
+
+
+_FIRST = (
+    "status", "state", "reason", "contact_rate", "objective", "n_bounds", "path_changed", "path"
+)  # fmt: skip
+"""First columns of a table of missions."""
+
+
+def table_of(history: xr.Dataset, missions: Sequence[Mission]) -> pd.DataFrame:
+    """Table with a row for each mission of a history, labelled by its number, from 1.
+
+    Columns are the scalars of `Result.history`, `n_bounds`, the number of bounds that were run, and
+    the `path` as text, "9,0 8,1"; first those of the outcome, then diagnostics and seconds.
+    """
+    index = pd.RangeIndex(1, len(missions) + 1, name="mission")
+    columns = {n: a.values for n, a in history.data_vars.items() if a.dims == ("iteration",)}
+    if missions:
+        paths = [path_text(path[path[:, 0] >= 0].tolist()) for path in history["path"].values]
+        columns |= {"n_bounds": [len(mission.bounds) for mission in missions], "path": paths}
+    names = [name for name in _FIRST if name in columns]
+    names += [name for name in columns if name not in names]
+    return pd.DataFrame({name: columns[name] for name in names}, index)
 
 
 @dataclass(eq=False)
@@ -217,14 +239,6 @@ class History:
                 **trust_map.coords,
             },
         )
-
-    def summary(self) -> pd.DataFrame:
-        """Table with one row for each mission: its plan, status and diagnostics."""
-        plans = [entry.plan for entry in self.entries]
-        paths = [" ".join(f"{r},{c}" for r, c in plan.path) for plan in plans]
-        index = pd.RangeIndex(1, len(self.entries) + 1, name="mission")
-        table = pd.DataFrame([entry.row for entry in self.entries], index=index)
-        return table.assign(n_bounds=[len(m.bounds) for m in self.missions], path=paths)
 
     def to_state(self) -> dict[str, Any]:
         """Everything that no file of a `Result` holds, as JSON can hold it."""

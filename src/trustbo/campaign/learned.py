@@ -8,7 +8,14 @@ import pandas as pd
 import xarray as xr
 
 from trustbo.campaign.failures import learn_hazard
-from trustbo.campaign.history import LEARNED, TOLD, History, Posterior, whole_posterior
+from trustbo.campaign.history import (
+    LEARNED,
+    TOLD,
+    History,
+    Posterior,
+    table_of,
+    whole_posterior,
+)
 from trustbo.campaign.learning import CannotLearnError
 from trustbo.campaign.options import CampaignOptions
 from trustbo.data import Mission
@@ -121,9 +128,13 @@ class LearnedMissions:
         """Dataset as `Result.history`; empty before the first mission."""
         return self.log.to_dataset()
 
+    def table(self) -> pd.DataFrame:
+        """Table with a row for each mission, as `Result.table`."""
+        return table_of(self.history, self.missions)
+
     def summary(self) -> pd.DataFrame:
-        """Table with one row for each mission: its plan, status and diagnostics."""
-        return self.log.summary()
+        """Return `table`, by the name that it had in version 0.2."""
+        return self.table()
 
     def _learn(self, seed: int) -> None:
         """Fit the posterior of all missions that are not set aside; if it is refused, go on."""

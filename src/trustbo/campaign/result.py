@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.card import campaign_card
 from trustbo.campaign.damage import naming_what_is_left, read_json
 from trustbo.campaign.failures import under_risk
-from trustbo.campaign.history import Kept, Posterior, Posteriors, whole_posterior
+from trustbo.campaign.history import Kept, Posterior, Posteriors, table_of, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
-from trustbo.data import Cell, Mission, path_text
+from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
@@ -116,6 +118,15 @@ class Result(Displayed):
             )
         return whole_posterior(self.posteriors[-1], self.missions)
 
+    def table(self) -> pd.DataFrame:
+        """Table with a row for each mission, labelled by its number, from 1; also `history.csv`.
+
+        Columns are its `status`, `state` and the `reason` of that, mean `contact_rate`, the plan's
+        `objective`, `n_bounds` that were run, `path_changed` and the `path` as text, "9,0 8,1";
+        then the posterior's diagnostics and seconds, as in `history`.
+        """
+        return table_of(self.history, self.missions)
+
     @cached_property
     def planner(self) -> Planner:
         """Planner as the campaign's, with the awareness believed in at the end."""
@@ -162,13 +173,14 @@ class Result(Displayed):
             seed: Seed of the choice of draws.
 
         Returns:
-            Dataset over (row, col) with `trust_mean` and `trust_sd` over the posterior, the mean
-            `cost` 1 - sigma(trust), `path_probability` (of a cell to be on the best path), and
-            each feature's awareness, the mean over robots, by its name, or as `awareness_<name>`
-            where another map or a dim has that name. NaN where no robot can go. Where places have
-            effects, also `place_mean` and `place_sd` of the cell's, and `place_bounds_mean`, the
-            mean of those of the bounds into it (see `models.place_maps`); of robots' own effects,
-            the mean over robots.
+            Dataset over (y, x), the centres of the cells' rows and columns in CRS metres, so that
+            `isel(y=row, x=col)` is a cell; `maps.rio` has the CRS and writes rasters. It holds
+            `trust_mean` and `trust_sd` over the posterior, the mean `cost` 1 - sigma(trust),
+            `path_probability` (of a cell to be on the best path), and each feature's awareness, the
+            mean over robots, by its name, or as `awareness_<name>` where another map or a dim has
+            that name. NaN where no robot can go. Where places have effects, also `place_mean` and
+            `place_sd` of the cell's, and `place_bounds_mean`, the mean of those of the bounds into
+            it (see `models.place_maps`); of robots' own effects, the mean over robots.
         """
         if n_draws is None and seed == 0:
             return self._maps.copy(deep=True)  # the caller may write into it
@@ -194,7 +206,7 @@ class Result(Displayed):
             maps[own] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
         maps["path_probability"] = share
         maps = maps.assign(places.data_vars)
-        return maps.where(self.workspace.passable)
+        return self.workspace.grid.place(maps.where(self.workspace.passable))
 
     def _places(self) -> xr.Dataset:
         """Maps of the effects of places, (row, col), where there are some."""
@@ -273,10 +285,7 @@ class Result(Displayed):
             remove_checked(folder / _BELIEVED)
         else:
             write_tree(folder / _BELIEVED, xr.DataTree(self.believed))
-        scalars = [n for n, a in self.history.data_vars.items() if a.dims == ("iteration",)]
-        table = self.history[scalars].to_dataframe()[scalars]
-        table["path"] = [path_text(path[path[:, 0] >= 0]) for path in self.history["path"].values]
-        write_text(folder / "history.csv", table.to_csv())
+        write_text(folder / "history.csv", self.table().to_csv())
         record = {
             "n_missions": len(self.missions),
             "path": self.path,

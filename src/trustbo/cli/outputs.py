@@ -91,14 +91,14 @@ def write_figure(path: Path, axes) -> None:
 
 def _print_table(result: "Result") -> None:
     """Print one line for each mission, and the recommended path."""
-    name, label = ("r_hat", "R-hat") if "r_hat" in result.history else ("k_hat", "k-hat")
+    table = result.table()
+    name, label = ("r_hat", "R-hat") if "r_hat" in table else ("k_hat", "k-hat")
     print(f"mission  status  contact  objective  {label}  path")
-    for i in result.history["iteration"].values:
-        row = result.history.sel(iteration=i)
+    for i, row in enumerate(table.to_dict("records"), start=1):
         change = "first" if i == 1 else "changed" if row["path_changed"] else "same"
         print(
-            f"{i:7d}  {row['status'].item():6s}  {row['contact_rate'].item():7.3f}  "
-            f"{row['objective'].item():9.3f}  {row[name].item():5.3f}  {change}"
+            f"{i:7d}  {row['status']:6s}  {row['contact_rate']:7.3f}  "
+            f"{row['objective']:9.3f}  {row[name]:5.3f}  {change}"
         )
     print(f"stopped: {result.stop_reason}")
     print(f"recommended: {' '.join(f'{row},{col}' for row, col in result.path)}")

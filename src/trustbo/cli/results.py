@@ -1,6 +1,7 @@
 """`trustbo report` and `trustbo export`: a result as one page, or as files for other programs."""
 
 import sys
+from math import radians
 from pathlib import Path
 
 from trustbo.cli.errors import one_line_errors
@@ -37,12 +38,16 @@ def export(
     formats: list[str],
     out: Path | None = None,
     resolution: float | None = None,
+    origin: str | None = None,
+    rotation: float = 0.0,
+    frame: str = "map",
     debug: bool = False,
 ) -> None:
     """Write a result's maps and path for GIS, GPS units and robots.
 
     Example: trustbo export out/demo --format geotiff --format gpx
     All formats: trustbo export out/demo --format all --out for-the-field
+    For a robot, from its start: trustbo export out/demo --format ros2_bag --origin auto
 
     With all, formats that cannot be written (a place on Earth without a terrain, a
     bag that exists already) are left out with a line that says so; a format asked
@@ -61,7 +66,10 @@ def export(
             reasons = left_out(result, target)
             absent = {name: why for name, why in reasons.items() if name not in formats}
             chosen = [name for name in FORMATS if name not in absent]
-        files = export_result(result, target, chosen, resolution=resolution)
+        files = export_result(
+            result, target, chosen, resolution=resolution, origin=origin,
+            rotation=radians(rotation), frame=frame,
+        )  # fmt: skip
         for name, why in absent.items():
             print(f"left out {name}: {why}", file=sys.stderr)
         for file in files:

@@ -9,6 +9,7 @@ from rasterio.crs import CRS
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.workspace import Workspace
+from trustbo.workspace.grid import over_cells
 
 Maps = xr.Dataset | xr.DataArray
 LEAD = "lead"
@@ -44,10 +45,11 @@ def as_dataset(maps: Maps) -> xr.Dataset:
 def require_maps(maps: Maps, workspace: Workspace) -> xr.Dataset:
     """Return maps of a workspace's cells as floats, dims (row, col), without coordinates.
 
-    ShapeError: no maps, or other dims or another number of cells. TrustboError: no numbers.
+    Those of `Result.maps` have dims (y, x). ShapeError: no maps, or other dims or another number of
+    cells. TrustboError: no numbers.
     """
     shape, bands = workspace.grid.shape, {}
-    for name, values in as_dataset(maps).data_vars.items():
+    for name, values in over_cells(as_dataset(maps)).data_vars.items():
         if set(values.dims) != {"row", "col"}:
             raise ShapeError(
                 f"map {name!r} has dims {values.dims}; it must have (row, col): take a mean, or "

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import xarray as xr
 
@@ -16,6 +16,7 @@ from trustbo.export.checks import (
     require_names_for_netcdf,
     require_names_for_sql,
 )
+from trustbo.export.frame import Frame, Origin, frame_file, frame_of
 from trustbo.export.paths import tables_beside, write_path
 from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
@@ -30,7 +31,8 @@ class _Content:
     """Result to write."""
 
     result: Result
-    resolution: float | None
+    for_ros: dict[str, Any]
+    """Arguments of the maps and bags for ROS."""
 
     @cached_property
     def maps(self) -> xr.Dataset:
@@ -61,6 +63,9 @@ def export_result(
     formats: Sequence[str] = ("geotiff", "geojson"),
     *,
     resolution: float | None = None,
+    origin: Origin = None,
+    rotation: float = 0.0,
+    frame: str = "map",
 ) -> list[Path]:
     """Write the maps and the recommended path of a result to a folder.
 
@@ -70,6 +75,10 @@ def export_result(
         formats: Names of formats, keys of `FORMATS`.
         resolution: Side of a pixel of the maps for ROS, m; by default that of a cell, or a tenth of
             its shorter side if cells are not square.
+        origin: Position in the CRS that is (0, 0) of the maps and bags for ROS, x and y, m, or with
+            names; `"auto"`: the centre of the path's first cell. By default that of the CRS.
+        rotation: Angle from east to the x axis of their frame, rad, anticlockwise.
+        frame: Name of their frame; see `write_ros_map`.
 
     Returns:
         Files written; the folder of a ROS 2 bag.
@@ -85,19 +94,27 @@ def export_result(
     target, for_ros = require_folder(folder), not chosen.keys().isdisjoint(_ROS)
     if resolution is not None:
         require_positive("resolution", resolution)
-        if not for_ros:
+    place = frame_of(result.workspace, origin, rotation, frame, result.path[0])
+    given = {"resolution": resolution, "origin": origin, "rotation": rotation, "frame": frame}
+    for option, default in _FOR_ROS.items():
+        if not for_ros and (value := given[option]) != default:
+            shown = f"{value:g}" if isinstance(value, float | int) else repr(value)
             raise TrustboError(
-                f"resolution={resolution:g} is of maps for ROS; leave it out, or ask for one of "
+                f"{option}={shown} is of maps for ROS; leave it out, or ask for one of "
                 f"{', '.join(_ROS)}."
             )
     for name in chosen:
         _require_possible(name, result, target)
-    content = _Content(result, resolution)
+    at = None if origin is None else place.origin  # "auto" is not known to a map alone
+    content = _Content(result, given | {"origin": at})
     if for_ros:
         occupancy(content.maps["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
-    return [file for kind in chosen.values() for file in kind.files_in(target, result)]
+    written = [file for kind in chosen.values() for file in kind.files_in(target, result)]
+    if place != Frame():
+        written += [frame_file(target / kind.files[0]) for n, kind in chosen.items() if n in _ROS]
+    return written
 
 
 def left_out(result: Result, folder: FilePath) -> dict[str, str]:
@@ -136,7 +153,7 @@ def _write_maps(content: _Content, file: Path) -> None:
     write_geotiff(file, maps, content.result.workspace, style=False)
     row, col = content.result.path[0]
     # The trust of the start cell is assumed; it must not set the limits of the colours.
-    learned = maps.where((maps["row"] != row) | (maps["col"] != col))
+    learned = maps.where((maps["y"] != maps["y"][row]) | (maps["x"] != maps["x"][col]))
     write_style(file.with_suffix(".qml"), learned)
 
 
@@ -151,12 +168,12 @@ def _write_tables(content: _Content, file: Path) -> None:
 
 def _write_map(content: _Content, file: Path) -> None:
     workspace, cost = content.result.workspace, content.maps["cost"]
-    write_ros_map(file, cost, workspace, resolution=content.resolution)
+    write_ros_map(file, cost, workspace, **content.for_ros)
 
 
 def _write_bag(content: _Content, file: Path) -> None:
     workspace, cost = content.result.workspace, content.maps["cost"]
-    write_ros_bag(file, content.result, cost, workspace, resolution=content.resolution)
+    write_ros_bag(file, content.result, cost, workspace, **content.for_ros)
 
 
 def _write_path(content: _Content, file: Path) -> None:
@@ -170,6 +187,8 @@ def _require_netcdf(result: Result) -> None:
 
 _BAGS = ("ros1_bag", "ros2_bag")
 _ROS = ("ros_map", *_BAGS)
+_FOR_ROS = {"resolution": None, "origin": None, "rotation": 0.0, "frame": "map"}
+"""Options of the formats for ROS, with their defaults."""
 _FORMATS = {
     "geotiff": _Format(
         "all maps as bands of a GeoTIFF, with a style for QGIS",

@@ -16,6 +16,8 @@ from trustbo.planning.plan import QUANTILES
 from trustbo.workspace import Workspace
 
 _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
+_LEAST = 1e-6
+"""Least probability in tables; a smaller one is 0."""
 
 
 def plan_of(plan: Plan | Result, workspace: Workspace | None) -> Plan:
@@ -49,11 +51,12 @@ def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
         for end, q in _BAND.items():
             columns[f"trust_{robot}_{end}"] = np.insert(plan.bands[q, :, i], 0, np.nan)
     if plan.risk is not None:
-        columns["p_fail"] = np.insert(plan.risk.p_fail, 0, np.nan)
-        for end, p in zip(_BAND, plan.risk.p_fail_band, strict=True):
-            columns[f"p_fail_{end}"] = np.insert(p, 0, np.nan)
-        for cause, p in plan.risk.by_cause.items():
-            columns[f"p_fail_{cause}"] = np.insert(p, 0, np.nan)
+        chances = {"p_fail": plan.risk.p_fail}
+        ends = zip(_BAND, plan.risk.p_fail_band, strict=True)
+        chances |= {f"p_fail_{end}": p for end, p in ends}
+        chances |= {f"p_fail_{cause}": p for cause, p in plan.risk.by_cause.items()}
+        seen = {name: np.where(p < _LEAST, 0.0, p) for name, p in chances.items()}
+        columns |= {name: np.insert(p, 0, np.nan) for name, p in seen.items()}
         columns["p_arrive"] = np.insert(np.cumprod(1.0 - plan.risk.p_fail), 0, 1.0)
     return _frame(plan, columns, x, y)
 

@@ -1,8 +1,7 @@
 """Maps and paths for ROS: files of map_server and Nav2, and bags.
 
-Coordinates are in the frame `map`, x east and y north, in metres: by default those of the terrain's
-CRS. RViz draws in float32, which is coarse so far from 0; `origin=(0.0, 0.0)` puts the lower left
-corner of the grid there instead.
+Coordinates are in a frame, by default `map` with x east and y north in metres of the terrain's CRS.
+RViz draws in float32, which is coarse so far from 0: `origin` puts (0, 0) near the robots.
 """
 
 import math
@@ -17,6 +16,7 @@ import yaml
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import LEAD, require_maps
+from trustbo.export.frame import Frame, Origin, frame_file, frame_of, write_frame
 from trustbo.export.layers import plan_of, routes_of
 from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.logs.bagfile import STORAGES, Record, require_new_bag, write_messages
@@ -35,8 +35,7 @@ class _Raster(NamedTuple):
 
     values: np.ndarray  # (row, col), int8, the southern row first
     resolution: float  # m
-    corner: tuple[float, float]  # lower left, x and y in the frame `map`, m
-    shift: np.ndarray  # from the grid's metres into the frame, (2,)
+    corner: tuple[float, float]  # lower left, x and y in the frame, m
 
 
 def occupancy(
@@ -53,27 +52,53 @@ def occupancy(
     ShapeError: other dims or another number of cells. TrustboError: a cost outside [0, 1], or a
     resolution that is not positive, or far too fine.
     """
+    return _raster(cost, workspace, resolution, Frame()).values
+
+
+def _raster(
+    cost: xr.DataArray, workspace: Workspace, resolution: float | None, frame: Frame
+) -> _Raster:
+    """Map of a cost whose pixels lie along the axes of a frame."""
+    cells, grid = _cells(cost, workspace), workspace.grid
+    rows, cols = grid.shape
+    side = _resolution(workspace, resolution, turned=frame.rotation != 0.0)
+    left, bottom, right, top = grid.bounds
+    if frame.rotation:
+        corners = frame.of_crs(np.array([[a, b] for a in (left, right) for b in (bottom, top)]))
+        corner, extent = corners.min(0), np.ptp(corners, axis=0)
+    else:
+        corner = frame.of_crs(np.array(grid.corner))
+        extent = np.array([cols * grid.cell_width, rows * grid.cell_height])
+    width, height = extent / side
+    if height * width > _MOST_PIXELS:
+        raise TrustboError(
+            f"resolution={side:g} m gives {height * width:.1e} pixels; take a coarser one."
+        )
+    # The quotient may be whole up to rounding.
+    n_x, n_y = (math.ceil(n - 1e-6) for n in (width, height))
+    values = np.full((n_y, n_x), UNKNOWN, np.int8)
+    # From the lower left corner on: along a row of pixels, and from row to row.
+    axes = frame.axes
+    at = frame.to_crs(corner) - grid.corner if frame.rotation else np.zeros(2)
+    along = (np.arange(n_x)[:, None] + 0.5) * side * axes[0]
+    for i in range(n_y):
+        x, y = (at + along + (i + 0.5) * side * axes[1]).T
+        row, col = rows - 1 - np.floor(y / grid.cell_height), np.floor(x / grid.cell_width)
+        known = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        values[i, known] = cells[row[known].astype(int), col[known].astype(int)]
+    x, y = corner.tolist()
+    return _Raster(values, side, (x, y))
+
+
+def _cells(cost: xr.DataArray, workspace: Workspace) -> np.ndarray:
+    """Occupancy of the cells, (row, col), int8, the northern row first."""
     (values,) = require_maps(cost.rename("cost"), workspace).data_vars.values()
     known = values.values
     if (bad := (known < 0.0) | (known > 1.0)).any():
         cell = tuple(int(i) for i in np.argwhere(bad)[0])
         raise TrustboError(f"cost{list(cell)} = {known[cell]:g} is outside [0, 1].")
     cells = np.where(np.isnan(known), UNKNOWN, np.fmin(np.rint(100.0 * known), WORST_PASSABLE))
-    cells = np.where(workspace.passable.values, cells, IMPASSABLE).astype(np.int8)
-    grid, side = workspace.grid, _resolution(workspace, resolution)
-    rows, cols = grid.shape
-    height, width = rows * grid.cell_height / side, cols * grid.cell_width / side
-    if height * width > _MOST_PIXELS:
-        raise TrustboError(
-            f"resolution={side:g} m gives {height * width:.1e} pixels; take a coarser one."
-        )
-    # The quotient may be whole up to rounding.
-    y, x = ((np.arange(math.ceil(n - 1e-6)) + 0.5) * side for n in (height, width))
-    row, col = rows - 1 - (y // grid.cell_height).astype(int), (x // grid.cell_width).astype(int)
-    within = (row >= 0)[:, None] & (col < cols)
-    return np.where(within, cells[np.ix_(row.clip(0), col.clip(None, cols - 1))], UNKNOWN).astype(
-        np.int8
-    )
+    return np.where(workspace.passable.values, cells, IMPASSABLE).astype(np.int8)
 
 
 def write_ros_map(
@@ -82,7 +107,9 @@ def write_ros_map(
     workspace: Workspace,
     *,
     resolution: float | None = None,
-    origin: tuple[float, float] | None = None,
+    origin: Origin = None,
+    rotation: float = 0.0,
+    frame: str = "map",
 ) -> None:
     """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml file, and a .pgm beside it.
 
@@ -93,17 +120,24 @@ def write_ros_map(
         workspace: Workspace of the cells.
         resolution: Side of a pixel, m, by default that of a cell, or a tenth of its shorter side if
             cells are not square.
-        origin: Position of the lower left corner of the grid in the frame `map`, m; by default its
-            position in the CRS.
+        origin: Position in the CRS that is (0, 0) of the frame: x and y, m, or with names, such as
+            `"lon=174.7,lat=-41.3"`; by default that of the CRS.
+        rotation: Angle from east to the x axis of the frame, rad, anticlockwise. Pixels lie along
+            its axes: they take the cost of the cell at their centre.
+        frame: Name of the frame. Unless all three are left out, a file whose name ends in
+            _frame.yaml, beside the map, says where it is.
 
     Raises:
         ShapeError: The dims or the number of cells differ.
         TrustboError: A cost is outside [0, 1]; the resolution is not positive, or far too fine; the
-            origin is not a position; or the file cannot be written.
+            origin is no position, or over 100 km from the grid; a rotation or a name of a frame
+            that cannot be; or the file cannot be written.
     """
     target = require_file(path, ".yaml", ".yml")
     picture = require_file(target.with_suffix(".pgm"))
-    raster = _raster(cost, workspace, resolution, origin)
+    place = frame_of(workspace, origin, rotation, frame)
+    frame_file(target)
+    raster = _raster(cost, workspace, resolution, place)
     height, width = raster.values.shape
     # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value,
     # 255 as -1; Nav2 does so up to 100, and takes larger bytes as unknown.
@@ -120,6 +154,7 @@ def write_ros_map(
         "free_thresh": 0.196,
     }
     write_file(picture, lambda file: file.write_bytes(head + pixels))
+    write_frame(target, place, workspace)
     # Last, as it names the picture.
     write_text(target, yaml.safe_dump(record, sort_keys=False, default_flow_style=None))
 
@@ -133,7 +168,9 @@ def write_ros_bag(
     version: int | None = None,
     storage: str = "mcap",
     resolution: float | None = None,
-    origin: tuple[float, float] | None = None,
+    origin: Origin = None,
+    rotation: float = 0.0,
+    frame: str = "map",
 ) -> None:
     """Write a cost map, a path, and all robots' posts and ways as a ROS bag.
 
@@ -157,7 +194,9 @@ def write_ros_bag(
         version: Version of ROS, 1 or 2; by default that of the suffix.
         storage: Storage of ROS 2, "mcap" or "sqlite3".
         resolution: Side of a pixel, m, see `write_ros_map`.
-        origin: Position of the lower left corner, m, see `write_ros_map`.
+        origin: See `write_ros_map`; `"auto"` is the centre of the path's first cell.
+        rotation: See `write_ros_map`.
+        frame: Name of the frame of all messages, see `write_ros_map`.
 
     Raises:
         ShapeError: The dims, or the number of cells or robots, differ.
@@ -169,8 +208,10 @@ def write_ros_bag(
     of_path = require_new_bag(target, version)
     plan = plan_of(plan, workspace)
     require_robots(workspace)
-    raster = _raster(cost, workspace, resolution, origin)
-    topics = _topics(plan, raster.shift)
+    place = frame_of(workspace, origin, rotation, frame, plan.path[0])
+    frame_file(target)
+    raster = _raster(cost, workspace, resolution, place)
+    topics = _topics(plan, place)
 
     of_kind = {PATH: Messages.path, POSES: Messages.poses}
 
@@ -186,40 +227,20 @@ def write_ros_bag(
             ),
         ]
 
-    write_messages(target, of_path, storage, records, latched=True)
+    write_messages(target, of_path, storage, records, latched=True, frame=frame)
+    write_frame(target, place, workspace)
 
 
-def _raster(
-    cost: xr.DataArray,
-    workspace: Workspace,
-    resolution: float | None,
-    origin: tuple[float, float] | None,
-) -> _Raster:
-    grid = workspace.grid
-    own = np.array(grid.corner)
-    corner = own if origin is None else _position(origin)
-    values = occupancy(cost, workspace, resolution=resolution)
-    x, y = corner.tolist()
-    return _Raster(values, _resolution(workspace, resolution), (x, y), corner - own)
-
-
-def _resolution(workspace: Workspace, resolution: float | None) -> float:
-    """Side of a pixel, m."""
+def _resolution(workspace: Workspace, resolution: float | None, *, turned: bool) -> float:
+    """Side of a pixel, m; by default a number that one can read."""
     if resolution is not None:
         return require_positive("resolution", resolution)
     height, width = workspace.grid.cell_height, workspace.grid.cell_width
+    is_round = math.isclose(width, round(width, 2), rel_tol=1e-9)
+    if math.isclose(height, width, rel_tol=1e-6) and is_round and not turned:
+        return round(width, 2)
     # Pixels of ROS are square; with ten per cell, its edges are off by a twentieth at most.
-    return width if math.isclose(height, width, rel_tol=1e-6) else min(height, width) / 10.0
-
-
-def _position(origin: tuple[float, float]) -> np.ndarray:
-    try:
-        position = np.array(origin, dtype=float)
-    except (TypeError, ValueError):
-        position = np.array(np.nan)
-    if position.shape != (2,) or not np.isfinite(position).all():
-        raise TrustboError(f"origin must be two finite numbers (x, y); got {origin!r}.")
-    return position
+    return float(f"{min(height, width) / 10.0:.2g}")
 
 
 def require_robots(workspace: Workspace) -> None:
@@ -228,21 +249,22 @@ def require_robots(workspace: Workspace) -> None:
         require_topic_names(LEAD, workspace.team.names)
 
 
-def _topics(plan: Plan, shift: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """Return the type and the poses (pose, 3) of each topic, shifted into the frame `map`."""
+def _topics(plan: Plan, frame: Frame) -> dict[str, tuple[str, np.ndarray]]:
+    """Return the type and the poses (pose, 3) of each topic, in the frame."""
     centers = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
-    topics = {"path": (PATH, _onward(centers + shift))}
+    topics = {"path": (PATH, _onward(frame.of_crs(centers)))}
     if plan.waypoints is None or plan.posts is None:
         return topics
-    topics[f"{LEAD}/waypoints"] = POSES, _onward(plan.waypoints + shift)
+    waypoints = frame.of_crs(plan.waypoints)
+    topics[f"{LEAD}/waypoints"] = POSES, _onward(waypoints)
     for i, robot in enumerate(plan.workspace.team.names):
-        own = plan.posts[:, i]
-        topics[f"{robot}/posts"] = POSES, _towards(own + shift, plan.waypoints[1:] - own)
+        own = frame.of_crs(plan.posts[:, i])
+        topics[f"{robot}/posts"] = POSES, _towards(own, waypoints[1:] - own)
     for robot, ways in routes_of(plan).items():
         if ways:
             # The end of a way is the start of the next.
             points = np.concatenate([ways[0][:1], *(way[1:] for way in ways)])
-            topics[f"{robot}/way"] = PATH, _onward(points + shift)
+            topics[f"{robot}/way"] = PATH, _onward(frame.of_crs(points))
     return topics
 
 

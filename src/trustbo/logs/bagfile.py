@@ -152,12 +152,13 @@ def write_messages(
     records: Callable[[Messages], Iterable[Record]],
     *,
     latched: bool = False,
+    frame: str = "map",
 ) -> None:
     """Write a bag whole or not at all; TrustboError without rosbags.
 
     The path, a file or folder, must not exist; its parent is made if need be. `version` of ROS is 1
     or 2, `storage` of ROS 2 one of `STORAGES`. `records` makes records in order of time with the
-    given `Messages`. If `latched`, late subscribers get the messages played before.
+    given `Messages`, in `frame`. If `latched`, late subscribers get the messages played before.
     """
     try:
         from rosbags import rosbag1, rosbag2
@@ -178,7 +179,7 @@ def write_messages(
         options = _latch(version) if latched else {}
         connections: dict[str, Any] = {}
         with writer:
-            for time, topic, kind, message in records(Messages(store.types)):
+            for time, topic, kind, message in records(Messages(store.types, frame)):
                 if topic not in connections:
                     connections[topic] = writer.add_connection(
                         topic, kind, typestore=store, **options

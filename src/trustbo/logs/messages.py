@@ -78,9 +78,9 @@ def require_topic_names(lead: str, robots: Sequence[str]) -> None:
 class Messages:
     """Factory of messages of one version of ROS."""
 
-    def __init__(self, types: Mapping[str, Any]) -> None:
-        """Hold the message classes by name, as rosbags has them."""
-        self._types = types
+    def __init__(self, types: Mapping[str, Any], frame: str = "map") -> None:
+        """Hold the message classes by name, as rosbags has them, and the frame of positions."""
+        self._types, self._frame = types, frame
 
     def text(self, text: str) -> Any:
         """Make a string."""
@@ -99,20 +99,20 @@ class Messages:
         return self._types[NUMBERS](layout=layout, data=np.asarray(values, dtype=np.float64))
 
     def pose(self, time: int, pose: np.ndarray) -> Any:
-        """Make a pose (x, y, heading) at a time in ns, in the frame `map`."""
+        """Make a pose (x, y, heading) at a time in ns, in the frame."""
         return self._types[POSE](header=self._header(time), pose=self._pose(pose))
 
     def path(self, time: int, poses: np.ndarray) -> Any:
-        """Make a path through poses, shape (pose, 3), in the frame `map`."""
+        """Make a path through poses, shape (pose, 3), in the frame."""
         stamped = [self.pose(time, pose) for pose in poses]
         return self._types[PATH](header=self._header(time), poses=stamped)
 
     def poses(self, time: int, poses: np.ndarray) -> Any:
-        """Make an array of poses, shape (pose, 3), in the frame `map`."""
+        """Make an array of poses, shape (pose, 3), in the frame."""
         return self._types[POSES](header=self._header(time), poses=[self._pose(p) for p in poses])
 
     def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
-        """Make a map in the frame `map` from int8 values (row, col), the southern row first.
+        """Make a map in the frame from int8 values (row, col), the southern row first.
 
         Time in ns, side of a pixel in m, and the pose of the lower left corner.
         """
@@ -135,7 +135,7 @@ class Messages:
     def _header(self, time: int) -> Any:
         head = self._types["std_msgs/msg/Header"]
         number = {"seq": 0} if "seq" in head.__dataclass_fields__ else {}  # of ROS 1 alone
-        return head(stamp=self._stamp(time), frame_id="map", **number)
+        return head(stamp=self._stamp(time), frame_id=self._frame, **number)
 
     def _pose(self, pose: np.ndarray) -> Any:
         x, y, heading = (float(value) for value in pose)

@@ -29,6 +29,8 @@ from trustbo.models.posterior_tree import missions_of
 from trustbo.parallel import one_blas_thread
 
 _LEVEL = 0.05
+_LEAST = 1e-6
+"""Least probability in tables; a smaller one is 0."""
 _SITES = ({"beta0", "beta", "b", "delta_w", "delta_v"}, {"B0", "B", "b", "Delta_w", "Delta_v"})
 _ATTRIBUTES = ("observation", "response", "x0_mean", "x0_sd", "seed")
 
@@ -42,7 +44,8 @@ class Criticism(Displayed):
         fault: Check that explains most of what is wrong, `"none"` if nothing is found.
         table: Row of each check (index `check`): the label with the strongest evidence; its
             statistic; p, of this check alone; p_adjusted, for the number of checks (Holm); p_after,
-            once the fault that explains most is accounted for; and the finding in words.
+            once the fault that explains most is accounted for; and the finding in words. A
+            probability below 1e-6, which is extrapolated, is 0.
         rates: Row of each measured rate: mission, bound, robot, row, col, contact_rate, expected
             and sd given the rates before, standardised residual, pit, and `ahead`, the standardised
             residual of predictions one mission ahead.
@@ -162,6 +165,8 @@ def _criticise(
     rows["coverage"] = coverage_row(curves)
     head = ["label", "statistic", "p", "p_adjusted", "p_after", "finding"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=head).rename_axis("check")
+    chances = ["p", "p_adjusted", "p_after"]
+    table[chances] = table[chances].mask(table[chances] < _LEAST, 0.0)
     worth = worth_of(posterior, missions, model) if compare else worth_of(None, missions, None)
     return Criticism(verdict_of(fault, table), fault, table, rates, groups, curves, worth)
 

@@ -28,6 +28,7 @@ from trustbo.plots.layout import (
 from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Grid, Workspace
+from trustbo.workspace.grid import over_cells
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
@@ -278,7 +279,8 @@ def _draw_map(
     *,
     relief: bool,
 ) -> AxesImage:
-    data = np.where(workspace.passable.values, values.transpose("row", "col").values, np.nan)
+    shown = over_cells(values).transpose("row", "col").values
+    data = np.where(workspace.passable.values, shown, np.nan)
     ax.set_facecolor(theme().closed)
     extent = extent_of(workspace.grid)
     image = ax.imshow(data, cmap=cmap, norm=norm, extent=extent, interpolation="nearest")

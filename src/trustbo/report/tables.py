@@ -1,7 +1,6 @@
 """Tables of a page."""
 
 import numpy as np
-import xarray as xr
 from arviz_stats import sampling_diagnostics
 
 from trustbo.campaign.result import Result
@@ -65,26 +64,25 @@ def parameter_table(result: Result) -> Table:
 
 def history_table(result: Result) -> Table:
     """Tabulate the missions, one per row."""
-    history = result.history
+    table = result.table()
     columns = {
-        "status": lambda row: str(row["status"].item()).replace("_", " "),
-        "contact rate": lambda row: number(row["contact_rate"].item(), 2),
-        "objective": lambda row: number(row["objective"].item(), 3),
-        "path": _change,
+        "status": [status.replace("_", " ") for status in table["status"]],
+        "contact rate": [number(rate, 2) for rate in table["contact_rate"]],
+        "objective": [number(value, 3) for value in table["objective"]],
+        "path": ["first", *("new" if new else "same" for new in table["path_changed"][1:])],
     }
     for name, label, places in (
         ("regret", "regret (%)", 1), ("r_hat", "R-hat", 3), ("ess_bulk", "bulk ESS", 0),
         ("divergences", "divergences", 0), ("k_hat", "k-hat", 2), ("kish", "Kish size", 0),
     ):  # fmt: skip
-        if name in history:
-            columns[label] = lambda row, n=name, p=places: number(float(row[n].item()), p)
-    columns["seconds"] = lambda row: number(
-        sum(float(row[f"seconds_{what}"].item()) for what in ("plan", "run", "fit")), 1
-    )
-    rows = []
-    for i in history["iteration"].values:
-        row = history.sel(iteration=i)
-        rows.append([str(i), *(text(row) for text in columns.values())])
+        if name in table:
+            columns[label] = [number(float(value), places) for value in table[name]]
+    seconds = table.filter(regex="^seconds_").sum(axis=1, skipna=False)
+    columns["seconds"] = [number(value, 1) for value in seconds]
+    rows = [
+        [str(i), *row]
+        for i, row in zip(table.index, zip(*columns.values(), strict=True), strict=True)
+    ]
     return Table(
         "Each mission: how it ended, the mean contact rate measured, the objective when it was "
         "planned, the posterior's diagnostics, and the seconds for all of it.",
@@ -120,12 +118,6 @@ def settings_table(result: Result) -> Table:
     """Tabulate the settings of the campaign."""
     rows = [(name.replace("_", " "), _plain(value)) for name, value in result.settings.items()]
     return Table("Settings of the campaign.", ("setting", "value"), rows, text_columns=(1,))
-
-
-def _change(row: xr.Dataset) -> str:
-    if int(row["iteration"]) == 1:
-        return "first"
-    return "new" if bool(row["path_changed"]) else "same"
 
 
 def _plain(value: object) -> str:

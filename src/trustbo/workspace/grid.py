@@ -8,12 +8,11 @@ from numba import njit
 from numpy.typing import ArrayLike
 from rasterio.crs import CRS
 from rasterio.transform import from_origin
-from rasterio.warp import transform as transform_points
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TerrainError, TrustboError, require_pair
-from trustbo.workspace.location import WGS84, Location, cell_of, crs_name
+from trustbo.workspace.location import Location, cell_of, crs_name, lonlat_of
 
 Sums = tuple[np.ndarray, np.ndarray]
 """Sum over each cell's pixels with data, and their number, each of shape (row, col)."""
@@ -144,9 +143,7 @@ class Grid(Displayed):
         Raises:
             TrustboError: The grid has no CRS.
         """
-        x, y = self.center(cell)
-        lon, lat = transform_points(self.require_crs(), WGS84, [x], [y])[:2]
-        return lon[0], lat[0]
+        return lonlat_of(self, self.center(cell))
 
     def cell_at_lonlat(self, lon: float, lat: float) -> Cell:
         """Cell at a position in degrees (WGS 84).

@@ -173,10 +173,10 @@ def _number(what: str, name: str, value: object, whole: bool) -> float:
     return int(number) if whole else number
 
 
-def _position(
+def position_of(
     grid: "Grid", names: tuple[str, str], values: Iterable[float]
 ) -> tuple[float, float] | None:
-    """X and y of a location, m; None for degrees that are no place of the CRS."""
+    """X and y of a location, CRS metres; None for degrees that are no place of the CRS."""
     a, b = values
     if names == METRES:
         return a, b
@@ -192,12 +192,18 @@ def _position(
     return (x, y) if np.isfinite([x, y]).all() else None
 
 
+def lonlat_of(grid: "Grid", position: tuple[float, float]) -> tuple[float, float]:
+    """Longitude and latitude of a position in CRS metres; TrustboError without a CRS."""
+    lon, lat = transform_points(grid.require_crs(), WGS84, *([value] for value in position))[:2]
+    return lon[0], lat[0]
+
+
 def _cell(grid: "Grid", names: tuple[str, str], values: Iterable[float]) -> Cell | None:
     """Cell of a location; None off the grid."""
     a, b = values
     if names == CELL:
         row, col = a, b
-    elif (position := _position(grid, names, (a, b))) is None:
+    elif (position := position_of(grid, names, (a, b))) is None:
         return None
     else:
         x, y = position
@@ -216,7 +222,7 @@ def _understood(found: Named, grid: "Grid") -> str:
         )
     if names == METRES:
         return f"{found.typed} (x {a:.1f}, y {b:.1f} m in {crs_name(grid)})"
-    position = _position(grid, names, (a, b))
+    position = position_of(grid, names, (a, b))
     there = "no place of the CRS" if position is None else "x {:.1f}, y {:.1f} m".format(*position)
     return f"{found.typed} (longitude {a:g}, latitude {b:g}, {there})"
 
@@ -249,9 +255,9 @@ def _names_for(location: object, grid: "Grid") -> str:
 
 def _nearest(found: Named, grid: "Grid", passable: np.ndarray | None) -> str:
     """Sentence that names the nearest (passable) cell, and its distance if that is long."""
-    position, turned = _position(grid, found.names, found.values), ""
+    position, turned = position_of(grid, found.names, found.values), ""
     if position is None:
-        position = _position(grid, found.names, found.values[::-1])
+        position = position_of(grid, found.names, found.values[::-1])
         turned = " of lon and lat swapped"
     if position is None:
         return ""
