@@ -233,14 +233,12 @@ class Mission(Displayed):
         """
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
         if failed_at is not None or reason:
-            status = _reason(failed_at, reason, status, len(path) - 1)
-            z, y, duration, n_ticks = (
-                None if values is None else _until(name, values, failed_at, len(y))
-                for name, values in (
-                    ("awareness", z), ("contact_rate", y), ("duration", duration),
-                    ("n_ticks", n_ticks),
-                )
-            )  # fmt: skip
+            last, status = _failure(failed_at, reason, status, len(path) - 1)
+            z, y = _until(last, z), _until(last, y)
+            duration, n_ticks = (
+                None if values is None else _until(last, as_array(name, values))
+                for name, values in (("duration", duration), ("n_ticks", n_ticks))
+            )
         if z.ndim == 3 and len(z) == len(y) == 0:
             raise ShapeError(
                 "a mission has at least one bound; got 0. If the robots were stopped before "
@@ -360,31 +358,30 @@ def default_features(n_features: int) -> tuple[str, ...]:
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
 
 
-def _reason(failed_at: int | None, reason: str, status: str, n_bounds: int) -> str:
-    """Outcome of a mission that failed in a bound."""
+def _failure(failed_at: int | None, reason: str, status: str, n_bounds: int) -> tuple[int, str]:
+    """Bound, from 1, in which a mission failed, and its outcome."""
     if failed_at is None:
         raise TrustboError(
             f"reason={reason!r} needs failed_at=, the number of the bound, from 1, that ended the "
             "mission."
         )
-    if require_whole("failed_at", failed_at, 1) > n_bounds:
-        raise TrustboError(f"failed_at = {failed_at}, but the path has {n_bounds} bounds.")
+    if (last := require_whole("failed_at", failed_at, 1)) > n_bounds:
+        raise TrustboError(f"failed_at = {last}, but the path has {n_bounds} bounds.")
     if status != "ok":
         raise TrustboError(f"status={status!r} is given beside failed_at=; give reason= instead.")
-    return require_choice("reason", reason or "aborted", STATUSES[1:])
+    return last, require_choice("reason", reason or "aborted", STATUSES[1:])
 
 
-def _until(what: str, values: ArrayLike, last: int | None, n_rows: int) -> np.ndarray:
+def _until(last: int, values: np.ndarray) -> np.ndarray:
     """Rows of the first `last` bounds; NaN for the last one where the arrays end before it."""
-    array = as_array(what, values)
-    assert last is not None  # noqa: S101  # `_reason`
-    if array.ndim and n_rows < last - 1:
+    if not values.ndim:
+        return values
+    if len(values) < last - 1:
         raise ShapeError(
-            f"failed_at = {last}, but the arrays have {n_rows} bounds; give all bounds before it."
+            f"failed_at = {last}, but the arrays have {len(values)} bounds; give all before it."
         )
-    if array.ndim and len(array) == last - 1:
-        return np.pad(array, [(0, 1)] + [(0, 0)] * (array.ndim - 1), constant_values=np.nan)
-    return array[:last] if array.ndim else array
+    rest = np.full((max(last - len(values), 0), *values.shape[1:]), np.nan)
+    return np.concatenate([values[:last], rest])
 
 
 def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import gpxpy
 import numpy as np
+import pandas as pd
 import pytest
 from pyproj import Transformer
 from references import geometry_of_blob
@@ -222,7 +223,7 @@ def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
 def test_a_chance_too_small_to_mean_anything_is_0_in_tables(result, tmp_path):
     risk = result.plan.risk
     by_cause = {cause: np.full(len(risk.p_fail), 4.8e-161) for cause in risk.by_cause}
-    plan = replace(result.plan, risk=replace(risk, by_cause=by_cause))
+    plan = replace(result.plan, risk=risk._replace(by_cause=by_cause))
     write_path(tmp_path / "path.csv", plan)
     table = pd.read_csv(tmp_path / "path.csv")
     assert (table[[f"p_fail_{cause}" for cause in by_cause]][1:] == 0.0).all(axis=None)

@@ -97,7 +97,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
     """Missions that a posterior holds the data of."""
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
-    names = {f"{dim}s": [str(name) for name in data[dim].values] for dim in ("robot", "feature")}
+    robots, features = ([str(n) for n in data[dim].values] for dim in ("robot", "feature"))
     found = []
     for j in range(data.sizes["mission"]):
         one = data.isel(mission=j)
@@ -107,12 +107,17 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
         start = cells[0]
         if "start_row" in one:
             start = (int(one["start_row"]), int(one["start_col"]))
-        arrays = {
-            name: one[name].values for name in ("awareness", "contact_rate", "duration", "n_ticks")
-        }
+        z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
         found.append(
             Mission.from_arrays(
-                [start, *cells], **arrays, status=str(one["status"].values), **names
+                [start, *cells],
+                z,
+                y,
+                seconds,
+                str(one["status"].values),
+                n_ticks=one["n_ticks"].values,
+                robots=robots,
+                features=features,
             )
         )
     return found

@@ -93,8 +93,10 @@ class ModelSimulator(DescribedSimulator):
         ticks = None if self.n_ticks is None else np.full(rates.shape, self.n_ticks)
         n, status = self._end(cells, seed)
         ticks = None if ticks is None else ticks[:n]
-        names = {"features": self.workspace.features, "robots": self.workspace.team.names}
-        return Mission.from_arrays(cells, z[:n], rates[:n], status=status, n_ticks=ticks, **names)
+        return Mission.from_arrays(
+            cells, z[:n], rates[:n], status=status, n_ticks=ticks,
+            features=self.workspace.features, robots=self.workspace.team.names,
+        )  # fmt: skip
 
     def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
         """Number of bounds that are run, and the status that the mission ends with."""
