@@ -88,7 +88,7 @@ def test_the_commands_of_a_page_run_from_top_to_bottom(
     for name in ("dem", "dsm"):
         terrain[name].astype("float32").rio.to_raster(f"{name}.tif")
     commands = [words for words, content in PAGES[page] if content is None]
-    for name in () if commands[0][1] in ("run", "demo") else ("mine", "demo"):
+    for name in () if commands[0][1] in ("run", "demo", "info") else ("mine", "demo"):
         shutil.copytree(campaign, Path("out") / name, ignore=shutil.ignore_patterns(".lock"))
     Path("config.yaml").write_text(short(STUDY))  # a user's own
     for words, content in PAGES[page]:
