@@ -151,6 +151,23 @@ def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationa
         np.testing.assert_allclose(latent.log_density(z) - log_prior, expected, rtol=10 * rtol)
 
 
+@pytest.mark.parametrize("family", ["gaussian", "censored"])
+@pytest.mark.parametrize("score", [-3000.0, -1450.0, 1450.0, 3000.0])
+def test_a_length_scale_that_underflows_is_one_of_independent_cells(score, family):
+    """Newton's search for the mode looks so far out, where exp is 0, denormal or infinite."""
+    missions, place = random_missions(0), PlaceEffect()
+    target = target_of(missions, place)
+    if family == "censored":
+        batch = tb.stacking.stack_missions(missions)
+        places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
+        gathered = gather_chains(FAMILIES[family], batch, places=places)
+        target = LatentTarget(*gathered, Priors(), (place, places))
+    z = np.zeros((2, target.n_scores if family == "gaussian" else 6))
+    z[:, 4] = score, 40.0 * np.sign(score)  # a length scale of 1e-9 cells, or of 1e9
+    far, near = target.log_density(z) + 0.5 * z[:, 4] ** 2
+    assert far == pytest.approx(near, abs=1e-6)
+
+
 def test_a_mission_of_weight_one_half_counts_by_the_root_of_its_density():
     """With no effect in common, densities of missions multiply."""
     place, priors = PlaceEffect(), Priors()

@@ -212,3 +212,14 @@ def test_where_coefficients_do_not_integrate_out_nuts_is_taken_and_says_why():
     assert resolve_sampler(censored, "auto") == ("joint", expected)
     with pytest.raises(TrustboError, match=expected):
         resolve_sampler(censored, "exact")
+
+
+@pytest.mark.parametrize("inter_robot", ["full", "ordered"])
+def test_noises_that_underflow_have_no_density_and_raise_nothing(inter_robot):
+    model = CoupledTrust(inter_robot=inter_robot)
+    target = target_of(small(), model)
+    z = np.zeros((2, target.n_scores))
+    of_sizes = 2 + (2 if inter_robot == "full" else 1)  # behind beta0 and the coupling
+    z[:, of_sizes : of_sizes + 2] = [[-800.0], [-380.0]]
+    z[:, 0] = -40.0  # a beta0 of 0 leaves nothing of the start's variance
+    assert (target.log_density(z) == -np.inf).all()

@@ -99,7 +99,7 @@ def integrate(sequences: Sequences, at: Dynamics) -> tuple[np.ndarray, np.ndarra
     return value, factor
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _integrate(data, at, first, last, value, factor):
     n_missions, n_bounds, n = data.y.shape
     p = len(data.robot)
@@ -132,7 +132,7 @@ def _integrate(data, at, first, last, value, factor):
         value[t] = -0.5 * (total + A[p, p] ** 2)
 
 
-@nb.njit(**PART)
+@nb.njit(error_model="numpy", **PART)
 def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
     """Gains and inverse scales of innovations of each bound, robot by robot (`vector`)."""
     n = len(B0)
@@ -172,7 +172,7 @@ def _filter(seen, length, B0, Q, R, x0_sd, lag, gain, scale, of_bound):
         copy(J[:n, :n], P)
 
 
-@nb.njit(**PART)
+@nb.njit(error_model="numpy", **PART)
 def _whiten(data, s, B0, spread, gain, scale, m, J, rows, n_rows):
     """Write the whitened innovations of one mission as rows; number of rows then."""
     n, q = m.shape
@@ -208,7 +208,7 @@ def _whiten(data, s, B0, spread, gain, scale, m, J, rows, n_rows):
     return n_rows
 
 
-@nb.njit(**PART)
+@nb.njit(error_model="numpy", **PART)
 def _cholesky(A):
     """Factor of A's lower triangle, in place, zeros above; NaN where it is not positive."""
     n = len(A)

@@ -17,6 +17,10 @@ from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs  # pyright: ignore
 
 JITTER = 1e-4
 """Least tau_e in units of tau_s or the noise: below, K_g is singular to rounding."""
+LENGTH_SCALES = 1e-6, 1e6
+"""Least and largest length scale, in cells: beyond, cells are independent, or equal, to rounding."""
+
+_compiled = nb.njit(cache=True, error_model="numpy")
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> np.ndarray:
@@ -31,7 +35,7 @@ def correlation(places: np.ndarray, others: np.ndarray, length_scale: float) -> 
     return matern(np.hypot(gap[..., 1], gap[..., 2]), length_scale) * (gap[..., 0] == 0)
 
 
-@nb.njit(cache=True)
+@_compiled
 def fill_cells(M, cells, shape, w, tau_s, length_scale, tau_e):
     """Lower triangle of M = tau_e^2 I + tau_s^2 W K W; cells (cell, 3)."""
     table = np.empty(shape)
@@ -48,7 +52,7 @@ def fill_cells(M, cells, shape, w, tau_s, length_scale, tau_e):
         M[i, i] += tau_e**2
 
 
-@nb.njit(cache=True)
+@_compiled
 def fill_units(A, M_inverse, cell_of, n_c, tau_e):
     """Lower triangle of K_g^-1, from that of M^-1."""
     for i in range(len(cell_of)):
@@ -60,7 +64,7 @@ def fill_units(A, M_inverse, cell_of, n_c, tau_e):
                 A[i, j] += tau_e**-2 * ((i == j) - 1.0 / n_c[ci])
 
 
-@nb.njit(cache=True)
+@_compiled
 def add_rows(A, h, S, R, a, weight, length, kind, unit):
     """Add what rows say of g: A += sum w a^2 S to a lower triangle, h (c, unit) += sum w a R."""
     for s in range(len(a)):

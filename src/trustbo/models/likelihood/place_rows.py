@@ -73,7 +73,7 @@ def gather_rows(
     return Rows(y, seen, X, a, weights, unit, length, kind, float((weights @ seen).sum()))
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, error_model="numpy")
 def filter_rows(theta, x0_sd, y, seen, X, a, weight, length, kind):
     """S (point, kind, K, K), R (point, row, K, c), G (point, c, c) and log |L L'| (point,).
 

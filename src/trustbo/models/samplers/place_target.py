@@ -47,7 +47,9 @@ def hyperparameters(priors: Priors, place: PlaceEffect, z: np.ndarray) -> np.nda
     theta[:, 4], rest = 1.0, iter(z[:, 3:].T)
     if place.cells:
         theta[:, 3] = scores.half_normal(next(rest), place.tau_s)
-        theta[:, 4] = place.length_scale * np.exp(place.length_scale_sd * next(rest))
+        length_scale = place.length_scale * np.exp(place.length_scale_sd * next(rest))
+        # A search for the mode may step to where the exponential is 0 or infinite.
+        theta[:, 4] = np.clip(length_scale, *place_prior.LENGTH_SCALES)
     if place.bounds:
         theta[:, 5] = scores.half_normal(next(rest), place.tau_e)
     return theta
@@ -133,6 +135,7 @@ class PlaceTarget:
             total = np.hypot(theta[:, 1], theta[:, 2])
             ok = np.isfinite(theta).all(1) & (total > 1e-12) & np.isfinite(log_prior)
             theta = np.where(ok[:, None], theta, 0.1)
+            total = np.hypot(theta[:, 1], theta[:, 2])
             floor = place_prior.JITTER * np.maximum(theta[:, 3], total)
             theta[:, 5] = np.maximum(theta[:, 5], floor)
             found = self._integrate(theta, keep=keep)
