@@ -31,6 +31,7 @@ from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_
 from trustbo.models import BoundRisk, params_of, place_maps
 from trustbo.models.hazard import measures_of
 from trustbo.planning import Plan, Planner
+from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
 
@@ -285,7 +286,7 @@ class Result(Displayed):
             remove_checked(folder / _BELIEVED)
         else:
             write_tree(folder / _BELIEVED, xr.DataTree(self.believed))
-        write_text(folder / "history.csv", self.table().to_csv())
+        write_text(folder / "history.csv", frame_as_csv(self.table()))
         record = {
             "n_missions": len(self.missions),
             "path": self.path,

@@ -29,6 +29,7 @@ def study(
     with one_line_errors(debug):
         from trustbo import plots
         from trustbo.files import require_file, write_text
+        from trustbo.spreadsheet import frame_as_csv
         from trustbo.study import run_study, summary
         from trustbo.study.table import axes_of
 
@@ -39,7 +40,7 @@ def study(
         results = run_study(config, out, executor, n_workers=workers, progress=not quiet)
         known = bool(results["regret"].notnull().any())
         table = summary(results, variable="regret" if known else "value")
-        write_text(out / "summary.csv", table.to_csv())
+        write_text(out / "summary.csv", frame_as_csv(table))
         if known:
             others = [name for name in axes_of(results) if name != "policy"]
             axes = plots.regret_curves(results, panels=others[0] if others else None)

@@ -37,6 +37,7 @@ def worlds(
     """
     with one_line_errors(debug):
         from trustbo.files import require_file, write_text
+        from trustbo.spreadsheet import frame_as_csv
         from trustbo.study.benchmark import as_text, run_worlds, worlds_table
         from trustbo.study.contenders import BASELINES
 
@@ -55,7 +56,7 @@ def worlds(
             n_workers=workers, progress=not quiet, **chosen,
         )  # fmt: skip
         table = worlds_table(results, by)
-        write_text(out / "worlds.csv", table.to_csv())
+        write_text(out / "worlds.csv", frame_as_csv(table))
         if not quiet:
             print(as_text(table))
         print(f"results are in {out}/; in Python: trustbo.study.load_study({str(out)!r})")

@@ -17,6 +17,7 @@ from trustbo.export.gpx import gpx_routes
 from trustbo.export.layers import bounds_layer, plan_of, posts_layer, way_points, ways_layer
 from trustbo.files import FilePath, require_file, to_json, write_file, write_text
 from trustbo.planning import Plan
+from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
 
 _WGS84 = "EPSG:4326"
@@ -188,7 +189,7 @@ def _write_csv(file: Path, plan: Plan) -> None:
             after = 1 + list(table.columns).index("y")
             table.insert(after, "longitude", place.x)
             table.insert(after + 1, "latitude", place.y)
-        write_text(own, table.to_csv(index=False, lineterminator="\n"))
+        write_text(own, frame_as_csv(table, index=False))
 
 
 def _of_terrain(plan: Plan) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import pandas as pd
 from trustbo.campaign.result import Result
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.logs.rows import column_of
+from trustbo.spreadsheet import frame_as_csv
 
 _TRUST = ("trust_mean", "trust_sd")
 
@@ -52,7 +53,7 @@ def write_csv(path: FilePath, result: Result) -> None:
                     | dict(zip(map(_column, mission.features), bound.awareness[i], strict=True))
                     | {n: a[j][k, i] if j in a else np.nan for n, a in trust.items()}
                 )
-    write_text(target, pd.DataFrame(rows).to_csv(index=False, lineterminator="\n"))
+    write_text(target, frame_as_csv(pd.DataFrame(rows), index=False))
 
 
 def _column(feature: str) -> str:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from trustbo.data import FEATURES, Cell
 from trustbo.errors import TrustboError
+from trustbo.spreadsheet import meant
 from trustbo.workspace.grid import Grid
 
 KEYS = ("mission", "bound", "robot", "row", "col")
@@ -181,7 +182,9 @@ def _from_file(file: Path) -> tuple[list[str], list[list[str]]]:
             raise TrustboError(f"row {i} has {len(row)} values, the header {len(header)}.")
     if separator == ";":  # spreadsheets write it where the decimal sign is a comma
         rows = [[re.sub(r"^([+-]?\d+),(\d+)$", r"\1.\2", text) for text in row] for row in rows]
-    return [name.strip() for name in header], [[row[j] for row in rows] for j in range(len(header))]
+    rows = [[meant(text) for text in row] for row in rows]
+    names = [meant(name.strip()) for name in header]
+    return names, [[row[j] for row in rows] for j in range(len(names))]
 
 
 def _of(table: Any) -> tuple[list[str], list[list[object]]]:

@@ -16,18 +16,17 @@ feature with the name of one of these columns takes the prefix `awareness_`, e.g
 read as such.
 """
 
-import csv
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
-from trustbo.files import FilePath, write_file
+from trustbo.files import FilePath, write_text
 from trustbo.logs.rows import KEYS, Row, column_of, features_of, parse_rows, read_columns
+from trustbo.spreadsheet import rows_as_csv
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
@@ -110,11 +109,7 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
                     own += map(_text, bound.awareness[i])
                 lines.append([j, k, robot, *cell, *own])
 
-    def write(file: Path) -> None:
-        with file.open("w", newline="", encoding="utf-8") as stream:
-            csv.writer(stream, lineterminator="\n").writerows(lines)
-
-    write_file(path, write)
+    write_text(path, rows_as_csv(lines))
 
 
 def _mission(

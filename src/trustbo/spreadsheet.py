@@ -1,0 +1,48 @@
+"""Cells of CSV files: text that a spreadsheet would run as a formula is written as text.
+
+A spreadsheet evaluates a cell that begins with `=`, `+`, `-`, `@`, a tab or a line end. Such text
+gets a single quote before it (OWASP, CSV injection), and so does text that begins with quotes and
+then one of these, so that reading is the inverse of writing. Numbers, such as -0.5, stay numbers.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Sequence
+
+import pandas as pd
+
+_RUNS = re.compile("'*[=+\\-@\t\r\n\N{FULLWIDTH EQUALS SIGN}\N{FULLWIDTH PLUS SIGN}"
+                   "\N{FULLWIDTH HYPHEN-MINUS}\N{FULLWIDTH COMMERCIAL AT}]")  # fmt: skip
+
+
+def harmless(text: str) -> str:
+    """Text of a cell as it is written."""
+    return f"'{text}" if _RUNS.match(text) and not _is_number(text) else text
+
+
+def meant(cell: str) -> str:
+    """Text of a cell as it was before `harmless`."""
+    return cell[1:] if cell.startswith("'") and _RUNS.match(cell) else cell
+
+
+def rows_as_csv(rows: Iterable[Sequence[object]]) -> str:
+    """Rows of a table as the text of a CSV file."""
+    stream = io.StringIO(newline="")
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerows([harmless(str(cell)) for cell in row] for row in rows)
+    return stream.getvalue()
+
+
+def frame_as_csv(table: pd.DataFrame, *, index: bool = True) -> str:
+    """Table of pandas as the text of a CSV file, its header and index too."""
+    plain = io.StringIO(table.to_csv(index=index, lineterminator="\n"), newline="")
+    return rows_as_csv(csv.reader(plain))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
