@@ -4,6 +4,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import trustbo as tb
 from trustbo.models import PooledTrust, Priors, TrustFilter, TrustParams, fit, loo, params_of
@@ -170,6 +171,25 @@ MISTAKES = {
     ),
     "a fit's negative seed": (lambda c: fit([c.mission], seed=-1), "seed must be .* 0 on; got -1"),
     "a fit's broken seed": (lambda c: fit([c.mission], seed=1.5), "seed must be .* 0 on; got 1.5"),
+    "no features": (
+        lambda c: fit([tb.Mission.from_arrays(c.path, c.z[..., :0], c.y)]),
+        r"one feature at least; got awareness of shape .3, 0.. .* that is 0 everywhere",
+    ),
+    "a workspace without features": (
+        lambda c: made(3, 6, 6, 0), r"length 0; got shape .3, 6, 6, 0.. .* that is 0 everywhere"
+    ),
+    "awareness as text": (
+        lambda c: tb.Workspace.from_awareness("high"), "array of numbers; got 'high'"
+    ),
+    "parameters of a result": (
+        lambda c: params_of(c.result), "takes a posterior from fit; got a Result. Give its .post"
+    ),
+    "a filter over any tree": (
+        lambda c: TrustFilter(xr.DataTree()), "TrustFilter takes .* this DataTree has no 'posteri"
+    ),
+    "LOO of any tree": (
+        lambda c: loo(xr.DataTree()), "loo takes a posterior from fit; this DataTree has no 'post"
+    ),
     "LOO of a result": (lambda c: loo(c.result), "a posterior from fit; .* Give its .posterior"),
     "curves of a result": (
         lambda c: regret_curves(c.result), "a study.s dataset, from study.load_study; got a Result"

@@ -76,6 +76,11 @@ class Bound(Displayed):
                 "awareness, contact_rate and duration must have one row per robot; "
                 f"got {lengths[0]}, {lengths[1]}, {lengths[2]}."
             )
+        if not self.awareness.size:
+            raise ShapeError(
+                "a bound is of one robot and one feature at least; got awareness of shape "
+                f"{self.awareness.shape}. Without features, give one that is 0 everywhere."
+            )
         require_choice("status", self.status, STATUSES)
         ticks = np.full(lengths[0], np.nan) if self.n_ticks is None else self.n_ticks
         object.__setattr__(self, "n_ticks", as_array("n_ticks", ticks))

@@ -7,8 +7,16 @@ from models.likelihood.test_scalar import random_params
 from references import dense_log_likelihood, dense_posterior_of_trust
 from scipy import stats
 
+import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import CoupledParams, RobotParams, TrustFilter, TrustParams
+from trustbo.models import (
+    CoupledParams,
+    PooledTrust,
+    RobotParams,
+    TrustFilter,
+    TrustParams,
+    params_of,
+)
 from trustbo.workspace import AwarenessBelief, Workspace
 
 
@@ -285,3 +293,19 @@ def test_rates_ahead_have_the_interval_of_the_model():
     for _ in range(6):
         cut.update(np.ones((2, 2)), [1.0, 1.0])
     assert (cut.predict(np.ones((1, 2, 2))).rate_high == 1.0).all()
+
+
+def test_a_campaign_s_posterior_of_parameters_alone_is_followed():
+    rng = np.random.default_rng(0)
+    workspace = tb.Workspace.from_awareness(rng.uniform(size=(2, 4, 4, 2)))
+    campaign = tb.Campaign(workspace, (3, 0), (0, 3), model=PooledTrust())
+    path = campaign.ask().path
+    shape = len(path) - 1, 2
+    z, y = rng.uniform(size=(*shape, 2)), rng.uniform(size=shape)
+    whole = campaign.tell(tb.Mission.from_arrays(path, z, y))
+    alone = TrustFilter(campaign.posteriors[-1])
+    assert alone.state.mean.shape == (2,)
+    expected = TrustFilter(params_of(whole), 2).update(z[0], y[0])
+    np.testing.assert_array_equal(alone.update(z[0], y[0]).mean, expected.mean)
+    with pytest.raises(ShapeError, match="posterior is of 2 robots; got n_robots=3"):
+        TrustFilter(campaign.posteriors[-1], 3)

@@ -13,6 +13,7 @@ from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.likelihood.live import Effect, Rates
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params, params_of
+from trustbo.models.posterior_tree import require_posterior
 from trustbo.models.ticks import broadcast_ticks
 from trustbo.workspace.belief import AwarenessBelief
 from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
@@ -89,12 +90,13 @@ class TrustFilter:
                 family, or one that is not the posterior's.
         """
         if isinstance(posterior, xr.DataTree):
-            own = posterior["constant_data"].sizes["robot"]
-            if n_robots not in (None, own):
+            require_posterior("TrustFilter", posterior)
+            own = _robots_of(posterior)
+            if n_robots is not None and own not in (None, n_robots):
                 raise ShapeError(
                     f"the posterior is of {own} robots; got n_robots={n_robots!r}. Leave it out."
                 )
-            n_robots = own
+            n_robots = n_robots if own is None else own
             response = _of_posterior(posterior, "response", response)
             observation = _of_posterior(posterior, "observation", observation)
             posterior = params_of(posterior)
@@ -362,6 +364,13 @@ class _Running(NamedTuple):
         """Rates so far."""
         with np.errstate(invalid="ignore"):
             return Rates(family, self.contacts / self.ticks, self.ticks)
+
+
+def _robots_of(posterior: xr.DataTree) -> int | None:
+    """Number of robots; None where version 0.2.0 kept parameters alone, which all share."""
+    if "constant_data" in posterior.children:
+        return posterior["constant_data"].sizes["robot"]
+    return posterior.attrs.get("n_robots")
 
 
 def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:

@@ -10,6 +10,7 @@ from arviz_stats.utils import ELPDData
 
 from trustbo.errors import TrustboError
 from trustbo.models.posterior_groups import LIKELIHOODS, complete
+from trustbo.models.posterior_tree import require_posterior
 
 
 def loo(posterior: xr.DataTree) -> ELPDData:
@@ -29,11 +30,7 @@ def loo(posterior: xr.DataTree) -> ELPDData:
     Raises:
         TrustboError: Fewer than two missions have rates, a view `by_rate`; or see `complete`.
     """
-    if not isinstance(posterior, xr.DataTree):
-        remedy = " Give its .posterior." if hasattr(posterior, "posterior") else ""
-        raise TrustboError(
-            f"loo takes a posterior from fit; got a {type(posterior).__name__}.{remedy}"
-        )
+    posterior = require_posterior("loo", posterior)
     if "observed_data" in posterior.children and "rate" in posterior["observed_data"].dims:
         raise TrustboError("loo leaves out missions; of a view by rate, give the posterior itself.")
     posterior = complete(posterior)

@@ -15,6 +15,7 @@ from trustbo.models.likelihood.scalar import ScalarSSM
 from trustbo.models.likelihood.vector import VectorSSM
 from trustbo.models.parameter_draws import PLACES, Numbers, ParameterDraws
 from trustbo.models.place_maps import place_maps_of
+from trustbo.models.posterior_tree import require_posterior
 
 
 class _Apart(ParameterDraws):
@@ -213,6 +214,18 @@ def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Number
     )
 
 
+def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
+    """All draws of a posterior by name, chains joined: leading axis (draw,)."""
+    draws = posterior["posterior"].to_dataset()
+    n = draws.sizes["chain"] * draws.sizes["draw"]
+    # In one layout, whether they were just sampled or read from a file: sums over draws then round
+    # alike, and a campaign that resumes is the campaign it was.
+    arrays = {
+        str(name): each.transpose("chain", "draw", ...).values for name, each in draws.items()
+    }
+    return {name: np.ascontiguousarray(a).reshape(n, *a.shape[2:]) for name, a in arrays.items()}
+
+
 def params_of(posterior: xr.DataTree) -> Params:
     """All draws of a posterior as parameters, chains joined: leading axis (draw,).
 
@@ -223,15 +236,10 @@ def params_of(posterior: xr.DataTree) -> Params:
         `TrustParams`, `RobotParams`, `CoupledParams` or `DriftParams`, according to the model.
 
     Raises:
-        TrustboError: This process has made no `DriftTrust` with the drift of the posterior.
+        TrustboError: No posterior of `fit`; or one with the drift of a `DriftTrust` that this
+            process has not made.
     """
-    draws = posterior["posterior"].to_dataset().stack(sample=("chain", "draw"))
-    # In one layout, whether they were just sampled or read from a file: sums over draws then round
-    # alike, and a campaign that resumes is the campaign it was.
-    sites = {
-        str(n): np.ascontiguousarray(draws[n].transpose("sample", ...).values)
-        for n in draws.data_vars
-    }
+    sites = sites_of(require_posterior("params_of", posterior))
     params = params_from(sites, posterior.attrs)
     if "places" not in posterior.children:
         return params

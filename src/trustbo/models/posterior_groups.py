@@ -20,7 +20,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, params_from, params_of
 from trustbo.models.place import bounds_of
 from trustbo.models.place_maps import prior_maps
-from trustbo.models.posterior_tree import missions_of, to_datatree
+from trustbo.models.posterior_tree import missions_of, require_posterior, to_datatree
 from trustbo.stacking import MissionBatch, stack_missions
 
 LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
@@ -93,7 +93,7 @@ def complete(
         TrustboError: The posterior holds no data and no missions are given; or its trust does not
             integrate out, so that only `fit` can tell.
     """
-    if "latent" in posterior.children:
+    if "latent" in require_posterior("complete", posterior).children:
         return posterior
     law = Law.of(posterior)
     if missions is None:

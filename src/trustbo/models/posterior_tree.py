@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
+from trustbo.errors import TrustboError
 from trustbo.stacking import MissionBatch, stack_missions
 
 _DIMS = {
@@ -15,6 +16,24 @@ _DIMS = {
     "trust_sd": ("mission", "bound", "robot"),
     "contact_rate": ("mission", "bound", "robot"),
 }
+_ATTRIBUTES = "observation", "response", "x0_mean", "x0_sd"
+
+
+def require_posterior(who: str, value: object) -> xr.DataTree:
+    """Return `value` if it is a posterior from `fit`, else raise TrustboError for `who`."""
+    if not isinstance(value, xr.DataTree):
+        remedy = " Give its .posterior." if hasattr(value, "posterior") else ""
+        raise TrustboError(
+            f"{who} takes a posterior from fit; got a {type(value).__name__}.{remedy}"
+        )
+    missing = [] if "posterior" in value.children else ["posterior"]
+    missing += [name for name in _ATTRIBUTES if name not in value.attrs]
+    if missing:
+        raise TrustboError(
+            f"{who} takes a posterior from fit; this DataTree has no {missing[0]!r}. Give one of "
+            "trustbo.models.fit, whole."
+        )
+    return value
 
 
 def to_datatree(

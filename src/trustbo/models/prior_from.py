@@ -10,6 +10,7 @@ import xarray as xr
 from trustbo.errors import TrustboError
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
+from trustbo.models.params import sites_of
 from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.samplers.priors_numpy import number, numbers
@@ -39,7 +40,7 @@ def prior_from(posteriors: Sequence[xr.DataTree], model: TrustModel | None = Non
     if model is None:
         model = PooledTrust(place=PlaceEffect() if with_places else None)
     base = model.for_features(features).priors
-    sites = [_flat(each) for each in posteriors]
+    sites = [sites_of(each) for each in posteriors]
     if not isinstance(base.beta, dist.Normal) or not isinstance(base.b, dist.Normal):
         raise TrustboError("prior_from needs Normal priors of beta and b to mix with.")
     beta = _mixed(
@@ -83,12 +84,6 @@ def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
                 f"is of {each.attrs['model']} with {own}, posterior 0 has {names[0]}."
             )
     return names[0]
-
-
-def _flat(posterior: xr.DataTree) -> dict[str, np.ndarray]:
-    """Draws by name, chains joined."""
-    sites = posterior["posterior"].to_dataset().stack(sample=("chain", "draw"))
-    return {str(n): sites[n].transpose("sample", ...).values for n in sites.data_vars}
 
 
 def _stationary(

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from trustbo.data import as_array
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.workspace.moves import MOVES, existing_bounds
 
@@ -20,9 +21,14 @@ def of_cells(
     ShapeError: other axes. TrustboError: a value outside [0, 1], NaN in a passable cell or in a
     bound between two.
     """
-    z = np.asarray(awareness, dtype=float)
+    z = as_array("awareness", awareness)
     if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES[8])):
         raise ShapeError(f"awareness must be {_AXES}; got shape {z.shape}.")
+    if not z.size:
+        raise ShapeError(
+            f"awareness has an axis of length 0; got shape {z.shape}. Without features, give one "
+            "that is 0 everywhere."
+        )
     if (bad := (z < 0.0) | (z > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")

@@ -7,7 +7,7 @@ import pytest
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledParams, CoupledTrust, Priors, fit, sample_prior
+from trustbo.models import CoupledParams, CoupledTrust, Priors, fit, params_of, sample_prior
 from trustbo.models.params import ordered_params
 from trustbo.models.samplers.choice import resolve_sampler
 from trustbo.models.samplers.coupled_target import CoupledTarget
@@ -223,3 +223,13 @@ def test_noises_that_underflow_have_no_density_and_raise_nothing(inter_robot):
     z[:, of_sizes : of_sizes + 2] = [[-800.0], [-380.0]]
     z[:, 0] = -40.0  # a beta0 of 0 leaves nothing of the start's variance
     assert (target.log_density(z) == -np.inf).all()
+
+
+def test_one_robot_in_order_follows_none():
+    missions = small((4, 3), n_robots=1)
+    ordered, apart = (
+        params_of(fit(missions, CoupledTrust(inter_robot=kind))) for kind in ("ordered", "none")
+    )
+    for found, expected in ((ordered.B0, apart.beta0), (ordered.b, apart.b)):
+        assert found.mean() == pytest.approx(expected.mean(), abs=0.03)
+        assert found.std() == pytest.approx(expected.std(), abs=0.03)

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs  # pyright: ignore
 JITTER = 1e-4
 """Least tau_e in units of tau_s or the noise: below, K_g is singular to rounding."""
 LENGTH_SCALES = 1e-6, 1e6
-"""Least and largest length scale, in cells: beyond, cells are independent, or equal, to rounding."""
+"""Least and largest length scale, in cells: beyond, cells are independent, or equal."""
 
 _compiled = nb.njit(cache=True, error_model="numpy")
 
