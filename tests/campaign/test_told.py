@@ -274,9 +274,15 @@ def test_the_same_mission_told_twice_is_recognised(workspace):
 @pytest.mark.parametrize(
     ("extra", "said"),
     [
-        ({"regret": "low"}, "regret must be a number; got 'low'"),
-        ({"regret": None}, "regret must be a number; got None"),
+        ({"regret": "low"}, "regret must be a number, .* got 'low'"),
+        ({"regret": None}, "regret must be a number, .* got None"),
+        ({"regret": np.inf}, "regret must be a number, NaN where it is not known; got inf"),
+        ({"regret": 10**400}, "regret must be a number, NaN where it is not known; got 1000"),
         ({"status": 1.0}, "'status' is a column of the history"),
+        ({"row": 1.0}, "'row' is a column of the history"),
+        ({"kish": 1.0}, "'kish' is a column of the history"),
+        ({"a/b": 1.0}, "'a/b' cannot name a column; use letters, digits and _"),
+        ({"=a": 1.0}, "'=a' cannot name a column"),
     ],
 )
 def test_what_is_told_beside_the_mission_is_checked_before(workspace, tmp_path, extra, said):
@@ -284,6 +290,19 @@ def test_what_is_told_beside_the_mission_is_checked_before(workspace, tmp_path, 
     with pytest.raises(tb.TrustboError, match=said):
         campaign.tell(rates(workspace, campaign.ask().path), **extra)
     assert not (tmp_path / "measured.nc").exists()
+
+
+def test_a_number_that_is_not_known_is_missing_in_the_history_also_after_loading(
+    workspace, tmp_path
+):
+    campaign = begin(workspace, tmp_path)
+    for seed, regret in enumerate([np.nan, 2.5]):
+        told = rates(workspace, campaign.ask().path, seed=seed)
+        campaign.tell(told, regret=regret, fuel=np.nan)
+    campaign.close()
+    history = tb.Campaign.load(tmp_path).result().history
+    np.testing.assert_array_equal(history["regret"], [np.nan, 2.5])
+    np.testing.assert_array_equal(history["fuel"], [np.nan, np.nan])
 
 
 @pytest.mark.parametrize("policy", ["thompson", "random"])

@@ -51,6 +51,19 @@ def test_everything_is_shown_without_complaint(seen):
     assert loaded == [True] * 9
 
 
+def test_the_page_may_fetch_nothing(seen):
+    refused = seen.execute_async_script(
+        """
+        const done = arguments[arguments.length - 1];
+        document.addEventListener('securitypolicyviolation', e => done(e.blockedURI));
+        setTimeout(() => done('loaded'), 5000);
+        new Image().src = 'http://127.0.0.1:9/pixel.png';
+        """
+    )
+    assert refused == "http://127.0.0.1:9/pixel.png"
+    assert seen.get_log("browser") != []  # read, so that the next test sees its own
+
+
 def test_nothing_overflows_the_page_and_text_can_be_read(seen):
     assert seen.execute_script("return document.scrollingElement.scrollWidth <= window.innerWidth")
     sizes = seen.execute_script(

@@ -381,3 +381,25 @@ def test_tags_of_an_array_that_make_no_sense_are_named(attribute, message):
     dem = synthetic_terrain((20.0, 20.0), seed=0)["dem"].assign_attrs(attribute)
     with pytest.raises(TerrainError, match=message):
         read_terrain(dem)
+
+
+def vrt(path, side):
+    """A file of 300 bytes that unpacks to side x side pixels of 1 m."""
+    path.write_text(
+        f'<VRTDataset rasterXSize="{side}" rasterYSize="{side}"><SRS>{UTM}</SRS>'
+        "<GeoTransform>5e5, 1, 0, 5e6, 0, -1</GeoTransform>"
+        '<VRTRasterBand dataType="Float32" band="1"/></VRTDataset>'
+    )
+    return path
+
+
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused_at_once(tmp_path):
+    dem = vrt(tmp_path / "dem.vrt", 70_000)
+    with pytest.raises(TerrainError, match=r"70000 x 70000 pixels, 39.2 GB .* max_pixels=9e6 or re"):
+        read_terrain(dem, dem)
+    with pytest.raises(TerrainError, match=r"70000 x 70000 pixels, 39.2 GB .* lazy=True"):
+        read_terrain(dem, dem, resolution=1.0)
+    window = read_terrain(dem, dem, lazy=True).isel(y=slice(0, 2), x=slice(0, 2))
+    assert (window["dem"].load() == 0.0).all()
+    with pytest.raises(TerrainError, match=r"1000000 x 1000000 pixels, too many .* gdal_translate"):
+        read_terrain(vrt(dem, 1_000_000), dem, max_pixels=9e6)

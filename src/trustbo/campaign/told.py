@@ -1,8 +1,8 @@
 """Checks of a mission that is told to a campaign, before anything is done with it."""
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,10 @@ from trustbo.workspace import Workspace
 
 RESERVED = (
     "objective", "path_changed", "contact_rate", "status", "state", "reason", "path", "trust_map",
-    "seconds_plan", "seconds_run", "seconds_fit",
+    "seconds_plan", "seconds_run", "seconds_fit", "n_bounds", "k_hat", "kish", "r_hat", "ess_bulk",
+    "divergences", "iteration", "mission", "step", "axis", "robot", "row", "col", "x", "y",
 )  # fmt: skip
-"""Names of the history's own columns."""
+"""Names of the history's own columns and axes."""
 
 
 def require_mission(
@@ -59,15 +60,24 @@ def require_extra(extra: Mapping[str, Any]) -> dict[str, float]:
     """Return more numbers of a mission as floats.
 
     Raises:
-        TrustboError: Not a number, or a name of the history's own columns.
+        TrustboError: Not a number, NaN for one that is not known; infinite; or a name that is no
+            identifier, which files could not keep, or one of the history's own.
     """
     checked = {}
     for name, value in extra.items():
         if name in RESERVED:
             raise TrustboError(f"{name!r} is a column of the history; give {value!r} another name.")
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise TrustboError(f"{name} must be a number; got {value!r}.")
-        checked[name] = float(value)
+        if not name.isidentifier():
+            raise TrustboError(f"{name!r} cannot name a column; use letters, digits and _.")
+        try:
+            number = math.inf if isinstance(value, bool | str) else float(value)
+        except (TypeError, ValueError, OverflowError):
+            number = math.inf
+        if math.isinf(number):
+            raise TrustboError(
+                f"{name} must be a number, NaN where it is not known; got {value!r:.60}."
+            )
+        checked[name] = number
     return checked
 
 

@@ -18,6 +18,7 @@ from trustbo.terrain.units import METRE
 
 CLIP_WARNING_SHARE = 0.02
 _ROWS = 256  # checked together
+_MOST_IN_MEMORY, _MOST_AVERAGED = 4e8, 1e11  # pixels of one raster: 3.2 GB; some 10 minutes
 _DEGREE = 111_195.0  # of latitude, m
 
 
@@ -52,7 +53,8 @@ def read_terrain(
         resolution: Pixel size in metres of rasters without a georeference; others with smaller
             pixels are averaged over whole numbers of pixels, to about this size.
         max_pixels: Number of pixels above which a raster is averaged likewise, with a warning,
-            unless `resolution` is given. None: no limit.
+            unless `resolution` is given. None: no limit up to 4e8 pixels, the most that are read
+            into memory then.
         nodata: Another stored value that means missing.
         lazy: Leave the heights in the files, for rasters larger than the memory. Both variables
             are then float32 and read when a window of them is loaded, e.g. by
@@ -65,11 +67,11 @@ def read_terrain(
         at the top, NaN where a raster has no data; the CRS is in `spatial_ref`.
 
     Raises:
-        TerrainError: No raster, no CRS, a rotated grid, a map in other units than metres or
-            degrees, heights in other units than metres or feet, no overlap, no data at all, or a
-            height of -999 m or beyond +-9000 m: an undeclared fill value. With `lazy`, the last
-            two are checked when a window is loaded: loading raises for a fill value, and `clean`
-            counts the valid pixels.
+        TerrainError: A raster too large for the memory, or to be averaged; no raster, no CRS, a
+            rotated grid, a map in other units than metres or degrees, heights in other units than
+            metres or feet, no overlap, no data at all, or a height of -999 m or beyond +-9000 m: an
+            undeclared fill value. With `lazy`, the last two are checked when a window is loaded:
+            loading raises for a fill value, and `clean` counts the valid pixels.
     """
     with ExitStack() as closing:
         sources = {"dem": dem} if dsm is None else {"dem": dem, "dsm": dsm}
@@ -85,7 +87,7 @@ def read_terrain(
             terrain = _dataset(ground.array(np.float32), surface.array(np.float32))
             terrain.set_close(closing.pop_all().close)
             return _noted(terrain, rasters)
-        heights = [raster.array(np.float64).load() for raster in {ground: 0, surface: 0}]
+        heights = _load(list({ground: 0, surface: 0}), limited=max_pixels is None)
     for raster, array in zip((ground, surface), heights, strict=False):
         if not np.isfinite(array).any():
             where = "" if raster is ground else " in the area of the DEM"
@@ -108,6 +110,28 @@ def _say(rasters: list[Raster]) -> None:
         )
 
 
+def _load(rasters: list[Raster], *, limited: bool) -> list[xr.DataArray]:
+    """Read the heights of rasters; TerrainError where the memory is, or surely would be, too small.
+
+    The files may be small: a compressed or sparse one of a megabyte unpacks to gigabytes.
+    """
+    for raster in rasters:
+        if limited and math.prod(raster.shape) > _MOST_IN_MEMORY:
+            raise _too_large(raster)
+    try:
+        return [raster.array(np.float64).load() for raster in rasters]
+    except MemoryError:
+        raise _too_large(max(rasters, key=lambda raster: math.prod(raster.shape))) from None
+
+
+def _too_large(raster: Raster) -> TerrainError:
+    rows, cols = raster.shape
+    return TerrainError(
+        f"{raster.name} has {rows} x {cols} pixels, {8e-9 * rows * cols:.3g} GB in memory; give "
+        "max_pixels=9e6 or resolution= (metres) to average them, or lazy=True to leave them there."
+    )
+
+
 def _averaged(
     rasters: list[Raster], resolution: float | None, max_pixels: float | None, progress: bool
 ) -> list[Raster]:
@@ -128,6 +152,11 @@ def _averaged(
             raise TerrainError(
                 f"{raster.name} has {raster.shape[0]} x {raster.shape[1]} pixels, too few to "
                 f"average {factor} x {factor} of them; give a smaller resolution or more pixels."
+            )
+        if factor > 1 and math.prod(raster.shape) > _MOST_AVERAGED:
+            raise TerrainError(
+                f"{raster.name} has {raster.shape[0]} x {raster.shape[1]} pixels, too many to "
+                "average; cut the area out first, e.g. with gdal_translate -projwin."
             )
     if resolution is None and max(factors) > 1:
         averaged = (
