@@ -1,5 +1,6 @@
 """What a newcomer gets wrong: each gives one line that says what was wrong, and what to do."""
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -7,13 +8,28 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
-from trustbo.models import PooledTrust, Priors, TrustFilter, TrustParams, fit, loo, params_of
+from trustbo.export import write_csv, write_path
+from trustbo.models import (
+    PlaceEffect,
+    PooledTrust,
+    Priors,
+    TrustFilter,
+    TrustParams,
+    fit,
+    loo,
+    params_of,
+    prior_predictive,
+    sample_prior,
+)
 from trustbo.planning import Planner, roll_trust
 from trustbo.plots import regret_curves
 from trustbo.report import write_report
 from trustbo.simulation import KinematicSimulator, ModelSimulator, Truth
+from trustbo.workspace.grid import Grid
 
 ENDS = (5, 0), (0, 5)
+PLACES = PooledTrust(place=PlaceEffect())
+GRID = Grid((5, 5), 380_000.0, 5_225_000.0, 100.0, 100.0, "EPSG:32616")
 TRUTH = TrustParams(0.5, np.array([0.2, 0.1]), 0.2, 0.05, 0.05)
 
 
@@ -197,6 +213,89 @@ MISTAKES = {
     "a number for a truth": (lambda c: c.iterate(truth=3), "must be Truth.of.simulator.; got 3"),
     "a policy of two": (
         lambda c: c.iterate(policy=lambda key, draws: None), "is called policy.key, draws, planner."
+    ),
+    # odd values
+    "weights as text": (lambda c: fit([c.mission], weights="a"), "weights must be an array of num"),
+    "a fit's workspace as text": (
+        lambda c: fit([c.mission], PLACES, workspace="x"), "workspace: got str 'x'; give the one"
+    ),
+    "an earlier number": (lambda c: fit([c.mission], earlier=3), "takes a posterior .* got a int"),
+    "a length scale in metres": (
+        lambda c: PlaceEffect(length_scale=1e6), r"1e\+06 exceeds 1000: it is of cells, not metres"
+    ),
+    "effects of places beyond trust": (lambda c: PlaceEffect(tau_s=1e300), "exceeds 100: .* trust"),
+    "a prior of no features": (
+        lambda c: sample_prior(PooledTrust(), 0, 10, 0), "n_features must be .* 1 on; got 0"
+    ),
+    "prior draws below 0": (
+        lambda c: sample_prior(PooledTrust(), 2, -1, 0), "n_draws must be .* 1 on; got -1"
+    ),
+    "a prior's negative seed": (
+        lambda c: sample_prior(PooledTrust(), 2, 10, -1), "seed must be .* 0 on; got -1"
+    ),
+    "a prior of a name": (lambda c: sample_prior("x", 2, 10, 0), "e.g. PooledTrust..; got 'x'"),
+    "prior predictions of text": (
+        lambda c: prior_predictive(PooledTrust(), "x"), "awareness must be an array of numbers"
+    ),
+    "a tuple for parameters": (
+        lambda c: Planner(c.workspace, *ENDS).plan((0.5, 0.1)), "params: got tuple .0.5, 0.1.; give"
+    ),
+    "a planner on text": (lambda c: Planner("x", *ENDS), "workspace: got str 'x'; give a trust"),
+    "a campaign on a terrain": (
+        lambda c: tb.Campaign(tb.terrain.example(), *ENDS), "workspace: got Dataset .* give a trust"
+    ),
+    "no path to suggest": (
+        lambda c: tb.Campaign(c.workspace, *ENDS).suggest(None), "path must be cells .* got None"
+    ),
+    "a filter's belief": (
+        lambda c: TrustFilter(TRUTH, 3, belief=3), "belief: got int 3; give an AwarenessBelief"
+    ),
+    "features by number": (
+        lambda c: tb.Workspace.from_awareness(np.ones((3, 6, 6, 2)) / 2, features=(1, 2)),
+        r"features must be a list of names; got \(1, 2\)",
+    ),
+    "features as one word": (
+        lambda c: tb.Mission.from_arrays(c.path, c.z, c.y, features="ab"), "list of names; got 'ab'"
+    ),
+    "two robots of one name": (
+        lambda c: tb.Mission.from_arrays(c.path, c.z, c.y, robots=("a", "b", "a")), "distinct names"
+    ),
+    "features without definitions": (
+        lambda c: tb.Workspace.from_terrain(tb.terrain.example(), features=("slope",)),
+        "features: got tuple .'slope',.; give definitions by name",
+    ),
+    "a terrain of 4 TB": (
+        lambda c: tb.terrain.synthetic_terrain((1e6, 1e6)), "1000000 x 1000000 pixels, more than"
+    ),
+    "a mission without a path": (
+        lambda c: tb.Mission.from_arrays(None, c.z, c.y), "path must be cells .* got None"
+    ),
+    "a single rate": (lambda c: tb.Mission.from_arrays(c.path, c.z, 0.5), "contact_rate .bound, r"),
+    "a simulator without a path": (
+        lambda c: c.simulator.run(None, seed=0), "path must be cells .row, col., start first"
+    ),
+    "a simulator's seed": (lambda c: c.simulator.run(c.path, seed="a"), "seed must .* got 'a'"),
+    "a simulator on text": (lambda c: ModelSimulator("x", TRUTH), "workspace: got str 'x'"),
+    "a simulator of a number": (lambda c: ModelSimulator(c.workspace, 3), "params: got int 3"),
+    "a path exported to nowhere": (
+        lambda c: write_path(None, c.result), "path of a file or folder; got a NoneType"
+    ),
+    "a number exported": (lambda c: write_path("p.csv", 3), "plan: got int 3; give a Plan"),
+    "a table of a number": (lambda c: write_csv("p.csv", 3), "result: got int 3; give a Result"),
+    "observers as text": (
+        lambda c: tb.Workspace.from_terrain(tb.terrain.example(), observers="x"), "array of numbers"
+    ),
+    "latitude first": (
+        lambda c: GRID.cell_at_lonlat(46.5, 200.0), r"lon 46.5, lat 200 is off .* longitude first"
+    ),
+    "a longitude of NaN": (
+        lambda c: GRID.cell_at_lonlat(np.nan, 1.0), r"lon, lat must be two finite .* \(nan"
+    ),
+    "an infinite position": (lambda c: GRID.cell_at(np.inf, 1.0), "x, y must be two finite"),
+    "a position as text": (lambda c: GRID.cell_at("a", "b"), "x, y must be an array of numbers"),
+    "a cell of one number": (lambda c: GRID.center(3), "cell must be two whole numbers"),
+    "a grid off the Earth": (
+        lambda c: replace(GRID, left=1e9, top=1e9).lonlat((0, 0)), "is no place on Earth in EPSG"
     ),
     "weights of other features": (
         lambda c: Planner(made(3, 6, 6, 3), *ENDS).plan(TRUTH), "2 weights, but awareness has 3"

@@ -13,8 +13,8 @@ from trustbo.display.svg import curve_picture
 from trustbo.errors import (
     ShapeError,
     TrustboError,
+    require_cells,
     require_choice,
-    require_pair,
     require_whole,
 )
 
@@ -244,7 +244,7 @@ class Mission(Displayed):
                 None if values is None else _until(last, as_array(name, values))
                 for name, values in (("duration", duration), ("n_ticks", n_ticks))
             )
-        if z.ndim == 3 and len(z) == len(y) == 0:
+        if z.ndim == 3 and z.shape[:1] == y.shape[:1] == (0,):
             raise ShapeError(
                 "a mission has at least one bound; got 0. If the robots were stopped before "
                 'bound 1 ended, tell campaign.fail("stuck", where=cell).'
@@ -258,7 +258,7 @@ class Mission(Displayed):
             _per_robot(name, values, y.shape)
             for name, values in (("duration", duration), ("n_ticks", n_ticks))
         )
-        cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
+        cells = require_cells("path", path)
         if len(y) > len(cells) - 1:
             raise ShapeError(f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}.")
         longest = np.nanmax(np.where(np.isnan(seconds), 0.0, seconds), axis=1)
@@ -275,7 +275,8 @@ class Mission(Displayed):
             )
             for k in range(len(y))
         )
-        return cls(cells, bounds, status, tuple(features), tuple(robots))
+        names = (("features", features), ("robots", robots))
+        return cls(cells, bounds, status, *(as_names(what, given) for what, given in names))
 
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
@@ -387,6 +388,17 @@ def _until(last: int, values: np.ndarray) -> np.ndarray:
         )
     rest = np.full((max(last - len(values), 0), *values.shape[1:]), np.nan)
     return np.concatenate([values[:last], rest])
+
+
+def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
+    """Names as a tuple; TrustboError where one is no text, or there twice."""
+    listed = isinstance(given, Iterable) and not isinstance(given, str)
+    names = tuple(given) if listed else ()
+    if not listed or not all(isinstance(name, str) for name in names):
+        raise TrustboError(f"{what} must be a list of names; got {given!r:.60}.")
+    if len(set(names)) < len(names):
+        raise TrustboError(f"{what} must be distinct names; got {names}.")
+    return names
 
 
 def _per_robot(what: str, values: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:

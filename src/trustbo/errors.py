@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 
 class TrustboError(ValueError):
@@ -81,6 +82,21 @@ def require_positive(what: str, value: object) -> float:
     if isinstance(value, str) or not 0.0 < number < math.inf:
         raise TrustboError(f"{what} must be positive and finite; got {value!r}.")
     return number
+
+
+def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
+    """Return `value` if it is of a class, or one of a union; TrustboError with a remedy if not."""
+    if not isinstance(value, kind):
+        shown = " ".join(repr(value).split())
+        raise TrustboError(f"{what}: got {type(value).__name__} {shown:.60}; {remedy}.")
+    return value
+
+
+def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:
+    """Return cells (row, col) in order, such as a path, or raise TrustboError."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise TrustboError(f"{what} must be cells (row, col), start first; got {value!r:.60}.")
+    return tuple(require_pair(f"{what}[{k}]", cell) for k, cell in enumerate(value))
 
 
 def require_pair(what: str, value: object) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from trustbo.campaign.history import (
 from trustbo.campaign.learning import CannotLearnError
 from trustbo.campaign.options import CampaignOptions
 from trustbo.data import Mission
-from trustbo.errors import require_whole
+from trustbo.errors import require_kind, require_whole
 from trustbo.models import BoundRisk, TrustModel, diagnostics, fit_hazard, params_of
 from trustbo.models.params import Params
 from trustbo.models.posterior_groups import parameters_alone
@@ -51,6 +51,7 @@ class LearnedMissions:
         seed: int,
     ) -> None:
         """Begin with the prior."""
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace, self.options, self.log = workspace, options, History()
         self._learning = options.learning(model, sampler)
         self.model, self.seed = self._learning.model, require_whole("seed", seed, 0)

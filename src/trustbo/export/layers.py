@@ -9,7 +9,7 @@ import pandas as pd
 import shapely
 
 from trustbo.campaign.result import Result
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import ShapeError, TrustboError, require_kind
 from trustbo.export.checks import LEAD, find_crs, require_lead_apart
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
@@ -26,7 +26,9 @@ def plan_of(plan: Plan | Result, workspace: Workspace | None) -> Plan:
     ShapeError: they differ in their numbers of robots. TrustboError: the path leaves the workspace,
     or a robot is called as the lead.
     """
+    remedy = "give a Plan, as Campaign.ask returns it, or a Result"
     plan = plan.plan if isinstance(plan, Result) else plan
+    require_kind("plan", plan, Plan, remedy)
     if workspace is not None and workspace is not plan.workspace:
         plan = replace(plan, workspace=workspace)
     for k, cell in enumerate(plan.path):

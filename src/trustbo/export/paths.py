@@ -106,8 +106,8 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
             workspace, a robot is called "lead", or the file cannot be written.
     """
     plan = plan_of(plan, workspace)
-    suffix = require_choice("suffix", Path(path).suffix.lower(), _WRITERS)
-    _WRITERS[suffix](require_file(path), plan)
+    file = require_file(path)
+    _WRITERS[require_choice("suffix", file.suffix.lower(), _WRITERS)](file, plan)
 
 
 def tables_beside(file: Path) -> tuple[Path, Path]:
@@ -179,7 +179,7 @@ def _write_geopackage(file: Path, plan: Plan) -> None:
 
 
 def _write_csv(file: Path, plan: Plan) -> None:
-    tables = {file: bounds_layer(plan).drop(columns="geometry")}
+    tables: dict[Path, Any] = {file: bounds_layer(plan).drop(columns="geometry")}
     if _of_terrain(plan):
         posts, ways = map(require_file, tables_beside(file))
         tables |= {posts: posts_layer(plan).drop(columns="geometry"), ways: way_points(plan)}

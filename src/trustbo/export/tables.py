@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 
 from trustbo.campaign.result import Result
+from trustbo.errors import require_kind
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.logs.rows import column_of
 from trustbo.spreadsheet import frame_as_csv
@@ -28,6 +29,7 @@ def write_csv(path: FilePath, result: Result) -> None:
         TrustboError: The file cannot be written.
     """
     target = require_file(path)
+    require_kind("result", result, Result, "give a Result, as iterate returns it")
     latent = result.posterior["latent"].to_dataset()
     # A posterior need not cover all missions: some are set aside, or wait to be learned from.
     numbers = [int(j) for j in latent["mission"].values]

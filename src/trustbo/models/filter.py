@@ -8,7 +8,14 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, as_array, require_shares, require_unit_interval
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_pair, require_whole
+from trustbo.errors import (
+    ShapeError,
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_pair,
+    require_whole,
+)
 from trustbo.models.likelihood.families import FAMILIES, Family
 from trustbo.models.likelihood.live import Effect, Rates
 from trustbo.models.model import RESPONSES
@@ -120,6 +127,8 @@ class TrustFilter:
         self._family = FAMILIES[family]
         lag = float(require_choice("response", response or "level", RESPONSES) == "change")
         self._core = self.params.live(lag, n_robots)
+        if belief is not None:
+            require_kind("belief", belief, AwarenessBelief, "give an AwarenessBelief")
         self._maps = None if belief is None else belief.draw(len(kept))
         self._grids = {np.shape(value)[-2:] for value in self.params.places.values()}
         if self._maps is not None:

@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Mission
-from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_whole
+from trustbo.data import Mission, as_array
+from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.models.backend import VERSIONS
 from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import TrustModel, require_model
@@ -19,7 +19,7 @@ from trustbo.models.place import Visited, bounds_of, visited
 from trustbo.models.place_maps import place_group
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.posterior_groups import Law, complete
-from trustbo.models.posterior_tree import to_datatree
+from trustbo.models.posterior_tree import require_posterior, to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.record import model_to_record
 from trustbo.models.samplers.choice import resolve_sampler, slow_places
@@ -103,8 +103,11 @@ def fit(
     settings = NutsSettings(n_warmup, n_draws, n_chains).checked()
     n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
     seed = require_whole("seed", seed, 0)
+    if earlier is not None:
+        require_posterior("earlier=", earlier)
     require_same_team(missions)
     if workspace is not None:
+        require_kind("workspace", workspace, Workspace, "give the one the missions were run on")
         missions = [workspace.fill(mission) for mission in missions]
     batch = stack_missions(missions)
     asked = model
@@ -254,7 +257,7 @@ def _weights(
     padded = np.ones(len(batch.contact_rate))
     if weights is None:
         return padded
-    given = np.asarray(weights, dtype=float)
+    given = as_array("weights", weights)
     if given.shape != (n_missions,):
         raise ShapeError(f"weights must be ({n_missions},), one per mission; got {given.shape}.")
     bad = ~((given >= 0.0) & (given <= 1.0))

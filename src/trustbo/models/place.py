@@ -17,6 +17,11 @@ N_MOVES = len(MOVES[8])
 MAX_VISITED = 4000
 """Largest number of visited bounds: the effort grows with its cube."""
 
+_MOST = {
+    "length_scale": (1000.0, "cells, not metres"),
+    "length_scale_sd": (3.0, "the logarithm of a length scale"),
+}
+
 
 @dataclass(frozen=True)
 class PlaceEffect:
@@ -37,7 +42,8 @@ class PlaceEffect:
         length_scale_sd: Its standard deviation, of the logarithm.
 
     Raises:
-        TrustboError: Neither cells nor bounds have an effect, or a number is not positive.
+        TrustboError: Neither cells nor bounds have an effect, or a number is not positive or far
+            too large.
     """
 
     cells: bool = True
@@ -54,7 +60,12 @@ class PlaceEffect:
                 "PlaceEffect needs an effect of cells or of bounds; for neither, give place=None."
             )
         for name in ("tau_s", "tau_e", "length_scale", "length_scale_sd"):
-            require_positive(f"PlaceEffect.{name}", getattr(self, name))
+            value = require_positive(f"PlaceEffect.{name}", getattr(self, name))
+            most, of = _MOST.get(name, (100.0, "trust, which is between 0 and 1"))
+            if value > most:
+                raise TrustboError(
+                    f"PlaceEffect.{name} = {value:g} exceeds {most:g}: it is of {of}."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:

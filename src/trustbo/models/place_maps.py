@@ -25,6 +25,7 @@ from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
 
 _STEP = 0.1  # of the logarithm of length scales
+_LARGEST = 4.0  # length scale in units of the grid's longer side
 _REACH = 5.0  # length scales at which the correlation is .002
 _JITTER = 1e-9
 _AXIS = {"place": "cell", "place_bound": "bound"}
@@ -112,6 +113,8 @@ def _kriging(
     """
     grid = np.column_stack([np.zeros(shape[0] * shape[1]), *np.indices(shape).reshape(2, -1)])
     own = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
+    # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.
+    length_scale = np.minimum(length_scale, _LARGEST * max(shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
     for step in np.unique(steps):
         scale, weights = float(np.exp(_STEP * step)), np.zeros((len(own), len(grid)))

@@ -10,11 +10,11 @@ from jax import Array, random
 from numpy.typing import ArrayLike
 from numpyro import handlers
 
-from trustbo.data import default_features
+from trustbo.data import as_array, default_features
 from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.models.backend import own_settings
 from trustbo.models.likelihood.generate import draw_missions
-from trustbo.models.model import TrustModel
+from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.models.ticks import broadcast_ticks, weigh_ticks
 from trustbo.stacking import MissionBatch
@@ -50,7 +50,8 @@ def prior_predictive(
         ShapeError: Awareness has other axes.
         TrustboError: The family needs n_ticks; or places have effects, which depend on paths.
     """
-    z = np.asarray(awareness, dtype=float)
+    require_model(model)
+    z = as_array("awareness", awareness)
     if z.ndim != 4:
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
     if model.place is not None:
@@ -102,6 +103,10 @@ def sample_prior(
         seed: Seed; the same seed gives the same draws.
         n_robots: Number of robots, for models whose robots have parameters of their own.
     """
+    require_model(model)
+    sizes = {"n_features": n_features, "n_robots": n_robots, "n_draws": n_draws}
+    n_features, n_robots, n_draws = (require_whole(name, n, 1) for name, n in sizes.items())
+    require_whole("seed", seed, 0)
     model = model.at_resolution({})
     drawn = draw_sites(model, (n_robots, n_features), n_draws, seed)
     return model.params(drawn, n_features)

@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_pair, require_whole
+from trustbo.errors import TrustboError, require_cells, require_kind, require_whole
 from trustbo.parallel import plain
 from trustbo.planning.engines.layers import Layers, build_layers
 from trustbo.planning.graph import (
@@ -62,6 +62,7 @@ class AdmissiblePaths:
 
         `max_bounds` None: shortest + `DEFAULT_EXTRA`.
         """
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace, self.connectivity = workspace, require_connectivity(connectivity)
         self.start = workspace.require_cell("start", start)
         self.goal = workspace.require_cell("goal", goal)
@@ -218,7 +219,7 @@ class AdmissiblePaths:
             where = np.array(flat).reshape(len(path), 2)
             cells = tuple(zip(flat[::2], flat[1::2], strict=True))
         except (TypeError, ValueError):  # find the faulty cell
-            cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
+            cells = require_cells("path", path)
             where = np.array(cells)
         if len(cells) < 2 or cells[0] != self.start or cells[-1] != self.goal:
             raise TrustboError(

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
 from trustbo.models.likelihood.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
@@ -249,6 +249,7 @@ class Planner(Displayed):
             raise TrustboError(
                 "plan takes one set of parameters; of a posterior, params_of(posterior).mean()."
             )
+        require_kind("params", params, Params, "give e.g. params_of(posterior).mean()")
         if params.leading:
             raise ShapeError(
                 f"give one draw at a time: the parameters have leading axes {params.leading}. Use "

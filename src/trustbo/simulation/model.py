@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_whole
+from trustbo.errors import (
+    ShapeError,
+    TrustboError,
+    require_cells,
+    require_choice,
+    require_kind,
+    require_whole,
+)
 from trustbo.models import CAUSES, PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
@@ -55,6 +62,8 @@ class ModelSimulator(DescribedSimulator):
             TrustboError: An n_ticks that is no number of ticks, or is missing; a chance outside
                 [0, 1]; an unknown cause, or shares that do not sum to 1.
         """
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+        require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
         self.workspace, self.params = workspace, params
         self.model = PooledTrust() if model is None else model
         shape = workspace.awareness.shape
@@ -83,10 +92,11 @@ class ModelSimulator(DescribedSimulator):
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
         """Run a path; the same seed gives the same mission."""
+        path = require_cells("path", path)
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         z = np.swapaxes(along(self.awareness, cells), 0, 1)
         with own_settings():  # else the caller's flags decide what is drawn
-            key = jax.random.key(seed)
+            key = jax.random.key(require_whole("seed", seed, 0))
         params = self.params.along(cells)
         sample = self.model.simulate(key, params, z[None], self.n_ticks)
         rates = np.clip(sample.contact_rate[0], 0.0, 1.0)

@@ -55,10 +55,11 @@ def _to_utm(raster: Raster) -> Raster:
 
 
 def _nowhere(raster: Raster) -> TerrainError:
-    bounds = ", ".join(f"{edge:.1f}" for edge in raster.bounds)
+    bounds = ", ".join(f"{edge:.8g}" for edge in raster.bounds)
+    order = ", x being the longitude and y the latitude" if raster.crs.is_geographic else ""
     return TerrainError(
         f"{raster.name} has CRS {raster.crs.to_string()}, but its bounds ({bounds}) are no place "
-        "on Earth in it; give the CRS its coordinates are in."
+        f"on Earth in it; give the CRS its coordinates are in{order}."
     )
 
 

@@ -18,7 +18,7 @@ from trustbo.terrain.units import METRE
 
 CLIP_WARNING_SHARE = 0.02
 _ROWS = 256  # checked together
-_MOST_IN_MEMORY, _MOST_AVERAGED = 4e8, 1e11  # pixels of one raster: 3.2 GB; some 10 minutes
+_MOST_IN_MEMORY, _MOST_AVERAGED = 4e8, 1e10  # pixels of one raster: 3.2 GB; some 20 minutes
 _DEGREE = 111_195.0  # of latitude, m
 
 

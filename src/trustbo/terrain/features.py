@@ -8,6 +8,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from trustbo.data import as_array
 from trustbo.errors import ShapeError, TerrainError, require_whole
 from trustbo.terrain import fan, rays, stencil
 from trustbo.terrain.dataset import pixel_size
@@ -186,7 +187,7 @@ def require_observers(terrain: xr.Dataset, observers: ArrayLike) -> np.ndarray:
 
     ShapeError: no list of positions. TerrainError: one is off the terrain.
     """
-    place = np.asarray(observers, dtype=float)
+    place = as_array("observers", observers)
     if place.ndim != 2 or place.shape[1] != 2 or not len(place):
         raise ShapeError(
             f"observers must be (observer, 2), x and y in CRS metres; got shape {place.shape}."

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.errors import TerrainError, TrustboError
+from trustbo.errors import TerrainError, TrustboError, require_kind
 from trustbo.parallel import in_order
 from trustbo.team import Team
 from trustbo.terrain import stencil
@@ -41,6 +41,8 @@ def feature_specs(features: Mapping[str, object]) -> dict[str, FeatureSpec]:
 
     TrustboError: an unknown name, or something that is no feature.
     """
+    remedy = "give definitions by name, e.g. {'slope': 'slope'}"
+    require_kind("features", features, Mapping, remedy)
     return {name: _spec(name, parts) for name, parts in features.items()}
 
 

@@ -80,7 +80,7 @@ class Grid(Displayed):
 
     def center(self, cell: Cell) -> tuple[float, float]:
         """X and y of a cell's centre, CRS metres."""
-        row, col = cell
+        row, col = require_pair("cell", cell)
         x = self.left + (col + 0.5) * self.cell_width
         return x, self.top - (row + 0.5) * self.cell_height
 
@@ -141,7 +141,7 @@ class Grid(Displayed):
         """Longitude and latitude of a cell's centre, degrees (WGS 84).
 
         Raises:
-            TrustboError: The grid has no CRS.
+            TrustboError: No cell; or the grid has no CRS, or is no place on Earth in it.
         """
         return lonlat_of(self, self.center(cell))
 

@@ -185,17 +185,27 @@ def position_of(
     crs = grid.require_crs()
     if not (-180.0 <= a <= 360.0 and -90.0 <= b <= 90.0):
         return None
-    try:
-        x, y = (found[0] for found in transform_points(WGS84, crs, [a], [b])[:2])
-    except Exception:  # PROJ's errors are GDAL's, without a base of their own
-        return None
-    return (x, y) if np.isfinite([x, y]).all() else None
+    return _moved(WGS84, crs, a, b)
 
 
 def lonlat_of(grid: "Grid", position: tuple[float, float]) -> tuple[float, float]:
-    """Longitude and latitude of a position in CRS metres; TrustboError without a CRS."""
-    lon, lat = transform_points(grid.require_crs(), WGS84, *([value] for value in position))[:2]
-    return lon[0], lat[0]
+    """Longitude and latitude of a position in CRS metres; TrustboError without a CRS, or off it."""
+    moved = _moved(grid.require_crs(), WGS84, *position)
+    if moved is None:
+        raise TrustboError(
+            f"({position[0]:.10g}, {position[1]:.10g}) is no place on Earth in {crs_name(grid)}; "
+            "give the terrain the CRS that its coordinates are in."
+        )
+    return moved
+
+
+def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float] | None:
+    """Position in another CRS; None if it is no place on Earth in one of them."""
+    try:
+        (u,), (v,) = transform_points(source, target, [x], [y])[:2]
+    except Exception:  # PROJ's errors are GDAL's, without a base of their own
+        return None
+    return (u, v) if np.isfinite([u, v]).all() else None
 
 
 def _cell(grid: "Grid", names: tuple[str, str], values: Iterable[float]) -> Cell | None:

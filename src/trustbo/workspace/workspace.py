@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import FEATURES, Cell, Mission, default_features, is_line_of_sight
+from trustbo.data import FEATURES, Cell, Mission, as_names, default_features, is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, TrustboError, require_positive
@@ -210,7 +210,7 @@ class Workspace(Displayed):
             )
         side = require_positive("cell_size", cell_size)
         grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
-        names = tuple(features) or default_features(z.shape[3])
+        names = as_names("features", features) or default_features(z.shape[3])
         if len(names) != z.shape[3]:
             raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
         coords = {
