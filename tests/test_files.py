@@ -7,12 +7,24 @@ import subprocess
 import sys
 import threading
 
+import netCDF4
 import pytest
 
 import trustbo.files
-from trustbo.campaign.damage import read_json
+from trustbo.campaign.damage import read_fields
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import read_checked, require_file, require_folder, write_checked, write_file
+from trustbo.files import (
+    read_checked,
+    read_yaml,
+    remove_checked,
+    remove_leftovers,
+    require_file,
+    require_folder,
+    write_checked,
+    write_file,
+)
+from trustbo.logs import read_missions
+from trustbo.logs.netcdf import read_tree
 
 
 @pytest.fixture(autouse=True)
@@ -148,17 +160,90 @@ def test_what_is_no_path_is_named(require):
     ("content", "message"),
     [
         ('{"seed": ', "is damaged: no JSON"),
-        ("3", "is damaged: no JSON"),
-        ('{"path": []}', "is damaged: it lacks seed, model"),
+        ("3", "is damaged: no record of fields"),
+        ('{"path": []}', "is damaged: it lacks n_missions, trust, value, settings"),
+        ("[" * 100_000, "is damaged: no JSON .maximum recursion depth"),
     ],
 )
 def test_a_record_that_is_none_is_named(tmp_path, content, message):
-    file = tmp_path / "record.json"
+    file = tmp_path / "result.json"
     file.write_text(content)
     with pytest.raises(DamagedFileError, match=message):
-        read_json(file, "seed", "path", "model")
+        read_fields(file)
     with pytest.raises(DamagedFileError, match="is missing"):
-        read_json(tmp_path / "other.json")
-    (tmp_path / "folder.json").mkdir()
-    with pytest.raises(DamagedFileError, match="cannot be read"):
-        read_json(tmp_path / "folder.json")
+        read_fields(tmp_path / "campaign.json")
+    (tmp_path / "campaign.json").mkdir()
+    with pytest.raises(DamagedFileError, match="cannot be read: it is a folder"):
+        read_fields(tmp_path / "campaign.json")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a system without pipes")
+@pytest.mark.parametrize("read", [read_checked, read_tree, read_yaml, read_missions])
+def test_a_pipe_a_device_or_a_sea_of_zeros_is_refused_at_once(tmp_path, read):
+    pipe, zeros, vast = (tmp_path / f"{name}.csv" for name in ("pipe", "zeros", "vast"))
+    os.mkfifo(pipe)
+    zeros.symlink_to("/dev/zero")
+    with vast.open("wb") as stream:
+        stream.truncate(1 << 40)
+    for file in (pipe, zeros):
+        with pytest.raises(TrustboError, match=rf"{file.name}' cannot be read: it is a pipe or a"):
+            read(file)
+    with pytest.raises(TrustboError, match=r"vast.csv' cannot be read: it has 1099511627776 bytes"):
+        read(vast)
+
+
+def test_a_small_file_that_unpacks_to_much_is_refused(tmp_path):
+    file = tmp_path / "bomb.nc"
+    with netCDF4.Dataset(file, "w") as data:
+        group = data.createGroup("missions")
+        group.createDimension("mission", 1 << 32)
+        group.createVariable("status", "f8", ("mission",), zlib=True)
+    assert file.stat().st_size < 100_000
+    with pytest.raises(DamagedFileError, match=r"bomb.nc' is too large for memory .* to 34359738"):
+        read_tree(file)
+
+
+@pytest.mark.parametrize("nested", ["[" * 5000, "- " * 5000 + "1", "{a: " * 5000])
+def test_yaml_that_is_nested_too_deeply_is_refused(tmp_path, nested):
+    (tmp_path / "deep.yaml").write_text(nested)
+    with pytest.raises(TrustboError, match=r"deep.yaml' is no YAML: "):
+        read_yaml(tmp_path / "deep.yaml")
+
+
+def test_only_what_has_our_mark_is_a_leftover(tmp_path):
+    """In the folder itself, and through no link."""
+    (tmp_path / "elsewhere").mkdir()
+    kept = [
+        tmp_path / name
+        for name in (".notes.2024.csv", ".bashrc.1", ".x.12", "elsewhere/.a.trustbo-12.nc")
+    ]
+    for file in kept:
+        file.write_text("mine")
+    linked = tmp_path / ".b.trustbo-12.nc"
+    linked.symlink_to(kept[0])
+    left = [tmp_path / ".a.trustbo-123.nc", tmp_path / "..a.nc.trustbo-123.sha256"]
+    for file in left:
+        file.write_text("half")
+    remove_leftovers(tmp_path)
+    (tmp_path / "linked").symlink_to("elsewhere")
+    remove_leftovers(tmp_path / "linked")
+    assert [file.exists() for file in [*kept, linked, *left]] == [True] * 5 + [False] * 2
+
+
+def test_a_file_is_not_written_through_a_link(tmp_path):
+    precious = tmp_path / "precious.txt"
+    precious.write_text("mine")
+    for name in ("a.txt", f".a.trustbo-{os.getpid()}.txt"):
+        (tmp_path / name).symlink_to(precious)
+    write_file(tmp_path / "a.txt", lambda file: file.write_text("ours"))
+    assert precious.read_text() == "mine"
+    assert (tmp_path / "a.txt").read_text() == "ours"
+    assert not (tmp_path / "a.txt").is_symlink()
+
+
+def test_a_file_without_a_sum_is_not_removed(tmp_path):
+    write_checked(tmp_path / "ours.nc", b"")
+    (tmp_path / "theirs.nc").write_bytes(b"")
+    for name in ("ours.nc", "theirs.nc"):
+        remove_checked(tmp_path / name)
+    assert [file.name for file in tmp_path.iterdir()] == ["theirs.nc"]

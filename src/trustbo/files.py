@@ -7,9 +7,10 @@ import os
 import re
 import shutil
 import signal
+import stat
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from os import PathLike
 from pathlib import Path
@@ -20,9 +21,11 @@ import numpy as np
 from trustbo.errors import DamagedFileError, TrustboError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR)
+_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
 _LEAST_FREE = 1 << 20
 """Bytes; libraries that write files by themselves do not say why they failed."""
+_MOST, _MOST_TEXT, _MOST_YAML = 1 << 35, 1 << 28, 1 << 22
+"""Bytes of the largest file that is read, the largest record, and the largest configuration."""
 
 FilePath = str | PathLike[str]
 
@@ -30,7 +33,8 @@ FilePath = str | PathLike[str]
 def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
     """Write a file atomically: `write` gets a temporary name of the same suffix, then renamed.
 
-    Ctrl-C and SIGTERM take effect after the write, a second one at once.
+    Ctrl-C and SIGTERM take effect after the write, a second one at once. A link of that name is
+    replaced by the file, and what it leads to is left alone.
 
     Args:
         path: File to write; its folder is made if it does not exist.
@@ -43,10 +47,12 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
     path = Path(path)
     with naming_refusal(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    temporary = temporary_name(path)
     try:
         with defer_interrupt():
+            temporary.unlink(missing_ok=True)  # not to write through a link of that name
             write(temporary)
+            _to_disk(temporary)
             os.replace(temporary, path)
     except Exception as error:
         full = isinstance(error, OSError) and error.errno in _FULL
@@ -62,6 +68,30 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def temporary_name(path: Path) -> Path:
+    """Name beside a file to write it under; with a mark that no other program's files have.
+
+    The suffix is the file's: libraries choose a format by it.
+    """
+    return path.with_name(f".{path.stem}.trustbo-{os.getpid()}{path.suffix}")
+
+
+def _to_disk(file: Path) -> None:
+    """Let a file's bytes outlast a power cut before its name does."""
+    with file.open("rb+") as stream:
+        os.fsync(stream.fileno())
+
+
+def folder_to_disk(folder: Path) -> None:
+    """Let the names in a folder outlast a power cut, where the system can."""
+    with suppress(OSError):  # folders cannot be opened everywhere
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
+
+
 @contextmanager
 def naming_refusal(folder: Path, file: Path | None = None, remedy: str = "") -> Iterator[None]:
     """Make the system's refusal to write to a folder a TrustboError that says what to do.
@@ -71,6 +101,10 @@ def naming_refusal(folder: Path, file: Path | None = None, remedy: str = "") -> 
     try:
         yield
     except OSError as error:
+        if error.errno in _FULL:
+            raise TrustboError(
+                f"the disk is full: nothing was written to {str(folder)!r}; make room and go on."
+            ) from error
         of_others = file is not None and error.filename not in (str(file), file)
         if error.errno not in _REFUSED or of_others:
             raise
@@ -114,25 +148,22 @@ def write_checked(path: FilePath, content: bytes) -> None:
     """
     path = Path(path)
     # Of the file that is there: its kept sum may be that of one whose writing died.
-    contents = [content, *([path.read_bytes()] if path.exists() else [])]
+    contents = [content, *([read_file(path)] if path.is_file() else [])]
     sums = "\n".join(hashlib.sha256(each).hexdigest() for each in contents)
-    _write_bytes(_sum_file(path), sums.encode())
-    _write_bytes(path, content)
+    write_file(sum_file(path), lambda file: file.write_text(sums, encoding="utf-8"))
+    write_file(path, lambda file: file.write_bytes(content))
+    folder_to_disk(path.parent)
 
 
-def read_checked(path: FilePath) -> bytes:
+def read_checked(path: FilePath, most: int = _MOST) -> bytes:
     """Read a file of `write_checked`, or any other file, which then has no sum to be checked.
 
     Raises:
-        DamagedFileError: There is no such file, or its bytes are not those that were written.
+        DamagedFileError: There is no such file, `read_file` refuses it, or its bytes are not those
+            that were written.
     """
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise DamagedFileError(f"{str(path)!r} is missing.") from None
-    except OSError as error:
-        raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
+    content = read_file(path, most)
     sums = _sums(path)
     if sums and hashlib.sha256(content).hexdigest() not in sums:
         raise DamagedFileError(
@@ -141,42 +172,107 @@ def read_checked(path: FilePath) -> bytes:
     return content
 
 
+def require_regular(path: FilePath, most: int = _MOST) -> Path:
+    """Return a file to read: no pipe, which would wait, no device, and not endless.
+
+    Raises:
+        DamagedFileError: There is no such file, it is none, or it has more than `most` bytes.
+    """
+    path = _as_path(path)
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        raise DamagedFileError(f"{str(path)!r} is missing.") from None
+    except OSError as error:
+        raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device"
+        raise DamagedFileError(f"{str(path)!r} cannot be read: it is {kind}, not a file.")
+    if status.st_size > most:
+        raise DamagedFileError(
+            f"{str(path)!r} cannot be read: it has {status.st_size} bytes, more than {most}."
+        )
+    return path
+
+
+def read_file(path: FilePath, most: int = _MOST) -> bytes:
+    """Read a file whole; DamagedFileError as of `require_regular`, or if it cannot be read."""
+    path = require_regular(path, most)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DamagedFileError(f"{str(path)!r} cannot be read: {error.strerror}.") from None
+    except MemoryError:
+        raise DamagedFileError(f"{str(path)!r} cannot be read: too large for memory.") from None
+
+
+def read_record(path: FilePath, *, checked: bool = True) -> Any:
+    """Read a JSON file, by default against the sum that `write_checked` kept.
+
+    Raises:
+        DamagedFileError: The file is missing, damaged, no JSON, or nested too deeply.
+    """
+    content = read_checked(path, _MOST_TEXT) if checked else read_file(path, _MOST_TEXT)
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError(f"{str(path)!r} is damaged: no JSON ({error}).") from None
+
+
+@contextmanager
+def interpreting(path: FilePath) -> Iterator[None]:
+    """Make the error of code that meets what it does not expect in a file a DamagedFileError.
+
+    Errors that are TrustboError are left as they are.
+    """
+    try:
+        yield
+    except TrustboError:
+        raise
+    except (
+        ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError,
+        ValueError,
+    ) as error:  # fmt: skip
+        said = " ".join(str(error).split())[:200]
+        raise DamagedFileError(
+            f"{str(path)!r} is damaged: it does not hold what it should ({said})."
+        ) from error
+
+
 def checksum(path: Path) -> str | None:
     """Return the sum that `write_checked` kept of a file; None where there is none."""
     return next(iter(_sums(path)), None)
 
 
 def remove_checked(path: Path) -> None:
-    """Remove a file and its sum, if they are there."""
+    """Remove a file of `write_checked` and its sum; one without a sum is another's, and stays."""
     with naming_refusal(path.parent):
-        path.unlink(missing_ok=True)
-        _sum_file(path).unlink(missing_ok=True)
+        if sum_file(path).is_file():
+            path.unlink(missing_ok=True)
+            sum_file(path).unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files that a process which died left; no other may be at work there."""
-    for file in folder.rglob(".*"):
-        if re.fullmatch(r"\..+\.\d+(\.\w+)?", file.name):
+    """Remove temporary files that a process which died left; no other may be at work there.
+
+    Those in the folder itself, by the mark of `temporary_name`; never through a link.
+    """
+    if folder.is_symlink() or not folder.is_dir():
+        return
+    for file in folder.iterdir():
+        ours = re.fullmatch(r"\..+\.trustbo-\d+(\.[^.]*)?", file.name)
+        if ours and file.is_file() and not file.is_symlink():
             file.unlink(missing_ok=True)
 
 
-def _write_bytes(path: Path, content: bytes) -> None:
-    def write(file: Path) -> None:
-        with file.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-
-    write_file(path, write)
-
-
-def _sum_file(path: Path) -> Path:
+def sum_file(path: Path) -> Path:
+    """Name of the hidden file that `write_checked` keeps a file's sums in."""
     return path.with_name(f".{path.name}.sha256")
 
 
 def _sums(path: Path) -> list[str]:
-    file = _sum_file(path)
-    return file.read_text().split() if file.exists() else []
+    file = sum_file(path)
+    return read_file(file).decode(errors="replace").split() if file.exists() else []
 
 
 def write_text(path: FilePath, text: str) -> None:
@@ -242,8 +338,8 @@ def read_yaml(file: Path) -> Any:
     import yaml  # loaded only where YAML is read
 
     try:
-        return yaml.safe_load(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TrustboError(f"cannot read {str(file)!r}: {error.strerror}.") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        return yaml.safe_load(read_file(file, _MOST_YAML).decode("utf-8"))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, TrustboError):
+            raise
         raise TrustboError(f"{str(file)!r} is no YAML: {' '.join(str(error).split())}") from None

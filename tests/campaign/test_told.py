@@ -399,7 +399,7 @@ def test_a_folder_that_may_not_be_written_to_is_named(workspace, folder, monkeyp
     def refuse_lock(self, *args, **kwargs):
         raise PermissionError(13, "Permission denied", self.lock_file)
 
-    monkeypatch.setattr("trustbo.campaign.folder.FileLock.acquire", refuse_lock)
+    monkeypatch.setattr("trustbo.campaign.replacing.FileLock.acquire", refuse_lock)
     with pytest.raises(tb.TrustboError, match=r"cannot write to .*: Permission denied; give a fol"):
         begin(workspace, folder.parent / "new")
     with pytest.raises(
@@ -421,7 +421,10 @@ def test_a_campaign_is_rebuilt_from_the_missions_measured(folder):
 def test_leftovers_of_dead_runs_are_removed_and_sums_kept(folder, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
-    dead = [copy / ".campaign.4711.json", copy / "posteriors" / ".0002.4711.nc"]
+    dead = [
+        copy / ".campaign.trustbo-4711.json",
+        copy / "posteriors" / ".0002.trustbo-4711.nc",
+    ]
     for file in dead:
         file.write_text("half")
     sums = sorted(copy.rglob(".*.sha256"))

@@ -18,12 +18,13 @@ from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import SET_ASIDE, TOLD, Entry, History
 from trustbo.campaign.learned import LearnedMissions
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, again
+from trustbo.campaign.replacing import STATE
 from trustbo.campaign.result import Result
 from trustbo.campaign.told import never_to_be_learned, require_extra, require_mission, require_new
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
-from trustbo.files import FilePath
+from trustbo.files import FilePath, interpreting
 from trustbo.models import CAUSES, TrustModel, params_of
 from trustbo.models.backend import VERSIONS
 from trustbo.models.record import model_from_record, model_to_record
@@ -239,7 +240,8 @@ class Campaign(LearnedMissions, Displayed):
         self.log.entries[number - 1].become(SET_ASIDE, str(reason))
         self._learn(self.seed_of("fit"))
         self._plan = self._believed = None
-        self._write()
+        if self._folder is not None:
+            self._replace(self._folder)  # the last posterior is another now
         return self.log.last_tree
 
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
@@ -405,27 +407,19 @@ class Campaign(LearnedMissions, Displayed):
         folder = CampaignFolder(directory, begun=True)
         try:
             state, measured, extras, kept = folder.read()
-            record = state["options"]
-            if "replan" in state["notes"]:  # of version 0.1
-                record.setdefault("replan", state["notes"]["replan"])
-            start, goal = (tuple(record.pop(name)) for name in ("start", "goal"))
-            chosen = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
-            learner = model_from_record(record.pop("model"), model)
-            named = {name: record.pop(name) for name in ("objective", "sampler", "seed")}
-            options = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
-            campaign = cls(
-                folder.read_workspace(), start, goal, model=learner, policy=chosen,
-                options=options, **named,
-            )  # fmt: skip
-            workspace = campaign.workspace
-            campaign.log = History.from_state(state, measured, extras, kept, workspace)
+            workspace = folder.read_workspace()
+            with interpreting(folder.path / STATE):
+                campaign = cls._restored(state, workspace, model, policy, **own)
+                campaign.log = History.from_state(state, measured, extras, kept, workspace)
+                if (suggested := state.get("suggested")) is not None:
+                    campaign._plan = plan_from_record(suggested, workspace)
             if campaign.awareness is not None:
                 for mission in campaign.log.measured:
                     campaign.awareness.update(mission)
-            if (last := campaign.log.last_tree) is not None:
-                campaign.belief = params_of(last)
-            suggested = state["suggested"]
-            campaign._plan = suggested and plan_from_record(suggested, workspace)
+            if (last := campaign.log.last) is not None:
+                tree = last()
+                with interpreting(last.file or folder.path):
+                    campaign.belief = params_of(tree)
             campaign._folder = folder
             for j in range(len(campaign.missions), len(measured)):
                 campaign._take(measured[j], extras[j])
@@ -433,6 +427,26 @@ class Campaign(LearnedMissions, Displayed):
             folder.close()
             raise
         return campaign
+
+    @classmethod
+    def _restored(
+        cls,
+        state: dict[str, Any],
+        workspace: Workspace,
+        model: TrustModel | None,
+        policy: Policy | None,
+        **own: Any,
+    ) -> Self:
+        """Campaign with the options of a state, see `load`; without its missions."""
+        record = dict(state["options"])
+        if "replan" in state["notes"]:  # of version 0.1
+            record.setdefault("replan", state["notes"]["replan"])
+        start, goal = (tuple(record.pop(name)) for name in ("start", "goal"))
+        chosen = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
+        learner = model_from_record(record.pop("model"), model)
+        named = {name: record.pop(name) for name in ("objective", "sampler", "seed")}
+        options = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
+        return cls(workspace, start, goal, model=learner, policy=chosen, options=options, **named)
 
     def stop(self, reason: str) -> Result:
         """End the campaign, which may still go on later, and return its result.
@@ -467,19 +481,24 @@ class Campaign(LearnedMissions, Displayed):
                 "Campaign.load, or choose another folder."
             )
         try:
-            folder.begin(self.workspace)
-            if self.log.entries:
-                folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
+            self._replace(folder)
         except BaseException:
             folder.close()
             raise
         self._folder = folder
-        self._write(whole=True)
 
-    def _write(self, *, whole: bool = False) -> None:
+    def _replace(self, folder: CampaignFolder) -> None:
+        """Write all of it in place of what the folder holds."""
+        result = self.result() if self.log.entries else None
+        with folder.replaced(self.workspace):
+            if self.log.entries:
+                folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
+            folder.write(self._state(), result, whole=True)
+
+    def _write(self) -> None:
+        """Write what the last mission added."""
         if self._folder is not None:
-            result = self.result() if self.log.entries else None
-            self._folder.write(self._state(), result, whole=whole)
+            self._folder.write(self._state(), self.result())
 
     def _write_state(self) -> None:
         if self._folder is not None:

@@ -1,33 +1,113 @@
 """Damaged files of a campaign: what is wrong, and what can still be read."""
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from trustbo.campaign.replacing import MEASURED, RESULT, STATE
 from trustbo.errors import DamagedFileError
-from trustbo.files import read_checked
+from trustbo.files import read_record
 
-MEASURED, FILLED = "measured.nc", "missions.nc"
+_FILLED = "missions.nc"
 _TELL = "tell them, in order, to a new campaign in another folder, with other_path=True"
 
+# Kinds of values: a type (float for any number), alternatives in a tuple, a list of one kind or of
+# one for each place, and a dict of those by name, `str` for all other names.
+_COUNT, _PATH = range(1_000_000), [[int, int]]
+_AFTER = [(_COUNT, None)]
+_CHOSEN = {
+    "start": [int, int], "goal": [int, int], "objective": str, "sampler": str, "policy": str,
+    "connectivity": int, "max_bounds": (int, str, None), "team": str, "length_weight": float,
+    "max_failure": (float, None), "failure_cost": (float, None), "initial": str, "update": str,
+    "forgetting": float, "awareness": str, "replan": str, "hazard": dict,
+}  # fmt: skip
+_PLAN = {
+    "path": _PATH, "positions": [[float, float]], "length": float, "trust": [[float]],
+    "bands": [[[float]]], "value": float, "success": float, "success_index": float,
+    "objective": str, "exact": bool, "bound": float, "revisits": int, "engine": str,
+    "seconds": float, "infeasible": bool,
+    "risk": (None, {
+        "p_fail": [float], "p_fail_band": [[float]], "p_arrive": float,
+        "p_arrive_band": [float, float], "by_cause": {str: [float]},
+    }),
+}  # fmt: skip
+_ROW = {"status": str, "state": str, "reason": str, str: (float, bool)}
+_NEEDED = {
+    STATE: ("n_missions", "options", "plans", "rows", "failures", "notes", "stop_reason"),
+    RESULT: ("n_missions", "path", "trust", "value", "settings", "stop_reason"),
+}
+_FIELDS: dict[str, dict[Any, Any]] = {
+    STATE: {
+        "n_missions": _COUNT,
+        "options": _CHOSEN | {"model": dict, "own_policy": bool, "own_awareness": bool},
+        "suggested": (_PLAN, None),
+        "plans": [_PLAN],
+        "rows": [_ROW],
+        "posterior_after": _AFTER,
+        "failures": [[int, str, _PATH, ([int, int], None)]],
+        "notes": {"simulator": str, "n_iterations": _COUNT, "stop": [dict]},
+        "stop_reason": str,
+    },
+    RESULT: {
+        "n_missions": _COUNT,
+        "path": _PATH,
+        "trust": [[float]],
+        "value": float,
+        "settings": _CHOSEN | {"model": str, "simulator": str, "response": str},
+        "posterior_after": _AFTER,
+        "stop_reason": str,
+    },
+}
 
-def read_json(file: Path, *fields: str) -> dict[str, Any]:
-    """Read a record with these fields.
+
+def read_fields(file: Path) -> dict[str, Any]:
+    """Read `campaign.json` or `result.json`.
 
     Raises:
-        DamagedFileError: The file is missing or damaged, or a field is.
+        DamagedFileError: The file is missing or damaged, or a field is missing or no such value.
     """
-    content = read_checked(file)
-    try:
-        record = json.loads(content)
-        missing = [name for name in fields if name not in record]
-    except (ValueError, TypeError) as error:
-        raise DamagedFileError(f"{str(file)!r} is damaged: no JSON ({error}).") from None
-    if missing:
+    record, needed = read_record(file), _NEEDED[file.name]
+    if not isinstance(record, dict):
+        raise DamagedFileError(f"{str(file)!r} is damaged: no record of fields.")
+    if missing := [name for name in needed if name not in record]:
         raise DamagedFileError(f"{str(file)!r} is damaged: it lacks {', '.join(missing)}.")
+    for name, kind in _FIELDS[file.name].items():
+        if name in record and not _fits(record[name], kind):
+            raise DamagedFileError(
+                f"{str(file)!r} is damaged: {name} = {str(record[name])[:60]} is none."
+            )
+    n = record["n_missions"]
+    for name in ("plans", "rows", "posterior_after"):
+        if len(record.get(name, range(n))) != n:
+            raise DamagedFileError(
+                f"{str(file)!r} is damaged: {name} has {len(record[name])} entries for "
+                f"{n} missions."
+            )
     return record
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of a kind."""
+    match kind:
+        case tuple():
+            return any(_fits(value, one) for one in kind)
+        case range():
+            return _fits(value, int) and value in kind
+        case [one]:
+            return isinstance(value, list) and all(_fits(v, one) for v in value)
+        case list():
+            return isinstance(value, list) and all(map(_fits, value, kind))
+        case dict():
+            return isinstance(value, dict) and all(
+                _fits(v, kind.get(name, kind.get(str, object))) for name, v in value.items()
+            )
+        case None:
+            return value is None
+    if kind in (int, float):  # a bool is an int, and an int beyond 64 bits no number of ours
+        whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1 << 63
+        return whole or (kind is float and isinstance(value, float))
+    return isinstance(value, kind)
 
 
 @contextmanager
@@ -36,7 +116,7 @@ def naming_what_is_left(folder: Path) -> Iterator[None]:
     try:
         yield
     except DamagedFileError as error:
-        for name, described in ((MEASURED, salvage), (FILLED, _salvage_filled)):
+        for name, described in ((MEASURED, salvage), (_FILLED, _salvage_filled)):
             if str(folder / name) not in str(error) and (folder / name).exists():
                 raise DamagedFileError(f"{error} {described(folder / name)}") from None
         raise

@@ -1,32 +1,32 @@
 """Folder of a campaign: one owner at a time, no file half-written, and every damage noticed."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import xarray as xr
-from filelock import FileLock, Timeout
 
-from trustbo.campaign.damage import MEASURED, naming_what_is_left, read_json, salvage
+from trustbo.campaign.damage import naming_what_is_left, read_fields, salvage
 from trustbo.campaign.history import Kept
-from trustbo.campaign.result import Result, read_kept
+from trustbo.campaign.replacing import (
+    MEASURED,
+    STATE,
+    WORKSPACE,
+    current,
+    hold,
+    replacing,
+    warn_of_others,
+)
+from trustbo.campaign.result import Result, read_kept, read_workspace
+from trustbo.campaign.told import require_extra
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import (
-    FilePath,
-    naming_refusal,
-    remove_checked,
-    remove_leftovers,
-    require_folder,
-    to_json,
-    write_checked,
-)
+from trustbo.files import FilePath, interpreting, to_json, write_checked
 from trustbo.logs.netcdf import missions_of_tree, read_tree, write_missions, write_tree
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
-
-STATE, WORKSPACE = "campaign.json", "workspace.nc"
 
 
 class Contents(NamedTuple):
@@ -67,40 +67,44 @@ class CampaignFolder:
             if measured.exists():
                 raise DamagedFileError(f"{said} {STATE!r} is missing. {salvage(measured)}")
             raise TrustboError(f"{said} give a folder that one was saved to.")
-        self._lock = FileLock(self.path / ".lock", timeout=0)
         read = " tb.load_result reads one that may not." if begun else ""
-        try:
-            with naming_refusal(self.path, remedy=read):
-                require_folder(directory).mkdir(parents=True, exist_ok=True)
-                self._lock.acquire()
-        except Timeout:
-            raise TrustboError(
-                f"another campaign is at work in {str(self.path)!r}; close it first, or choose "
-                "another folder."
-            ) from None
-        remove_leftovers(self.path)
+        self._lock = hold(directory, read)
+        self._at = self.path  # or the folder that its successor is being written to
         self._n_ticks = 0  # missions whose ticks are in files of their own
 
     @property
     def is_used(self) -> bool:
         """Whether the folder holds a campaign."""
-        return (self.path / STATE).exists()
+        return (current(self.path) / STATE).exists()
 
     def close(self) -> None:
         """Let go of the folder."""
         self._lock.release()
 
-    def begin(self, workspace: Workspace) -> None:
-        """Replace what the folder holds by a campaign's workspace."""
-        for name in (STATE, "result.json", MEASURED):
-            remove_checked(self.path / name)
-        self._n_ticks = 0
-        write_tree(self.path / WORKSPACE, archive.workspace_to_tree(workspace))
+    @contextmanager
+    def replaced(self, workspace: Workspace) -> Iterator[None]:
+        """Write a campaign that takes the place of what the folder holds when it is whole.
+
+        Args:
+            workspace: Its workspace, which is written first.
+
+        Raises:
+            TrustboError: A file of another program would be replaced; see `require_ours`.
+        """
+        warn_of_others(self.path)
+        n_ticks, self._n_ticks = self._n_ticks, 0
+        try:
+            with replacing(self.path) as self._at:
+                write_tree(self._at / WORKSPACE, archive.workspace_to_tree(workspace))
+                yield
+                n_ticks = self._n_ticks
+        finally:
+            self._at, self._n_ticks = self.path, n_ticks
 
     def read_workspace(self) -> Workspace:
         """Read the campaign's workspace."""
         with naming_what_is_left(self.path):
-            return archive.workspace_from_tree(read_tree(self.path / WORKSPACE))
+            return read_workspace(self.path)
 
     def write_measured(
         self, missions: Sequence[Mission], extras: Sequence[Mapping[str, float]]
@@ -108,7 +112,7 @@ class CampaignFolder:
         """Write missions as they were told, and the numbers that they were told with."""
         since, self._n_ticks = min(self._n_ticks, len(missions) - 1), len(missions)
         notes = {"extra": json.dumps(list(extras))}
-        write_missions(self.path / MEASURED, missions, since=since, notes=notes)
+        write_missions(self._at / MEASURED, missions, since=since, notes=notes)
 
     def write(
         self,
@@ -127,10 +131,10 @@ class CampaignFolder:
             ended: Whether to write `posterior.nc` too, with all groups.
         """
         if result is not None:
-            result.save(self.path) if whole else result.checkpoint(self.path)
+            result.write(self._at, whole=whole, home=self.path)
             if ended and result.has_posterior:
-                write_tree(self.path / "posterior.nc", result.posterior)
-        write_checked(self.path / STATE, to_json(state).encode())
+                write_tree(self._at / "posterior.nc", result.posterior)
+        write_checked(self._at / STATE, to_json(state).encode())
 
     def read(self) -> Contents:
         """Read the state, the missions as told, and what was learned from all but maybe the last.
@@ -139,14 +143,15 @@ class CampaignFolder:
             DamagedFileError: A file is missing or damaged; the message says what can be read.
         """
         with naming_what_is_left(self.path):
-            state = read_state(self.path)
+            state = read_fields(self.path / STATE)
             measured: list[Mission] = []
             extras: list[dict[str, float]] = []
             n = state["n_missions"]
             if n or (self.path / MEASURED).exists():
                 tree = read_tree(self.path / MEASURED)
                 measured = missions_of_tree(tree, self.path / MEASURED)
-                extras = _extras(tree, len(measured))
+                with interpreting(self.path / MEASURED):
+                    extras = _extras(tree, len(measured))
             if len(measured) < n:
                 raise DamagedFileError(
                     f"{str(self.path / MEASURED)!r} holds {len(measured)} missions of {n}."
@@ -156,16 +161,10 @@ class CampaignFolder:
         return Contents(state, measured, extras, kept)
 
 
-def read_state(folder: Path) -> dict[str, Any]:
-    """Read the state of a campaign.
-
-    Raises:
-        DamagedFileError: The file is missing, damaged, or another's.
-    """
-    return read_json(folder / STATE, "n_missions", "options", "plans", "rows", "notes")
-
-
 def _extras(tree: xr.DataTree, n: int) -> list[dict[str, float]]:
     """Numbers that missions were told with; none in a file of version 0.1."""
     text = tree["missions"].attrs.get("extra")
-    return [{} for _ in range(n)] if text is None else json.loads(text)
+    extras = [{} for _ in range(n)] if text is None else json.loads(text)
+    if len(extras) != n:
+        raise ValueError(f"{len(extras)} extras of {n} missions")
+    return [require_extra(extra) for extra in extras]

@@ -1,5 +1,6 @@
 """Result of a campaign, in memory and on disk."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,16 +13,18 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.card import campaign_card
-from trustbo.campaign.damage import naming_what_is_left, read_json
+from trustbo.campaign.damage import naming_what_is_left, read_fields
 from trustbo.campaign.failures import under_risk
 from trustbo.campaign.history import Kept, Posterior, Posteriors, table_of, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
+from trustbo.campaign.replacing import RESULT, STATE, WORKSPACE, current, held, replacing
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
-    remove_checked,
+    interpreting,
+    read_record,
     require_folder,
     to_json,
     write_checked,
@@ -34,11 +37,12 @@ from trustbo.planning import Plan, Planner
 from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
+from trustbo.workspace.moves import require_on_grid
 
 if TYPE_CHECKING:
     from trustbo.plots import Explorer
 
-_BELIEVED = "believed.nc"
+_MISSIONS, _HISTORY, _BELIEVED = "missions.nc", "history.nc", "believed.nc"
 
 
 _NEW = ("max_failure", "failure_cost")
@@ -249,55 +253,75 @@ class Result(Displayed):
 
         Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
         (the last of them), `missions.nc`, `workspace.nc`, `history.nc`, `history.csv` and
-        `result.json`. Files that another result left there are replaced.
+        `result.json`. Another result there is replaced, all at once; files that trustbo did not
+        write are left alone.
 
         Raises:
-            TrustboError: The folder's name belongs to a file.
+            TrustboError: The folder's name belongs to a file, a file in it that trustbo did not
+                write would be replaced, or it holds a campaign that this result is not of.
         """
         folder = require_folder(directory)
-        remove_checked(folder / "result.json")  # its other files are replaced now
-        write_tree(folder / "workspace.nc", archive.workspace_to_tree(self.workspace))
-        self._write(folder, whole=True)
-        if self.has_posterior:
-            write_tree(folder / "posterior.nc", self.posterior)
+        held_there = current(folder)
+        if (held_there / STATE).exists():
+            if not self._is_in(held_there):
+                raise TrustboError(
+                    f"{str(folder)!r} holds a campaign, with missions as they were told, which a "
+                    "result does not have; give another folder."
+                )
+            if self.has_posterior:
+                write_tree(held_there / "posterior.nc", self.posterior)
+            return
+        with held(folder), replacing(folder) as new:
+            write_tree(new / WORKSPACE, archive.workspace_to_tree(self.workspace))
+            self.write(new, whole=True, home=folder)
+            if self.has_posterior:
+                write_tree(new / "posterior.nc", self.posterior)
 
-    def checkpoint(self, directory: FilePath) -> None:
-        """Write the last mission to a folder that holds all before it.
+    def write(self, folder: Path, *, whole: bool, home: Path) -> None:
+        """Write all but the workspace, for a campaign that is kept.
 
-        The workspace and the earlier posteriors never change, and are not written again.
+        Args:
+            folder: Folder to write to.
+            whole: Whether to write all missions, or only the last to a folder that has all before
+                it: earlier posteriors never change.
+            home: Folder that the files will be in; another where they replace what is there.
         """
-        self._write(require_folder(directory), whole=False)
-
-    def _write(self, folder: Path, *, whole: bool) -> None:
-        """Write all but the workspace; of missions before the last only if `whole`."""
-        files = {_posterior_file(folder, kept.after): kept for kept in self._kept if kept}
-        for file, kept in list(files.items())[0 if whole else -2 :]:
-            if whole or file != kept.file:
-                write_tree(file, kept())
-                kept.file = file  # it is there from now on
-        for file in (folder / "posteriors").glob("*.nc"):
-            if file not in files:
-                remove_checked(file)
+        files = list({kept.after: kept for kept in self._kept if kept}.values())
+        for kept in files if whole else files[-2:]:  # the last but one may have shrunk
+            name = _posterior_file(kept.after)
+            if whole or home / name != kept.file:
+                write_tree(folder / name, kept())
+                kept.file = home / name  # it is there from now on
         since = 0 if whole else len(self.missions)  # whose ticks are there
-        write_missions(folder / "missions.nc", self.missions, since=since)
+        write_missions(folder / _MISSIONS, self.missions, since=since)
         history = self.history.assign(final_trust_map=self.trust_map)
-        write_tree(folder / "history.nc", xr.DataTree(history))
-        if self.believed is None:
-            remove_checked(folder / _BELIEVED)
-        else:
+        write_tree(folder / _HISTORY, xr.DataTree(history))
+        if self.believed is not None:
             write_tree(folder / _BELIEVED, xr.DataTree(self.believed))
         write_text(folder / "history.csv", frame_as_csv(self.table()))
-        record = {
-            "n_missions": len(self.missions),
-            "path": self.path,
-            "trust": self.trust.tolist(),
-            "value": self.value,
-            "settings": self.settings,
-            "stop_reason": self.stop_reason,
-            "posterior_after": [kept and kept.after for kept in self._kept],
-        }
         # Written last: its presence means that the rest is complete.
-        write_checked(folder / "result.json", to_json(record).encode())
+        write_checked(folder / RESULT, self._record().encode())
+
+    def _record(self) -> str:
+        """Everything that no other file holds, as JSON."""
+        return to_json(
+            {
+                "n_missions": len(self.missions),
+                "path": self.path,
+                "trust": self.trust.tolist(),
+                "value": self.value,
+                "settings": self.settings,
+                "stop_reason": self.stop_reason,
+                "posterior_after": [kept and kept.after for kept in self._kept],
+            }
+        )
+
+    def _is_in(self, folder: Path) -> bool:
+        """Whether a folder holds this very result."""
+        try:
+            return to_json(read_record(folder / RESULT)) == to_json(json.loads(self._record()))
+        except DamagedFileError:
+            return False
 
     @property
     def _kept(self) -> list[Posterior | None]:
@@ -316,25 +340,33 @@ def load_result(directory: FilePath) -> Result:
         TrustboError: The folder holds no result.
         DamagedFileError: A file is missing or damaged; the message says what can be read.
     """
-    folder = Path(directory)
-    if not (folder / "result.json").exists():
-        raise TrustboError(f"{str(folder)!r} holds no result; give a folder written by save().")
+    folder = current(Path(directory))
+    if not (folder / RESULT).exists():
+        raise TrustboError(f"{str(directory)!r} holds no result; give a folder written by save().")
     with naming_what_is_left(folder):
-        record = read_json(folder / "result.json", "n_missions", "settings", "path", "stop_reason")
+        record = read_fields(folder / RESULT)
         # A run killed while it saved may have left one mission more than the record counts.
         missions, posteriors, history = read_kept(folder, record)
-        believed = None
+        workspace, believed = read_workspace(folder), None
         if record["settings"].get("awareness") == "belief":
             believed = read_tree(folder / _BELIEVED).to_dataset()
+        with interpreting(folder / _HISTORY):
+            trust_map = history["final_trust_map"].rename("trust")
+            history = history.drop_vars("final_trust_map")
+        with interpreting(folder / RESULT):
+            trust = np.array(record["trust"], dtype=float)
+            path = require_on_grid(record["path"], workspace.grid.shape)
+            if trust.shape != (len(path) - 1, workspace.awareness.sizes["robot"]):
+                raise ValueError(f"trust of shape {trust.shape} along {len(path)} cells")
         return Result(
-            archive.workspace_from_tree(read_tree(folder / "workspace.nc")),
+            workspace,
             missions,
             posteriors,
-            [_cell(cell) for cell in record["path"]],
-            np.array(record["trust"]),
+            list(path),
+            trust,
             record["value"],
-            history["final_trust_map"].rename("trust"),
-            history.drop_vars("final_trust_map"),
+            trust_map,
+            history,
             record["settings"],
             record["stop_reason"],
             believed,
@@ -347,16 +379,26 @@ def read_kept(folder: Path, record: dict[str, Any]) -> Kept:
     order = record.get("posterior_after", range(1, n + 1))  # of version 0.1: one a mission
     kept: dict[int, Posterior] = {}
     for after in {*order} - {None}:
-        file = _posterior_file(folder, after)
+        file = folder / _posterior_file(after)
         if not file.exists():
             raise DamagedFileError(f"{str(file)!r} is missing.")
         kept[after] = Posterior(after, file=file)
-    history = read_tree(folder / "history.nc").to_dataset()
-    return Kept(
-        read_missions(folder / "missions.nc")[:n],
-        Posteriors(kept.get(after) for after in order),
-        history.isel(iteration=slice(n)),
-    )
+    history, missions = read_tree(folder / _HISTORY).to_dataset(), folder / _MISSIONS
+    with interpreting(folder / _HISTORY):
+        history = history.isel(iteration=slice(n))
+        if (rows := history.sizes["iteration"]) != n:
+            raise ValueError(f"{rows} missions of {n}")
+    filled = read_missions(missions)[:n]
+    if len(filled) != n:
+        raise DamagedFileError(f"{str(missions)!r} holds {len(filled)} missions of {n}.")
+    return Kept(filled, Posteriors(kept.get(after) for after in order), history)
+
+
+def read_workspace(folder: Path) -> Workspace:
+    """Read the workspace of a campaign or result; DamagedFileError if it is missing or damaged."""
+    tree = read_tree(folder / WORKSPACE)
+    with interpreting(folder / WORKSPACE):
+        return archive.workspace_from_tree(tree)
 
 
 def _cell(pair: Any) -> Cell:
@@ -364,5 +406,5 @@ def _cell(pair: Any) -> Cell:
     return int(row), int(col)
 
 
-def _posterior_file(folder: Path, after: int) -> Path:
-    return folder / "posteriors" / f"{after:04d}.nc"
+def _posterior_file(after: int) -> Path:
+    return Path("posteriors") / f"{after:04d}.nc"

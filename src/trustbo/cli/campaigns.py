@@ -116,8 +116,9 @@ def demo(
     with one_line_errors(debug, campaign=out):
         _require_names(policy, objective, model, sampler, iterations=iterations, seed=seed)
         require_outputs(out, "dem.tif", "dsm.tif", overwrite=overwrite)
-        for file in example_files("wellington"):
-            write_file(out / Path(file).name, partial(copyfile, file))
+        for file in map(Path, example_files("wellington")):
+            _require_same(out / file.name, file)
+            write_file(out / file.name, partial(copyfile, file))
     run(
         dem=out / "dem.tif",
         dsm=out / "dsm.tif",
@@ -207,15 +208,26 @@ def _models() -> dict[str, Any]:
     return {model.kind: model for model in NAMED_MODELS}
 
 
+def _require_same(file: Path, example: Path) -> None:
+    """Refuse to replace a raster of the user's own: TrustboError."""
+    from trustbo.files import read_file
+
+    if file.exists() and read_file(file) != example.read_bytes():
+        raise TrustboError(
+            f"{str(file)!r} is not that of the demo, and would be replaced; give another --out."
+        )
+
+
 def _state(folder: Path) -> dict[str, Any]:
     """Read the state of a campaign from its folder."""
-    if not (folder / "campaign.json").exists():
-        raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
-    from trustbo.campaign.damage import naming_what_is_left
-    from trustbo.campaign.folder import read_state
+    from trustbo.campaign.damage import naming_what_is_left, read_fields
+    from trustbo.campaign.replacing import STATE, current
 
-    with naming_what_is_left(folder):
-        state = read_state(folder)
+    kept = current(folder)
+    if not (kept / STATE).exists():
+        raise TrustboError(f"{str(folder)!r} holds no campaign; give the --out of trustbo run.")
+    with naming_what_is_left(kept):
+        state = read_fields(kept / STATE)
     name = state["notes"].get("simulator")
     if name != "KinematicSimulator":
         raise TrustboError(
@@ -228,13 +240,15 @@ def _state(folder: Path) -> dict[str, Any]:
 
 def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
     """Make the simulator that the campaign was begun with."""
-    from trustbo.logs.netcdf import read_tree
+    from trustbo.campaign.replacing import STATE, current
+    from trustbo.campaign.result import read_workspace
+    from trustbo.files import interpreting
     from trustbo.simulation import KinematicSimulator
     from trustbo.workspace import Sight
-    from trustbo.workspace import netcdf as archive
 
-    workspace = archive.workspace_from_tree(read_tree(folder / "workspace.nc"))
-    sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
-    return KinematicSimulator(
-        workspace, sight=sight, tick=notes["tick"], bounding=notes["bounding"]
-    )
+    workspace = read_workspace(current(folder))
+    with interpreting(folder / STATE):
+        sight = Sight(notes["sight"], notes["extinction"], notes["crown_base"])
+        return KinematicSimulator(
+            workspace, sight=sight, tick=notes["tick"], bounding=notes["bounding"]
+        )

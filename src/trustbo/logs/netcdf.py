@@ -1,6 +1,8 @@
 """Missions as trees of arrays, for netCDF files."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,20 @@ import xarray as xr
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import FilePath, defer_interrupt, read_checked, remove_checked, write_checked
+from trustbo.files import (
+    FilePath,
+    defer_interrupt,
+    interpreting,
+    read_checked,
+    remove_checked,
+    write_checked,
+)
 from trustbo.stacking import require_same_team
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
+_PACKED, _SMALL = 100, 1 << 28
+"""Bytes that a byte of a file may unpack to, and bytes that any file may."""
 
 
 def read_tree(path: FilePath) -> xr.DataTree:
@@ -24,10 +35,31 @@ def read_tree(path: FilePath) -> xr.DataTree:
     """
     content = read_checked(path)
     try:
-        with defer_interrupt(), xr.open_datatree(content, engine="netcdf4") as tree:
-            return tree.load()
-    except (OSError, ValueError, RuntimeError, KeyError):
+        with defer_interrupt():
+            _require_size(content)
+            with xr.open_datatree(content, engine="netcdf4") as tree:
+                return tree.load()
+    except MemoryError as error:
+        raise DamagedFileError(f"{str(path)!r} is too large for memory {error}.") from None
+    except Exception:  # the library raises many kinds for bytes that are no netCDF
         raise DamagedFileError(f"{str(path)!r} is damaged, or no netCDF file.") from None
+
+
+def _require_size(content: bytes) -> None:
+    """Raise MemoryError for a file whose arrays have far more bytes than it."""
+    import netCDF4  # loaded only where netCDF is read
+
+    most = _PACKED * len(content) + _SMALL
+    with netCDF4.Dataset("a file", memory=content) as data:
+        size, groups = 0, [data]
+        while groups:
+            group = groups.pop()
+            groups += group.groups.values()
+            for array in group.variables.values():
+                kind = array.dtype  # str, for texts of any length
+                size += math.prod(array.shape) * (kind.itemsize if kind is not str else 8)
+    if size > most:
+        raise MemoryError(f"({len(content)} bytes unpack to {size})")
 
 
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
@@ -82,7 +114,7 @@ def read_missions(path: FilePath) -> list[Mission]:
 
 def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
     """Missions of a tree that was read from a file, see `read_missions`."""
-    try:
+    with _holding_missions(path):
         table = {str(n): a.values for n, a in tree["missions"].to_dataset().variables.items()}
         if "exposure" in table:  # its name in version 0.1
             table["n_ticks"] = table.pop("exposure")
@@ -94,8 +126,16 @@ def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
                 ticks = read_tree(file).to_dataset()
             missions.append(_mission(table, j, ticks))
         return missions
-    except KeyError as error:
-        raise DamagedFileError(f"{str(path)!r} holds no missions: it lacks {error}.") from None
+
+
+@contextmanager
+def _holding_missions(path: FilePath) -> Iterator[None]:
+    """Name what a file of missions lacks."""
+    with interpreting(path):
+        try:
+            yield
+        except KeyError as error:
+            raise DamagedFileError(f"{str(path)!r} holds no missions: it lacks {error}.") from None
 
 
 def _table(missions: Sequence[Mission]) -> xr.Dataset:

@@ -22,7 +22,8 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.to_dataset() for n, index in workspace.composites.items()}
     if workspace.terrain is not None and workspace.pixels is not None:
-        tree |= {"terrain": workspace.terrain, "pixels": workspace.pixels.drop_vars("spatial_ref")}
+        pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # the terrain's
+        tree |= {"terrain": workspace.terrain, "pixels": pixels}
     result = xr.DataTree.from_dict(tree)
     result.attrs = {
         "grid": to_json(asdict(workspace.grid)),
@@ -37,7 +38,10 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     """Convert a tree of `workspace_to_tree` back."""
     cells = tree["cells"].to_dataset()
     grid, team = json.loads(tree.attrs["grid"]), json.loads(tree.attrs["team"])
-    has_terrain = "terrain" in tree
+    terrain = pixels = None
+    if "terrain" in tree:
+        terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
+        pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])
     return Workspace(
         cells["awareness"],
         cells["passable"],
@@ -47,8 +51,8 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
             lead=Robot(**team["lead"]),
             names=tuple(team["names"]),
         ),
-        tree["terrain"].to_dataset().set_coords("spatial_ref") if has_terrain else None,
-        tree["pixels"].to_dataset() if has_terrain else None,
+        terrain,
+        pixels,
         {
             name: CompositeIndex.from_dataset(node.to_dataset())
             for name, node in (tree["composites"].children if "composites" in tree else {}).items()

@@ -1,0 +1,264 @@
+"""Folders of campaigns and results: the files in them that are ours, and replacing them whole.
+
+A campaign or result that replaces another is first written whole to a hidden folder within its
+folder. One renaming makes that the successor, which is read from then on; then its files get their
+names in the folder, and the hidden folder goes. Wherever a process dies, a reader finds the one
+before or the successor, whole.
+"""
+
+import os
+import re
+import secrets
+import shutil
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.files import (
+    FilePath,
+    folder_to_disk,
+    naming_refusal,
+    read_record,
+    remove_checked,
+    remove_leftovers,
+    require_folder,
+    sum_file,
+    temporary_name,
+)
+
+STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
+_RECORDS = (STATE, RESULT)
+_OTHERS = ("missions.nc", "history.nc", "history.csv", "believed.nc", "posterior.nc")
+_NAMES = (*_OTHERS, MEASURED, WORKSPACE, RESULT, STATE)
+"""Names of our files, the records last: what they describe is removed before them."""
+_ROOMS = ("posteriors", "ticks")
+"""Folders of numbered files."""
+_NEXT, _NEW, _OLD = ".trustbo-next", ".trustbo-new-", ".trustbo-old-"
+_MARKED = re.compile(r"\.trustbo-(new|old)-\w+")
+_INPUTS = ("dem.tif", "dsm.tif")
+"""Rasters that lie with a campaign by custom."""
+
+
+def current(folder: Path) -> Path:
+    """Return the folder to read: the successor within it, if one is whole and not in place yet."""
+    successor = folder / _NEXT
+    return successor if successor.is_dir() and not successor.is_symlink() else folder
+
+
+@contextmanager
+def held(directory: FilePath, remedy: str = "") -> Iterator[Path]:
+    """Hold a folder, made if need be, against every other process; TrustboError if it is held."""
+    lock = hold(directory, remedy)
+    try:
+        yield Path(directory)
+    finally:
+        lock.release()
+
+
+def hold(directory: FilePath, remedy: str = "") -> FileLock:
+    """Return the lock of a folder, with nothing half-done left in it; see `held`."""
+    folder = require_folder(directory)
+    lock = FileLock(folder / ".trustbo.lock", timeout=0)
+    with naming_refusal(folder, remedy=remedy):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise TrustboError(
+                f"another campaign is at work in {str(folder)!r}; close it first, or choose "
+                "another folder."
+            ) from None
+        try:
+            for room in (folder, *(folder / name for name in _ROOMS)):
+                remove_leftovers(room)
+            for left in [f for f in folder.iterdir() if _MARKED.fullmatch(f.name)]:
+                _clear(left)
+            _put_in_place(folder)
+        except BaseException:
+            lock.release()
+            raise
+    return lock
+
+
+@contextmanager
+def replacing(folder: Path) -> Iterator[Path]:
+    """Give a new folder to write a campaign or result to, which then replaces that in `folder`.
+
+    `folder` must be held. Where writing fails, it is as it was.
+    """
+    require_ours(folder)
+    with naming_refusal(folder):
+        new = Path(tempfile.mkdtemp(prefix=_NEW, dir=folder))
+    try:
+        yield new
+        folder_to_disk(new)
+        with naming_refusal(folder):
+            os.rename(new, folder / _NEXT)
+    except BaseException:
+        _clear(new)
+        raise
+    folder_to_disk(folder)
+    _put_in_place(folder)
+
+
+def require_ours(folder: Path, *others: str) -> None:
+    """Refuse a folder in which a file of another program has the name of one of ours.
+
+    `others` are names of more files to be written. Other files of a folder that was not ours stay,
+    and a warning names them.
+
+    Raises:
+        TrustboError: Such a file, or a link in place of a folder of ours.
+    """
+    if not folder.is_dir():
+        return
+    for room in _ROOMS:
+        if (folder / room).is_symlink():
+            raise TrustboError(
+                f"{str(folder / room)!r} is a link; files are replaced there that may be of "
+                "another campaign. Make it a folder, or choose another folder for the campaign."
+            )
+    known, ours = own_files(folder), _is_ours(folder)
+    more = [] if ours else [folder / name for name in others]
+    for file in (*_files(folder), *more):
+        if os.path.lexists(file) and file not in known:
+            raise TrustboError(
+                f"{str(file)!r} was not written by trustbo, and would be replaced; move it, or "
+                "choose another folder."
+            )
+
+
+def warn_of_others(folder: Path) -> None:
+    """Warn of what lies in a folder that no campaign or result was kept in before."""
+    if not folder.is_dir() or _is_ours(folder):
+        return
+    own = {f.relative_to(folder).parts[0] for f in own_files(folder)} | set(_INPUTS)
+    names = sorted(f.name for f in folder.iterdir())
+    names = [name for name in names if name not in own and not name.startswith(".")]
+    if names:
+        listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        warnings.warn(
+            f"{str(folder)!r} holds other files too ({listed}); they are left as they are.",
+            stacklevel=2,
+        )
+
+
+def own_files(folder: Path) -> list[Path]:
+    """Files of a campaign or result in a folder that this library wrote, its records last.
+
+    Our names in a folder of ours; numbered ones if they have a sum, or a record counts them, for
+    version 0.1 wrote no sums.
+    """
+    known, counted = _is_ours(folder), {f"{after:04d}.nc" for after in _counted(folder)}
+    return [
+        file
+        for file in _files(folder)
+        if file.is_file()
+        and (
+            known
+            if file.parent == folder
+            else sum_file(file).is_file()
+            or (file.parent.name == _ROOMS[0] and file.name in counted)
+        )
+    ]
+
+
+def _files(folder: Path) -> list[Path]:
+    """Names of ours in a folder, numbered ones that are there and others that may be."""
+    numbered = []
+    for room in (folder / name for name in _ROOMS):
+        if room.is_dir() and not room.is_symlink():
+            numbered += [f for f in sorted(room.iterdir()) if re.fullmatch(r"\d{4,}\.nc", f.name)]
+    return [*numbered, *(folder / name for name in _NAMES)]
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder holds a campaign or result, be it damaged, or one whose writing died."""
+    names = (folder / name for name in (*_RECORDS, WORKSPACE, MEASURED))
+    return any(f.is_file() and sum_file(f).is_file() for f in names) or bool(_records(folder))
+
+
+def _records(folder: Path) -> list[dict[str, Any]]:
+    """Records in a folder that can be read, of a campaign or a result."""
+    found = []
+    for name in _RECORDS:
+        with suppress(DamagedFileError):
+            record = read_record(folder / name)
+            if isinstance(record, dict) and {"n_missions", "stop_reason"} <= record.keys():
+                found.append(record)
+    return found
+
+
+def _counted(folder: Path) -> set[int]:
+    """Numbers of the posteriors that the records of a folder count."""
+    found = set()
+    for record in _records(folder):
+        n, after = record["n_missions"], record.get("posterior_after")
+        if after is None and isinstance(n, int):  # of version 0.1: one a mission
+            after = range(1, min(n, 10_000) + 1)
+        if isinstance(after, list | range):
+            found |= {number for number in after if isinstance(number, int)}
+    return found
+
+
+def _put_in_place(folder: Path) -> None:
+    """Give the files of a successor their names in the folder; again, where that was cut off."""
+    successor = current(folder)
+    if successor == folder:
+        return
+    written = [f for own in own_files(successor) for f in (own, sum_file(own)) if f.is_file()]
+    files = [file.relative_to(successor) for file in written]
+    for file in own_files(folder):
+        if file.relative_to(folder) not in files:
+            _remove(file)
+    for name in files:
+        _link(successor / name, folder / name)
+    folder_to_disk(folder)
+    # It is read no longer once it has another name.
+    old = folder / f"{_OLD}{secrets.token_hex(4)}"
+    os.rename(successor, old)
+    folder_to_disk(folder)
+    _clear(old)
+
+
+def _remove(file: Path) -> None:
+    if sum_file(file).is_file():
+        remove_checked(file)
+    else:
+        file.unlink(missing_ok=True)
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give a file another name, which replaces what goes by it; a copy where links are refused."""
+    if os.path.lexists(target) and os.path.samestat(source.lstat(), target.lstat()):
+        return
+    target.parent.mkdir(exist_ok=True)
+    temporary = temporary_name(target)
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(source, temporary)
+    except OSError:
+        shutil.copyfile(source, temporary)
+    os.replace(temporary, target)
+
+
+def _clear(folder: Path) -> None:
+    """Remove what we wrote to a hidden folder of ours, and the folder if nothing else is in it."""
+    if folder.is_symlink() or not folder.is_dir():
+        return
+    for room in (*(folder / name for name in _ROOMS), folder):
+        if room.is_symlink() or not room.is_dir():
+            continue
+        remove_leftovers(room)
+        own = {f for file in _files(folder) for f in (file, sum_file(file)) if f.parent == room}
+        own |= {f for f in room.glob(".*.sha256") if re.fullmatch(r"\.\d+\.nc\.sha256", f.name)}
+        for file in own:
+            file.unlink(missing_ok=True)
+        with suppress(OSError):  # not empty
+            room.rmdir()
