@@ -6,7 +6,7 @@
 # make docs       build the documentation site, and say where to open it
 # make bench      install the peers, and print the figures we claim beside theirs
 # make peers      ask pip whether the peers can be installed, and install nothing
-# make clean      remove everything that make made
+# make clean      remove what make made, but not the campaigns in out/
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -47,8 +47,9 @@ peers: $(VENV)/.installed
 	$(PIP) --dry-run --editable ".[bench]"
 
 clean:
-	rm -rf $(VENV) .cache out build dist .pytest_cache .ruff_cache .import_linter_cache
-	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) .cache out/docs build dist .pytest_cache .ruff_cache .import_linter_cache
+	rm -rf __pycache__
+	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
 	@python=$$(sh scripts/find_python.sh) && echo "creating $(VENV) with $$python" && \

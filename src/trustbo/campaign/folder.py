@@ -17,6 +17,7 @@ from trustbo.campaign.replacing import (
     current,
     hold,
     replacing,
+    require_ours,
     warn_of_others,
 )
 from trustbo.campaign.result import Result, read_kept, read_workspace
@@ -91,6 +92,7 @@ class CampaignFolder:
         Raises:
             TrustboError: A file of another program would be replaced; see `require_ours`.
         """
+        require_ours(self.path)
         warn_of_others(self.path)
         n_ticks, self._n_ticks = self._n_ticks, 0
         try:

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from trustbo.plots import Explorer
 
 _MISSIONS, _HISTORY, _BELIEVED = "missions.nc", "history.nc", "believed.nc"
+_POSTERIOR = "posterior.nc"
 
 
 _NEW = ("max_failure", "failure_cost")
@@ -268,14 +269,15 @@ class Result(Displayed):
                     f"{str(folder)!r} holds a campaign, with missions as they were told, which a "
                     "result does not have; give another folder."
                 )
-            if self.has_posterior:
-                write_tree(held_there / "posterior.nc", self.posterior)
+            whole = held_there / _POSTERIOR
+            if self.has_posterior and not whole.exists():  # written when a campaign ends
+                write_tree(whole, self.posterior)
             return
         with held(folder), replacing(folder) as new:
             write_tree(new / WORKSPACE, archive.workspace_to_tree(self.workspace))
             self.write(new, whole=True, home=folder)
             if self.has_posterior:
-                write_tree(new / "posterior.nc", self.posterior)
+                write_tree(new / _POSTERIOR, self.posterior)
 
     def write(self, folder: Path, *, whole: bool, home: Path) -> None:
         """Write all but the workspace, for a campaign that is kept.

@@ -28,13 +28,13 @@ def study(
     use_no_screen()
     with one_line_errors(debug):
         from trustbo import plots
-        from trustbo.files import require_file, write_text
+        from trustbo.files import write_text
         from trustbo.spreadsheet import frame_as_csv
         from trustbo.study import run_study, summary
+        from trustbo.study.store import Store
         from trustbo.study.table import axes_of
 
-        for name in ("summary.csv", "regret.png"):
-            require_file(out / name)
+        Store(out).require_free("summary.csv", "regret.png")
         if executor is None:
             executor = "loky" if find_spec("loky") else "serial"
         results = run_study(config, out, executor, n_workers=workers, progress=not quiet)

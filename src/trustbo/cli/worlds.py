@@ -36,12 +36,13 @@ def worlds(
     the rest. Your own policy, model or simulator is named module:name.
     """
     with one_line_errors(debug):
-        from trustbo.files import require_file, write_text
+        from trustbo.files import write_text
         from trustbo.spreadsheet import frame_as_csv
         from trustbo.study.benchmark import as_text, run_worlds, worlds_table
         from trustbo.study.contenders import BASELINES
+        from trustbo.study.store import Store
 
-        require_file(out / "worlds.csv")
+        Store(out).require_free("worlds.csv")
         if executor is None:
             executor = "loky" if find_spec("loky") and not quick else "serial"
         chosen = {

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trustbo.errors import TrustboError, pip_install
-from trustbo.files import naming_refusal
+from trustbo.files import naming_refusal, require_regular
 from trustbo.logs.messages import CONTACT_TYPES, POSE_TYPES, READERS, Messages, stamp_of
 from trustbo.logs.recording import Series
 
@@ -113,6 +113,8 @@ def opened(path: Path) -> Iterator[Bag]:
         raise _no_rosbags() from None
     if not path.exists():
         raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
+    if not path.is_dir():
+        require_regular(path)
     try:
         # Bags of ROS 2 before Iron do not define their types.
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -10,7 +10,7 @@ from scipy import stats
 from tqdm import tqdm
 
 from trustbo.errors import TrustboError, require_whole
-from trustbo.files import FilePath, write_text
+from trustbo.files import FilePath, read_record, write_text
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
@@ -154,7 +154,9 @@ def _uniformity(ranks: np.ndarray, n_ranked: int) -> float:
 def _read(checkpoint: FilePath | None, asked: str) -> list[dict[str, int]]:
     if checkpoint is None or not Path(checkpoint).exists():
         return []
-    kept = json.loads(Path(checkpoint).read_text(encoding="utf-8"))
+    kept = read_record(checkpoint, checked=False)
+    if not isinstance(kept, dict) or not {"asked", "ranks"} <= kept.keys():
+        raise TrustboError(f"{str(checkpoint)!r} holds no ranks; give another file, or delete it.")
     if kept["asked"] != asked:
         raise TrustboError(
             f"{str(checkpoint)!r} holds ranks of other arguments: {kept['asked']}. Give another "

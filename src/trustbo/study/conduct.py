@@ -10,7 +10,7 @@ import xarray as xr
 from tqdm import tqdm
 
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath
+from trustbo.files import FilePath, interpreting
 from trustbo.models.backend import VERSIONS
 from trustbo.study.configuration import Study, read_study
 from trustbo.study.executors import completed, require_executor
@@ -122,7 +122,8 @@ def load_study(directory: FilePath) -> xr.Dataset:
     records = {key: store.read(key) for key in table if store.has(key)}
     if not records:
         raise TrustboError(f"no run of the study in {str(store.folder)!r} has ended yet.")
-    dataset = to_dataset(records, table)
+    with interpreting(store.folder):
+        dataset = to_dataset(records, table)
     n_failed = sum(store.failure(key) is not None for key in table)
     return dataset.assign_attrs(n_runs=len(table), n_failed=n_failed)
 

@@ -2,11 +2,12 @@
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
-from trustbo.errors import TrustboError
-from trustbo.files import FilePath, require_folder, write_text
+from trustbo.errors import DamagedFileError, TrustboError
+from trustbo.files import FilePath, read_record, require_file, require_folder, write_text
 from trustbo.study.run import Run
 
 
@@ -17,8 +18,24 @@ class Store:
         """Use a folder, which need not exist yet; TrustboError if its name belongs to a file."""
         self.folder = require_folder(directory)
 
+    def require_free(self, *names: str) -> None:
+        """Refuse a folder where tables or figures would replace files of another program.
+
+        Raises:
+            TrustboError: One of these names is taken, by a folder, or in a folder without a study.
+        """
+        for name in names:
+            file = require_file(self.folder / name)
+            if file.exists() and not (self.folder / "study.json").is_file():
+                raise TrustboError(
+                    f"{str(file)!r} was not written by trustbo, and would be replaced; move it, "
+                    "or choose another folder."
+                )
+
     def write_study(self, settings: dict[str, Any], runs: list[Run]) -> None:
         """Write `study.json`: the settings, and the table of runs by key."""
+        if os.path.lexists(self.folder / "study.json"):
+            self.table()  # refuses a file of another program
         table = {run.key: run.labels for run in runs}
         self._write("study.json", {"study": settings, "runs": table})
 
@@ -29,7 +46,10 @@ class Store:
             raise TrustboError(
                 f"{str(self.folder)!r} holds no study; give a folder that run_study wrote to."
             )
-        return json.loads(file.read_text(encoding="utf-8"))["runs"]
+        runs = _read(file).get("runs")
+        if not isinstance(runs, dict) or not all(isinstance(one, dict) for one in runs.values()):
+            raise DamagedFileError(f"{str(file)!r} is damaged, or of no study: it has no runs.")
+        return runs
 
     def has(self, key: str) -> bool:
         """Whether the run has ended."""
@@ -45,12 +65,12 @@ class Store:
 
     def read(self, key: str) -> dict[str, Any]:
         """Read the record of a run that has ended."""
-        return json.loads(self._run(key).read_text(encoding="utf-8"))
+        return _read(self._run(key))
 
     def failure(self, key: str) -> dict[str, Any] | None:
         """Read the record of a run that failed; None if it did not."""
         file = self._failure(key)
-        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+        return _read(file) if file.is_file() else None
 
     def _run(self, key: str) -> Path:
         return self.folder / "runs" / f"{key}.json"
@@ -61,6 +81,13 @@ class Store:
     def _write(self, name: str, record: dict[str, Any]) -> None:
         text = json.dumps(_plain(record), indent=1, allow_nan=False, default=str)
         write_text(self.folder / name, text)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    record = read_record(file, checked=False)
+    if not isinstance(record, dict):
+        raise DamagedFileError(f"{str(file)!r} is damaged: no record of fields.")
+    return record
 
 
 def _plain(value: Any) -> Any:

@@ -13,7 +13,7 @@ from sklearn.decomposition import PCA
 
 from trustbo import zheng2023
 from trustbo.errors import TerrainError, TrustboError, require_choice, require_whole
-from trustbo.files import FilePath, write_file
+from trustbo.files import FilePath, interpreting, require_regular, write_file
 
 SCALINGS = ("percentile", "minmax", "logistic")
 METHODS = ("pca", "zheng2023")
@@ -227,7 +227,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
     @classmethod
     def load(cls, path: FilePath) -> Self:
         """Read an index that `save` wrote."""
-        with xr.open_dataset(path) as data:
+        with interpreting(require_regular(path)), xr.open_dataset(path) as data:
             return cls.from_dataset(data.load())
 
     def _columns(self, features: xr.Dataset) -> Sequence[np.ndarray]:

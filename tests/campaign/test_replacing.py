@@ -1,0 +1,293 @@
+"""A folder keeps what others wrote, and a campaign in it is replaced as a whole or not at all."""
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulators import ModelSimulator
+
+import trustbo as tb
+from trustbo.campaign.replacing import current, own_files
+
+ENDS = ((2, 0), (0, 2))
+FOREIGN = (
+    "notes.txt", "results.csv", ".bashrc.1", ".notes.2024.csv", "posteriors/mine.nc",
+    "posteriors/.draft.12.nc", "ticks/readme.7", "sub/.survey.2023.tif", "sub/.git/.x.12",
+)  # fmt: skip
+
+
+def make_workspace():
+    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(2, 3, 3, 2)))
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return make_workspace()
+
+
+def run(workspace, folder, seed=0, n=2, **options):
+    return tb.iterate(
+        workspace, *ENDS, n_iterations=n, simulator=ModelSimulator(workspace), checkpoint=folder,
+        seed=seed, sampler="exact", policy="random", progress=False, **options,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def kept(workspace, tmp_path_factory):
+    """Folder of a campaign of two missions; tests copy it."""
+    folder = tmp_path_factory.mktemp("kept") / "campaign"
+    run(workspace, folder)
+    return folder
+
+
+@pytest.fixture
+def folder(kept, tmp_path):
+    return Path(shutil.copytree(kept, tmp_path / "folder"))
+
+
+def add_foreign(folder, parent):
+    """Files of others in a folder, and links to a file and a folder elsewhere."""
+    elsewhere = parent / "elsewhere"
+    (elsewhere / "posteriors").mkdir(parents=True, exist_ok=True)
+    (elsewhere / ".a.12").write_text("elsewhere")
+    (elsewhere / "posteriors" / "0001.nc").write_text("elsewhere")
+    for name in FOREIGN:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(f"mine: {name}")
+    (folder / "posteriors" / "linked.nc").symlink_to(elsewhere / ".a.12")
+    (folder / ".linked.12").symlink_to(elsewhere / ".a.12")
+    (folder / "linked").symlink_to(elsewhere)
+    return [elsewhere, *(folder / name for name in (*FOREIGN, "posteriors/linked.nc",
+                                                    ".linked.12", "linked"))]  # fmt: skip
+
+
+def contents(paths):
+    """What is at paths, links not followed."""
+    found = {}
+    for path in paths:
+        inside = [path, *path.rglob("*")] if path.is_dir() and not path.is_symlink() else [path]
+        for file in inside:
+            if file.is_symlink():
+                found[file] = os.readlink(file)
+            elif not file.is_dir():
+                found[file] = hashlib.sha256(file.read_bytes()).hexdigest()
+    return found
+
+
+def replacements(workspace):
+    """Ways to replace the campaign in a folder."""
+
+    def keep(folder, other):
+        with tb.Campaign.load(other) as campaign:
+            campaign.keep(folder)
+
+    def save(folder, other):
+        with tb.Campaign.load(other) as campaign:
+            campaign.save(folder)
+
+    def begin(folder, other):
+        run(tb.load_result(folder).workspace, folder, seed=1, n=1)
+
+    def set_aside(folder, other):
+        with tb.Campaign.load(folder) as campaign:
+            campaign.set_aside("a test")
+
+    def save_result(folder, other):
+        for record in (folder / "campaign.json", folder / ".campaign.json.sha256"):
+            record.unlink()  # else it is refused
+        tb.load_result(other).save(folder)
+
+    return {f.__name__: f for f in (keep, save, begin, set_aside, save_result)}
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory):
+    """Folder of a campaign on other awareness, of one mission."""
+    folder = tmp_path_factory.mktemp("other") / "campaign"
+    awareness = np.random.default_rng(5).uniform(size=(2, 3, 3, 2))
+    run(tb.Workspace.from_awareness(awareness), folder, seed=3, n=1)
+    return folder
+
+
+@pytest.mark.parametrize("how", [*replacements(None), "resume", "load"])
+def test_files_of_others_are_kept(how, workspace, folder, other, tmp_path):
+    before = contents(add_foreign(folder, tmp_path))
+    if how == "resume":
+        tb.resume(folder, simulator=ModelSimulator(workspace), n_iterations=3, progress=False)
+    elif how == "load":
+        tb.Campaign.load(folder).close()
+    else:
+        replacements(workspace)[how](folder, other)
+    assert contents(before) == before
+    stems = {f.stem for f in (folder / "posteriors").glob("0*.nc")}
+    n = {"resume": 3, "load": 2, "set_aside": 2}.get(how, 1)
+    assert stems == {f"{j + 1:04d}" for j in range(n)}
+    assert not [f.name for f in folder.iterdir() if f.name.startswith((".trustbo-",))]
+
+
+def test_a_folder_of_other_files_is_used_with_a_warning(workspace, tmp_path):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    before = contents(add_foreign(folder, tmp_path))
+    with pytest.warns(UserWarning, match=r"folder' holds other files too .linked, notes.txt, pos"):
+        run(workspace, folder, n=1)
+    assert contents(before) == before
+    with pytest.warns(UserWarning, match="holds other files too") as said:
+        (tmp_path / "next").mkdir()
+        (tmp_path / "next" / "mine").write_text("")
+        tb.Campaign(workspace, *ENDS, directory=tmp_path / "next").close()
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize(
+    "name", ["history.csv", "result.json", "measured.nc", "posteriors/0001.nc", "ticks/0002.nc"]
+)
+def test_a_file_of_others_with_our_name_is_not_replaced(name, workspace, tmp_path):
+    mine = tmp_path / "folder" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_text('{"mine": 1}')
+    result = tb.load_result(run_once(workspace, tmp_path))
+    for replace in (
+        lambda: tb.Campaign(workspace, *ENDS, directory=tmp_path / "folder"),
+        lambda: run(workspace, tmp_path / "folder"),
+        lambda: result.save(tmp_path / "folder"),
+    ):
+        with pytest.raises(tb.TrustboError, match=f"{name}' was not written by trustbo, and wou"):
+            replace()
+    assert [f.read_text() for f in (tmp_path / "folder").rglob("*") if f.suffix == mine.suffix] == [
+        '{"mine": 1}'
+    ]
+
+
+def run_once(workspace, tmp_path):
+    run(workspace, tmp_path / "once", n=1)
+    return tmp_path / "once"
+
+
+def test_a_linked_folder_of_posteriors_is_not_written_to(workspace, folder, other):
+    (folder / "posteriors").rename(folder.parent / "posteriors")
+    (folder / "posteriors").symlink_to(folder.parent / "posteriors")
+    before = contents([folder.parent / "posteriors"])
+    with pytest.raises(tb.TrustboError, match="posteriors' is a link; files are replaced there"):
+        run(workspace, folder)
+    assert contents(before) == before
+    assert len(tb.load_result(folder).posteriors[0].children) > 0  # it is read
+
+
+def test_a_result_does_not_replace_a_campaign(folder, other):
+    result = tb.load_result(other)
+    before = contents([folder])
+    with pytest.raises(tb.TrustboError, match="holds a campaign, with missions as they were told"):
+        result.save(folder)
+    assert contents([folder]) == before
+    tb.load_result(folder).save(folder)  # its own is there already
+    assert contents([folder]) == before
+
+
+def numbers(folder):
+    """What a reader finds: of the result, None if there is none; and of the campaign."""
+    try:
+        result = tb.load_result(folder)
+        read = (
+            len(result.missions), result.workspace.awareness.values.tobytes(), tuple(result.path),
+            result.history["state"].values.tolist(), result.trust.tobytes(),
+            [p and p["posterior"]["b"].values.tobytes() for p in result.posteriors],
+            [m.contact_rate.tobytes() for m in result.missions],
+        )  # fmt: skip
+    except tb.DamagedFileError:
+        raise
+    except tb.TrustboError:
+        read = None
+    if not (current(folder) / "campaign.json").exists():
+        return read, None
+    copy = folder.with_name(f"{folder.name}-opened")
+    shutil.copytree(folder, copy, symlinks=True)
+    try:
+        with tb.Campaign.load(copy) as campaign:
+            rates = [mission.contact_rate.tobytes() for mission in campaign.log.measured]
+            states = [entry.state for entry in campaign.log.entries]
+            whole = (rates, states, campaign.workspace.awareness.values.tobytes(), campaign.seed)
+    finally:
+        shutil.rmtree(copy)
+    return read, whole
+
+
+def moments_of(folder, copies, monkeypatch):
+    """Copy the folder just before each change of it, as a kill then leaves it."""
+
+    def watched(change):
+        def changes(file, *others, **options):
+            if folder in Path(file).parents and os.path.lexists(file):
+                copies.append(copies[0].with_name(f"moment{len(copies)}"))
+                shutil.copytree(folder, copies[-1], symlinks=True)
+            return change(file, *others, **options)
+
+        return changes
+
+    for name in ("replace", "rename", "link"):
+        monkeypatch.setattr(os, name, watched(getattr(os, name)))
+    for name in ("unlink", "rmdir"):
+        monkeypatch.setattr(Path, name, watched(getattr(Path, name)))
+
+
+@pytest.mark.parametrize("how", replacements(None))
+def test_wherever_it_dies_there_is_the_old_campaign_or_the_new(
+    how, workspace, folder, other, tmp_path, monkeypatch
+):
+    replace, copies = replacements(workspace)[how], [tmp_path / "moment0"]
+    shutil.copytree(folder, copies[0])
+    if how == "save_result":
+        for record in ("campaign.json", ".campaign.json.sha256"):
+            (copies[0] / record).unlink()
+            (folder / record).unlink()
+    found = [numbers(copies[0])]
+    with monkeypatch.context() as patch:
+        moments_of(folder, copies, patch)
+        if how == "save_result":
+            tb.load_result(other).save(folder)
+        elif how == "begin":  # what comes after is no replacement
+            tb.Campaign(tb.load_result(folder).workspace, *ENDS, seed=1).keep(folder)
+        else:
+            replace(folder, other)
+    found += [numbers(copy) for copy in (*copies[1:], folder)]
+    assert len(found) > 30
+    old, new = found[0], found[-1]
+    assert old != new
+    assert all(each in (old, new) for each in found)
+    turns = sum(a != b for a, b in zip(found, found[1:], strict=False))
+    assert turns == 1
+
+
+def test_a_replacement_that_fails_leaves_everything(workspace, folder, monkeypatch):
+    before = contents(own_files(folder))
+    with tb.Campaign.load(folder) as campaign, monkeypatch.context() as patch:
+        patch.setattr("trustbo.campaign.result.write_missions", None)
+        with pytest.raises(TypeError):
+            campaign.save(folder)
+        patch.undo()
+        assert contents(before) == before
+        assert not [f.name for f in folder.iterdir() if f.name.startswith(".trustbo-")]
+        campaign.save(folder)
+
+
+def test_without_hard_links_files_are_copied(folder, other, monkeypatch):
+    def refuse(*names):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    replacements(None)["save"](folder, other)
+    assert numbers(folder) == numbers(other)
+
+
+def test_a_folder_of_version_0_1_is_replaced_and_what_has_gone_is_gone(workspace, tmp_path):
+    folder = tmp_path / "old"
+    shutil.copytree(Path(__file__).parents[1] / "data" / "campaign_0.1", folder)
+    (folder / "posteriors" / "mine.nc").write_text("mine")
+    with tb.Campaign(workspace, *ENDS) as campaign:
+        campaign.keep(folder)
+    names = {f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file()}
+    shown = {name for name in names if not Path(name).name.startswith(".")}
+    assert shown == {"campaign.json", "workspace.nc", "posteriors/mine.nc"}
