@@ -3,6 +3,7 @@
 import hashlib
 import os
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -135,11 +136,7 @@ def test_a_folder_of_other_files_is_used_with_a_warning(workspace, tmp_path):
     with pytest.warns(UserWarning, match=r"folder' holds other files too .linked, notes.txt, pos"):
         run(workspace, folder, n=1)
     assert contents(before) == before
-    with pytest.warns(UserWarning, match="holds other files too") as said:
-        (tmp_path / "next").mkdir()
-        (tmp_path / "next" / "mine").write_text("")
-        tb.Campaign(workspace, *ENDS, directory=tmp_path / "next").close()
-    assert len(said) == 1
+    tb.Campaign.load(folder).close()  # and silently later, as warnings are errors here
 
 
 @pytest.mark.parametrize(
@@ -257,7 +254,7 @@ def test_wherever_it_dies_there_is_the_old_campaign_or_the_new(
     old, new = found[0], found[-1]
     assert old != new
     assert all(each in (old, new) for each in found)
-    turns = sum(a != b for a, b in zip(found, found[1:], strict=False))
+    turns = sum(a != b for a, b in pairwise(found))
     assert turns == 1
 
 
