@@ -6,10 +6,13 @@ Each campaign is drawn from its seed: terrain or awareness alone, shape, robots,
 policy, objective, options, threats, odd data. It is run once undisturbed and once with mishaps, and
 must come to the same paths, states and posterior. Counted are exceptions that are no TrustboError,
 missions that were told and are not in the folder, folders that do not open, and campaigns that
-differ. Outcomes are appended to FILE (out/chaos.jsonl), a line each; run again, it goes on.
+differ. Every folder holds files of other programs, some in links: none may be missing or changed.
+Each is then read, saved, and read again, twice round, and must be equal. Outcomes are appended to
+FILE (out/chaos.jsonl), a line each; run again, it goes on.
 """
 
 import errno
+import hashlib
 import json
 import os
 import shutil
@@ -27,12 +30,19 @@ import numpy as np
 
 import trustbo as tb
 import trustbo.files
+from trustbo.campaign.replacing import current, own_files
 from trustbo.models import CoupledTrust, PooledTrust, TrustParams
 from trustbo.simulation import Degradation, KinematicSimulator, ModelSimulator, Threat
 
 N = next((int(word) for word in sys.argv[1:] if word.isdigit()), 300)
 OUT = Path(sys.argv[sys.argv.index("--out") + 1] if "--out" in sys.argv else "out/chaos.jsonl")
 MISHAPS = ("kill", "full disk", "flags", "damage", "errors in logs", "interrupt")
+FOREIGN = (
+    "notes.txt", "old.csv", ".bashrc.1", ".notes.2024.csv", "posteriors/mine.nc", "ticks/raw.12",
+    "posteriors/.draft.12.nc", "posteriors/copy of 0001.nc", "sub/.survey.2023.tif",
+    "sub/.git/.x.12",
+)  # fmt: skip
+LINKS = {"linked": "", ".linked.12": ".a.12", "posteriors/linked.nc": ".a.12", "ticks/all": ""}
 DATA = ("usual", "usual", "usual", "perfect", "none", "constant", "gaps", "nothing", "mixed")
 
 
@@ -137,6 +147,63 @@ def dies_at(write, error):
         trustbo.files.os.replace = replace_file
 
 
+def plant(folder, elsewhere):
+    """Put files of other programs into a folder, and links to some elsewhere; their contents."""
+    for file in (".a.12", "0001.nc", ".0002.4711.nc", "campaign.json"):
+        elsewhere.mkdir(exist_ok=True)
+        (elsewhere / file).write_text(f"elsewhere: {file}")
+    for name in FOREIGN:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(f"mine: {name}")
+    for name, target in LINKS.items():
+        (folder / name).symlink_to(elsewhere / target)
+    files = [*(folder / name for name in (*FOREIGN, *LINKS)), *elsewhere.iterdir()]
+    return {file: content(file) for file in files}
+
+
+def content(file):
+    """Target of a link, hash of a file, None where there is none."""
+    if file.is_symlink():
+        return os.readlink(file)
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.exists() else None
+
+
+def round_trip(folder, parent):
+    """Read, save and read a folder, twice round, as a result and as a campaign; what differs."""
+    first = before = tb.load_result(folder)
+    with tb.Campaign.load(folder) as campaign:
+        campaign.save(parent / "saved")
+        told = [np.nan_to_num(m.contact_rate, nan=-1.0) for m in campaign.log.measured]
+    for n in range(2):
+        before.save(parent / f"round{n}")
+        before = tb.load_result(parent / f"round{n}")
+        if not (same(first, before) and alike(first.workspace, before.workspace)):
+            return f"the result differs after {n + 1} rounds"
+        if not first.history.drop_vars("trust_map").equals(before.history.drop_vars("trust_map")):
+            return f"the history differs after {n + 1} rounds"
+    for n in range(2):
+        with tb.Campaign.load(parent / "saved") as campaign:
+            again = [np.nan_to_num(m.contact_rate, nan=-1.0) for m in campaign.log.measured]
+            if not all(map(np.array_equal, told, again)):
+                return "the missions as they were told differ"
+            campaign.save(parent / "saved")  # over itself
+        if not same(first, tb.load_result(parent / "saved")):
+            return f"the campaign differs after {n + 1} rounds"
+    for name in ("round0", "round1", "saved"):
+        shutil.rmtree(parent / name)
+    return ""
+
+
+def alike(one, other):
+    """Whether two workspaces are the same, terrain and pixels included."""
+    if (one.terrain is None) != (other.terrain is None):
+        return False
+    pairs = [(one.awareness, other.awareness), (one.passable, other.passable)]
+    if one.terrain is not None:
+        pairs += [(one.terrain, other.terrain), (one.pixels, other.pixels)]
+    return one.grid == other.grid and all(a.identical(b) for a, b in pairs)
+
+
 def same(one, other):
     """Whether two results have the same missions, states, posteriors and path."""
     if len(one.missions) != len(other.missions) or one.path != other.path:
@@ -161,7 +228,7 @@ def run(campaign, simulator, folder):
 
 def go_on(campaign, simulator, folder):
     """Resume, or begin anew where nothing had been begun."""
-    if not (folder / "campaign.json").exists():
+    if not (current(folder) / "campaign.json").exists():
         return run(campaign, simulator, folder)
     return tb.resume(folder, simulator=simulator, n_iterations=3, progress=False)
 
@@ -236,8 +303,8 @@ def bad_logs(rng, mission, earlier):
 def damage(rng, folder):
     """Change a file of a copy of the folder: it opens as it was, or names the file."""
     copy = folder.with_name(f"{folder.name}-copy")
-    shutil.copytree(folder, copy)
-    files = sorted(f for f in copy.rglob("*") if f.suffix in (".nc", ".json"))
+    shutil.copytree(folder, copy, symlinks=True)
+    files = [f for f in own_files(copy) if f.suffix in (".nc", ".json")]
     file = files[rng.integers(len(files))]
     content = bytearray(file.read_bytes())
     how = rng.integers(3)
@@ -273,6 +340,9 @@ def outcome(seed):
         except tb.TrustboError as refused:  # options that do not go together, before any work
             return record | {"outcome": "refused", "said": str(refused)}
         campaign = ((workspace, *ends), options)
+        planted = {}
+        for folder in folders:
+            planted |= plant(folder, Path(parent) / "elsewhere")
         try:
             plain = run(campaign, simulator, folders[0])
             disturbed = suffer(mishap, seed, campaign, simulator, folders[1])
@@ -283,6 +353,13 @@ def outcome(seed):
                 with tb.Campaign.load(folder) as opened:
                     if len(opened.missions) != 3:
                         return record | {"outcome": "lost a mission"}
+            record["foreign"] = len(planted)
+            record["gone"] = [f.name for f, was in planted.items() if content(f) != was]
+            record["round trips"] = 2
+            if said := [said for folder in folders if (said := round_trip(folder, Path(parent)))]:
+                return record | {"outcome": "not read as written", "said": said[0]}
+            if record["gone"]:
+                return record | {"outcome": "foreign files gone", "said": str(record["gone"])}
         except tb.TrustboError as refused:
             return record | {"outcome": "error", "said": str(refused),
                              "where": traceback.format_exc()[-1500:]}  # fmt: skip
@@ -312,6 +389,11 @@ def main():
     print(f"\n{N} campaigns: {dict(Counter(r['outcome'] for r in records))}")
     for name in ("data", "model", "sampler", "policy", "objective"):
         print(f"by {name}: {dict(Counter(r[name] for r in records))}")
+    planted, gone = (sum(n) for n in zip(*(
+        (r.get("foreign", 0), len(r.get("gone", ()))) for r in records), strict=True))  # fmt: skip
+    trips = sum(r.get("round trips", 0) for r in records)
+    print(f"foreign files: {planted}, of which missing or changed: {gone}")
+    print(f"folders read, saved and read again, twice: {trips}")
     states = sum((Counter(r.get("states", {})) for r in records), Counter())
     print(f"states of missions: {dict(states)}")
     for record in records:
