@@ -23,6 +23,7 @@ from trustbo.stacking import require_same_team
 
 STATES = ("speed_ratio", "pitch", "roll", "return_range", "visible_share")
 """State of a robot at a tick: share of its speed on level ground; rad; rad; m; share of beams."""
+_TICKS = "ticks"
 _PACKED, _SMALL = 100, 1 << 28
 """Bytes that a byte of a file may unpack to, and bytes that any file may."""
 
@@ -75,7 +76,9 @@ def write_missions(
     since: int = 0,
     notes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write missions to a netCDF file, and the ticks of each to a file in `ticks/` beside it.
+    """Write missions to a netCDF file, and the ticks of each to a file in a folder beside it.
+
+    That is `ticks/` for the files of a campaign, and has the name of any other file.
 
     Args:
         path: File of all missions.
@@ -86,18 +89,24 @@ def write_missions(
     TrustboError: states with another shape than (tick, robot, state).
     """
     for j in range(since, len(missions)):
-        file, recorded = ticks_file(path, j), _ticks(missions[j])
+        file, recorded = ticks_file(path, _ticks_name(path), j), _ticks(missions[j])
         if recorded is None:
             remove_checked(file)
         else:
             write_tree(file, xr.DataTree(recorded))
-    table = _table(missions).assign_attrs(notes or {})
+    table = _table(missions).assign_attrs({_TICKS: _ticks_name(path), **(notes or {})})
     write_tree(path, xr.DataTree.from_dict({"missions": table}))
 
 
-def ticks_file(path: FilePath, j: int) -> Path:
-    """Name of the file with the ticks of mission j, from 0, beside a file of missions."""
-    return Path(path).parent / "ticks" / f"{j + 1:04d}.nc"
+def ticks_file(path: FilePath, folder: str, j: int) -> Path:
+    """Name of the file with the ticks of mission j, from 0, in a folder beside the missions'."""
+    return Path(path).parent / Path(folder).name / f"{j + 1:04d}.nc"
+
+
+def _ticks_name(path: FilePath) -> str:
+    """Name of the folder of ticks: two files of missions share one only in a campaign."""
+    name = Path(path)
+    return _TICKS if name.name in ("measured.nc", "missions.nc") else f"{name.stem}.{_TICKS}"
 
 
 def read_missions(path: FilePath) -> list[Mission]:
@@ -115,14 +124,16 @@ def read_missions(path: FilePath) -> list[Mission]:
 def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
     """Missions of a tree that was read from a file, see `read_missions`."""
     with _holding_missions(path):
-        table = {str(n): a.values for n, a in tree["missions"].to_dataset().variables.items()}
+        kept = tree["missions"].to_dataset()
+        table = {str(n): a.values for n, a in kept.variables.items()}
+        folder = str(kept.attrs.get(_TICKS, _TICKS))  # files of version 0.2 do not name it
         if "exposure" in table:  # its name in version 0.1
             table["n_ticks"] = table.pop("exposure")
         old = tree["ticks"].to_dataset() if "ticks" in tree.children else None
         missions = []
         for j in range(len(table["status"])):
             ticks = None if old is None else old.isel(tick=old["mission"].values == j)
-            if ticks is None and (file := ticks_file(path, j)).exists():
+            if ticks is None and (file := ticks_file(path, folder, j)).exists():
                 ticks = read_tree(file).to_dataset()
             missions.append(_mission(table, j, ticks))
         return missions
