@@ -337,6 +337,8 @@ def read_yaml(file: Path) -> Any:
     """Read a YAML file; TrustboError if there is none, or it is not YAML."""
     import yaml  # loaded only where YAML is read
 
+    if not file.exists():
+        raise TrustboError(f"cannot read {str(file)!r}: No such file or directory.")
     try:
         return yaml.safe_load(read_file(file, _MOST_YAML).decode("utf-8"))
     except (yaml.YAMLError, ValueError, RecursionError) as error:

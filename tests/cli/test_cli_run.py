@@ -262,3 +262,24 @@ def test_a_folder_in_place_of_a_file_is_named_before_any_work(name, invoke, tmp_
 def test_debug_shows_the_traceback(invoke, flags, tmp_path):
     done = invoke("run", *flags, "--policy", "bold", "--out", tmp_path, "--debug")
     assert isinstance(done.exception, ValueError)
+
+
+def test_files_of_others_are_not_replaced_by_results(invoke, flags, tmp_path):
+    """With --overwrite, too: it is for the campaign in the folder."""
+    for name in ("report.html", "maps.tif", "history.csv"):
+        out = tmp_path / name
+        out.mkdir()
+        (out / name).write_text("mine")
+        for more in ((), ("--overwrite",)):
+            done = invoke("run", *flags, "--out", out, *more)
+            assert done.exit_code == 2
+            assert f"{name}' was not written by trustbo, and would be replaced" in done.stderr
+        assert [f.read_text() for f in out.iterdir()] == ["mine"]
+
+
+def test_the_demo_does_not_replace_a_dem_of_others(invoke, tmp_path):
+    (tmp_path / "dem.tif").write_text("mine")
+    done = invoke("demo", "--out", tmp_path, "--overwrite")
+    assert done.exit_code == 2
+    assert "dem.tif' is not that of the demo, and would be replaced; give another" in done.stderr
+    assert (tmp_path / "dem.tif").read_text() == "mine"
