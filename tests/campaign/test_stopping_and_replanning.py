@@ -72,6 +72,36 @@ def test_patience_asks_for_several_missions_in_a_row(workspace):
     assert rule(campaign).startswith("regret_bound")
 
 
+@pytest.mark.parametrize("fails", [True, False])
+def test_no_campaign_ends_on_a_path_of_which_a_bound_was_never_completed(workspace, fails):
+    """The last bound of the best path may be the robots' end, and no mission came there yet."""
+    rule = tb.RegretBound(eps=0.9, delta=0.5, patience=2, min_missions=2)
+    campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
+    for seed in range(2):
+        other = ((3, 0), (2, 1), (1, 2), (0, 2), (0, 3))
+        campaign.tell(ModelSimulator(workspace).run(other, seed=seed), other_path=True)
+    path = campaign.recommend().path
+    assert path == ((3, 0), (2, 1), (1, 2), (0, 3))
+    assert min(rule.probability(campaign, n) for n in (1, 2)) == 1.0  # of the regret it is sure
+    assert rule(campaign) is None
+    driven = ModelSimulator(workspace, fail_at=3 if fails else None)
+    campaign.tell(driven.run(path, seed=2), other_path=True)
+    assert rule(campaign).startswith("regret_bound")
+    assert (campaign.recommend().path == path) is not fails
+
+
+def test_rules_are_asked_between_missions_only(workspace):
+    """A rule may take it that there is a mission."""
+    seen = []
+
+    def enough(campaign):
+        seen.append(campaign.missions[-1].status)
+        return len(seen) == 2
+
+    assert len(iterate(workspace, stop=enough).missions) == 2
+    assert seen == ["ok", "ok"]
+
+
 def test_seconds_and_rules_of_one_s_own_stop_too(workspace):
     def enough(campaign):
         return len(campaign.missions) >= 2

@@ -444,19 +444,27 @@ def test_a_campaign_that_its_rule_has_ended_gives_back_its_result(workspace, tmp
         workspace, *ENDS, sampler="exact", objective="mean", n_iterations=5, stop=rule,
         checkpoint=tmp_path, **options,
     )  # fmt: skip
-    assert (len(ended.missions), ended.stop_reason[:12]) == (2, "regret_bound")
+    n = len(ended.missions)
+    assert (n < 5, ended.stop_reason[:12]) == (True, "regret_bound")
     again = tb.resume(tmp_path, **options)
-    assert (len(again.missions), again.stop_reason) == (2, ended.stop_reason)
+    assert (len(again.missions), again.stop_reason) == (n, ended.stop_reason)
     assert tb.load_result(tmp_path).stop_reason == ended.stop_reason
     # Killed before its verdict was written: asked before anything is driven.
     state = json.loads((tmp_path / "campaign.json").read_text())
     (tmp_path / "campaign.json").write_text(json.dumps(state | {"stop_reason": "interrupted"}))
     (tmp_path / ".campaign.json.sha256").unlink()
     again = tb.resume(tmp_path, **options)
-    assert (len(again.missions), again.stop_reason) == (2, ended.stop_reason)
+    assert (len(again.missions), again.stop_reason) == (n, ended.stop_reason)
+    # The rule, given again, begun with, or another that is satisfied, ends it before it drives.
+    for more in ({"stop": rule}, {"n_iterations": 9}, {"stop": rule, "n_iterations": 9}):
+        again = tb.resume(tmp_path, **more, **options)
+        assert (len(again.missions), again.stop_reason) == (n, ended.stop_reason)
+    again = tb.resume(tmp_path, stop=lambda campaign: "seen enough", **options)
+    assert (len(again.missions), again.stop_reason) == (n, "seen enough")
+    assert tb.load_result(tmp_path).stop_reason == "seen enough"
     # More is asked for by word.
-    assert len(tb.resume(tmp_path, stop=[], n_iterations=3, **options).missions) == 3
-    assert len(tb.resume(tmp_path, n_iterations=6, **options).missions) > 3
+    assert len(tb.resume(tmp_path, stop=[], n_iterations=n + 1, **options).missions) == n + 1
+    assert len(tb.resume(tmp_path, n_iterations=n + 3, **options).missions) == n + 3
 
 
 def test_a_rule_of_one_s_own_is_asked_for_again(workspace, tmp_path):

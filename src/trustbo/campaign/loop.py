@@ -62,8 +62,8 @@ def iterate(
             `KinematicSimulator(workspace)`.
         truth: Truth of the simulator, `simulation.Truth.of(simulator)`: the regret of each plan
             goes into the history, in % of the contact that the best admissible path keeps.
-        stop: Rules to end before `n_iterations`: a `RegretBound`, `Seconds`, a callable
-            `stop(campaign) -> reason or None`, or several of them.
+        stop: Rules to end before `n_iterations`, asked between missions: a `RegretBound`,
+            `Seconds`, a callable `stop(campaign) -> reason or None`, or several of them.
         checkpoint: Folder in which everything is kept as it goes, replacing another campaign in it.
             If the process dies, `resume` goes on from it.
         seed: Seed of everything random.
@@ -115,7 +115,8 @@ def resume(
 ) -> Result:
     """Go on with a campaign that `iterate(checkpoint=directory)` began, with identical results.
 
-    One that its rule has ended gives back its result, unless `stop` or more missions are asked for.
+    One that its rule has ended gives back its result, unless `stop` or more missions are asked for;
+    the rules, new or those that it was begun with, are asked before anything is driven.
 
     Args:
         directory: Folder of its checkpoint.
@@ -146,9 +147,6 @@ def resume(
             campaign, simulator, n_iterations=total, truth=truth, stop=rules, progress=progress
         )
         _require_same(before, log.notes)
-        reason = reason_to_stop(rules, campaign) if done and not ended else None
-        if reason is not None:  # the rule's verdict came too late to be written
-            return campaign.stop(reason)
         log.stop_reason = "interrupted"
         for _ in steps:
             pass
@@ -226,7 +224,13 @@ def _missions(
     progress: bool | str,
 ) -> Iterator[tuple[Plan, Mission]]:
     with Progress(campaign, n_iterations, progress) as shown:
-        while len(campaign.missions) < n_iterations:
+        while True:
+            # Before each mission: of a campaign that goes on, the rules may be satisfied already.
+            if campaign.missions and (reason := reason_to_stop(rules, campaign)):
+                campaign.stop(reason)
+                return
+            if len(campaign.missions) >= n_iterations:
+                break
             plan = campaign.ask()
             mission = _run(campaign, runner, plan)
             extra = {}
@@ -241,9 +245,6 @@ def _missions(
             for callback in campaign.options.callbacks:
                 callback(campaign, mission)
             yield plan, mission
-            if reason := reason_to_stop(rules, campaign):
-                campaign.stop(reason)
-                return
     campaign.stop("n_iterations")
 
 

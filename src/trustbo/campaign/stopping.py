@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from trustbo.campaign.campaign import Campaign
+from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.models import params_of
+from trustbo.workspace.moves import bounds_along
 
 Stop = Callable[[Campaign], str | bool | None]
-"""Rule that is called after each mission; a reason (or True) ends the campaign."""
+"""Rule that is called between missions; a reason (or True) ends the campaign."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,9 @@ class RegretBound:
     recommended path is the value it lacks under that draw, relative to the best path's: the contact
     it loses more, as a share of what the best path keeps, for lost_contact, and a share of the best
     path's value for other objectives. Stop when P(regret <= eps) >= 1 - delta after each of the
-    last `patience` missions. ("The path did not change" would be the wrong test: near-ties change
-    for ever.)
+    last `patience` missions, and robots have completed every bound of the path at least once: that
+    untried ground lets them pass is an assumption of the map. ("The path did not change" would be
+    the wrong test: near-ties change for ever.)
 
     Attributes:
         eps: Regret that is good enough, as a share; .05 is 5 %.
@@ -58,7 +61,7 @@ class RegretBound:
         if n < max(self.min_missions, self.patience):
             return None
         sure = [self.probability(campaign, n - i) for i in range(self.patience)]
-        if min(sure) < 1.0 - self.delta:
+        if min(sure) < 1.0 - self.delta or not _is_driven(campaign, campaign.recommend().path):
             return None
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 
@@ -71,6 +74,12 @@ class RegretBound:
         path = planner.plan(draws.mean()).path
         drawn = planner.plan_draws(draws, n_draws=self.n_draws)
         return float(np.mean(drawn.relative_regret(path) <= self.eps))
+
+
+def _is_driven(campaign: Campaign, path: Sequence[Cell]) -> bool:
+    """Whether robots have completed every bound of a path, in missions that were not set aside."""
+    risk, bounds = campaign.risk, tuple(bounds_along(np.array(path)).T)
+    return bool((risk.exposures[bounds] > risk.failures[bounds]).all())
 
 
 @dataclass(frozen=True)
