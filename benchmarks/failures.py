@@ -6,12 +6,19 @@ Worlds with tight slope limits, named ground:limit:excess. The assumed limit is 
 the excess, in degrees: 0, geometry knows all that it can; above, ways lead over ground that stops
 robots; `aged`, the limit is right and the DEM an old one. Each part of a world is kept in a file of
 its own in --out; called again, it goes on where it stopped. --csv writes the bins of reliability.
+
+The part `reliability` compares the chance to arrive that a campaign's plan has before missions 1,
+2, 5 and 15 with the share of runs of that plan which arrive. It has a file for each campaign:
+--jobs processes share the courses. With the source of another version in PYTHONPATH and another
+--out, it measures that version; `product` is of 1 - p_fail, all that 0.2 knew.
 """
 
 import argparse
 import json
+import multiprocessing
 import time
 import warnings
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +39,8 @@ LEAST = 100
 SAFE = 0.9
 """Share of missions that arrive on a safe path."""
 LIMITS = (0.05, 0.1, 0.2)
+ASKED = (1, 2, 5, 15)
+"""Missions before which the reliability of the plan is judged."""
 
 
 def world_of(name, data, simulate=KinematicSimulator):
@@ -165,6 +174,57 @@ def limits(world, simulator, given):
     }
 
 
+def judged_plans(world, simulator, course, seed, given):
+    """Chance to arrive of a campaign's plans, and the share of runs of each that arrive."""
+    campaign, found = tb.Campaign(
+        simulator.workspace, *world.ends(course), sampler="exact", seed=seed
+    ), []  # fmt: skip
+    for number in range(1, max(ASKED) + 1):
+        plan = campaign.ask()
+        if number in ASKED:
+            runs = [simulator.run(plan.path, seed=20_000 + run) for run in range(given.runs)]
+            found.append(
+                {
+                    "mission": number,
+                    "p_arrive": plan.p_arrive,
+                    "product": float(np.prod(1.0 - plan.p_fail)),
+                    "arrived": float(np.mean([run.status == "ok" for run in runs])),
+                    "k_hat": campaign.hazard.attrs["k_hat"],
+                    "seconds": campaign.hazard.attrs["seconds"],
+                }
+            )
+        if number < max(ASKED):
+            mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
+            campaign.tell(mission, again=True)
+    return found
+
+
+def judge_course(name, course, given):
+    """Campaigns of a course, those that the folder lacks run now, by seed."""
+    warnings.simplefilter("ignore")
+    folder, found, built = Path(given.out) / "reliability", {}, None
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(given.seeds):
+        file = folder / f"{name.replace(':', '_')}_{course}_{seed}.json"
+        if not file.exists():
+            built = built or world_of(name, given.data)
+            rows = judged_plans(*built, course, seed, given)
+            file.write_text(json.dumps(rows) + "\n")
+        found[seed] = json.loads(file.read_text())
+    return found
+
+
+def reliability(names, given):
+    """Judged plans of all campaigns, by world and course."""
+    tasks = [(name, course) for name in names for course in given.courses]
+    if given.jobs == 1:
+        return {task: judge_course(*task, given) for task in tasks}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(given.jobs, mp_context=context) as pool:
+        jobs = {task: pool.submit(judge_course, *task, given) for task in tasks}
+        return {task: job.result() for task, job in jobs.items()}
+
+
 PARTS = {"safe": safe_paths, "campaigns": campaigns, "learn": learn, "limits": limits}
 
 
@@ -254,6 +314,39 @@ def print_limits(results):
         print(f"| {most} | {len(held)} of {len(runs)} | {' | '.join(cells)} | {shown(other)} |")
 
 
+def print_reliability(found):
+    """Means by mission and excess; intervals, 95 %, are bootstraps over courses of worlds."""
+    print("\n| excess | mission | predicted | product | arrived | predicted - arrived | Brier |")
+    print("|---:|---:|---:|---:|---:|---:|---:|")
+    rng, table = np.random.default_rng(0), []
+    for (name, _), campaigns in found.items():
+        rows = np.array(
+            [
+                [[row[k] for k in ("p_arrive", "product", "arrived")] for row in one]
+                for one in campaigns.values()
+            ]
+        )
+        p, product, arrived = np.moveaxis(rows, -1, 0)  # each (seed, mission)
+        brier = (p - arrived) ** 2 + arrived * (1.0 - arrived)
+        means = np.stack([p, product, arrived, p - arrived, brier]).mean(1)
+        table.append((name.split(":")[2], means))
+    for excess in ("0", "4", "both"):
+        own = np.array([means for which, means in table if excess in (which, "both")])
+        if not len(own):
+            continue
+        again = own[rng.integers(len(own), size=(2000, len(own)))].mean(1)
+        low, high = np.quantile(again, [0.025, 0.975], axis=0)
+        for k, mission in enumerate(ASKED):
+            cells = [
+                f"{own.mean(0)[i, k]:.3f} ({low[i, k]:.3f} to {high[i, k]:.3f})" for i in range(5)
+            ]
+            print(f"| {excess} | {mission} | {' | '.join(cells)} |")
+    rows = [row for seeds in found.values() for one in seeds.values() for row in one]
+    k_hat, seconds = (max(row[name] for row in rows) for name in ("k_hat", "seconds"))
+    refused = np.mean([row["k_hat"] > 0.7 for row in rows])
+    print(f"\nlargest k-hat {k_hat:.2f}, refused {refused:.1%}; slowest fit {seconds:.2f} s")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("quick", nargs="?", choices=["quick"])
@@ -261,19 +354,28 @@ def main():
     parser.add_argument("--out", default="out/failures")
     parser.add_argument("--csv")
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
-    parser.add_argument("--parts", nargs="*", default=list(PARTS), choices=list(PARTS))
+    parser.add_argument(
+        "--parts", nargs="*", default=[*PARTS, "reliability"], choices=[*PARTS, "reliability"]
+    )
     parser.add_argument("--courses", nargs="*", default=COURSES, choices=COURSES)
     parser.add_argument("--simulator", default="kinematic", choices=["kinematic", "mujoco"])
     parser.add_argument("--unseen", type=int, default=5000)
     parser.add_argument("--missions", type=int, default=15)
     parser.add_argument("--after", type=int, default=200)
     parser.add_argument("--policy")
+    parser.add_argument("--seeds", type=int, default=3, help="campaigns of a course, reliability")
+    parser.add_argument("--runs", type=int, default=50, help="runs of a plan, reliability")
+    parser.add_argument("--jobs", type=int, default=1, help="processes, reliability")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     if given.quick:
         given.out, given.unseen, given.courses = f"{given.out}-quick", 300, given.courses[:1]
+        given.seeds, given.runs = 1, 10
     Path(given.out).mkdir(parents=True, exist_ok=True)
     names = [n for n in given.worlds if given.data or n.startswith("synthetic")]
+    if "reliability" in given.parts:
+        print_reliability(reliability([n for n in names if n.split(":")[2] in ("0", "4")], given))
+    given.parts = [part for part in given.parts if part in PARTS]
     results = {name: measure(name, given) for name in names}
     if "campaigns" in given.parts:
         print_campaigns(results)

@@ -69,6 +69,9 @@ def test_run_passes_every_choice_on(invoke, flags, tmp_path):
     assert {name: record["settings"][name] for name in chosen} == chosen
     assert record["stop_reason"].startswith("regret_bound: P(regret <= 0.9)")
     assert record["n_missions"] == 3  # the fewest that the rule asks for
+    again = invoke("resume", tmp_path, "--stop-regret", 0.9, "--quiet")  # which ends it at once
+    assert again.exit_code == 0, again.output
+    assert json.loads((tmp_path / "result.json").read_text())["n_missions"] == 3
 
 
 @pytest.mark.parametrize(

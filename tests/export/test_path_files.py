@@ -211,10 +211,8 @@ def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
     np.testing.assert_array_equal(table["p_fail"][1:], risk.p_fail)
     for end, p in zip(("low", "high"), risk.p_fail_band, strict=True):
         np.testing.assert_array_equal(table[f"p_fail_{end}"][1:], np.where(p < 1e-6, 0.0, p))
-    arrive = [1.0]
-    for p in risk.p_fail:
-        arrive.append(arrive[-1] * (1.0 - p))
-    np.testing.assert_allclose(table["p_arrive"], arrive, rtol=1e-12)
+    np.testing.assert_array_equal(table["p_arrive"], [1.0, *risk.p_reach])
+    assert (np.diff(table["p_arrive"]) < 0.0).all()
     assert table["p_arrive"].iloc[-1] == pytest.approx(result.plan.p_arrive)
     causes = [table[f"p_fail_{cause}"][1:] for cause in tb.models.CAUSES]
     np.testing.assert_allclose(sum(causes), risk.p_fail, rtol=1e-12)

@@ -11,6 +11,7 @@ from trustbo.errors import PosteriorError, TrustboError
 from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.models.exposures import Exposures
 from trustbo.models.hazard_sampler import _Density, impute, sample
+from trustbo.workspace.moves import MOVES
 
 
 def workspace(n=3):
@@ -24,6 +25,7 @@ def mission(path, status="ok", n_bounds=None):
     )
 
 
+LIMIT = np.deg2rad(22.0)
 ROW = ((0, 0), (0, 1), (0, 2))
 
 
@@ -38,7 +40,7 @@ def exposures(n, failed, lost=(), weights=None):
 
 def law(difficulty):
     x = np.asarray(difficulty, dtype=float)
-    return Hazard().law(x, ("tilt", "narrowness")[: x.shape[1]])
+    return Hazard().law(x, ("tilt", "narrowness")[: x.shape[1]], LIMIT)
 
 
 def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
@@ -46,22 +48,25 @@ def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
     n = np.array([1, 2, 3, 12, 5, 0, 30])
     failed = np.array([0, 1, 3, 0, 2, 0, 11])
     of = law(rng.uniform(size=(7, 2)))
-    z = rng.standard_normal((20, 4))
+    z = rng.standard_normal((20, 5))
     alpha, beta = of(z)
     binomial = stats.betabinom.logpmf(failed, n, alpha, beta) - np.log(special.comb(n, failed))
     expected = binomial.sum(1) + stats.norm.logpdf(z).sum(1)
     np.testing.assert_allclose(_Density(of, exposures(n, failed)).known(z), expected, rtol=1e-9)
 
 
-def test_prior_means_are_logistic_in_difficulty_with_the_tilt_by_its_log():
-    x = np.array([[0.5, 0.5], [1.0, 0.5], [0.5, 0.9]])
-    prior = Hazard(intercept=(-3.0, 0.5), coefficient=(1.0, 2.0), log_tilt=(0.7, 0.4))
-    of = prior.law(x, ("tilt", "narrowness"))
-    alpha, beta = (part[0] for part in of(np.array([[0.2, -1.0, 0.5, 2.0]])))
-    tilt, narrow = np.exp(0.7 - 0.4), 1.0 + 2.0 * 0.5
-    logit = -3.0 + 0.5 * 0.2 + np.array([0.0, tilt * 0.5, narrow * 0.4])
+def test_a_bound_is_passed_if_neither_its_difficulty_nor_the_limit_stops_robots():
+    """By the tangents: 18 degrees are tan(18)/tan(22) of the limit."""
+    tilt = np.tan(np.deg2rad([22.0, 18.0, 10.0])) / np.tan(np.deg2rad(22.0))
+    x = np.column_stack([tilt, [0.5, 0.9, 0.1]])
+    prior = Hazard(intercept=(-3.0, 0.5), coefficient=(1.0, 2.0), margin=(1.0, 3.0))
+    of = prior.law(x, ("tilt", "narrowness"), LIMIT)
+    alpha, beta = (part[0] for part in of(np.array([[0.2, 0.5, -0.4, 1.2, 2.0]])))
+    logit = -2.9 + 2.0 * (x[:, 1] - 0.5)
+    over = (np.array([0.0, -4.0, -12.0]) + 1.0 - 0.4 * 3.0) / np.exp(0.5 * 1.2)
     np.testing.assert_allclose(alpha + beta, np.exp(-0.5 + 2.0), rtol=1e-10)
-    np.testing.assert_allclose(alpha / (alpha + beta), special.expit(logit), rtol=1e-10)
+    passed = (1.0 - special.expit(logit)) * (1.0 - special.expit(over))
+    np.testing.assert_allclose(alpha / (alpha + beta), 1.0 - passed, rtol=1e-9)
 
 
 def test_fractional_weights_have_the_ratio_of_beta_functions():
@@ -125,6 +130,33 @@ def test_posterior_means_equal_those_of_a_grid():
     assert points.k_hat < 0.5
 
 
+def test_the_posterior_of_the_margin_equals_quadrature_with_chances_integrated_out():
+    """Three bounds of 22, 19 and 10 degrees; all but the limit is held by narrow priors."""
+    tight = {n: (v, 1e-3) for n, v in (("intercept", -6.0), ("log_strength", 0.3))}
+    prior = Hazard(coefficient=(2.0, 1e-3), margin=(1.0, 3.0), log_width=(0.0, 0.5), **tight)
+    degrees, narrow = np.array([22.0, 19.0, 10.0]), np.array([0.2, 0.6, 0.5])
+    tilt = np.tan(np.deg2rad(degrees)) / np.tan(LIMIT)
+    n, failed = np.array([2, 2, 3]), np.array([2, 1, 0])
+    law = prior.law(np.column_stack([tilt, narrow]), ("tilt", "narrowness"), LIMIT)
+    points = sample(law, exposures(n, failed), seed=0)
+    axis = np.linspace(-6.0, 6.0, 401)
+    margin, log_width = np.meshgrid(1.0 + 3.0 * axis, 0.5 * axis, indexing="ij")
+    log_p, base = stats.norm.logpdf(axis)[:, None] + stats.norm.logpdf(axis), -6.0
+    for e in range(3):
+        easy = 1.0 / (1.0 + np.exp(base + 2.0 * (narrow[e] - 0.5)))
+        flat = 1.0 / (1.0 + np.exp((degrees[e] - 22.0 + margin) / np.exp(log_width)))
+        a, b = np.exp(0.3) * (1.0 - easy * flat) + 1e-12, np.exp(0.3) * easy * flat + 1e-12
+        log_p += stats.betabinom.logpmf(failed[e], n[e], a, b)
+    weight = special.softmax(log_p)
+    values = law.values(points.z)
+    for i, drawn in ((2, margin), (3, np.exp(log_width))):
+        mean = (weight * drawn).sum()
+        sd = np.sqrt((weight * drawn**2).sum() - mean**2)
+        # An effective sample of over 400 of 2048 points: 3 standard errors.
+        assert abs(points.weights @ values[:, i] - mean) < 0.15 * sd, i
+    assert points.k_hat < 0.7
+
+
 @pytest.mark.slow  # many data sets
 def test_the_hazard_is_calibrated():
     """SBC: ranks of hyperparameters and of chances are uniform over 200 data sets."""
@@ -132,9 +164,9 @@ def test_the_hazard_is_calibrated():
     rng = np.random.default_rng(1)
     ranks = []
     for seed in range(n_sets):
-        x = rng.uniform(size=(n_bounds, 2)) * 1.5
-        of = prior.law(x, ("tilt", "narrowness"))
-        z = rng.standard_normal((1, 4))
+        x = rng.uniform(size=(n_bounds, 2)) * (1.2, 1.5)
+        of = prior.law(x, ("tilt", "narrowness"), LIMIT)
+        z = rng.standard_normal((1, 5))
         p = rng.beta(*(part[0] for part in of(z)))
         n, failed, lost = np.zeros(n_bounds), np.zeros(n_bounds), []
         for j in range(12):
@@ -162,7 +194,7 @@ def test_the_hazard_is_calibrated():
         # Chances underflow to 0 in truth and draws alike: such ties are broken at random.
         ties = rng.integers((drawn == truth).sum(0) + 1)
         ranks.append((drawn < truth).sum(0) + ties)
-    names = ["intercept", "w1", "w2", "log s", "p0", "p1", "arrive"]
+    names = ["intercept", "weight", "margin", "width", "strength", "p0", "p1", "arrive"]
     for name, of_one in zip(names, np.array(ranks).T, strict=True):
         counts = np.bincount(of_one, minlength=n_ranks).reshape(10, 2).sum(1)
         assert stats.chisquare(counts).pvalue > 1e-3, (name, counts)
@@ -209,6 +241,58 @@ def test_draws_of_chances_have_the_moments_of_the_map():
     error = 5.0 * risk.sd[exists] / np.sqrt(1000)
     assert (np.abs(draws.mean(0) - risk.mean)[exists] < error).all()
     np.testing.assert_allclose(draws.std(0)[exists], risk.sd[exists], rtol=0.15)
+
+
+@pytest.fixture(scope="module")
+def hilly():
+    """Ground of which some bounds are near the limit of 11 degrees."""
+    robot = tb.Robot(max_slope=np.deg2rad(11.0))
+    terrain = tb.terrain.synthetic_terrain((150.0, 150.0), resolution=2.0, seed=3, relief=8.0)
+    return tb.Workspace.from_terrain(
+        terrain, (5, 5), tb.Team(robots=(robot,), lead=robot), bounds=False
+    )
+
+
+def test_one_failure_on_steep_ground_teaches_all_that_is_as_steep(hilly):
+    tilt = np.nan_to_num(hilly.difficulty.sel(measure="tilt").values)
+    steepest = np.argsort(tilt.ravel())[::-1][:6]
+    assert 0.8 < tilt.flat[steepest[-1]] < 1.05
+    move, row, col = np.unravel_index(steepest, tilt.shape)
+    cells = [(row[0] - MOVES[8][move[0]][0], col[0] - MOVES[8][move[0]][1]), (row[0], col[0])]
+    path = [tuple(int(i) for i in cell) for cell in cells]
+    prior, gone = Hazard().prior(hilly), fit_hazard([], hilly, lost=[LostMission(path, "tipped")])
+    after = BoundRisk.of(gone, hilly)
+    others = move[1:], row[1:], col[1:]
+    assert (after.mean[others] > prior.mean[others] + 0.1).all()
+    flat = np.unravel_index(np.argmin(np.where(tilt > 0.0, tilt, 9.0)), tilt.shape)
+    assert after.mean[flat] < 0.5 * after.mean[others].min()
+    # Its prior margin is shared: bounds are passed together, or fail together.
+    drawn = 1.0 - prior.draw(1000)[:, *others]
+    assert drawn.prod(1).mean() > drawn.mean(0).prod() + 0.1
+    assert gone["margin"].mean() > 1.0
+    assert (gone["margin"].attrs["units"], gone["width"].attrs["units"]) == ("degrees", "degrees")
+    assert gone["measure"].values.tolist() == ["untraversable", "narrowness", "tightness"]
+
+
+def test_few_draws_have_the_mean_chance_to_arrive_of_many(hilly):
+    risk = Hazard().prior(hilly)
+    at = np.nonzero(risk.exists & (risk.steepness > -4.0))
+    arrive = [(1.0 - risk.draw(n, seed=1)[:, *at]).prod(1) for n in (100, 10_000)]
+    # A plain mean of 100 has a standard error of sd / 10.
+    assert abs(arrive[0].mean() - arrive[1].mean()) < 0.5 * arrive[1].std() / 10.0
+
+
+def test_a_group_of_version_0_2_without_a_limit_means_what_it_meant(hilly):
+    names, rng = hilly.difficulty["measure"].values.tolist(), np.random.default_rng(0)
+    new = fit_hazard([], hilly).drop_vars(
+        ["margin", "width", "coefficient", "measure", "p_fail", "p_fail_sd"]
+    )
+    weights = rng.uniform(0.0, 4.0, (1000, 4))
+    old = new.assign_coords(measure=names).assign(coefficient=(("draw", "measure"), weights))
+    risk, exists = BoundRisk.of(old, hilly), hilly.passable_bounds.values
+    x = hilly.difficulty.values[exists] - 0.5
+    expected = special.expit(old["intercept"].values[:, None] + weights @ x.T).mean(0)
+    np.testing.assert_allclose(risk.mean[exists], expected, rtol=1e-7)
 
 
 def test_the_same_seed_gives_the_same_hazard():

@@ -121,7 +121,7 @@ def check(plan, best, limit=None):
     assert plan.exact
     np.testing.assert_allclose(plan.value, best, rtol=1e-9, atol=1e-11)
     if limit is not None:
-        assert 1.0 - plan.p_arrive <= limit + 1e-9
+        assert 1.0 - np.prod(1.0 - plan.p_fail) <= limit + 1e-9
 
 
 @pytest.mark.parametrize("n", [4, 5])
@@ -225,7 +225,7 @@ def test_an_infeasible_limit_is_said_with_the_least_there_is_or_the_safest_is_pl
         np.testing.assert_allclose(error.value.p_fail, least, rtol=1e-9)
         assert error.value.path[-1] == case.ends[1]
         plan = case.planner(**options, infeasible="safest").plan(case.params)
-        np.testing.assert_allclose(1.0 - plan.p_arrive, least, rtol=1e-9)
+        np.testing.assert_allclose(1.0 - np.prod(1.0 - plan.p_fail), least, rtol=1e-9)
         check(plan, case.best(case.p_fail <= least + 1e-12))
 
 
@@ -242,7 +242,32 @@ def test_all_draws_are_planned_and_the_expectation_is_within_the_limit():
         drawn = planner.plan_draws(draws)
         alone = [planner.plan(draws.draw(d)).value for d in range(5)]
         np.testing.assert_allclose(drawn.values, alone, rtol=1e-9)
-    assert 1.0 - planner.plan_expected(draws).p_arrive <= limit + 1e-9
+    expected = planner.plan_expected(draws)
+    assert 1.0 - np.prod(1.0 - expected.p_fail) <= limit + 1e-9
+
+
+def test_bounds_that_fail_together_are_one_chance_to_fail_not_many():
+    """One event in 4 fails all bounds: three of four missions arrive on any path."""
+    case = Case("lost_contact", 4, 1)
+    draws = np.zeros((8, *case.p.shape))
+    draws[::4] = 1.0
+    p = np.where(np.isnan(case.p), np.nan, 0.25)
+    planner = Planner(case.workspace, *case.ends, **case.options).with_risk(p, draws)
+    plan = planner.plan(case.params)
+    n = len(plan.path) - 1
+    assert n >= 3
+    assert plan.p_arrive == pytest.approx(0.75, rel=1e-12)
+    np.testing.assert_allclose(plan.risk.p_reach, 0.75)
+    # Limits and costs add bounds up as if they were independent: never too bright here.
+    within = Planner(case.workspace, *case.ends, **case.options, max_failure=0.3)
+    with pytest.raises(InfeasibleError, match=f"the least is {1.0 - 0.75**planner.shortest:.4g}"):
+        within.with_risk(p, draws).plan(case.params)
+    record = json.loads(json.dumps(plan_to_record(plan)))
+    assert plan_from_record(record, case.workspace).risk.p_reach.tolist() == [0.75] * n
+    del record["risk"]["p_reach"]  # as version 0.2 wrote it
+    again = plan_from_record(record, case.workspace).risk
+    np.testing.assert_allclose(again.p_reach, 0.75 ** np.arange(1, n + 1))
+    assert again.p_arrive == plan.p_arrive
 
 
 def test_a_plan_says_its_chance_to_arrive_with_its_band_by_bound_and_cause():
@@ -253,8 +278,13 @@ def test_a_plan_says_its_chance_to_arrive_with_its_band_by_bound_and_cause():
     steps = np.diff(np.array(plan.path), axis=0).tolist()
     at = [MOVES[8].index(tuple(step)) for step in steps], rows[1:], cols[1:]
     np.testing.assert_array_equal(plan.p_fail, case.p[at])
-    np.testing.assert_allclose(plan.p_arrive, np.prod(1.0 - case.p[at]))
+    bare = Planner(case.workspace, *case.ends, **case.options).with_risk(case.p)
+    np.testing.assert_allclose(
+        bare.evaluate(plan.path, case.params).p_arrive, np.prod(1.0 - case.p[at])
+    )
     drawn = np.prod(1.0 - case.draws[:, *at], axis=1)
+    exact = np.prod(1.0 - case.p[at]) / np.prod(1.0 - case.draws[:, *at].mean(0))
+    np.testing.assert_allclose(plan.p_arrive, drawn.mean() * exact)
     np.testing.assert_allclose(plan.p_arrive_band, np.quantile(drawn, [0.05, 0.95]))
     band = np.quantile(case.draws[:, *at], [0.05, 0.95], axis=0)
     np.testing.assert_allclose(plan.risk.p_fail_band, band)

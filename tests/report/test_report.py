@@ -100,7 +100,12 @@ def page(text):
 def test_the_chance_to_arrive_is_told_from_1_and_no_cause_on_a_tie():
     share = np.array([8e-4, 0.0])
     risk = PathRisk(
-        share, np.zeros((2, 2)), 0.9992, (0.99971, 1.0 - 1e-9), {"a": share, "b": share}
+        share,
+        np.zeros((2, 2)),
+        0.9992,
+        (0.99971, 1.0 - 1e-9),
+        {"a": share, "b": share},
+        1.0 - share,
     )
     assert _arrival(risk) == (
         "It reaches the goal with probability 0.9992 (90 % band 0.9997 to 1.0000); its bound 1 is "

@@ -514,10 +514,12 @@ class Campaign(LearnedMissions, Displayed):
         bands = self.planner_now().bands(plan.path, self.belief)
         now = time.perf_counter()
         self._asked = now - started, now
-        if plan.infeasible and plan.p_arrive is not None:
+        if plan.infeasible and plan.p_fail is not None:
+            p_fail = 1.0 - np.prod(1.0 - plan.p_fail)  # by which max_failure goes
             warnings.warn(
-                f"the plan fails with a chance of {1.0 - plan.p_arrive:.3g}, beyond max_failure = "
-                f"{self.options.max_failure:g}; no safer path keeps within it, or none was found.",
+                f"the plan fails with a chance of {p_fail:.3g}, bounds taken for independent, "
+                f"beyond max_failure = {self.options.max_failure:g}; no safer path keeps within "
+                "it, or none was found.",
                 stacklevel=4,
             )
         return replace(plan, bands=bands)

@@ -198,7 +198,9 @@ class CampaignOptions:
             if name not in _OWN:
                 raise unknown("option of one's own", name, _OWN)
         awareness = again("awareness", record["awareness"], own.get("awareness"), own_awareness)
-        return cls.of({**record, **own, "awareness": awareness})
+        # Version 0.2 had a weight of the tilt, where there is a margin of the limit now.
+        hazard = {n: v for n, v in record.get("hazard", {}).items() if n != "log_tilt"}
+        return cls.of({**record, **own, "awareness": awareness, "hazard": hazard})
 
 
 def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":

@@ -154,8 +154,8 @@ class Result(Displayed):
         planner = options.planner(self.workspace, start, goal, objective, *law)
         if "hazard" in self.posterior.children:
             hazard = self.posterior["hazard"].to_dataset()
-            # None of the workspace's measures where the terrain was taken away.
-            if hazard["measure"].values.tolist() == measures_of(self.workspace):
+            # The workspace has no measures where the terrain was taken away.
+            if {*hazard["measure"].values.tolist()} <= {*measures_of(self.workspace)}:
                 planner = under_risk(planner, BoundRisk.of(hazard, self.workspace))
         if self.believed is None:
             return planner

@@ -150,8 +150,8 @@ def resume(
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
     The result is the same as without the interruption. The folder keeps all flags.
-    A campaign that --stop-regret has ended goes on with more --iterations, or another
-    --stop-regret.
+    A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
+    before anything is driven.
     """
     with one_line_errors(debug, campaign=folder):
         if iterations is not None:

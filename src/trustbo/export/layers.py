@@ -59,7 +59,7 @@ def bounds_layer(plan: Plan) -> gpd.GeoDataFrame:
         chances |= {f"p_fail_{cause}": p for cause, p in plan.risk.by_cause.items()}
         seen = {name: np.where(p < _LEAST, 0.0, p) for name, p in chances.items()}
         columns |= {name: np.insert(p, 0, np.nan) for name, p in seen.items()}
-        columns["p_arrive"] = np.insert(np.cumprod(1.0 - plan.risk.p_fail), 0, 1.0)
+        columns["p_arrive"] = np.insert(plan.risk.p_reach, 0, 1.0)
     return _frame(plan, columns, x, y)
 
 

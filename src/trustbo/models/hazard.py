@@ -1,12 +1,14 @@
 """Hazard of bounds: the chance that a bound ends the mission, learned from missions.
 
 Bound e, from one cell to the next, fails with chance p_e ~ Beta(s m_e, s (1 - m_e)). Its prior mean
-is a logistic of how difficult the way is in terms of the robots' own slope limit,
+follows from how difficult the way is, and how steep, t_e degrees beyond the assumed slope limit,
 
-    logit m_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2),
+    1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
+    logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2),
 
-so that a bound that was never tried is judged by others like it, and one that was tried mostly by
-what happened there: the less strength s, the more. DESIGN 5.12; docs/failures.md.
+where the margin, by which the true limit is below the assumed one, is not known: a bound that was
+never tried is judged by others like it, and one that was tried mostly by what happened there, the
+less strength s, the more. DESIGN 5.12; docs/failures.md.
 """
 
 import time
@@ -20,7 +22,15 @@ from numpy.typing import ArrayLike
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_positive, require_whole
 from trustbo.models.exposures import CAUSES, Exposures, LostMission
-from trustbo.models.hazard_sampler import LIMIT, Law, Points, sample
+from trustbo.models.hazard_sampler import (
+    LIMIT,
+    LIMIT_NAMES,
+    TILT,
+    Law,
+    Points,
+    sample,
+    steepness_of,
+)
 from trustbo.models.risk import BoundRisk
 from trustbo.models.samplers.weights import systematic
 from trustbo.workspace import Workspace
@@ -38,8 +48,12 @@ class Hazard:
         intercept: Prior of the logit of the mean chance at medium difficulty.
         coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
             limit (1), but for the tilt.
-        log_tilt: Prior of the log of the weight w of the tilt. It may be large: where the true
-            limit is passed, the chance rises from .1 to .9 within 4.4 / w of the assumed limit.
+        margin: Prior of the degrees by which the team's true slope limit is below the assumed one.
+            Bounds share it: a failure on one makes all that are as steep dangerous. The default has
+            a limit that is right, and one that is 4 degrees too high, both plausible; give a small
+            sd for a limit that was measured.
+        log_width: Prior of the log of the width of the limit in degrees: the chance to fail rises
+            from .1 to .9 within 4.4 widths of tilt.
         log_strength: Prior of the log of the strength s: the failures and successes that the mean
             is worth, few where bounds fail always or never.
         cause: Concentration of the Dirichlet over the causes of failure, for each.
@@ -50,7 +64,8 @@ class Hazard:
 
     intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
-    log_tilt: tuple[float, float] = (0.7, 1.0)
+    margin: tuple[float, float] = (1.0, 4.0)
+    log_width: tuple[float, float] = (0.0, 0.5)
     log_strength: tuple[float, float] = (-0.5, 1.0)
     cause: float = 0.2
 
@@ -61,13 +76,19 @@ class Hazard:
             object.__setattr__(self, name, value)
         require_positive("cause", self.cause)
 
-    def law(self, difficulty: np.ndarray, measures: Sequence[str]) -> Law:
-        """Law of bounds of these difficulties, (bound, measure), from the names of the measures."""
-        is_tilt = [name == "tilt" for name in measures]
-        weights = [self.log_tilt if is_log else self.coefficient for is_log in is_tilt]
-        center, scale = np.array([self.intercept, *weights, self.log_strength]).T
-        is_log = np.array([False, *is_tilt, True])
-        return Law(center, scale, is_log, difficulty - REFERENCE)
+    def law(self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float) -> Law:
+        """Law of bounds of these difficulties, (bound, measure), from the names of the measures.
+
+        The tilt is judged by the limit, `max_slope` in rad less the margin, the others by weights.
+        """
+        has_weight = np.array([name != TILT for name in measures], dtype=bool)
+        weights, limit, steepness = [self.coefficient] * int(has_weight.sum()), [], None
+        if TILT in measures:
+            limit = [self.margin, self.log_width]
+            steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
+        center, scale = np.array([self.intercept, *weights, *limit, self.log_strength]).T
+        is_log = np.array([*[False] * (1 + len(weights)), *[False, True][: len(limit)], True])
+        return Law(center, scale, is_log, difficulty[:, has_weight] - REFERENCE, steepness)
 
     def prior(self, workspace: Workspace, *, seed: int = 0, n_draws: int = 1000) -> BoundRisk:
         """Risk of the bounds of a workspace before any mission."""
@@ -106,6 +127,7 @@ def fit_hazard(
 
     Returns:
         The group `hazard` of a posterior: `intercept` (draw), `coefficient` (draw, measure),
+        `margin` and `width` of the slope limit (draw), in degrees, where there is a terrain,
         `strength` (draw), and `place` (draw, lost), the bound from 1 at which each mission lost
         somewhere unknown failed; `p_fail` and `p_fail_sd` (move, row, col), posterior mean and sd
         of the chance to fail, NaN where there is no bound; `exposures` and `failures` (move, row,
@@ -122,7 +144,7 @@ def fit_hazard(
     _require_on_grid(exposures, difficulty.shape[1:3])
     met = difficulty[*exposures.bounds.T]
     # A bound that the map says does not exist was driven all the same: as hard as can be.
-    law = hazard.law(np.nan_to_num(met, nan=1.0), names)
+    law = hazard.law(np.nan_to_num(met, nan=1.0), names, workspace.team.max_slope)
     points = sample(law, exposures, seed)
     group = _dataset(hazard, law, exposures, points, workspace, n_draws, seed)
     risk = BoundRisk.of(group, workspace)
@@ -146,7 +168,7 @@ def _require_on_grid(exposures: Exposures, shape: tuple[int, ...]) -> None:
 
 
 def measures_of(workspace: Workspace) -> list[str]:
-    """Names of the measures of difficulty that a hazard of a workspace has weights of."""
+    """Names of the measures of difficulty of a workspace, none without a terrain."""
     return [str(name) for name in workspace.difficulty["measure"].values]
 
 
@@ -162,7 +184,9 @@ def _dataset(
     """The group without the maps of chances."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(systematic(points.weights, n_draws, rng))
-    values = law.values(points.z[chosen])
+    weights, limit, strength = law.parts(law.values(points.z[chosen]))
+    degrees = {"units": "degrees"}  # there may be no limit
+    of_limit = {n: ("draw", v, degrees) for n, v in zip(LIMIT_NAMES, limit.T, strict=False)}
     shape = workspace.difficulty.shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)
     n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
@@ -173,9 +197,10 @@ def _dataset(
     maps = ("move", "row", "col")
     return xr.Dataset(
         {
-            "intercept": ("draw", values[:, 0]),
-            "coefficient": (("draw", "measure"), values[:, 1:-1]),
-            "strength": ("draw", values[:, -1]),
+            "intercept": ("draw", weights[:, 0]),
+            "coefficient": (("draw", "measure"), weights[:, 1:]),
+            **of_limit,
+            "strength": ("draw", strength),
             "place": (("draw", "lost"), points.places[chosen] + 1),
             "lost_bound": (("lost", "bound", "axis"), lost),
             "lost_weight": ("lost", exposures.lost_weights),
@@ -185,7 +210,7 @@ def _dataset(
         },
         {
             "draw": np.arange(n_draws),
-            "measure": measures_of(workspace),
+            "measure": [name for name in measures_of(workspace) if name != TILT],
             "cause": list(CAUSES),
             "axis": list(maps),
             "move": list(MOVE_NAMES),
@@ -201,4 +226,4 @@ def _dataset(
     )
 
 
-_NORMALS = ("intercept", "coefficient", "log_tilt", "log_strength")
+_NORMALS = ("intercept", "coefficient", "margin", "log_width", "log_strength")

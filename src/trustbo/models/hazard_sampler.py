@@ -17,7 +17,7 @@ The modes are those of a density in which lost missions are independent given z;
 depends on it.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import special, stats
@@ -32,13 +32,17 @@ _GOOD = 0.5  # k-hat beyond which the proposal is fitted to its own points
 _PASSES = 3  # at most
 _KERNELS, _NARROW = 32, 0.9  # components of that proposal, and their width in units of all points'
 _STRONGEST = 50.0
-"""Largest log of a parameter: the mode search may try what overflows."""
+"""Largest log of a parameter, and minus the least: the mode search may try what overflows."""
 _LOG2_POINTS = 11
 _DEGREES = 5.0
 _WIDTH = 1.2  # proposals are wider than the posterior's curvature says
 _DEFENCE = 0.1  # share of the prior, as wide as anything can be
 FLOOR = 1e-12
 """Least alpha and beta of a prior Beta: the logistic of a mean may round to 0 or 1."""
+TILT = "tilt"
+"""Measure of difficulty that the slope limit is of."""
+LIMIT_NAMES = ("margin", "width")
+"""Parameters of the robots' slope limit, degrees."""
 _NORMAL = 0.5 * np.log(2.0 * np.pi)
 
 
@@ -58,18 +62,62 @@ class Law(NamedTuple):
     scale: np.ndarray  # (parameter,), their sds
     is_log: np.ndarray  # (parameter,), whether the prior is of the log
     difficulty: np.ndarray  # (bound, measure)
+    steepness: np.ndarray | None  # (bound,), degrees beyond the assumed limit; None: no limit
+
+    def of(self, bounds: np.ndarray) -> Self:
+        """Law of some of the bounds."""
+        steepness = None if self.steepness is None else self.steepness[bounds]
+        return self._replace(difficulty=self.difficulty[bounds], steepness=steepness)
 
     def __call__(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Alpha and beta of each Beta, each (point, bound)."""
-        values = self.values(z)
-        logit, strength = values[:, :1] + values[:, 1:-1] @ self.difficulty.T, values[:, -1:]
-        return strength * special.expit(logit) + FLOOR, strength * special.expit(-logit) + FLOOR
+        return prior_betas(*self.parts(self.values(z)), self.difficulty, self.steepness)
+
+    def parts(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Weights (point, 1 + measure), limit (point, 0 or 2) and strength (point,) of values."""
+        n = 1 + self.difficulty.shape[1]
+        return values[:, :n], values[:, n:-1], values[:, -1]
 
     def values(self, z: np.ndarray) -> np.ndarray:
-        """Intercept, coefficients and strength, (point, parameter)."""
+        """Intercept, coefficients, margin and width of the limit, and strength.
+
+        Shape (point, parameter); without a limit, margin and width are absent.
+        """
         values = self.center + self.scale * z
-        values[:, self.is_log] = np.exp(np.minimum(values[:, self.is_log], _STRONGEST))
+        values[:, self.is_log] = np.exp(np.clip(values[:, self.is_log], -_STRONGEST, _STRONGEST))
         return values
+
+
+def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
+    """Degrees by which a tilt, as a share of the limit's tangent, is beyond the limit, rad."""
+    return np.rad2deg(np.arctan(tilt * np.tan(max_slope)) - max_slope)
+
+
+def prior_betas(
+    weights: np.ndarray,
+    limit: np.ndarray,
+    strength: np.ndarray,
+    difficulty: np.ndarray,
+    steepness: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute alpha and beta of the prior Beta of each bound, each (point, bound).
+
+    A bound is passed if neither its difficulty nor the limit stops the robots: 1 - m is the product
+    of sigma(-logit) and sigma(-(steepness + margin) / width).
+
+    Args:
+        weights: Intercept and coefficients, (point, 1 + measure).
+        limit: Margin and width, (point, 2), degrees; not used where `steepness` is None.
+        strength: Strength, (point,).
+        difficulty: Difficulty less its reference, (bound, measure).
+        steepness: Degrees by which each bound is beyond the assumed limit, (bound,), or None.
+    """
+    logit = weights[:, :1] + weights[:, 1:] @ difficulty.T
+    fails, passes = special.expit(logit), special.expit(-logit)
+    if steepness is not None:
+        beyond = (steepness + limit[:, :1]) / limit[:, 1:]
+        fails, passes = fails + passes * special.expit(beyond), passes * special.expit(-beyond)
+    return strength[:, None] * fails + FLOOR, strength[:, None] * passes + FLOOR
 
 
 def sample(law: Law, exposures: Exposures, seed: int) -> Points:
@@ -191,7 +239,7 @@ class _Density:
     def __init__(self, law: Law, exposures: Exposures) -> None:
         self._law, self._exposures = law, exposures
         self._met = exposures.n > 0.0
-        self._known_law = law._replace(difficulty=law.difficulty[self._met])
+        self._known_law = law.of(self._met)
 
     def known(self, z: np.ndarray) -> np.ndarray:
         """Prior and outcomes of known exposures, shape (point,)."""

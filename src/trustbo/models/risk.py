@@ -6,13 +6,13 @@ from typing import Self
 
 import numpy as np
 import xarray as xr
-from scipy import special
 
 from trustbo.errors import require_whole
-from trustbo.models.hazard_sampler import FLOOR, add_lost
+from trustbo.models.hazard_sampler import LIMIT_NAMES, TILT, add_lost, prior_betas, steepness_of
 from trustbo.workspace import Workspace
 
 _ENTRIES = 1 << 20  # of (draw, bound) at a time
+_SOME = 256  # bounds by which draws are put in order
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,11 @@ class BoundRisk:
 
     Attributes:
         coefficients: Weights in the logit of the prior mean, intercept first, (draw, 1 + measure).
+        limit: Margin and width of the slope limit, degrees, (draw, 2); (draw, 0) without a limit.
         strength: Strength of the Betas, (draw,).
         difficulty: Difficulty less its reference, (move, row, col, measure).
+        steepness: Degrees by which bounds are beyond the assumed slope limit, (move, row, col), or
+            None without a limit.
         exists: Whether there is a bound, (move, row, col).
         exposures: Known exposures, (move, row, col).
         failures: Known failures, (move, row, col).
@@ -36,8 +39,10 @@ class BoundRisk:
     """
 
     coefficients: np.ndarray
+    limit: np.ndarray
     strength: np.ndarray
     difficulty: np.ndarray
+    steepness: np.ndarray | None
     exists: np.ndarray
     exposures: np.ndarray
     failures: np.ndarray
@@ -52,10 +57,18 @@ class BoundRisk:
         count = hazard["failures_by_cause"].values + hazard.attrs["cause_concentration"]
         names = [str(name) for name in hazard["cause"].values]
         terms = [hazard["intercept"].values[:, None], hazard["coefficient"].values]
+        limit = [hazard[name].values for name in LIMIT_NAMES if name in hazard]  # 0.2 has none
+        difficulty, steepness = workspace.difficulty, None
+        if limit:
+            tilt = difficulty.sel(measure=TILT).values
+            steepness = steepness_of(tilt, workspace.team.max_slope)
+        measures = hazard["measure"].values.tolist()
         risk = cls(
             np.concatenate(terms, axis=1),
+            np.reshape(limit, (len(limit), hazard.sizes["draw"])).T,
             hazard["strength"].values,
-            workspace.difficulty.values - hazard.attrs["reference"],
+            difficulty.sel(measure=measures).values - hazard.attrs["reference"],
+            steepness,
             workspace.passable_bounds.values,
             hazard["exposures"].values,
             hazard["failures"].values,
@@ -91,16 +104,24 @@ class BoundRisk:
         """Draws of the chances to fail, shape (draw, move, row, col).
 
         Args:
-            n: Number of draws; those of the hyperparameters are taken in turn.
+            n: Number of draws. Those of the hyperparameters are taken at even steps from the
+                mildest to the worst, so that few draws have the posterior's mean chance to arrive.
             seed: Seed of the draws from the Betas.
         """
         rng = np.random.default_rng(seed)
         out = np.full((require_whole("n", n, 1), *self.exists.shape), np.nan)
-        every = np.flatnonzero(self.exists)
+        every, order = np.flatnonzero(self.exists), self._mildest_first
+        chosen = rng.permutation(order[((np.arange(n) + 0.5) / n * len(order)).astype(int)])
         for part in _parts(n, len(every)):
-            which = np.arange(part.start, part.stop) % len(self.strength)
-            out[part, self.exists] = rng.beta(*self._betas(which, every))
+            out[part, self.exists] = rng.beta(*self._betas(chosen[part], every))
         return out
+
+    @cached_property
+    def _mildest_first(self) -> np.ndarray:
+        """Indices of the draws of the hyperparameters, by the mean chance of some of the bounds."""
+        some = np.flatnonzero(self.exists)
+        a, b = self._betas(np.arange(len(self.strength)), some[:: 1 + len(some) // _SOME])
+        return np.argsort((a / (a + b)).mean(1))
 
     @cached_property
     def _moments(self) -> tuple[np.ndarray, np.ndarray]:
@@ -120,12 +141,12 @@ class BoundRisk:
 
     def _betas(self, draws: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Alpha and beta of the posterior Betas of bounds, flat indices; each (draw, bound)."""
-        x = self.difficulty[np.unravel_index(bounds, self.exists.shape)]
-        coefficients, strength = self.coefficients[draws], self.strength[draws, None]
-        logit = coefficients[:, :1] + coefficients[:, 1:] @ x.T
+        at = np.unravel_index(bounds, self.exists.shape)
+        steepness = None if self.steepness is None else self.steepness[at]
+        drawn = self.coefficients[draws], self.limit[draws], self.strength[draws]
+        a, b = prior_betas(*drawn, self.difficulty[at], steepness)
         n, failed = self.exposures.ravel()[bounds], self.failures.ravel()[bounds]
-        a = strength * special.expit(logit) + FLOOR + failed
-        b = strength * special.expit(-logit) + FLOOR + n - failed
+        a, b = a + failed, b + n - failed
         for j, (path, weight) in enumerate(zip(self.lost, self.lost_weights, strict=True)):
             met = np.asarray(np.ravel_multi_index(tuple(path.T), self.exists.shape))
             add_lost(_places_in(bounds, met), weight, self.place[draws, j] - 1, a, b)

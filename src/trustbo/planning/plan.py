@@ -105,7 +105,7 @@ class Plan(Displayed):
 
     @property
     def p_arrive(self) -> float | None:
-        """Chance that the mission reaches the goal, at the posterior mean of the risk."""
+        """Chance that the mission reaches the goal, the mean over draws of the risk."""
         return None if self.risk is None else self.risk.p_arrive
 
     @property

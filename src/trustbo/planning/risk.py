@@ -107,7 +107,10 @@ class Risk:
                 raise TrustboError(f"{name} must be in [0, 1]; got {worst:g}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Chance to reach the end of a path, the product of 1 - p_fail."""
+        """Product of 1 - p_fail along a path, what the limits and costs of planning go by.
+
+        Where the draws have bounds fail together, the chance to arrive is larger: see `along`.
+        """
         return float(np.prod(1.0 - self.p_fail[_at(path)]))
 
     def share_within(self, path: Sequence[Cell] | np.ndarray, max_failure: float) -> float:
@@ -125,19 +128,33 @@ class Risk:
             cause: np.broadcast_to(s, self.p_fail.shape)[at] for cause, s in self.causes.items()
         }
         band, arrive = np.full((2, len(p)), np.nan), (np.nan, np.nan)
+        reach = np.cumprod(1.0 - p)
         if self.draws is not None:
             drawn = self.draws[at]
             band = np.quantile(drawn, _BAND, axis=0)
             low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
             arrive = low, high
+            reach = np.minimum(reach * _dependence(drawn), np.minimum.accumulate(1.0 - p))
         by_cause = {cause: share * p for cause, share in shares.items()}
-        return PathRisk(p, band, float(np.prod(1.0 - p)), arrive, by_cause)
+        return PathRisk(p, band, float(reach[-1]), arrive, by_cause, reach)
 
 
 def _at(path: Sequence[Cell] | np.ndarray) -> tuple[Any, ...]:
     """Index of the bounds of a path in arrays (..., move, row, col)."""
     rows, cols = np.asarray(path)[1:].T
     return ..., moves_along(path), rows, cols
+
+
+def _dependence(draws: np.ndarray) -> np.ndarray:
+    """Mean over draws of the product of 1 - p, over the product of the means, (bound,).
+
+    For draws (draw, bound), of the first bound, the first two, and so on: the factor by which
+    bounds are likelier to be passed together than if they were independent. Times the product of
+    1 - p_fail it is the mean over draws with the error of few draws in each p_fail taken out.
+    """
+    together = np.cumprod(1.0 - draws, axis=1).mean(0)
+    apart = np.cumprod((1.0 - draws).mean(0))
+    return np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
 
 
 class PathRisk(NamedTuple):
@@ -148,11 +165,14 @@ class PathRisk(NamedTuple):
     p_fail_band: np.ndarray
     """Ends of its 90 % band over draws, shape (end, bound); NaN without draws."""
     p_arrive: float
-    """Chance to reach the goal at the posterior mean, the product of 1 - p_fail."""
+    """Chance to reach the goal: the mean over draws of the product of 1 - p_fail, as bounds depend
+    on what they have in common; without draws, the product of the means."""
     p_arrive_band: tuple[float, float]
     """Ends of its 90 % band over draws; NaN without draws."""
     by_cause: Mapping[str, np.ndarray]
     """`p_fail` by cause of the failure, each of shape (bound,)."""
+    p_reach: np.ndarray
+    """Chance to complete each bound and all before it, shape (bound,); the last is `p_arrive`."""
 
     def to_record(self) -> dict[str, Any]:
         """Convert to plain lists and numbers."""
@@ -162,18 +182,20 @@ class PathRisk(NamedTuple):
             "p_fail": self.p_fail.tolist(),
             "p_fail_band": self.p_fail_band.tolist(),
             "by_cause": by_cause,
+            "p_reach": self.p_reach.tolist(),
         }
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
         """Convert the record of `to_record` back."""
-        low, high = record["p_arrive_band"]
+        (low, high), p_fail = record["p_arrive_band"], np.array(record["p_fail"])
         return cls(
-            np.array(record["p_fail"]),
+            p_fail,
             np.array(record["p_fail_band"]),
             record["p_arrive"],
             (low, high),
             {cause: np.array(p) for cause, p in record["by_cause"].items()},
+            np.array(record.get("p_reach", np.cumprod(1.0 - p_fail))),  # not in version 0.2
         )
 
 
