@@ -42,9 +42,9 @@ from trustbo.models import (
     sample_statistics,
 )
 from trustbo.models.samplers.exact import _matched, _modes, _target
-from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.reparam import reparametrise
 from trustbo.models.samplers.run import draw_posterior, nuts_data
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -245,7 +245,7 @@ def pooled(quick):
     reference = unknowns(trustbo_exact(data.missions)(1000).sites)
     print_header(HEADER)
     exact = measure("trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
-    settings = NutsSettings(n_draws=100 if quick else 1000)
+    settings = NutsSettings(draws=100 if quick else 1000)
     sampler = trustbo_nuts(PooledTrust(), data.missions, settings)
     nuts = measure("trustbo NUTS, 4 x (300 + 1000)", sampler, reference)
     mcmc = numpyro_pooled(arrays, reference, quick)
@@ -403,7 +403,7 @@ def coupled(quick):
     data = simulate(model, coupled_truth, 20)
     arrays = (data.awareness, data.rates)
     print(f"\n## coupled: {data.rates.size} observations, 42 unknowns\n")
-    settings = NutsSettings(n_draws=100 if quick else 1000)
+    settings = NutsSettings(draws=100 if quick else 1000)
     sampler, kept = trustbo_nuts(model, data.missions, settings), {}
 
     def remembered(seed):

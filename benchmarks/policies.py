@@ -36,8 +36,8 @@ from scipy.stats import binomtest, rankdata
 from trustbo.data import Mission
 from trustbo.models import PooledTrust, sample_prior
 from trustbo.models.params import assemble_params
-from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import draw_posterior
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.planning import POLICIES, Planner
 from trustbo.stacking import stack_missions
 from trustbo.workspace import AwarenessBelief, Workspace
@@ -108,7 +108,7 @@ def run_mission(rng, truth, awareness, path):
 def learn(missions, seed):
     """1000 draws from the posterior: those of `fit`, without all else that it reports."""
     batch = stack_missions(missions)
-    settings, weight = NutsSettings(n_draws=250), np.ones(len(batch.contact_rate))
+    settings, weight = NutsSettings(draws=250), np.ones(len(batch.contact_rate))
     with warnings.catch_warnings(action="ignore"):  # NUTS instead, where weights are uneven
         draws, _ = draw_posterior(MODEL, "exact", settings, seed, batch, weight, check=False)
     sites = {name: v.reshape(-1, *v.shape[2:]) for name, v in draws.params.items()}

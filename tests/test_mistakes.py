@@ -179,9 +179,9 @@ MISTAKES = {
         lambda c: roll_trust(TRUTH._replace(place=np.zeros((1, 6, 6))), c.z),
         "With the awareness of a path's bounds, give params.along.path.",
     ),
-    "no draws": (lambda c: fit([c.mission], n_draws=0), "n_draws must be a .* 1 on; got 0"),
+    "no draws": (lambda c: fit([c.mission], draws=0), "draws must be a .* 1 on; got 0"),
     "no chains": (lambda c: fit([c.mission], n_chains=0), "n_chains must be a .* 1 on; got 0"),
-    "a warm-up below 0": (lambda c: fit([c.mission], n_warmup=-1), "n_warmup must .*0 on; got -1"),
+    "a warm-up below 0": (lambda c: fit([c.mission], warmup=-1), "warmup must .*0 on; got -1"),
     "half a trajectory": (
         lambda c: fit([c.mission], n_trajectories=0.5), "n_trajectories must be .* 1 on; got 0.5"
     ),

@@ -1,5 +1,6 @@
 """Errors that trustbo raises for input it refuses; each is also a ValueError."""
 
+import difflib
 import math
 import operator
 import os
@@ -106,3 +107,11 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     except (TypeError, ValueError):
         raise TrustboError(f"{what} must be two whole numbers (row, col); got {value!r}.") from None
     return first, second
+
+
+def unknown(what: str, name: str, known: Iterable[str]) -> TrustboError:
+    """Error for an unknown name, with those that may be meant."""
+    known = list(known)
+    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(known)}."
+    return TrustboError(f"unknown {what} {name!r}; {advice}")

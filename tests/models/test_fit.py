@@ -6,14 +6,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+import xarray as xr
 from models.conftest import simulate_missions
 from numpyro.infer import MCMC, NUTS
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.models import PooledTrust, Priors, diagnostics, fit, params_of
-from trustbo.models.samplers import complaints, run
-from trustbo.models.samplers.nuts import NutsSettings, run_nuts
+from trustbo.models.samplers import complaints, nuts, run
+from trustbo.models.samplers.nuts import _advance, run_nuts
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.stacking import stack_missions
 
 SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]
@@ -104,11 +106,46 @@ def test_the_same_seed_gives_the_same_posterior(posterior, missions):
     assert (other["posterior"]["b"].values != posterior["posterior"]["b"].values).any()
 
 
+def test_draws_do_not_depend_on_how_often_the_clock_is_looked_at(missions, monkeypatch, capsys):
+    few = {"sampler": "nuts", "draws": 30, "check": False, "whole": False}
+    usual = fit(missions, **few)["posterior"].to_dataset()
+    monkeypatch.setattr(nuts, "_SECONDS", 0.0)  # one draw at a time
+    xr.testing.assert_identical(fit(missions, **few)["posterior"].to_dataset(), usual)
+    assert capsys.readouterr().err == ""
+
+
+def test_settings_have_the_names_of_before_too_and_those_of_nuts_are_for_nuts(missions):
+    now, before = (
+        fit(missions, sampler="exact", whole=False, n_chains=2, **{name: 60})["posterior"]
+        for name in ("draws", "n_draws")
+    )
+    xr.testing.assert_identical(now.to_dataset(), before.to_dataset())
+    assert (now.sizes["chain"], now.sizes["draw"]) == (2, 60)
+    for name, value in {"warmup": 50, "target_accept": 0.95, "max_tree_depth": 8}.items():
+        expected = f'{name} is for NUTS, and the sampler is "exact": give sampler "nuts"'
+        with pytest.raises(TrustboError, match=expected):
+            fit(missions, **{name: value})
+    with pytest.raises(TrustboError, match="unknown setting 'n_wamup'; did you mean warmup"):
+        fit(missions, n_wamup=3)
+    for wrong in (0, 1.0, "0.9", True, np.nan):
+        with pytest.raises(TrustboError, match="target_accept must be between 0 and 1; got"):
+            fit(missions, sampler="nuts", target_accept=wrong)
+    with pytest.raises(TrustboError, match=r"max_tree_depth must be a .* from 1 on; got 0"):
+        fit(missions, sampler="nuts", max_tree_depth=0)
+
+
+def test_trajectories_keep_to_their_limit(missions):
+    few = {"draws": 30, "warmup": 30, "n_chains": 1, "check": False, "whole": False}
+    short = fit(missions, sampler="nuts", max_tree_depth=2, **few)["sample_stats"]
+    assert short["tree_depth"].max() == 2
+    assert short.sizes["draw"] == 30
+
+
 def test_more_missions_and_other_priors_meet_the_same_compiled_program(posterior):
-    compiled = run_nuts._cache_size()
+    compiled = _advance._cache_size()
     for n in (3, 4, 8):  # three lengths of missions each
         fit(simulate_missions(n), PooledTrust(Priors(x0_sd=0.1 * n)), "nuts")
-    assert run_nuts._cache_size() == compiled
+    assert _advance._cache_size() == compiled
 
 
 HEAVY = Priors(b=dist.Cauchy(0.0, 0.5), delta_v=dist.HalfCauchy(0.2))
@@ -132,7 +169,7 @@ def test_missing_rates_are_predicted_through(with_a_gap):
     assert np.isnan(posterior["observed_data"]["contact_rate"].sel(mission=0, bound=3, robot="r2"))
 
 
-def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypatch):
+def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypatch, capsys):
     """A limit that no run meets; the longer run takes the short one's length, and its program."""
     assert (complaints.MAX_RHAT, complaints.MIN_ESS) == (1.01, 400.0)
     tried = []
@@ -145,7 +182,10 @@ def test_a_bad_posterior_is_refused_with_the_parameter_s_name(missions, monkeypa
     monkeypatch.setattr(complaints, "MIN_ESS", 1e6)
     expected = r"bulk ESS of beta0 is \d{3,} \(at least 1000000\)"
     with pytest.raises(PosteriorError, match=expected) as error:
-        fit(missions, sampler="nuts")
+        fit(missions, sampler="nuts", progress=True)
+    assert capsys.readouterr().err.startswith(
+        "NUTS again, for longer (4 chains of 600 + 2000 draws, target_accept 0.98): bulk ESS of b"
+    )
     assert tried == [NutsSettings(), NutsSettings(600, 2000, 4, 0.98, collapse=True)]
     assert error.value.posterior.attrs["retries"] == 1
     assert fit(missions, sampler="nuts", check=False).attrs["retries"] == 0

@@ -40,7 +40,11 @@ class LearnedMissions:
         log: Missions as measured, their states, plans, posteriors and failures (a `History`).
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
             first mission, one from the prior.
+        progress: Whether fits show their progress, see `models.fit`; `iterate` and `missions` set
+            it.
     """
+
+    progress: bool | None = None
 
     def __init__(
         self,
@@ -152,6 +156,7 @@ class LearnedMissions:
                 self.log.last_tree,
                 seed,
                 self.workspace,
+                self.progress,
             )
         except CannotLearnError as error:
             for j in waiting:

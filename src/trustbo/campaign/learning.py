@@ -1,14 +1,15 @@
 """Learning of a campaign: its model, its sampler, and the weight of a mission."""
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import cast
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
+from trustbo.display.bars import place_of, say
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.models import (
     TrustModel,
@@ -22,6 +23,7 @@ from trustbo.models.likelihood.families import AUTO
 from trustbo.models.model import require_model
 from trustbo.models.params import Params
 from trustbo.models.samplers.choice import resolve_sampler
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.workspace import Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
 
@@ -45,10 +47,12 @@ class Learning:
     sampler: str
     update: str
     forgetting: float
+    sampling: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_model(self.model)
-        resolve_sampler(self.model, self.sampler)
+        sampler, _ = resolve_sampler(self.model, self.sampler)
+        NutsSettings.of(self.sampling).require_sampler(sampler)
         gaussian = self.model.family.integrates_out and self.model.observation != AUTO
         if self.forgetting < 1.0 and not (self.update == "refit" and gaussian):
             raise TrustboError(
@@ -70,6 +74,7 @@ class Learning:
         last: xr.DataTree | None,
         seed: int,
         workspace: Workspace | None = None,
+        progress: bool | None = None,
     ) -> xr.DataTree:
         """Fit the posterior of missions; one that is refused is tried again in other ways.
 
@@ -79,6 +84,7 @@ class Learning:
             last: Posterior of the others.
             seed: Seed of the sampler.
             workspace: Workspace of the missions, where places have effects.
+            progress: Whether NUTS and further attempts are shown, see `models.fit`.
 
         Returns:
             Posterior of the parameters, see `models.complete`.
@@ -95,11 +101,14 @@ class Learning:
         if self.forgetting < 1.0:
             weights = self.forgetting ** np.arange(len(missions) - 1, -1, -1)
         reason = ""
-        for sampler, n_draws, shift in self._attempts():
+        for shift, (sampler, sampling) in enumerate(self._attempts()):
+            if reason:
+                more = f'sampler "{sampler}" and {sampling["draws"]} draws a chain'
+                say(place_of(progress), f"another try, with {more}, as the last failed: {reason}.")
             try:
                 return fit(
                     missions, model, sampler, workspace=workspace, earlier=last, weights=weights,
-                    seed=seed + shift, n_draws=n_draws, whole=False,
+                    seed=seed + shift, progress=progress, whole=False, **sampling,
                 )  # fmt: skip
             except PosteriorError as error:
                 reason = error.reason
@@ -111,18 +120,20 @@ class Learning:
                 reason = f"{type(error).__name__}: {error}"
         raise CannotLearnError(reason)
 
-    def _attempts(self) -> list[tuple[str, int, int]]:
-        """Sampler, draws of a chain, and what is added to the seed, for each attempt."""
+    def _attempts(self) -> list[tuple[str, dict[str, Any]]]:
+        """Sampler of each attempt, and the number and care of its draws."""
         sampler, _ = resolve_sampler(self.model, self.sampler)
         # Draws of the exact sampler are nearly independent, and effects of places make them large.
         n = _N_DRAWS // 4 if sampler == "exact" and self.model.place else _N_DRAWS
-        attempts = [(self.sampler, n, 0), (self.sampler, 2 * n, 1)]
+        asked = {"draws": n, **self.sampling}
+        attempts = [(self.sampler, asked), (self.sampler, asked | {"draws": 2 * asked["draws"]})]
         other = "nuts" if sampler == "exact" else "exact"
         try:
             resolve_sampler(self.model, other)
         except TrustboError:
             return attempts
-        return [*attempts, (other, 2 * _N_DRAWS, 2)]
+        shared = NutsSettings.of(asked | {"draws": 2 * max(asked["draws"], _N_DRAWS)}).shared
+        return [*attempts, (other, shared)]
 
     def prior_belief(
         self, initial: str, n_robots: int, features: Sequence[str], seed: int

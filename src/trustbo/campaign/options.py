@@ -3,12 +3,11 @@
 Importing it loads nothing heavy, for `trustbo --help` is made from its fields.
 """
 
-import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, unknown
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -60,6 +59,11 @@ class CampaignOptions:
             `"belief"`, or an `AwarenessBelief` of your own, policies draw from it too.
         hazard: Priors of the chance that a bound fails. A `models.Hazard`, or some of its fields
             by name.
+        n_chains: Number of chains of NUTS; draws of other samplers are divided among them.
+        warmup: Warm-up draws of each chain of NUTS, 300 by default.
+        draws: Draws kept of each chain, 1000 by default; 250 of the exact sampler with places.
+        target_accept: Acceptance rate of NUTS, .9 by default; towards 1 it takes smaller steps.
+        max_tree_depth: Doublings of a trajectory of NUTS at most, 10 by default.
         replan: Replanning after each mission or after each bound. Under `"bound"` the rest is
             planned from the trust of now, see `replanning.run_replanning`; for `iterate` and
             `missions`.
@@ -83,17 +87,24 @@ class CampaignOptions:
         default="map", metadata=_of(LEARNING, "map", "belief")
     )
     hazard: "Hazard | Mapping[str, Any]" = field(default_factory=dict, metadata=_of(LEARNING))
+    n_chains: int | None = field(default=None, metadata=_of(LEARNING))
+    warmup: int | None = field(default=None, metadata=_of(LEARNING))
+    draws: int | None = field(default=None, metadata=_of(LEARNING))
+    target_accept: float | None = field(default=None, metadata=_of(LEARNING))
+    max_tree_depth: int | None = field(default=None, metadata=_of(LEARNING))
     replan: str = field(default="mission", metadata=_of(RUNNING, "mission", "bound"))
     callbacks: "Sequence[Callback]" = field(default=(), metadata=_of(RUNNING))
 
     def __post_init__(self) -> None:
         from trustbo.models.likelihood.gram import require_forgetting
+        from trustbo.models.samplers.settings import NutsSettings
 
         for option in fields(self):
             choices = option.metadata["choices"]
             if choices and not (option.name == "awareness" and self.own_awareness):
                 require_choice(option.name, getattr(self, option.name), choices)
         require_forgetting(self.forgetting)
+        NutsSettings.of(self.sampling)
         object.__setattr__(self, "hazard", _hazard_of(self.hazard))
         object.__setattr__(self, "callbacks", tuple(self.callbacks))
         for callback in self.callbacks:
@@ -132,6 +143,13 @@ class CampaignOptions:
         return cast("Hazard", self.hazard)
 
     @property
+    def sampling(self) -> dict[str, Any]:
+        """Number and care of draws, as far as they are given, by the names of `models.fit`."""
+        names = ("n_chains", "warmup", "draws", "target_accept", "max_tree_depth")
+        given = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in given.items() if value is not None}
+
+    @property
     def own_awareness(self) -> bool:
         """Whether the user gave a belief about the awareness."""
         if isinstance(self.awareness, str):
@@ -164,7 +182,7 @@ class CampaignOptions:
 
         if model is None:  # moments that are matched are those of the paper's parameters
             model = PooledTrust(place=PlaceEffect() if self.update == "refit" else None)
-        return Learning(model, sampler, self.update, self.forgetting)
+        return Learning(model, sampler, self.update, self.forgetting, self.sampling)
 
     def belief(self, workspace: "Workspace") -> "AwarenessBelief | None":
         """Belief about the awareness; None where the map is trusted."""
@@ -240,11 +258,3 @@ def again(name: str, kept: Any, given: Any, was_own: bool) -> Any:
     if given is not None and not was_own:
         raise TrustboError(f"the campaign's {name} is {kept!r}, none of your own; leave {name}=.")
     return kept if given is None else given
-
-
-def unknown(what: str, name: str, known: Iterable[str]) -> TrustboError:
-    """Error for an unknown name, with those that may be meant."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(known)}."
-    return TrustboError(f"unknown {what} {name!r}; {advice}")

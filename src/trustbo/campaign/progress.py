@@ -1,16 +1,11 @@
 """Progress of a campaign: a bar in a terminal, lines in a file, a bar and a map in a notebook."""
 
 import logging
-import sys
-import warnings
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-with warnings.catch_warnings():  # without ipywidgets its bars are of text, which is as good
-    warnings.simplefilter("ignore")
-    from tqdm.auto import tqdm
-
 from trustbo.campaign.history import LEARNED
+from trustbo.display.bars import FILE, NOTEBOOK, bar_in, place_of, say
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -37,20 +32,18 @@ class Progress:
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
         """Show nothing yet, and nothing at all if `progress` is False."""
-        self._campaign, self._total, self._shown = campaign, total, bool(progress)
-        self._notebook = self._shown and in_notebook()
-        # Carriage returns are for a terminal; a file gets lines.
-        self._lines = self._shown and not self._notebook and not sys.stderr.isatty()
+        self._campaign, self._total = campaign, total
+        self._place = place_of(bool(progress))
         self._map: Any = None
-        if self._notebook and progress is True:
+        if self._place == NOTEBOOK and progress is True:
             from IPython.display import display
 
             self._map = display(campaign, display_id=True)
 
     def __enter__(self) -> Self:
         done = len(self._campaign.missions)
-        silent = not self._shown or self._lines
-        self._bar = tqdm(total=self._total, initial=done, desc="missions", disable=silent)
+        self._before, self._campaign.progress = self._campaign.progress, bool(self._place)
+        self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
         return self
 
     def __exit__(
@@ -60,6 +53,7 @@ class Progress:
         at: TracebackType | None,
     ) -> None:
         self._bar.close()
+        self._campaign.progress = self._before
         if self._map is not None and kind is None:  # the result is what a cell shows afterwards
             self._map.update(_Nothing())
 
@@ -69,19 +63,10 @@ class Progress:
         self._bar.set_postfix_str(report, refresh=False)
         self._bar.update()
         _log.info("mission %d: %s", number, report)
-        if self._lines:
-            tqdm.write(f"mission {number}/{self._total}: {report}", file=sys.stderr)
+        if self._place == FILE:
+            say(FILE, f"mission {number}/{self._total}: {report}")
         if self._map is not None:
             self._map.update(self._campaign)
-
-
-def in_notebook() -> bool:
-    """Whether the code runs in a kernel of Jupyter."""
-    if "IPython" not in sys.modules:
-        return False
-    from IPython import get_ipython
-
-    return getattr(get_ipython(), "kernel", None) is not None
 
 
 def report_of(campaign: "Campaign") -> str:

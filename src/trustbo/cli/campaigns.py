@@ -12,6 +12,7 @@ from trustbo.cli.terrains import Rasters, pair, team_of
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
+    from trustbo.models import TrustModel
     from trustbo.simulation import KinematicSimulator
 
 
@@ -61,6 +62,7 @@ def run(
         chosen = CampaignOptions(**options)
         require_outputs(out, overwrite=overwrite)
         trust_model = _models()[model](observation=observation).model()
+        _require_sampling(chosen, trust_model, sampler)
         team = team_of(max_slope, robots, lidar_range)
         from trustbo import simulation
         from trustbo.campaign.loop import iterate
@@ -200,6 +202,14 @@ def _require_names(
         require_choice(what, name, choices)
     require_whole("n_iterations", iterations, 1)
     require_whole("seed", seed, 0)
+
+
+def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: str) -> None:
+    """Refuse settings of NUTS (TrustboError) for another sampler before a raster is read."""
+    from trustbo.models.samplers.choice import resolve_sampler
+    from trustbo.models.samplers.settings import NutsSettings
+
+    NutsSettings.of(options.sampling).require_sampler(resolve_sampler(model, sampler)[0])
 
 
 def _models() -> dict[str, Any]:

@@ -6,9 +6,8 @@ from typing import Any
 
 import typer
 
-from trustbo.campaign.options import unknown
 from trustbo.cli.errors import fail
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, unknown
 
 _FILES = ("dem", "dsm")
 """Flags whose paths are relative to the file, not to the working directory."""

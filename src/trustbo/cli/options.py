@@ -166,12 +166,12 @@ def _campaign_flags() -> list[inspect.Parameter]:
         kind = type(option.default)
         if kind not in _METAVARS:
             continue
-        numeric = option.type == float | None
+        typed, parser = _OPTIONAL.get(option.type, (kind, None))
         flag = typer.Option(
             help=texts.get(option.name, ""),
             rich_help_panel=_PANELS[option.metadata["part"]],
-            metavar=_METAVARS[float if numeric else kind],
-            parser=_number if numeric else _whole_or_name if option.default is None else None,
+            metavar=_METAVARS[typed],
+            parser=parser,
         )
         of_flag: Any = {"default": option.default, "annotation": Annotated[kind, flag]}
         parameters.append(inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, **of_flag))
@@ -187,3 +187,18 @@ def _number(text: str) -> float:
 
 def _whole_or_name(text: str) -> int | str:
     return int(text) if text.isdigit() else text
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no whole number.") from None
+
+
+_OPTIONAL: dict[Any, tuple[type, Callable[[str], Any]]] = {
+    float | None: (float, _number),
+    int | None: (int, _whole),
+    int | str | None: (type(None), _whole_or_name),
+}
+"""Placeholders and parsers of options that are None by default, by their types."""

@@ -11,6 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Mission, as_array
+from trustbo.display.bars import place_of
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.models.backend import VERSIONS
 from trustbo.models.likelihood.families import AUTO
@@ -22,10 +23,11 @@ from trustbo.models.posterior_groups import Law, complete
 from trustbo.models.posterior_tree import require_posterior, to_datatree
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.record import model_to_record
-from trustbo.models.samplers.choice import resolve_sampler, slow_places
-from trustbo.models.samplers.nuts import NutsSettings
+from trustbo.models.samplers.choice import faster_than_nuts, resolve_sampler, slow_places
 from trustbo.models.samplers.run import Draws, UnevenWeightsError, draw_posterior
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.models.samplers.student import Student
+from trustbo.models.samplers.watching import Watch
 from trustbo.models.ticks import TickWeights, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, require_same_team, stack_missions
 from trustbo.workspace import Workspace
@@ -42,12 +44,16 @@ def fit(
     earlier: xr.DataTree | None = None,
     weights: ArrayLike | None = None,
     seed: int = 0,
-    n_warmup: int = 300,
-    n_draws: int = 1000,
+    progress: bool | None = None,
     n_chains: int = 4,
+    warmup: int = 300,
+    draws: int = 1000,
+    target_accept: float = 0.9,
+    max_tree_depth: int = 10,
     n_trajectories: int = 200,
     check: bool = True,
     whole: bool = True,
+    **former: int,
 ) -> xr.DataTree:
     """Posterior of the trust model's parameters, and of latent trust, given missions.
 
@@ -71,14 +77,20 @@ def fit(
         weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
             observations.
         seed: Seed; the same seed gives the same posterior.
-        n_warmup: Warm-up draws per chain of NUTS, not kept.
-        n_draws: Draws kept per chain.
-        n_chains: Number of chains.
+        progress: Whether NUTS shows its chains in a bar, and first what they will take if that is
+            long. By default in a terminal and in a notebook; True prints lines into a file too.
+        n_chains: Number of chains; the exact sampler's draws are divided among them.
+        warmup: Warm-up draws per chain of NUTS, not kept.
+        draws: Draws kept per chain.
+        target_accept: Acceptance rate that NUTS adapts its steps to: towards 1, steps are
+            smaller, and divergences fewer.
+        max_tree_depth: Doublings of a trajectory of NUTS at most: 10 allow 1023 steps for a draw.
         n_trajectories: Draws, spread evenly over the chains, for which latent trust is kept.
         check: Refuse a posterior with R-hat > 1.01, bulk ESS < 400 or a divergence that a longer
             run does not cure; `False` returns it unchecked.
         whole: Whether to add latent trust, log-likelihoods and predictions at once; `complete` adds
             them later, where trust follows from the parameters.
+        **former: Numbers `n_warmup` and `n_draws`, the names of `warmup` and `draws` until 0.2.
 
     Returns:
         An ArviZ DataTree with the groups `posterior` (for `PooledTrust` beta0, beta[feature], b,
@@ -94,13 +106,15 @@ def fit(
     Raises:
         ShapeError: There are no missions, or they disagree on robots or features.
         TrustboError: An awareness value is NaN, the sampler is unknown or does not suit the model,
-            no contact rate was measured, a path leaves the workspace, or a number of draws or the
-            seed is no whole number.
+            no contact rate was measured, a path leaves the workspace, a number of draws or the
+            seed is no whole number, or a setting of NUTS is given and the sampler is another.
         PosteriorError: The diagnostics are beyond their limits.
     """
     model = PooledTrust() if model is None else model
     require_model(model)
-    settings = NutsSettings(n_warmup, n_draws, n_chains).checked()
+    given = {"warmup": warmup, "draws": draws, "n_chains": n_chains}
+    care = {"target_accept": target_accept, "max_tree_depth": max_tree_depth}
+    settings = NutsSettings.of({**given, **care}, former)
     n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
     seed = require_whole("seed", seed, 0)
     if earlier is not None:
@@ -121,36 +135,40 @@ def fit(
     def draw(model: TrustModel, *, fallback: bool) -> _Drawn:
         model = model.for_features(missions[0].features)
         chosen, reason = resolve_sampler(model, sampler)
+        settings.require_sampler(chosen)
         if sampler == "auto" and chosen != "exact" and model.place is not None:
             warnings.warn(slow_places(reason), stacklevel=3)
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
         start = _proposal(earlier)
-        draws, complaints = draw_posterior(
+        faster = "" if chosen == "exact" else faster_than_nuts(model)
+        # Of a campaign, the first fit says it for all.
+        watch = Watch(place_of(progress), faster, estimates=earlier is None)
+        drawn, complaints = draw_posterior(
             floored, chosen, settings, seed, batch, weight, places, start, check=check,
-            fallback=fallback,
+            fallback=fallback, watch=watch,
         )  # fmt: skip
-        return _Drawn(model, prior, draws, complaints, draws.fallback or reason)
+        return _Drawn(model, prior, drawn, complaints, drawn.fallback or reason)
 
     try:
         drawn = draw(model, fallback=asked.observation != AUTO or model.family.integrates_out)
     except UnevenWeightsError as error:
         family_reason += f", but the {model.observation} ones' {error}: Gaussian ones instead"
         drawn = draw(asked.observing("gaussian"), fallback=True)
-    model, prior, draws, complaints, reason = drawn
+    model, prior, sampled, complaints, reason = drawn
     groups = {
-        "posterior": {name: draws.params[name] for name in model.dims},
-        "sample_stats": draws.stats,
+        "posterior": {name: sampled.params[name] for name in model.dims},
+        "sample_stats": sampled.stats,
         "prior": {name: values[None] for name, values in prior.items()},
     }
     posterior = to_datatree(groups, missions, model.dims)
     if places is not None:
-        posterior["places"] = xr.DataTree(place_group(draws.places, places, seed))
+        posterior["places"] = xr.DataTree(place_group(sampled.places, places, seed))
     posterior.attrs |= {
         **_record(model, batch, resolution(ticks)),
-        **draws.summary,
+        **sampled.summary,
         "observation_reason": family_reason,
-        "sampler": draws.sampler,
+        "sampler": sampled.sampler,
         "sampler_reason": reason,
         "seed": seed,
     }
@@ -160,7 +178,7 @@ def fit(
         posterior.attrs["weights"] = counted.values.tolist()
     if whole or not Law.of(posterior).keeps_trust:
         posterior = complete(
-            posterior, missions, model=model, n_trajectories=n_trajectories, latents=draws.latents
+            posterior, missions, model=model, n_trajectories=n_trajectories, latents=sampled.latents
         )
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)

@@ -16,8 +16,8 @@ from trustbo.models.model import TrustModel
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.prior_predictive import draw_sites
 from trustbo.models.samplers.choice import resolve_sampler
-from trustbo.models.samplers.nuts import NutsSettings
 from trustbo.models.samplers.run import draw_posterior
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.models.sbc_places import Walks
 from trustbo.stacking import MissionBatch
 
@@ -72,12 +72,12 @@ def sbc(
     sampler, _ = resolve_sampler(model, sampler)
     require_whole("n_datasets", n_datasets, 1)
     kept = require_whole("n_ranked", n_ranked, _CHAINS) // _CHAINS
-    settings = NutsSettings(n_draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)
-    thinned = np.linspace(0, settings.n_draws - 1, kept).astype(int)
+    settings = NutsSettings(draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)
+    thinned = np.linspace(0, settings.draws - 1, kept).astype(int)
     awareness = np.random.default_rng(seed).uniform(size=shape)
     ticks = np.full(shape[:3], float(n_ticks))
     asked = f"{model.describe()}, {model.priors.describe()}, {sampler}, {shape}, {n_ticks}, "
-    asked += f"{settings}, {n_ranked}, {seed}"
+    asked += f"{settings!r}, {n_ranked}, {seed}"
     ranks = _read(checkpoint, asked)
     walks = None if model.place is None else Walks.random(shape[:2], seed)
     model = model.at_resolution({float(n_ticks): 1.0})

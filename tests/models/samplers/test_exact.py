@@ -17,7 +17,8 @@ from trustbo.errors import TrustboError
 from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams, diagnostics, fit
 from trustbo.models.likelihood.gram import sufficient_statistics
 from trustbo.models.samplers.exact import sample_exact
-from trustbo.models.samplers.nuts import NutsSettings, run_nuts
+from trustbo.models.samplers.nuts import run_nuts
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.models.samplers.target import NutsData
 from trustbo.stacking import stack_missions
 
@@ -89,7 +90,7 @@ def test_exact_draws_and_a_long_nuts_run_agree(seed):
     batch = stack_missions(missions)
     exact = sample_exact(sufficient_statistics(batch, 0.5), Priors(), 4000, seed).params
     with jax.enable_x64(True):
-        settings = NutsSettings(n_draws=20_000)
+        settings = NutsSettings(draws=20_000)
         data = NutsData(*batch, np.ones(len(batch.contact_rate)))
         nuts = run_nuts(settings, jax.random.key(seed), PooledTrust(), data).params
         nuts = {name: np.asarray(a).reshape(80_000, -1) for name, a in nuts.items()}

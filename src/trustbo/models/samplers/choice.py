@@ -61,6 +61,13 @@ def slow_places(reason: str) -> str:
     )
 
 
+def faster_than_nuts(model: TrustModel) -> str:
+    """Advice on what takes less time than NUTS on this model."""
+    if resolve_sampler(model, "auto")[0] == "exact":
+        return 'sampler "exact" takes seconds'
+    return "fewer draws or chains take less"
+
+
 def is_coupled(model: TrustModel) -> bool:
     """Whether robots influence each other."""
     return isinstance(model, CoupledTrust) and not model.robots_are_apart

@@ -42,6 +42,13 @@ _OF_PLACES = {"tau_s", "length_scale", "tau_e", "place_white"}
 _AUTOREGRESSIONS = {"beta0", "mean_beta0", "B0_diagonal"}
 
 
+class Frame(NamedTuple):
+    """Constants of the coordinates, found at a first mode."""
+
+    linearisation: Array | None
+    robots: RobotFit | None
+
+
 class Reparametrisation(NamedTuple):
     """A posterior in the coordinates that NUTS samples."""
 
@@ -59,13 +66,18 @@ class Reparametrisation(NamedTuple):
     As the noises go to 0 around a perfect fit, a density of few data grows without bound, but holds
     no mass: each location parameter takes a power of the noise away. That is added, as in REML.
     """
-    linearisation: Array | None
+    frame: Frame
     draw_effects: Callable[[Array, Array], Array]
     """Effects of places given such a vector, one draw by a key, where these integrate out."""
 
 
 def reparametrise(
-    model: TrustModel, data: NutsData, *, complete: bool = False, collapse: bool = False
+    model: TrustModel,
+    data: NutsData,
+    *,
+    complete: bool = False,
+    collapse: bool = False,
+    frame: Frame | None = None,
 ) -> Reparametrisation:
     """Change variables so that the posterior is close to a sphere.
 
@@ -74,12 +86,15 @@ def reparametrise(
         data: Missions.
         complete: Whether no rate is missing before the last of a mission.
         collapse: Whether to put innovations in the places of weights and intercept.
+        frame: Frame of an earlier call, which is then not searched again.
     """
     space = Coordinates(model, data, complete=complete, collapse=collapse)
     target, robots, pooling = space.target, None, model.partial_pooling
     joint = not model.family.integrates_out
     zeros = {"innovations": jnp.zeros(innovations_shape(data))} if joint else {}
-    if pooling is not None or model.family.linearises:
+    if frame is not None:
+        target.linearisation, robots = frame
+    elif pooling is not None or model.family.linearises:
         mode, _ = newton(lambda theta: space.potential({"theta": theta, **zeros}), target.start)
         if model.family.linearises:
             target.linearise(space.to_sites(mode)[0])
@@ -106,7 +121,7 @@ def reparametrise(
     def draw_effects(theta: Array, key: Array) -> Array:
         return target.draw_effects(target.values(space.to_sites(theta, robots)[0]), key)
 
-    known = constrain, potential, profile, target.linearisation, draw_effects
+    known = constrain, potential, profile, Frame(target.linearisation, robots), draw_effects
     return Reparametrisation(starts, longest, *known)
 
 

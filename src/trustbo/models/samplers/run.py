@@ -27,11 +27,13 @@ from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.models.samplers.importance import ScoreTarget, sample_scores
 from trustbo.models.samplers.latent_hierarchical_target import LatentHierarchicalTarget
 from trustbo.models.samplers.latent_target import LatentTarget
-from trustbo.models.samplers.nuts import NutsSettings, run_nuts
+from trustbo.models.samplers.nuts import run_nuts
 from trustbo.models.samplers.place_draws import split_units
 from trustbo.models.samplers.place_target import PlaceTarget
+from trustbo.models.samplers.settings import NutsSettings
 from trustbo.models.samplers.student import Student
 from trustbo.models.samplers.target import NutsData
+from trustbo.models.samplers.watching import SILENT, Watch
 from trustbo.stacking import MissionBatch
 
 
@@ -66,6 +68,7 @@ def draw_posterior(
     *,
     check: bool,
     fallback: bool = True,
+    watch: Watch = SILENT,
 ) -> tuple[Draws, list[str]]:
     """Draws given a batch, and complaints about them.
 
@@ -81,6 +84,7 @@ def draw_posterior(
             posterior.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
         fallback: Whether NUTS takes over, with a warning, where the exact sampler fails.
+        watch: Observer of the progress of NUTS.
 
     Raises:
         UnevenWeightsError: The exact sampler fails, and there is no fallback.
@@ -99,7 +103,9 @@ def draw_posterior(
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
     data = nuts_data(model, batch, weight, places)
     with own_settings():
-        draws, complaints = _sample_nuts(model, settings, random.key(seed), data, check=check)
+        draws, complaints = _sample_nuts(
+            model, settings, random.key(seed), data, watch, check=check
+        )
     if places is not None:
         draws = _with_effects(model, draws, places, seed)
     return draws._replace(fallback=failure), complaints
@@ -136,7 +142,7 @@ def _sample_exact(
     weight: np.ndarray | None,
 ) -> Draws:
     """Draws by importance sampling; UnevenWeightsError: its weights are too uneven."""
-    shape = (settings.n_chains, settings.n_draws)
+    shape = (settings.n_chains, settings.draws)
     each = [
         sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
         for i, statistics in enumerate(model.gather(batch, weight))
@@ -156,7 +162,7 @@ def _sample_scores(
     start: Student | None,
 ) -> Draws:
     """The same for places, partial pooling, coupled robots, and rates that are not Gaussian."""
-    shape = (settings.n_chains, settings.n_draws)
+    shape = (settings.n_chains, settings.draws)
     targets = _targets(model, batch, weight, places)
     coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
     if start is not None and coupled and len(start.center) != coupled.n_scores:
@@ -239,19 +245,17 @@ def _sample_nuts(
     settings: NutsSettings,
     key: Array,
     data: NutsData,
+    watch: Watch,
     *,
     check: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws by NUTS, longer ones if the first are bad, and complaints about the last."""
-    collapse = data.places is None
-    longer = NutsSettings(
-        2 * settings.n_warmup, 2 * settings.n_draws, settings.n_chains, 0.98, collapse=collapse
-    )
     complete = _is_complete(np.asarray(data.contact_rate))
     name = "nuts" if model.family.integrates_out else "joint"
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
-        raw = run_nuts(tried, random.fold_in(key, retries), model, data, complete=complete)
+        own = random.fold_in(key, retries)
+        raw = run_nuts(tried, own, model, data, complete=complete, watch=watch)
         params, stats = ({k: np.asarray(v) for k, v in g.items()} for g in (raw.params, raw.stats))
         stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
         innovations = None if raw.innovations is None else np.asarray(raw.innovations)
@@ -260,7 +264,11 @@ def _sample_nuts(
         return draws, [*complaints_of(params, stats), *complaints_of_modes(raw)] if check else []
 
     draws, complaints = attempt(settings, 0)
-    return attempt(longer, 1) if complaints else (draws, complaints)
+    if not complaints:
+        return draws, complaints
+    longer = settings.longer(collapse=data.places is None)
+    watch.retry(longer, complaints)
+    return attempt(longer, 1)
 
 
 def _with_effects(model: TrustModel, draws: Draws, places: Visited, seed: int) -> Draws:

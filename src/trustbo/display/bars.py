@@ -1,0 +1,44 @@
+"""Bars and lines that show progress: in a terminal, in a notebook, or in a file."""
+
+import sys
+import warnings
+from typing import Any
+
+with warnings.catch_warnings():  # without ipywidgets its bars are of text, which is as good
+    warnings.simplefilter("ignore")
+    from tqdm.auto import tqdm
+
+NOWHERE, TERMINAL, NOTEBOOK, FILE = "", "terminal", "notebook", "file"
+"""Places of progress; a file gets lines alone, as carriage returns are for a terminal."""
+
+
+def place_of(progress: bool | None) -> str:
+    """Place that progress is shown in; None is True, but leaves a file as it is."""
+    if progress is not None and not progress:
+        return NOWHERE
+    if in_notebook():
+        return NOTEBOOK
+    if sys.stderr.isatty():
+        return TERMINAL
+    return NOWHERE if progress is None else FILE
+
+
+def in_notebook() -> bool:
+    """Whether the code runs in a kernel of Jupyter."""
+    if "IPython" not in sys.modules:
+        return False
+    from IPython import get_ipython
+
+    return getattr(get_ipython(), "kernel", None) is not None
+
+
+def bar_in(place: str, **options: Any) -> tqdm:
+    """Bar in a terminal or a notebook; in other places it is not shown."""
+    return tqdm(disable=place not in (TERMINAL, NOTEBOOK), **options)
+
+
+def say(place: str, line: str) -> None:
+    """Print a line above the bars."""
+    if place:
+        # A notebook sets off what comes by stderr as if it were an error.
+        tqdm.write(line, file=sys.stdout if place == NOTEBOOK else sys.stderr)

@@ -1,0 +1,86 @@
+"""Length and care of a run of NUTS: names, defaults and limits."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
+
+from trustbo.errors import TrustboError, require_whole, unknown
+
+_FORMER = {"n_warmup": "warmup", "n_draws": "draws"}
+"""Names until version 0.2, which are still taken."""
+_OF_ALL = ("n_chains", "draws")
+"""Settings that the exact sampler takes too: the number and the shape of its draws."""
+
+
+class NutsSettings(NamedTuple):
+    """Length and care of a NUTS run."""
+
+    warmup: int = 300
+    draws: int = 1000
+    n_chains: int = 4
+    target_accept: float = 0.9
+    max_tree_depth: int = 10
+    collapse: bool = False
+    """Collapse the pooled model's weights and intercept: slower, but no funnel for few data."""
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any], former: Mapping[str, Any] | None = None) -> Self:
+        """Settings by name, checked.
+
+        Args:
+            given: Values by name; None leaves a default.
+            former: Values by the names of version 0.2.
+
+        Raises:
+            TrustboError: An unknown name, or a number outside its range.
+        """
+        values = {name: value for name, value in given.items() if value is not None}
+        for name, value in (former or {}).items():
+            if name not in _FORMER:
+                raise unknown("setting", name, SETTINGS)
+            values[_FORMER[name]] = value
+        settings = cls(**values)
+        accept = settings.target_accept
+        if isinstance(accept, bool | str) or not 0.0 < accept < 1.0:
+            raise TrustboError(f"target_accept must be between 0 and 1; got {accept!r}.")
+        return settings._replace(
+            warmup=require_whole("warmup", settings.warmup, 0),
+            draws=require_whole("draws", settings.draws, 1),
+            n_chains=require_whole("n_chains", settings.n_chains, 1),
+            target_accept=float(accept),
+            max_tree_depth=require_whole("max_tree_depth", settings.max_tree_depth, 1),
+        )
+
+    def require_sampler(self, sampler: str) -> None:
+        """Refuse settings that are not the defaults where the exact sampler ignores them.
+
+        Raises:
+            TrustboError: A setting of NUTS alone, and another sampler.
+        """
+        own = [n for n in SETTINGS if n not in _OF_ALL and getattr(self, n) != _DEFAULTS[n]]
+        if sampler == "exact" and own:
+            raise TrustboError(
+                f"{', '.join(own)} {'is' if len(own) == 1 else 'are'} for NUTS, and the sampler "
+                f'is "exact": give sampler "nuts", or leave {"it" if len(own) == 1 else "them"}.'
+            )
+
+    @property
+    def shared(self) -> dict[str, int]:
+        """Settings that every sampler takes."""
+        return {name: getattr(self, name) for name in _OF_ALL}
+
+    def longer(self, *, collapse: bool) -> Self:
+        """Settings of another try, after draws that were refused."""
+        return self._replace(
+            warmup=2 * self.warmup,
+            draws=2 * self.draws,
+            target_accept=max(self.target_accept, 0.98),
+            collapse=collapse,
+        )
+
+    def __str__(self) -> str:
+        return f"{self.n_chains} chains of {self.warmup} + {self.draws} draws"
+
+
+_DEFAULTS = NutsSettings._field_defaults
+SETTINGS = ("n_chains", "warmup", "draws", "target_accept", "max_tree_depth")
+"""Names of the settings that users give."""

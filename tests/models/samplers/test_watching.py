@@ -1,0 +1,67 @@
+"""Progress of NUTS: what is said of a long run, and that a short one is quiet."""
+
+import numpy as np
+import pytest
+
+from trustbo.display.bars import FILE, NOWHERE, TERMINAL
+from trustbo.models.samplers.settings import NutsSettings
+from trustbo.models.samplers.watching import Watch, about
+
+SETTINGS = NutsSettings(300, 1000, 4)  # 5200 draws
+
+
+def run(watch, seconds):
+    """Show a trial of draws of 8 leapfrog steps, of so many seconds, after dearer ones."""
+    with watch.running(SETTINGS) as seen:
+        seen.compiled()
+        for n_steps in (500, 8, 8, 8, 8, 8):
+            seen.advanced(seconds / 8 * 10 * n_steps, stats_of(10, n_steps))
+
+
+def stats_of(n, n_steps=8, n_divergences=1):
+    return {"n_steps": np.full(n, n_steps), "diverging": np.arange(n) < n_divergences}
+
+
+@pytest.mark.parametrize(("place", "said"), [(FILE, 1), (NOWHERE, 0)])
+def test_a_long_run_is_announced_once_with_what_is_faster(place, said, capsys):
+    run(Watch(place, 'sampler "exact" takes seconds'), 0.05)
+    expected = 'NUTS: 4 chains of 300 + 1000 draws, about 4 min. Faster: sampler "exact" takes'
+    assert capsys.readouterr().err.count(expected) == said
+
+
+def test_a_short_run_is_not_announced_nor_one_whose_time_is_known(capsys):
+    run(Watch(FILE), 0.0015)
+    run(Watch(FILE, estimates=False), 1.0)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_bar_names_the_chain_the_phase_and_divergences_after_the_warm_up(capsys):
+    with Watch(TERMINAL).running(SETTINGS) as seen:
+        for _ in range(5):
+            seen.advanced(0.2, stats_of(520, n_divergences=3))
+            seen._bar.refresh()
+    shown = capsys.readouterr().err
+    assert "NUTS, compiling:   0%" in shown
+    assert "NUTS, chain 1 of 4, warm-up:  10%" in shown
+    assert "NUTS, chain 2 of 4, draws:  50%" in shown
+    assert "9 divergences" in shown
+
+
+def test_a_second_run_says_that_it_is_one_and_why(capsys):
+    watch = Watch(FILE)
+    run(watch, 0.0)
+    watch.retry(SETTINGS.longer(collapse=False), ["R-hat of b is 1.050 (limit 1.01)", "2 others"])
+    assert capsys.readouterr().err == (
+        "NUTS again, for longer (4 chains of 600 + 2000 draws, target_accept 0.98): R-hat of b is "
+        "1.050 (limit 1.01) and 1 more.\n"
+    )
+    run(watch, 0.1)
+    assert capsys.readouterr().err.startswith("NUTS, second run: 4 chains of 300 + 1000 draws, ")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(12, "about 10 s"), (94, "about 90 s"), (141, "about 2 min"), (9000, "about 2 h")],
+)
+def test_rough_times_are_round(seconds, text):
+    assert about(seconds) == text
