@@ -1,9 +1,9 @@
 """Progress of NUTS: a bar of its chains, and the time it will take, from its first draws.
 
-A trial of its own would be thrown away, so the trial is the start of the first chain. Its very first
-draws, while the step size is still sought, may take a hundred times the usual number of leapfrog
-steps: the time of a step is that of all, and their number a draw the median of the trial's second
-half. The estimate is a rough one all the same, and the bar corrects it.
+A trial of its own would be thrown away, so the trial is the start of the first chain. Its very
+first draws, while the step size is still sought, may take a hundred times the usual number of
+leapfrog steps: the time of a step is that of all, and their number a draw the median of the trial's
+second half. The estimate is a rough one all the same, and the bar corrects it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from trustbo.models.samplers.settings import NutsSettings
 
 LONG = 10.0
 """Seconds from which on it is said what a run will take."""
-_TRIAL_DRAWS, _TRIAL_SECONDS, _MOST_SECONDS = 30, 1.0, 10.0
+_TRIAL_DRAWS, _TRIAL_SECONDS = 30, 1.0
 
 
 class Watch:
@@ -72,8 +72,7 @@ class Watch:
             return
         self._seconds += seconds
         self._n_steps = np.append(self._n_steps, stats["n_steps"])
-        tried = self._draws >= _TRIAL_DRAWS and self._seconds >= _TRIAL_SECONDS
-        if tried or self._seconds >= _MOST_SECONDS:
+        if self._draws >= _TRIAL_DRAWS and self._seconds >= _TRIAL_SECONDS:
             self._estimate()
 
     def retry(self, settings: NutsSettings, complaints: Sequence[str]) -> None:
