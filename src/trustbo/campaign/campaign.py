@@ -460,6 +460,19 @@ class Campaign(LearnedMissions, Displayed):
             self._folder.write(self._state(), result, ended=True)
         return result
 
+    def folder_of_page(self) -> Path:
+        """Folder that the campaign is kept in, for its page.
+
+        Raises:
+            TrustboError: There is none.
+        """
+        if self._folder is None:
+            raise TrustboError(
+                'progress="page" writes report.html into the campaign\'s folder; give directory=, '
+                "or checkpoint= to iterate."
+            )
+        return self._folder.path
+
     def close(self) -> None:
         """Let go of the folder; the campaign is kept there no longer."""
         if self._folder is not None:

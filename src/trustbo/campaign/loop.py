@@ -68,7 +68,8 @@ def iterate(
             If the process dies, `resume` goes on from it.
         seed: Seed of everything random.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
-            missions; `"bar"` for the bar alone.
+            missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
+            too, a page that reloads itself while the campaign runs.
         **options: Fields of `CampaignOptions`, or a whole one as `options`.
 
     Returns:
@@ -79,6 +80,8 @@ def iterate(
         NoPathError: The goal cannot be reached.
     """
     n_iterations = require_whole("n_iterations", n_iterations, 1)
+    if progress == "page" and checkpoint is None:
+        raise TrustboError('progress="page" writes report.html into the checkpoint; give one.')
     campaign = Campaign(
         workspace,
         start,
@@ -127,7 +130,8 @@ def resume(
         policy: The same policy; see `Campaign.load`.
         stop: Rules in place of those that it was begun with; needed where one was your own.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
-            missions; `"bar"` for the bar alone.
+            missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
+            too, a page that reloads itself while the campaign runs.
         **own: The same `awareness` and `callbacks`; see `Campaign.load`.
 
     Raises:
@@ -171,7 +175,8 @@ def missions(
         truth: Truth as in `iterate`.
         stop: Rules as in `iterate`.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
-            missions; `"bar"` for the bar alone.
+            missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
+            too, a page that reloads itself while the campaign runs.
 
     Yields:
         Plan of each mission, and the mission, learned from already.
@@ -245,7 +250,7 @@ def _missions(
             for callback in campaign.options.callbacks:
                 callback(campaign, mission)
             yield plan, mission
-    campaign.stop("n_iterations")
+        campaign.stop("n_iterations")
 
 
 def _run(campaign: Campaign, runner: Any, plan: Plan) -> Mission:

@@ -1,6 +1,7 @@
 """Progress of a campaign: a bar in a terminal, lines in a file, a bar and a map in a notebook."""
 
 import logging
+from importlib import import_module
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -28,6 +29,7 @@ class Progress:
 
     Under `progress=True` a notebook also shows the campaign itself, its map of trust and the
     contact of its missions, renewed after each and gone at the end; `"bar"` leaves it out.
+    `"page"` keeps a page of it in the campaign's folder, which becomes the report.
     """
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
@@ -35,6 +37,10 @@ class Progress:
         self._campaign, self._total = campaign, total
         self._place = place_of(bool(progress))
         self._map: Any = None
+        self._page: Any = None
+        if progress == "page":
+            live = import_module("trustbo.report.live")  # by name: it lies above
+            self._page = live.LivePage(campaign.folder_of_page() / "report.html", total)
         if self._place == NOTEBOOK and progress is True:
             from IPython.display import display
 
@@ -43,6 +49,9 @@ class Progress:
     def __enter__(self) -> Self:
         done = len(self._campaign.missions)
         self._before, self._campaign.progress = self._campaign.progress, bool(self._place)
+        if self._page is not None:
+            self._page.__enter__()
+            say(self._place, f"follow the campaign at {self._page.path.resolve().as_uri()}")
         self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
         return self
 
@@ -56,6 +65,10 @@ class Progress:
         self._campaign.progress = self._before
         if self._map is not None and kind is None:  # the result is what a cell shows afterwards
             self._map.update(_Nothing())
+        if self._page is not None:
+            self._page.__exit__(kind, error, at)
+            if kind is None:
+                self._page.finish(self._campaign.result())
 
     def step(self) -> None:
         """Show the last mission."""
@@ -67,6 +80,8 @@ class Progress:
             say(FILE, f"mission {number}/{self._total}: {report}")
         if self._map is not None:
             self._map.update(self._campaign)
+        if self._page is not None:
+            self._page(self._campaign)
 
 
 def report_of(campaign: "Campaign") -> str:

@@ -1,5 +1,7 @@
 """`trustbo run`, `demo` and `resume`: campaigns on your own or a real terrain of ours."""
 
+from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
@@ -13,6 +15,7 @@ from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
     from trustbo.models import TrustModel
+    from trustbo.report import LivePage
     from trustbo.simulation import KinematicSimulator
 
 
@@ -39,6 +42,7 @@ def run(
     seed: int = 0,
     config: Path | None = None,
     out: Path = Path("out"),
+    page: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
     debug: bool = False,
@@ -73,21 +77,23 @@ def run(
         rasters = Rasters(dem, dsm, crs, resolution, nodata)
         found = rasters.found((start, goal), pair("shape", shape), team, progress=not quiet)
         workspace = Workspace.from_terrain(found.ground, found.grid.shape, team, sight=sight)
-        result = iterate(
-            workspace,
-            *found.ends,
-            n_iterations=iterations,
-            model=trust_model,
-            policy=policy,
-            objective=objective,
-            sampler=sampler,
-            simulator=simulation.KinematicSimulator(workspace),
-            stop=stop,
-            checkpoint=out,
-            seed=seed,
-            progress=not quiet,
-            options=chosen,
-        )
+        with _live_page(out, iterations) if page else nullcontext() as live:
+            chosen = chosen if live is None else replace(chosen, callbacks=(live,))
+            result = iterate(
+                workspace,
+                *found.ends,
+                n_iterations=iterations,
+                model=trust_model,
+                policy=policy,
+                objective=objective,
+                sampler=sampler,
+                simulator=simulation.KinematicSimulator(workspace),
+                stop=stop,
+                checkpoint=out,
+                seed=seed,
+                progress=not quiet,
+                options=chosen,
+            )
         write_outputs(result, out, table=not quiet)
 
 
@@ -202,6 +208,15 @@ def _require_names(
         require_choice(what, name, choices)
     require_whole("n_iterations", iterations, 1)
     require_whole("seed", seed, 0)
+
+
+def _live_page(out: Path, iterations: int) -> "LivePage":
+    """Page of the campaign while it runs; its address is printed."""
+    from trustbo.report import LivePage
+
+    page = LivePage(out / "report.html", iterations)
+    print(f"follow the campaign at {page.path.resolve().as_uri()}", flush=True)
+    return page
 
 
 def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: str) -> None:

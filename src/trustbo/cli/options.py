@@ -73,6 +73,7 @@ Program
   report.out FILE: File of the page; by default report.html in the folder.
   export.out FOLDER: Folder for the files; by default the result's.
   info.out FILE: Picture of the grid, a .png.
+  page: Keep report.html up to date while the campaign runs; it reloads itself in a browser.
   overwrite: Replace the campaign that the folder holds.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
@@ -99,6 +100,7 @@ Arguments
 """Flags by panel: name, placeholder and help; `command.name` where it differs by command."""
 _NAMES = {
     "overwrite": ("--overwrite",),  # without --no-overwrite
+    "page": ("--page",),
     "quick": ("--quick",),
     "quiet": ("--quiet", "-q"),
     "debug": ("--debug",),

@@ -43,6 +43,20 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Drawing:
+    """Small figure in the colours of the page's text, drawn in milliseconds.
+
+    Attributes:
+        caption: Caption, one sentence.
+        svg: Element of `display.svg`, its texts escaped.
+    """
+
+    caption: str
+    svg: str
+    kind: str = field(default="drawing", init=False)
+
+
+@dataclass(frozen=True)
 class Section:
     """Section of the page.
 
@@ -50,13 +64,13 @@ class Section:
         slug: Anchor of the section.
         title: Heading.
         text: Introduction of one or two sentences, or none.
-        blocks: Tables and pictures.
+        blocks: Tables, pictures and drawings.
     """
 
     slug: str
     title: str
     text: str
-    blocks: Sequence[Table | Picture]
+    blocks: Sequence[Table | Picture | Drawing]
 
 
 @dataclass(frozen=True)

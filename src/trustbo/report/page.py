@@ -1,6 +1,6 @@
 """Page of a result: one HTML file that needs no other."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jinja2
@@ -11,7 +11,7 @@ from trustbo.files import FilePath, require_file, write_text
 from trustbo.models import criticise
 from trustbo.models.backend import VERSIONS
 from trustbo.report import figures, tables
-from trustbo.report.blocks import Section
+from trustbo.report.blocks import Fact, Section
 from trustbo.report.numbers import counted
 from trustbo.report.summary import facts_of
 
@@ -41,6 +41,36 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     explorer = require_file(target.with_name(own))
     result.explore().save(explorer)
     name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
+    page = render(
+        name,
+        facts_of(result),
+        list(_sections(result)),
+        explorer=explorer.name,
+        version=result.settings.get("trustbo_version", VERSIONS["trustbo"]),
+    )
+    write_text(target, page)
+    return [target, explorer]
+
+
+def render(
+    title: str,
+    facts: Sequence[Fact],
+    sections: Sequence[Section],
+    *,
+    explorer: str | None = None,
+    refresh: int = 0,
+    version: str = VERSIONS["trustbo"],
+) -> str:
+    """Fill the page.
+
+    Args:
+        title: Title.
+        facts: Facts of the summary.
+        sections: Sections below it.
+        explorer: Name of the interactive page beside it; None without one.
+        refresh: Seconds after which the page reloads itself; 0 for never.
+        version: Version that made the result.
+    """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("trustbo.report", "."),
         autoescape=True,
@@ -48,15 +78,8 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    page = environment.get_template("page.html").render(
-        title=name,
-        facts=facts_of(result),
-        sections=list(_sections(result)),
-        explorer=explorer.name,
-        version=result.settings.get("trustbo_version", VERSIONS["trustbo"]),
-    )
-    write_text(target, page)
-    return [target, explorer]
+    filled = {"facts": facts, "sections": sections, "explorer": explorer, "refresh": refresh}
+    return environment.get_template("page.html").render(title=title, version=version, **filled)
 
 
 def _sections(result: Result) -> Iterator[Section]:

@@ -20,9 +20,12 @@ _MEANS = {
 }
 
 
-def facts_of(result: Result) -> list[Fact]:
-    """Return the facts of the summary: campaign, recommendation, value, diagnostics."""
-    plan = result.plan
+def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
+    """Return the facts of the summary: campaign, recommendation, value, diagnostics.
+
+    The `plan` is the result's; a campaign under way has it at hand.
+    """
+    plan = result.plan if plan is None else plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
         Fact("Recommended", _path(result, plan)),
@@ -127,6 +130,8 @@ def _soundness(result: Result) -> Fact:
             f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below {GOOD_KHAT}; "
             f"usable: up to {MAX_KHAT}), its effective points {number(kish, 0)} at least"
         )
+    if not said:
+        return Fact("Posteriors", "Nothing could be learned yet.")
     verdict = "They are well sampled" if good else "Do not rely on them"
     return Fact("Posteriors", f"{verdict}: {'; '.join(said)}.", good)
 

@@ -1,0 +1,91 @@
+"""First screen of the report while a campaign runs: a page that reloads itself."""
+
+import time
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.result import Result
+from trustbo.data import Mission
+from trustbo.display.svg import curve_picture, map_picture
+from trustbo.files import FilePath, require_file, write_text
+from trustbo.report import tables
+from trustbo.report.blocks import Drawing, Fact, Section
+from trustbo.report.numbers import counted
+from trustbo.report.page import render, write_report
+from trustbo.report.summary import facts_of
+
+_REFRESH = 5
+"""Seconds between two looks at the file."""
+
+
+class LivePage:
+    """Page of a campaign under way: a callback of campaigns, renewed after each mission.
+
+    The file is replaced as a whole, so that there is a page to be read at any time, after a crash
+    too: it tells as of which mission and what time it is.
+    """
+
+    def __init__(self, path: FilePath, total: int) -> None:
+        """Prepare the page.
+
+        Args:
+            path: HTML file to write, or to replace.
+            total: Number of missions in all.
+        """
+        self.path, self.total = require_file(path, ".html", ".htm"), total
+        self._campaign: Campaign | None = None
+
+    def __enter__(self) -> Self:
+        self._write("No mission is done yet")
+        return self
+
+    def __call__(self, campaign: Campaign, mission: Mission | None = None) -> None:
+        """Renew the page."""
+        self._campaign = campaign
+        self._write("Under way")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            self._write("It was interrupted", refresh=0)
+
+    def finish(self, result: Result) -> None:
+        """Write the usual report in its place."""
+        write_report(self.path, result)
+
+    def _write(self, state: str, *, refresh: int = _REFRESH) -> None:
+        campaign, n, facts, sections = self._campaign, 0, [], []
+        if campaign is not None:
+            result, n = campaign.result(), len(campaign.missions)
+            facts = facts_of(result, campaign.recommend())[:-1]  # but the reason of the end
+            sections = _sections(result)
+        said = f"{state}: as of mission {n} of {self.total}, at {time.strftime('%H:%M')}."
+        title = f"A campaign after {counted(n, 'mission')} of {self.total}"
+        page = render(title, [Fact("State", said), *facts], sections, refresh=refresh)
+        write_text(self.path, page)
+
+
+def _sections(result: Result) -> list[Section]:
+    """Sections of the first screen, drawn without figures that take seconds."""
+    grid, trust = result.workspace.grid, result.trust_map.values.copy()
+    trust[result.path[0]] = np.nan  # assumed there, and would set the limits of the colours
+    area = map_picture(
+        trust, result.path, aspect=grid.cell_height / grid.cell_width, label="expected trust"
+    )
+    rates = curve_picture(
+        result.history["contact_rate"].values, label="contact rate", x_label="missions"
+    )
+    path = "Expected trust now, and the path recommended now, from circle to star."
+    contact = "Mean contact rate that each mission measured."
+    table = tables.history_table(result)
+    return [
+        Section("maps", "Trust map", "", [Drawing(path, area)]),
+        Section("history", "The campaign", "", [Drawing(contact, rates), table]),
+    ]
