@@ -228,3 +228,19 @@ def test_a_belief_learns_the_awareness_that_missions_measure(workspace):
     blind = ModelSimulator(truth, blind=True).run(plan.path, seed=1)
     campaign.tell(blind, other_path=True)
     np.testing.assert_allclose(campaign.missions[1].awareness[0], believed[:, *cell])
+
+
+def test_settings_of_draws_are_options_and_go_to_every_fit(workspace):
+    sampling = {"draws": 60, "n_chains": 2}
+    campaign = Campaign(workspace, *ENDS, model=PooledTrust(), sampler="exact", **sampling)
+    campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    sizes = campaign.posterior["posterior"].sizes
+    assert (sizes["chain"], sizes["draw"]) == (2, 60)
+    expected = 'target_accept, max_tree_depth are for NUTS, and the sampler is "exact"'
+    with pytest.raises(TrustboError, match=expected):
+        Campaign(workspace, *ENDS, target_accept=0.95, max_tree_depth=8)
+    Campaign(workspace, *ENDS, sampler="nuts", target_accept=0.95)
+    with pytest.raises(TrustboError, match="unknown option 'warm_up'; did you mean warmup"):
+        Campaign(workspace, *ENDS, warm_up=3)
+    with pytest.raises(TrustboError, match=r"warmup must be a .* from 0 on; got -1"):
+        Campaign(workspace, *ENDS, sampler="nuts", warmup=-1)

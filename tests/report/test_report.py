@@ -14,7 +14,7 @@ import trustbo as tb
 from trustbo.models import CoupledTrust, TrustParams
 from trustbo.models.params import CoupledParams
 from trustbo.planning import PathRisk
-from trustbo.report import write_report
+from trustbo.report import LivePage, live, write_report
 from trustbo.report.numbers import decimals_for, number
 from trustbo.report.summary import _arrival, facts_of
 from trustbo.report.tables import parameter_table
@@ -315,3 +315,52 @@ def test_numbers_have_the_digits_they_are_sure_of():
 
 def read(text):
     return float(text.replace("\N{MINUS SIGN}", "-"))
+
+
+def test_a_page_follows_a_campaign_and_becomes_its_report(result, tmp_path, monkeypatch):
+    file, pages = tmp_path / "kept" / "report.html", []
+    write_text = live.write_text
+
+    def keep(path, text):
+        pages.append(text)
+        write_text(path, text)
+
+    monkeypatch.setattr(live, "write_text", keep)
+    monkeypatch.setattr(live, "write_report", lambda path, _: path.write_text("the report"))
+    settings = {"n_iterations": 2, "sampler": "exact", "progress": "page"}
+    with pytest.raises(tb.TrustboError, match=r'progress="page" writes report.html into the check'):
+        tb.iterate(result.workspace, (2, 0), (0, 2), **settings)
+    tb.iterate(result.workspace, (2, 0), (0, 2), checkpoint=file.parent, seed=1, **settings)
+    assert [re.findall(r"as of mission (\d) of 2, at \d\d:\d\d", page) for page in pages] == [
+        ["0"], ["1"], ["2"],
+    ]  # fmt: skip
+    for page in map(Page, pages):
+        assert ("meta", {"http-equiv": "refresh", "content": "5"}) in page.tags
+    assert len(Page(pages[-1]).tables[0]) == 3  # of two missions
+    assert "Figure 2." in pages[-1]
+    assert file.read_text() == "the report"
+
+
+def test_the_last_page_of_a_campaign_that_broke_is_readable_and_at_rest(result, tmp_path):
+    def broken(campaign, mission):
+        raise RuntimeError("out of battery")
+
+    with (
+        pytest.raises(RuntimeError, match="out of battery"),
+        LivePage(tmp_path / "page.html", 4) as page,
+    ):
+        options = {"callbacks": [page, broken], "sampler": "exact", "progress": False}
+        tb.iterate(result.workspace, (2, 0), (0, 2), n_iterations=4, **options)
+    text = (tmp_path / "page.html").read_text()
+    assert "It was interrupted: as of mission 1 of 4, at " in text
+    assert "refresh" not in text
+
+
+def test_evidence_of_the_exact_sampler_is_k_hat_on_card_and_page(result, page):
+    khat, kish = (float(result.history[name][-1]) for name in ("k_hat", "kish"))
+    assert f"exact: k-hat {khat:.2f} (good below 0.5), Kish size {kish:.0f}" in repr(result)
+    assert (
+        f"k-hat {khat:.2f} and Kish size {kish:.0f}: the evidence"
+        in parameter_table(result).caption
+    )
+    assert "these are the evidence, as R-hat and ESS" in " ".join(page.text)

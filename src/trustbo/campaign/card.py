@@ -9,7 +9,10 @@ import xarray as xr
 from trustbo.data import Cell
 from trustbo.display.card import Card
 from trustbo.display.svg import curve_picture, map_picture
+from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_RHAT
 from trustbo.workspace import Workspace
+
+_DIAGNOSTICS = ("k_hat", "kish", "r_hat", "ess_bulk", "divergences")
 
 
 def campaign_card(
@@ -35,5 +38,21 @@ def campaign_card(
         pictures.append(area)
         rates = history["contact_rate"].values
         pictures.append(lambda: curve_picture(rates, label="contact rate", x_label="missions"))
+    rows = [*rows, *_evidence(history)]
     options = [(name, str(value)) for name, value in settings.items() if len(str(value)) < 200]
     return Card(title, rows, pictures, {"options": options})
+
+
+def _evidence(history: xr.Dataset) -> list[tuple[str, str]]:
+    """Row of the diagnostics that tell whether the last posterior is sound, if there is one."""
+    last = {n: float(history[n].values[-1]) for n in _DIAGNOSTICS if n in history}
+    if np.isfinite(last.get("k_hat", np.nan)):
+        sizes = (
+            f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g}), Kish size {last['kish']:.0f}"
+        )
+        return [("posterior", f"exact: {sizes}; R-hat and ESS are no evidence")]
+    if np.isfinite(last.get("r_hat", np.nan)):
+        rhat = f"R-hat {last['r_hat']:.3f} (good up to {MAX_RHAT:g})"
+        ess = f"bulk ESS {last['ess_bulk']:.0f}, divergences {last['divergences']:.0f}"
+        return [("posterior", f"NUTS: {rhat}, {ess}")]
+    return []
