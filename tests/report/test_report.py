@@ -345,12 +345,13 @@ def test_the_last_page_of_a_campaign_that_broke_is_readable_and_at_rest(result, 
     def broken(campaign, mission):
         raise RuntimeError("out of battery")
 
-    with (
-        pytest.raises(RuntimeError, match="out of battery"),
-        LivePage(tmp_path / "page.html", 4) as page,
-    ):
-        options = {"callbacks": [page, broken], "sampler": "exact", "progress": False}
-        tb.iterate(result.workspace, (2, 0), (0, 2), n_iterations=4, **options)
+    def follow():
+        with LivePage(tmp_path / "page.html", 4) as page:
+            options = {"callbacks": [page, broken], "sampler": "exact", "progress": False}
+            tb.iterate(result.workspace, (2, 0), (0, 2), n_iterations=4, **options)
+
+    with pytest.raises(RuntimeError, match="out of battery"):
+        follow()
     text = (tmp_path / "page.html").read_text()
     assert "It was interrupted: as of mission 1 of 4, at " in text
     assert "refresh" not in text
@@ -359,8 +360,6 @@ def test_the_last_page_of_a_campaign_that_broke_is_readable_and_at_rest(result, 
 def test_evidence_of_the_exact_sampler_is_k_hat_on_card_and_page(result, page):
     khat, kish = (float(result.history[name][-1]) for name in ("k_hat", "kish"))
     assert f"exact: k-hat {khat:.2f} (good below 0.5), Kish size {kish:.0f}" in repr(result)
-    assert (
-        f"k-hat {khat:.2f} and Kish size {kish:.0f}: the evidence"
-        in parameter_table(result).caption
-    )
+    caption = parameter_table(result).caption
+    assert f"k-hat {khat:.2f} and Kish size {kish:.0f}: the evidence" in caption
     assert "these are the evidence, as R-hat and ESS" in " ".join(page.text)

@@ -47,10 +47,9 @@ def _evidence(history: xr.Dataset) -> list[tuple[str, str]]:
     """Row of the diagnostics that tell whether the last posterior is sound, if there is one."""
     last = {n: float(history[n].values[-1]) for n in _DIAGNOSTICS if n in history}
     if np.isfinite(last.get("k_hat", np.nan)):
-        sizes = (
-            f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g}), Kish size {last['kish']:.0f}"
-        )
-        return [("posterior", f"exact: {sizes}; R-hat and ESS are no evidence")]
+        khat = f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g})"
+        text = f"exact: {khat}, Kish size {last['kish']:.0f}; R-hat and ESS are no evidence"
+        return [("posterior", text)]
     if np.isfinite(last.get("r_hat", np.nan)):
         rhat = f"R-hat {last['r_hat']:.3f} (good up to {MAX_RHAT:g})"
         ess = f"bulk ESS {last['ess_bulk']:.0f}, divergences {last['divergences']:.0f}"

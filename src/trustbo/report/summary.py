@@ -128,8 +128,8 @@ def _soundness(result: Result) -> Fact:
         good = good and khat <= MAX_KHAT
         said.append(
             f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below {GOOD_KHAT}; "
-            f"usable: up to {MAX_KHAT}), its Kish size {number(kish, 0)} effective points at least; "
-            "these are the evidence, as R-hat and ESS of resampled draws are always good"
+            f"usable: up to {MAX_KHAT}), its Kish size {number(kish, 0)} effective points at "
+            "least; these are the evidence, as R-hat and ESS of resampled draws are always good"
         )
     if not said:
         return Fact("Posteriors", "Nothing could be learned yet.")
