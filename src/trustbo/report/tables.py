@@ -63,8 +63,8 @@ def parameter_table(result: Result) -> Table:
         khat, kish = (float(posterior.attrs[name]) for name in ("k_hat", "kish"))
         caption += (
             f", resampled by weights of k-hat {number(khat, 2)} and Kish size {number(kish, 0)}: "
-            "the evidence that the draws are sound. R-hat and ESS would be good whatever the weights "
-            "are, and are left out"
+            "the evidence that the draws are sound. R-hat and ESS would be good with any weights, "
+            "and are left out"
         )
     return Table(f"{caption}.", head, rows)
 

@@ -28,7 +28,7 @@ class Watch:
 
         Args:
             place: Place of `display.bars`.
-            faster: What takes less time than NUTS, for the estimate.
+            faster: Advice on what takes less time than NUTS, for the estimate.
             estimates: Whether to say what a run will take.
         """
         self._place, self._faster, self._estimates = place, faster, estimates
