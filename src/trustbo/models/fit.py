@@ -119,10 +119,7 @@ def fit(
     seed = require_whole("seed", seed, 0)
     if earlier is not None:
         require_posterior("earlier=", earlier)
-    require_same_team(missions)
-    if workspace is not None:
-        require_kind("workspace", workspace, Workspace, "give the one the missions were run on")
-        missions = [workspace.fill(mission) for mission in missions]
+    missions = _filled(missions, workspace)
     batch = stack_missions(missions)
     asked = model
     model, family_reason = _of_rates(asked, batch, weighted=weights is not None)
@@ -182,6 +179,15 @@ def fit(
         )
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
+
+
+def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:
+    """Missions of one team, with the awareness that they lack filled in from a workspace."""
+    require_same_team(missions)
+    if workspace is None:
+        return list(missions)
+    require_kind("workspace", workspace, Workspace, "give the one the missions were run on")
+    return [workspace.fill(mission) for mission in missions]
 
 
 def _require_sound(posterior: xr.DataTree, complaints: Sequence[str]) -> xr.DataTree:
