@@ -129,7 +129,7 @@ def test_a_page_is_stale_if_more_than_the_last_digit_differs(shown, printed, fou
 @pytest.mark.parametrize("namespace", NAMESPACES)
 def test_every_public_name_has_an_entry_and_an_example(namespace):
     module, text = import_module(namespace), page_of(namespace).read_text()
-    entries = set(re.findall(r"^\.\. auto\w+:: ([\w.]+)$", text, flags=re.M))
+    entries = set(re.findall(r"^\.\. (?:auto\w+|py:data):: ([\w.]+)$", text, flags=re.M))
     used = names_used("\n".join(block[1] for block in BLOCK.finditer(text)))
     parts = {name for name in module.__all__ if isinstance(getattr(module, name), ModuleType)}
     parts = {name for name in parts if f"{namespace}.{name}" in NAMESPACES}  # on their own pages
@@ -164,7 +164,9 @@ def test_a_name_in_a_comment_an_import_or_of_something_else_is_not_used():
 def test_every_entry_is_public():
     for namespace in NAMESPACES:
         module = import_module(namespace)
-        entries = re.findall(r"^\.\. auto\w+:: ([\w.]+)$", page_of(namespace).read_text(), re.M)
+        entries = re.findall(
+            r"^\.\. (?:auto\w+|py:data):: ([\w.]+)$", page_of(namespace).read_text(), re.M
+        )
         strangers = [e for e in entries if e.removeprefix(f"{namespace}.") not in module.__all__]
         assert [e for e in strangers if e != namespace] == []
 

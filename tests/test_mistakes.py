@@ -286,13 +286,13 @@ MISTAKES = {
         lambda c: tb.Workspace.from_terrain(tb.terrain.example(), observers="x"), "array of numbers"
     ),
     "latitude first": (
-        lambda c: GRID.cell_at_lonlat(46.5, 200.0), r"lon 46.5, lat 200 is off .* longitude first"
+        lambda c: GRID.cell_at_lonlat(46.5, 200.0), r"'lon=46.5,lat=200' .*no place of the CRS.*outside the grid"
     ),
     "a longitude of NaN": (
-        lambda c: GRID.cell_at_lonlat(np.nan, 1.0), r"lon, lat must be two finite .* \(nan"
+        lambda c: GRID.cell_at_lonlat(np.nan, 1.0), "lon must be a finite number; got nan"
     ),
-    "an infinite position": (lambda c: GRID.cell_at(np.inf, 1.0), "x, y must be two finite"),
-    "a position as text": (lambda c: GRID.cell_at("a", "b"), "x, y must be an array of numbers"),
+    "an infinite position": (lambda c: GRID.cell_at(np.inf, 1.0), "x must be a finite number; got inf"),
+    "a position as text": (lambda c: GRID.cell_at("a", "b"), "x must be a finite number; got 'a'"),
     "a cell of one number": (lambda c: GRID.center(3), "cell must be two whole numbers"),
     "a grid off the Earth": (
         lambda c: replace(GRID, left=1e9, top=1e9).lonlat((0, 0)), "is no place on Earth in EPSG"

