@@ -100,7 +100,7 @@ def show_dark_figures(app: Sphinx, docname: str, source: list[str]) -> None:
         if not (HERE / "figures" / "dark" / name).exists():
             return image[0]
         light = f"![{alt}]({folder}{name}){{.only-light}}"
-        return f"{light}\n![{alt}]({folder}dark/{name}){{.only-dark}}"
+        return f"{light} ![{alt}]({folder}dark/{name}){{.only-dark}}"  # notebooks are JSON
 
     source[0] = FIGURE.sub(both, source[0])
 

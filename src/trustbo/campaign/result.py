@@ -92,7 +92,7 @@ class Result(Displayed):
         rows = [
             ("missions", f"{len(self.missions)}; stopped: {self.stop_reason}"),
             ("recommended", f"{self.path[0]} to {self.path[-1]}, {len(self.path) - 1} bounds"),
-            ("value", f"{self.value:.4g} ({self.settings.get('objective', 'objective unknown')})"),
+            ("value", f"{self.value:.3g} ({self.settings.get('objective', 'objective unknown')})"),
             ("contact rate", f"{self.history['contact_rate'].values[-1]:.3f} on the last mission"),
             ("outcomes", ", ".join(map(str, self.history["status"].values))),
         ]

@@ -1,5 +1,6 @@
 """A card: the few numbers of an object that matter, a picture of it, and what opens on a click."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import NamedTuple
@@ -73,6 +74,23 @@ class Displayed:
 def number(value: float, unit: str = "", digits: int = 3) -> str:
     """Write a number with its unit."""
     return f"{value:.{digits}g}{' ' + unit if unit else ''}"
+
+
+def arrival(mean: float, band: tuple[float, float] | None) -> str:
+    """Text of a chance to arrive, its mean and its 90 % band over the posterior.
+
+    The mean is said to be one, as few draws that are much worse may leave it outside the band.
+    """
+    if band is None or not math.isfinite(band[0]):
+        return _chance(mean)
+    low, high = map(_chance, band)
+    span = low if low == high else f"{low} to {high}"
+    return f"{_chance(mean)} on average, {span} in 90 % of the draws"
+
+
+def _chance(p: float) -> str:
+    """Text of a chance of three decimals, of which one below 1 is told from it."""
+    return "over 0.999" if 0.9995 <= p < 1.0 else f"{p:.3f}"
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Cell, path_text
-from trustbo.display.card import Card, Displayed
+from trustbo.display.card import Card, Displayed, arrival
 from trustbo.display.svg import curve_picture
 from trustbo.planning.risk import PathRisk
 from trustbo.workspace import Workspace
@@ -66,22 +66,20 @@ class Plan(Displayed):
     infeasible: bool = False
 
     def _card(self) -> Card:
-        best = "no path is better" if self.exact else f"at most {self.bound:.4g} can be had"
+        best = "no path is better" if self.exact else f"at most {self.bound:.3g} can be had"
         if np.isnan(self.bound):
             best = "given, or a policy's choice: value and trust are the means"
         elif self.infeasible:
             best = "none of the safest paths is better; none keeps within max_failure"
         rows = [
-            ("path", f"{len(self.path) - 1} bounds, {self.length:.4g} m"),
-            ("value", f"{self.value:.4g} ({self.objective})"),
+            ("path", f"{len(self.path) - 1} bounds, {self.length:.0f} m"),
+            ("value", f"{self.value:.3g} ({self.objective})"),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
         if self.p_arrive is not None:
-            band = self.p_arrive_band
-            between = "" if band is None else f" ({band[0]:.3f} to {band[1]:.3f}, 90 %)"
             beyond = "; fails beyond max_failure" if self.infeasible else ""
-            rows.append(("chance to arrive", f"{self.p_arrive:.3f}{between}{beyond}"))
+            rows.append(("chance to arrive", arrival(self.p_arrive, self.p_arrive_band) + beyond))
         if self.engine != "given":
             rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 

@@ -3,6 +3,7 @@
 import numpy as np
 
 from trustbo.campaign.result import Result
+from trustbo.display.card import arrival
 from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import PathRisk, Plan
 from trustbo.report.blocks import Fact
@@ -84,30 +85,16 @@ def _exactness(plan: Plan) -> str:
 
 
 def _arrival(risk: PathRisk) -> str:
-    mean, (low, high) = risk.p_arrive, risk.p_arrive_band
-    mean_text, *ends = _chances(mean, *((low, high) if np.isfinite(low) else ()))
-    band = f" (90 % band {ends[0]} to {ends[1]})" if ends else ""
     worst = int(np.argmax(risk.p_fail))
     said = (
-        f"It reaches the goal with probability {mean_text}{band}; its bound "
-        f"{worst + 1} is the likeliest to fail, with {number(risk.p_fail[worst])}."
+        f"It reaches the goal with probability {arrival(risk.p_arrive, risk.p_arrive_band)}; its "
+        f"bound {worst + 1} is the likeliest to fail, with {number(risk.p_fail[worst])}."
     )
-    if mean < low:
-        said += " The mean is below the band, as a few draws are much worse than the rest."
-    elif mean > high:
-        said += " The mean is above the band, as a few draws are much better than the rest."
     causes = {cause: float(p.sum()) for cause, p in risk.by_cause.items()}
     likeliest = [c for c, p in causes.items() if p >= (1.0 - 1e-6) * max(causes.values())]
     if len(likeliest) == 1:
         said += f" The likeliest cause is {likeliest[0].replace('_', ' ')}."
     return said
-
-
-def _chances(*values: float) -> list[str]:
-    """Format chances with as many decimals as tell each from 1, from 3 to 6."""
-    rest = [1.0 - p for p in values if 1.0 - p > 1e-6]  # others are 1 with 6 decimals too
-    decimals = max(3, int(np.ceil(-np.log10(min(rest, default=1.0)))))
-    return [number(p, decimals) for p in values]
 
 
 def _soundness(result: Result) -> Fact:
