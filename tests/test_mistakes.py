@@ -131,6 +131,18 @@ MISTAKES = {
     "max_bound": (lambda c: c.iterate(max_bound=12), "did you mean max_bounds"),
     "2.5 missions": (lambda c: c.iterate(n_iterations=2.5), "a whole number from 1 on; got 2.5"),
     "no missions at all": (lambda c: c.iterate(n_iterations=0), "from 1 on; got 0"),
+    "too many bounds": (
+        lambda c: c.iterate(max_bounds=10**9),
+        r"max_bounds = 1000000000 admits paths .* more than a search can hold; give at most \d+",
+    ),
+    "a folder that is a number": (
+        lambda c: tb.load_result(3),
+        "give the path of a file or folder; got a int",
+    ),
+    "a campaign in a number": (
+        lambda c: tb.Campaign.load(3),
+        "give the path of a file or folder; got a int",
+    ),
     "too few bounds": (lambda c: c.iterate(max_bounds=2), "below the fewest possible"),
     "a negative seed": (lambda c: c.iterate(seed=-1), "a whole number from 0 on; got -1"),
     "a key for a seed": (lambda c: c.iterate(seed=np.array([1, 2])), "a whole number from 0 on"),
@@ -286,12 +298,13 @@ MISTAKES = {
         lambda c: tb.Workspace.from_terrain(tb.terrain.example(), observers="x"), "array of numbers"
     ),
     "latitude first": (
-        lambda c: GRID.cell_at_lonlat(46.5, 200.0), r"'lon=46.5,lat=200' .*no place of the CRS.*outside the grid"
+        lambda c: GRID.cell_at_lonlat(46.5, 200.0),
+        r"'lon=46.5,lat=200' .*no place of the CRS.*outside the grid",
     ),
     "a longitude of NaN": (
         lambda c: GRID.cell_at_lonlat(np.nan, 1.0), "lon must be a finite number; got nan"
     ),
-    "an infinite position": (lambda c: GRID.cell_at(np.inf, 1.0), "x must be a finite number; got inf"),
+    "an infinite position": (lambda c: GRID.cell_at(np.inf, 1.0), "x must be a finite .* got inf"),
     "a position as text": (lambda c: GRID.cell_at("a", "b"), "x must be a finite number; got 'a'"),
     "a cell of one number": (lambda c: GRID.center(3), "cell must be two whole numbers"),
     "a grid off the Earth": (

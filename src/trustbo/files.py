@@ -178,7 +178,7 @@ def require_regular(path: FilePath, most: int = _MOST) -> Path:
     Raises:
         DamagedFileError: There is no such file, it is none, or it has more than `most` bytes.
     """
-    path = _as_path(path)
+    path = as_path(path)
     try:
         status = path.stat()
     except FileNotFoundError:
@@ -303,7 +303,7 @@ def cache_folder(name: str) -> Path:
 
 def require_folder(directory: FilePath) -> Path:
     """Return a folder, which need not exist; TrustboError if it, or one above it, is a file."""
-    folder = _as_path(directory)
+    folder = as_path(directory)
     for part in (folder, *folder.parents):
         if part.exists():
             if not part.is_dir():
@@ -318,7 +318,7 @@ def require_file(path: FilePath, *suffixes: str) -> Path:
     `suffixes` are in lower case with the dot; none allow any. TrustboError: another suffix, a
     folder of that name, or a file of that of its folder.
     """
-    file = _as_path(path)
+    file = as_path(path)
     if file.is_dir():
         raise TrustboError(f"cannot write {str(file)!r}: it is a folder; name a file in it.")
     if suffixes and file.suffix.lower() not in suffixes:
@@ -327,7 +327,8 @@ def require_file(path: FilePath, *suffixes: str) -> Path:
     return file
 
 
-def _as_path(path: FilePath) -> Path:
+def as_path(path: FilePath) -> Path:
+    """Return a path; TrustboError if it is neither text nor a path."""
     if not isinstance(path, str | os.PathLike):
         raise TrustboError(f"give the path of a file or folder; got a {type(path).__name__}.")
     return Path(path)

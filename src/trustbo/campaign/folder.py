@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import xarray as xr
@@ -24,7 +23,7 @@ from trustbo.campaign.result import Result, read_kept, read_workspace
 from trustbo.campaign.told import require_extra
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import FilePath, interpreting, to_json, write_checked
+from trustbo.files import FilePath, as_path, interpreting, to_json, write_checked
 from trustbo.logs.netcdf import missions_of_tree, read_tree, write_missions, write_tree
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
@@ -61,7 +60,7 @@ class CampaignFolder:
             TrustboError: The folder holds no campaign and has to; another process holds it; it
                 may not be written to; or its name belongs to a file.
         """
-        self.path = Path(directory)
+        self.path = as_path(directory)
         if begun and not self.is_used:
             measured = self.path / MEASURED
             said = f"{str(directory)!r} holds no campaign;"

@@ -23,6 +23,7 @@ from trustbo.display.card import Card, Displayed
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
+    as_path,
     interpreting,
     read_record,
     require_folder,
@@ -342,7 +343,7 @@ def load_result(directory: FilePath) -> Result:
         TrustboError: The folder holds no result.
         DamagedFileError: A file is missing or damaged; the message says what can be read.
     """
-    folder = current(Path(directory))
+    folder = current(as_path(directory))
     if not (folder / RESULT).exists():
         raise TrustboError(f"{str(directory)!r} holds no result; give a folder written by save().")
     with naming_what_is_left(folder):

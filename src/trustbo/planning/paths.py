@@ -38,6 +38,10 @@ SIMPLE_EXTRA = 2
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
+_MOST_STATES = 20_000_000
+"""Most pairs of a cell and a number of bounds left, whose tables take some 3 GB."""
+
+
 class AdmissiblePaths:
     """Start, goal and the admissible paths between them, with the tables that engines need.
 
@@ -80,6 +84,12 @@ class AdmissiblePaths:
         require_way(self.bounds, self.bounds_to_goal, *ends, n_passable)
         self.shortest = int(self.bounds_to_goal[self.start])
         self.longest = self._most_bounds(max_bounds)
+        if self.longest * n_passable > _MOST_STATES:
+            raise TrustboError(
+                f"max_bounds = {max_bounds!r} admits paths of up to {self.longest} bounds over "
+                f"{n_passable} cells, more than a search can hold; give at most "
+                f"{_MOST_STATES // n_passable}."
+            )
         self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest
         self.u_turns = not isinstance(max_bounds, str)
         self.revisit = revisit
