@@ -58,8 +58,9 @@ def trust_maps(
     """Draw the trust map that missions were planned on, with their paths, Fig. 5 of the paper.
 
     The last panel shows the map and the recommended path after the last mission. All are on one
-    scale, from the 2 % to the 98 % quantile of the values, the start cell left out, whose trust is
-    assumed. A trust of 1 is that of unbroken contact; above it there is no other colour.
+    scale, from the 2 % to the 98 % quantile of what missions taught, the start cell left out, whose
+    trust is assumed: a draw of the prior may be far off. A trust of 1 is that of unbroken contact;
+    above it there is no other colour.
 
     Args:
         history: Map and path of each iteration, such as `Result.history`.
@@ -87,7 +88,7 @@ def trust_maps(
     maps, paths = [*maps, trust_map], [*paths, path]
     everything = np.stack([trust.transpose("row", "col").values for trust in maps])
     everything[:, *paths[0][0]] = np.nan
-    low, high = robust_limits(everything)
+    low, high = robust_limits(everything[learned.index(0) + 1 :] if 0 in learned else everything)
     high = min(high, 1.0) if low < 1.0 else high
     made = map_panels(workspace.grid, len(maps), look)
     colours = look.colours(COLOURS)
