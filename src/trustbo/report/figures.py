@@ -27,7 +27,7 @@ def trust_maps(result: Result) -> Picture:
         f"{counted(n_changes, 'time')}.",
         "Expected trust with which each cell can be reached, and the path planned on it (white, "
         "from circle to star): from the prior, and as missions taught it. All maps have one scale, "
-        "from the 2 % to the 98 % quantile of what was learned; 1 is the trust of unbroken contact.",
+        "the 2 % to the 98 % quantile of what was learned; 1 is the trust of unbroken contact.",
     )
 
 
