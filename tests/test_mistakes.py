@@ -133,7 +133,7 @@ MISTAKES = {
     "no missions at all": (lambda c: c.iterate(n_iterations=0), "from 1 on; got 0"),
     "too many bounds": (
         lambda c: c.iterate(max_bounds=10**9),
-        r"max_bounds = 1000000000 admits paths .* more than a search can hold; give at most \d+",
+        r"max_bounds = 1000000000 admits paths .* states, more than 2e\+07; give less",
     ),
     "a folder that is a number": (
         lambda c: tb.load_result(3),

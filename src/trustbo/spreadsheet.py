@@ -9,6 +9,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import pandas as pd
 
@@ -36,8 +37,13 @@ def rows_as_csv(rows: Iterable[Sequence[object]]) -> str:
 
 def frame_as_csv(table: pd.DataFrame, *, index: bool = True) -> str:
     """Table of pandas as the text of a CSV file, its header and index too."""
-    plain = io.StringIO(table.to_csv(index=index, lineterminator="\n"), newline="")
-    return rows_as_csv(csv.reader(plain))
+    made = table.rename(columns=_safe, index=_safe).map(_safe)
+    made.index.names = [_safe(name) for name in table.index.names]
+    return str(made.to_csv(index=index, lineterminator="\n"))
+
+
+def _safe(value: Any) -> Any:
+    return harmless(value) if isinstance(value, str) else value
 
 
 def _is_number(text: str) -> bool:

@@ -11,7 +11,9 @@ import pytest
 from simulators import ModelSimulator
 
 import trustbo as tb
+from trustbo.campaign import replacing
 from trustbo.campaign.replacing import current, own_files
+from trustbo.models import TrustParams
 
 ENDS = ((2, 0), (0, 2))
 FOREIGN = (
@@ -288,3 +290,58 @@ def test_a_folder_of_version_0_1_is_replaced_and_what_has_gone_is_gone(workspace
     names = {f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file()}
     shown = {name for name in names if not Path(name).name.startswith(".")}
     assert shown == {"campaign.json", "workspace.nc", "posteriors/mine.nc"}
+
+
+def test_a_replacement_cut_off_in_a_process_that_goes_on_loses_no_mission(tmp_path, monkeypatch):
+    """The successor is read from its name on: what is told then must not be written beside it."""
+    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 3, 3, 2)))
+    truth = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
+    simulator = tb.simulation.ModelSimulator(workspace, truth)
+    folder = tmp_path / "kept"
+    campaign = tb.Campaign(workspace, (2, 0), (0, 2), sampler="exact", directory=folder)
+
+    def drive():
+        path = campaign.ask().path
+        campaign.tell(simulator.run(path, seed=campaign.seed_of("mission")))
+
+    drive()
+    drive()
+    with monkeypatch.context() as patch:
+        link, calls = replacing._link, []
+
+        def cut_off(source, target):
+            calls.append(target)
+            if len(calls) == 2:
+                raise OSError(5, "Input/output error")
+            link(source, target)
+
+        patch.setattr("trustbo.campaign.replacing._link", cut_off)
+        with pytest.raises(OSError, match="Input/output error"):
+            campaign.set_aside("a bad day")
+    drive()
+    drive()
+    states = [str(state) for state in campaign.history["state"].values]
+    campaign.close()
+    again = tb.Campaign.load(folder)
+    assert [str(state) for state in again.history["state"].values] == states
+    assert states == ["learned", "set aside", "learned", "learned"]
+    for mine, kept in zip(campaign.posteriors, again.posteriors, strict=True):
+        np.testing.assert_array_equal(mine["posterior"]["beta0"], kept["posterior"]["beta0"])
+        np.testing.assert_array_equal(*(np.ravel(p.attrs["missions"]) for p in (mine, kept)))
+    again.close()
+
+
+def test_saving_to_its_own_folder_keeps_hold_of_it_when_it_fails(tmp_path, monkeypatch):
+    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 3, 3, 2)))
+    campaign = tb.Campaign(workspace, (2, 0), (0, 2), directory=tmp_path / "kept")
+
+    def refuse(*args, **kwargs):
+        raise tb.TrustboError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("trustbo.campaign.folder.write_checked", refuse)
+        with pytest.raises(tb.TrustboError, match="the disk is full"):
+            campaign.save(tmp_path / "kept")
+    with pytest.raises(tb.TrustboError, match="another campaign is at work"):
+        tb.Campaign.load(tmp_path / "kept")
+    campaign.close()

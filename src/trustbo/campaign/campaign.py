@@ -24,7 +24,7 @@ from trustbo.campaign.told import never_to_be_learned, require_extra, require_mi
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
-from trustbo.files import FilePath, interpreting
+from trustbo.files import FilePath, as_path, interpreting
 from trustbo.models import CAUSES, TrustModel, params_of
 from trustbo.models.backend import VERSIONS
 from trustbo.models.record import model_from_record, model_to_record
@@ -358,8 +358,16 @@ class Campaign(LearnedMissions, Displayed):
         Raises:
             TrustboError: Another campaign holds the folder, or its name belongs to a file.
         """
-        self.close()
-        self._open(CampaignFolder(directory), overwrite=True)
+        own, folder = self._folder, self._folder_for(directory)
+        self._open(folder, overwrite=True)
+        if own is not None and own is not folder:
+            own.close()
+
+    def _folder_for(self, directory: FilePath) -> CampaignFolder:
+        """Folder of a name, the campaign's own if it is kept there."""
+        own = self._folder
+        here = own is not None and own.path.resolve() == as_path(directory).resolve()
+        return own if own is not None and here else CampaignFolder(directory)
 
     def save(self, directory: FilePath) -> None:
         """Write everything to a folder that `Campaign.load` reads.
@@ -370,14 +378,11 @@ class Campaign(LearnedMissions, Displayed):
         Raises:
             TrustboError: Another campaign holds the folder, or its name belongs to a file.
         """
-        own, self._folder = self._folder, None
-        here = own is not None and own.path.resolve() == Path(directory).resolve()
-        folder = own if own is not None and here else CampaignFolder(directory)
+        folder = self._folder_for(directory)
         try:
-            self._open(folder, overwrite=True)
+            self._replace(folder)
         finally:
-            self._folder = own
-            if folder is not own:
+            if folder is not self._folder:
                 folder.close()
 
     @classmethod
@@ -496,7 +501,8 @@ class Campaign(LearnedMissions, Displayed):
         try:
             self._replace(folder)
         except BaseException:
-            folder.close()
+            if folder is not self._folder:
+                folder.close()
             raise
         self._folder = folder
 
@@ -507,6 +513,8 @@ class Campaign(LearnedMissions, Displayed):
             if self.log.entries:
                 folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
             folder.write(self._state(), result, whole=True)
+        if result is not None:
+            result.kept_in(folder.path)
 
     def _write(self) -> None:
         """Write what the last mission added."""

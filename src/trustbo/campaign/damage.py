@@ -29,9 +29,10 @@ _PLAN = {
     "seconds": float, "infeasible": bool,
     "risk": (None, {
         "p_fail": [float], "p_fail_band": [[float]], "p_arrive": float,
-        "p_arrive_band": [float, float], "by_cause": {str: [float]},
+        "p_arrive_band": [float, float], "by_cause": {str: [float]}, "p_reach": [float],
     }),
 }  # fmt: skip
+_COLUMNS = "objective", "path_changed", "contact_rate", "status"
 _ROW = {"status": str, "state": str, "reason": str, str: (float, bool)}
 _NEEDED = {
     STATE: ("n_missions", "options", "plans", "rows", "failures", "notes", "stop_reason"),
@@ -77,6 +78,9 @@ def read_fields(file: Path) -> dict[str, Any]:
             raise DamagedFileError(
                 f"{str(file)!r} is damaged: {name} = {str(record[name])[:60]} is none."
             )
+    for row in record.get("rows", []):
+        if lacks := [name for name in _COLUMNS if name not in row]:
+            raise DamagedFileError(f"{str(file)!r} is damaged: a mission lacks {', '.join(lacks)}.")
     n = record["n_missions"]
     for name in ("plans", "rows", "posterior_after"):
         if len(record.get(name, range(n))) != n:

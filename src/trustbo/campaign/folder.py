@@ -14,6 +14,7 @@ from trustbo.campaign.replacing import (
     STATE,
     WORKSPACE,
     current,
+    finish_replacing,
     hold,
     replacing,
     require_ours,
@@ -23,7 +24,14 @@ from trustbo.campaign.result import Result, read_kept, read_workspace
 from trustbo.campaign.told import require_extra
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import FilePath, as_path, interpreting, to_json, write_checked
+from trustbo.files import (
+    FilePath,
+    as_path,
+    interpreting,
+    remove_checked,
+    to_json,
+    write_checked,
+)
 from trustbo.logs.netcdf import missions_of_tree, read_tree, write_missions, write_tree
 from trustbo.workspace import Workspace
 from trustbo.workspace import netcdf as archive
@@ -111,6 +119,7 @@ class CampaignFolder:
         self, missions: Sequence[Mission], extras: Sequence[Mapping[str, float]]
     ) -> None:
         """Write missions as they were told, and the numbers that they were told with."""
+        finish_replacing(self.path)
         since, self._n_ticks = min(self._n_ticks, len(missions) - 1), len(missions)
         notes = {"extra": json.dumps(list(extras))}
         write_missions(self._at / MEASURED, missions, since=since, notes=notes)
@@ -131,10 +140,13 @@ class CampaignFolder:
             whole: Whether all of the result is new, or only the last mission.
             ended: Whether to write `posterior.nc` too, with all groups.
         """
+        finish_replacing(self.path)
         if result is not None:
             result.write(self._at, whole=whole, home=self.path)
             if ended and result.has_posterior:
                 write_tree(self._at / "posterior.nc", result.posterior)
+            elif not whole:
+                remove_checked(self._at / "posterior.nc")  # of the missions before
         write_checked(self._at / STATE, to_json(state).encode())
 
     def read(self) -> Contents:

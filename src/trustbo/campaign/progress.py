@@ -51,6 +51,8 @@ class Progress:
         self._before, self._campaign.progress = self._campaign.progress, bool(self._place)
         if self._page is not None:
             self._page.__enter__()
+            if done:
+                self._page(self._campaign)
             say(self._place, f"follow the campaign at {self._page.path.resolve().as_uri()}")
         self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
         return self

@@ -22,6 +22,7 @@ from filelock import FileLock, Timeout
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
+    defer_interrupt,
     folder_to_disk,
     naming_refusal,
     read_record,
@@ -98,13 +99,21 @@ def replacing(folder: Path) -> Iterator[Path]:
     try:
         yield new
         folder_to_disk(new)
-        with naming_refusal(folder):
-            os.rename(new, folder / _NEXT)
     except BaseException:
         _clear(new)
         raise
-    folder_to_disk(folder)
-    _put_in_place(folder)
+    # Ctrl-C waits: a process that went on would write beside a successor that is read.
+    with defer_interrupt(), naming_refusal(folder):
+        os.rename(new, folder / _NEXT)
+        folder_to_disk(folder)
+        _put_in_place(folder)
+
+
+def finish_replacing(folder: Path) -> None:
+    """Put a successor in place whose replacing was cut off, before more is written to a folder."""
+    if current(folder) != folder:
+        with defer_interrupt(), naming_refusal(folder):
+            _put_in_place(folder)
 
 
 def require_ours(folder: Path, *others: str) -> None:

@@ -279,6 +279,13 @@ class Result(Displayed):
             self.write(new, whole=True, home=folder)
             if self.has_posterior:
                 write_tree(new / _POSTERIOR, self.posterior)
+        self.kept_in(folder)
+
+    def kept_in(self, home: Path) -> None:
+        """Record that the posteriors are in a folder, all of them, from where they are read."""
+        for kept in self._kept:
+            if kept:
+                kept.file = home / _posterior_file(kept.after)
 
     def write(self, folder: Path, *, whole: bool, home: Path) -> None:
         """Write all but the workspace, for a campaign that is kept.
@@ -287,14 +294,16 @@ class Result(Displayed):
             folder: Folder to write to.
             whole: Whether to write all missions, or only the last to a folder that has all before
                 it: earlier posteriors never change.
-            home: Folder that the files will be in; another where they replace what is there.
+            home: Folder that the files will be in; another where they replace what is there, and
+                `kept_in` is to be called once they did.
         """
         files = list({kept.after: kept for kept in self._kept if kept}.values())
         for kept in files if whole else files[-2:]:  # the last but one may have shrunk
             name = _posterior_file(kept.after)
             if whole or home / name != kept.file:
                 write_tree(folder / name, kept())
-                kept.file = home / name  # it is there from now on
+                if folder == home:
+                    kept.file = home / name  # it is there from now on
         since = 0 if whole else len(self.missions)  # whose ticks are there
         write_missions(folder / _MISSIONS, self.missions, since=since)
         history = self.history.assign(final_trust_map=self.trust_map)

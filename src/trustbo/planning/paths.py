@@ -39,7 +39,7 @@ _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
 _MOST_STATES = 20_000_000
-"""Most pairs of a cell and a number of bounds left, whose tables take some 3 GB."""
+"""Most nodes of the layered DAG, whose tables take some 3 GB."""
 
 
 class AdmissiblePaths:
@@ -84,12 +84,6 @@ class AdmissiblePaths:
         require_way(self.bounds, self.bounds_to_goal, *ends, n_passable)
         self.shortest = int(self.bounds_to_goal[self.start])
         self.longest = self._most_bounds(max_bounds)
-        if self.longest * n_passable > _MOST_STATES:
-            raise TrustboError(
-                f"max_bounds = {max_bounds!r} admits paths of up to {self.longest} bounds over "
-                f"{n_passable} cells, more than a search can hold; give at most "
-                f"{_MOST_STATES // n_passable}."
-            )
         self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest
         self.u_turns = not isinstance(max_bounds, str)
         self.revisit = revisit
@@ -111,7 +105,18 @@ class AdmissiblePaths:
 
     @cached_property
     def layers(self) -> Layers:
-        """Layered DAG: the grid unrolled over the bounds that are left."""
+        """Layered DAG: the grid unrolled over the bounds that are left.
+
+        TrustboError: it is too large to be held.
+        """
+        near, far = plain(self.bounds_from_start), plain(self.bounds_to_goal)
+        reached = (near >= 0) & (far >= 0)
+        n_states = np.maximum(self.longest - near[reached] - far[reached] + 1, 0).sum()
+        if n_states > _MOST_STATES:
+            raise TrustboError(
+                f"max_bounds = {self.max_bounds!r} admits paths of up to {self.longest} bounds, "
+                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; give less."
+            )
         layers = build_layers(
             plain(self.bounds_to_goal),
             plain(self.bounds_from_start),

@@ -134,7 +134,7 @@ class Risk:
             band = np.quantile(drawn, _BAND, axis=0)
             low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
             arrive = low, high
-            reach = np.minimum(reach * _dependence(drawn), np.minimum.accumulate(1.0 - p))
+            reach = np.minimum.accumulate(np.minimum(reach * _dependence(drawn), 1.0 - p))
         by_cause = {cause: share * p for cause, share in shares.items()}
         return PathRisk(p, band, float(reach[-1]), arrive, by_cause, reach)
 

@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.ticker import MultipleLocator
 
+from trustbo.plots.style import SMALL
 from trustbo.workspace import Survey
 from trustbo.workspace.location import crs_name
 
@@ -36,7 +37,9 @@ def grid_map(found: Survey) -> Axes:
     ax.hlines(edges[1], -0.5, cols - 0.5, color="black", linewidth=0.4, alpha=0.5)
     if max(grid.shape) <= _MOST_NAMED:
         for row, col in np.ndindex(*grid.shape):
-            ax.text(col, row, f"{row},{col}", ha="center", va="center", fontsize=8)
+            ax.text(
+                col, row, f"{row},{col}", ha="center", va="center", fontsize=SMALL, color="black"
+            )
     if found.passable.sum() > 1:
         start, goal = found.ends
         for cell, marker, name in ((start, "o", "start"), (goal, "*", "goal")):

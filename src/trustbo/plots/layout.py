@@ -14,6 +14,8 @@ from trustbo.workspace import Grid
 
 PAGE = 7.6
 """Width of a page, inches: figures of several panels are no wider by default."""
+_KEY, _LETTER = 0.45, 0.068
+"""Widths of a legend's key with its margins, and of a letter of its text, inches."""
 _LETTERS = 11
 """Letters of a colour bar's label for each inch of the figure's height."""
 
@@ -100,17 +102,18 @@ def map_panels(
     width: float = 2.6,
     columns: int | None = None,
     margin: float = 1.0,
+    least: float = 1.2,
 ) -> Panels:
     """Lay out maps, see `small_multiples`; of a tall terrain there are more in a row."""
     tall = tallness(grid)
     if tall >= 2:
         width, columns = 0.6 * width, 5 if columns is None else columns
-    cols = min(style.n_columns or columns or _columns(n), n)
     room = (style.width or PAGE) - (margin if style.legend else 0.0)
+    cols = min(style.n_columns or columns or _columns(n), n, max(1, int(room / least)))
     if style.width is not None or (style.n_columns is None and width * cols > room):
         width = max(min(width, room / cols) if style.width is None else room / cols, 1.2)
     made = small_multiples(
-        n, (width, width * tall + 0.5), style, margin=margin, columns=columns, least=1.2,
+        n, (width, width * tall + 0.5), style, margin=margin, columns=columns, least=least,
         sharex=True, sharey=True,
     )  # fmt: skip
     if isinstance(made.figure, Figure) and style.ax is None:
@@ -126,7 +129,8 @@ def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
     elif style.title and style.ax is None and isinstance(made.figure, Figure):
         made.figure.suptitle(as_text(style.title), fontsize=MEDIUM + 1.0)
     for ax, title in zip(made.panels, titles, strict=True):
-        ax.set_title(as_text(title), fontsize=MEDIUM)
+        if title:
+            ax.set_title(as_text(title), fontsize=MEDIUM)
 
 
 def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: Any) -> None:
@@ -148,6 +152,10 @@ def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: An
     bar.ax.tick_params(labelsize=SMALL)
 
 
+def _width(figure: Figure | SubFigure) -> float:
+    return float(figure.get_figure(root=True).get_figwidth())  # pyright: ignore[reportOptionalMemberAccess]
+
+
 def _inches(figure: Figure | SubFigure) -> float:
     return float(figure.get_figure(root=True).get_figheight())  # pyright: ignore[reportOptionalMemberAccess]
 
@@ -161,7 +169,10 @@ def legend(made: Panels, handles: Sequence[Any], style: Style, **options: Any) -
     if style.ax is not None:
         made.panels[0].legend(**shape, loc="best")
         return
-    made.figure.legend(**shape | {"loc": "outside lower center", "ncols": 3} | options)
+    longest = max((len(str(handle.get_label())) for handle in handles), default=1)
+    room = int(_width(made.figure) / (_KEY + _LETTER * longest))
+    options["ncols"] = max(1, min(options.get("ncols", 3), room))
+    made.figure.legend(**shape | {"loc": "outside lower center"} | options)
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:

@@ -382,7 +382,7 @@ def draw_scale_of(ax: Axes, width: float, corner: tuple[int, int] = (1, 0)) -> N
     `corner` is (1, 0) for the lower right one, (0, 1) for the upper left one.
     """
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
-    length = max(step * magnitude for step in (1, 2, 5) if step * magnitude <= 0.4 * width)
+    length = max(f * magnitude for f in (1, 2, 5) if f * magnitude <= 0.4 * width * (1 + 1e-9))
     share = length / width  # of the axes
     x, y = (0.96 - share if corner[0] else 0.04), (0.87 if corner[1] else 0.045)
     (bar,) = ax.plot([x, x + length / width], [y, y], color="black", transform=ax.transAxes)

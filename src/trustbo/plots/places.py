@@ -70,7 +70,7 @@ def place_map(
         "sd": (Normalize(*_ends(maps, "sd", units)), look.colours(COLOURS)),
     }
     said = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
-    made = map_panels(grid, 2 * len(names), look, columns=2, width=3.4, margin=0.0)
+    made = map_panels(grid, 2 * len(names), look, columns=2, width=3.4, margin=0.0, least=2.0)
     titles = []
     for i, name in enumerate(names):
         own = maps.isel(robot=i)

@@ -86,8 +86,13 @@ def regret_curves(
     set_titles(made, titles, look)
     label_lower(made, "mission")
     first = made.panels[0]
-    first.set_ylabel(f"{_MEANING[variable]},\n% of the contact that the best keeps", fontsize=SMALL)
-    first.set_ylim(bottom=-0.03 * first.get_ylim()[1])  # shows markers at 0 whole
+    for ax in made.left:
+        ax.set_ylabel(
+            f"{_MEANING[variable]},\n% of the contact that the best keeps", fontsize=SMALL
+        )
+    top = max(ax.get_ylim()[1] for ax in made.panels)
+    for ax in made.panels:
+        ax.set_ylim(-0.03 * top, top)  # shows markers at 0 whole
     # Below the panels, so that it covers no curve.
     keys = first.get_legend_handles_labels()[0]
     said = f"{by}: median, 50 % and 90 % of runs"

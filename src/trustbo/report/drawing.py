@@ -17,8 +17,8 @@ from trustbo.plots.style import DARK, LIGHT
 from trustbo.report.blocks import Picture
 
 _PIXELS = 96
-_DOTS, _QUALITY = 160, 75
-"""Resolution of rasters such as hillshades, dots per inch, and their quality in WebP."""
+_DOTS = 160
+"""Resolution of rasters such as maps, dots per inch."""
 _PNG = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=\s]+)")
 _DIGITS = re.compile(r"(?<![\d.])([1-9]\d*\.\d\d)\d+")  # beyond a hundredth of a point
 _BETWEEN = re.compile(r">\s+<")
@@ -61,10 +61,10 @@ def themed(svg: str) -> str:
 
 
 def _smaller(png: re.Match[str]) -> str:
-    """Return the raster in WebP, where a hillshade has a tenth of the size of its PNG."""
+    """Return the raster in WebP, smaller than its PNG and with the same colours."""
     if not features.check("webp"):
         return png[0]
     file = io.BytesIO()
     with Raster.open(io.BytesIO(base64.b64decode(png[1]))) as raster:
-        raster.save(file, "WEBP", quality=_QUALITY)
+        raster.save(file, "WEBP", lossless=True)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"

@@ -155,7 +155,8 @@ def _of_text(text: str) -> object:
     """Mapping, or list, of the numbers of a text; the text itself where it is neither."""
     parts = [part for part in re.split(r",\s*|\s+", text.strip()) if part]
     if all("=" in part for part in parts):
-        return dict(part.split("=", 1) for part in parts)
+        named = [part.split("=", 1) for part in parts]
+        return dict(named) if len(dict(named)) == len(named) else text
     try:
         return [int(part) for part in parts]
     except ValueError:
@@ -165,7 +166,7 @@ def _of_text(text: str) -> object:
 def _number(what: str, name: str, value: object, whole: bool) -> float:
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number) or isinstance(value, bool) or (whole and number % 1.0):
         kind = "a whole number" if whole else "a finite number"

@@ -1,10 +1,15 @@
 """Length and care of a run of NUTS: names, defaults and limits."""
 
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, NamedTuple, Self
 
 from trustbo.errors import TrustboError, require_whole, unknown
 
+_OTHERS = (
+    "workspace", "earlier", "weights", "seed", "progress", "n_trajectories", "check", "whole",
+)  # fmt: skip
+"""Other keyword arguments of `fit`, for the advice on a misspelt one."""
 _FORMER = {"n_warmup": "warmup", "n_draws": "draws"}
 """Names until version 0.2, which are still taken."""
 _OF_ALL = ("n_chains", "draws")
@@ -36,11 +41,11 @@ class NutsSettings(NamedTuple):
         values = {name: value for name, value in given.items() if value is not None}
         for name, value in (former or {}).items():
             if name not in _FORMER:
-                raise unknown("setting", name, SETTINGS)
+                raise unknown("argument of fit", name, (*SETTINGS, *_OTHERS))
             values[_FORMER[name]] = value
         settings = cls(**values)
         accept = settings.target_accept
-        if isinstance(accept, bool | str) or not 0.0 < accept < 1.0:
+        if not isinstance(accept, Real) or isinstance(accept, bool) or not 0.0 < accept < 1.0:
             raise TrustboError(f"target_accept must be between 0 and 1; got {accept!r}.")
         return settings._replace(
             warmup=require_whole("warmup", settings.warmup, 0),
