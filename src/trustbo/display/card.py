@@ -84,7 +84,7 @@ def arrival(mean: float, band: tuple[float, float] | None) -> str:
     if band is None or not math.isfinite(band[0]):
         return _chance(mean)
     low, high = map(_chance, band)
-    span = low if low == high else f"{low} to {high}"
+    span = low if low == high or low.startswith("over") else f"{low} to {high}"
     return f"{_chance(mean)} on average, {span} in 90 % of the draws"
 
 
