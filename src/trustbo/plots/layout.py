@@ -148,6 +148,8 @@ def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: An
         shares = [ax.get_position().height for ax in axes[:: made.columns]]
         letters = int(_LETTERS * sum(shares) * _inches(made.figure))
         label = textwrap.fill(label, max(18, letters))
+    else:
+        bar.ax.locator_params(axis="x", nbins=4)
     bar.set_label(label, fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
 
