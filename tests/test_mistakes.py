@@ -131,6 +131,10 @@ MISTAKES = {
     "max_bound": (lambda c: c.iterate(max_bound=12), "did you mean max_bounds"),
     "2.5 missions": (lambda c: c.iterate(n_iterations=2.5), "a whole number from 1 on; got 2.5"),
     "no missions at all": (lambda c: c.iterate(n_iterations=0), "from 1 on; got 0"),
+    "a kind of progress": (
+        lambda c: c.iterate(progress="pgae"),
+        "unknown progress 'pgae'; choose one of bar, page",
+    ),
     "too many bounds": (
         lambda c: c.iterate(max_bounds=10**9),
         r"max_bounds = 1000000000 admits paths .* states, more than 2e\+07; give less",

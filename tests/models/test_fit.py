@@ -125,7 +125,7 @@ def test_settings_have_the_names_of_before_too_and_those_of_nuts_are_for_nuts(mi
         expected = f'{name} is for NUTS, and the sampler is "exact": give sampler "nuts"'
         with pytest.raises(TrustboError, match=expected):
             fit(missions, **{name: value})
-    with pytest.raises(TrustboError, match="unknown argument of fit 'n_wamup'; did you mean warmup"):
+    with pytest.raises(TrustboError, match="argument of fit 'n_wamup'; did you mean warmup"):
         fit(missions, n_wamup=3)
     for wrong in (0, 1.0, "0.9", True, np.nan):
         with pytest.raises(TrustboError, match="target_accept must be between 0 and 1; got"):

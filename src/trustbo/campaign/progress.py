@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from trustbo.campaign.history import LEARNED
 from trustbo.display.bars import FILE, NOTEBOOK, bar_in, place_of, say
+from trustbo.errors import require_choice
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -34,6 +35,8 @@ class Progress:
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
         """Show nothing yet, and nothing at all if `progress` is False."""
+        if isinstance(progress, str):
+            require_choice("progress", progress, ("bar", "page"))
         self._campaign, self._total = campaign, total
         self._place = place_of(bool(progress))
         self._map: Any = None
