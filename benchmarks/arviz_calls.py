@@ -78,9 +78,9 @@ az.loo_pit(dt)
 az.loo_r2(dt, "contact_rate")
 az.loo_score(dt)
 az.compare({"this": dt, "other": other})
-az.compare({"this": tb.models.loo(dt), "other": tb.models.loo(other)})
-az.plot_compare(az.compare({"this": tb.models.loo(dt), "other": tb.models.loo(other)}))
-az.plot_khat(tb.models.loo(dt))
+az.compare({"this": tb.inference.loo(dt), "other": tb.inference.loo(other)})
+az.plot_compare(az.compare({"this": tb.inference.loo(dt), "other": tb.inference.loo(other)}))
+az.plot_khat(tb.inference.loo(dt))
 az.plot_autocorr(dt, var_names=names)
 az.plot_bf(dt, "b")
 az.plot_convergence_dist(dt)
@@ -139,14 +139,14 @@ def subjects(quick: bool) -> tuple[dict[str, xr.DataTree], dict[str, xr.DataTree
     for _ in tb.missions(campaign, robots, n_iterations=25):
         pass
     missions = campaign.missions
-    found = {"exact": tb.models.fit(missions, model, sampler="exact")}
+    found = {"exact": tb.fit(missions, model, sampler="exact")}
     if not quick:
-        found["NUTS"] = tb.models.fit(missions, model, sampler="nuts")
+        found["NUTS"] = tb.fit(missions, model, sampler="nuts")
     weights = 0.9 ** np.arange(len(missions))[::-1]
-    found["weighted"] = tb.models.fit(missions, model, sampler="exact", weights=weights)
-    found["by rate"] = tb.models.by_rate(found["exact"])
-    half = tb.models.fit(missions[::2], model, sampler="exact")
-    other = tb.models.fit(missions, tb.models.CoupledTrust(inter_robot="none"))
+    found["weighted"] = tb.fit(missions, model, sampler="exact", weights=weights)
+    found["by rate"] = tb.inference.by_rate(found["exact"])
+    half = tb.fit(missions[::2], model, sampler="exact")
+    other = tb.fit(missions, tb.models.CoupledTrust(inter_robot="none"))
     return found, {"half": half, "other": other}
 
 

@@ -13,14 +13,8 @@ from pathlib import Path
 import jax.numpy as jnp
 from numpyro.distributions import HalfNormal, LogNormal, Normal
 
-from trustbo.models import (
-    CoupledTrust,
-    DriftTrust,
-    HierarchicalTrust,
-    PlaceEffect,
-    PooledTrust,
-    sbc,
-)
+from trustbo.inference import sbc
+from trustbo.models import CoupledTrust, DriftTrust, HierarchicalTrust, PlaceEffect, PooledTrust
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
 OWN = {

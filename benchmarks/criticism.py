@@ -20,8 +20,10 @@ import numpy as np
 from scipy import ndimage
 
 from trustbo import Mission
-from trustbo.models import PooledTrust, criticise, fit
-from trustbo.models.likelihood.place_prior import matern
+from trustbo.criticism import criticise
+from trustbo.inference import fit
+from trustbo.inference.evidence.place_prior import matern
+from trustbo.models import PooledTrust
 
 SHAPE, N_MISSIONS, N_ROBOTS = (10, 10), 15, 3
 FEATURES = ("traversability", "visibility", "line_of_sight")

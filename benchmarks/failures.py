@@ -26,7 +26,7 @@ import numpy as np
 from scipy import sparse
 
 import trustbo as tb
-from trustbo.models import CAUSES, BoundRisk, fit_hazard
+from trustbo.hazard import CAUSES, BoundRisk, fit_hazard
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.simulation import KinematicSimulator, MujocoSimulator, Truth
 from trustbo.study.world import COURSES, World

@@ -15,7 +15,8 @@ import warnings
 import numpy as np
 
 import trustbo as tb
-from trustbo.models import PlaceEffect, PooledTrust, fit
+from trustbo.inference import fit
+from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.study import run_worlds, worlds, worlds_table
 from trustbo.study.benchmark import as_text
 
@@ -84,7 +85,7 @@ def density(missions, family):
     """Log density of missions left out one by one."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Pareto k: 15 missions are few
-        return float(tb.models.loo(fit(missions, PooledTrust(observation=family))).elpd)
+        return float(tb.inference.loo(fit(missions, PooledTrust(observation=family))).elpd)
 
 
 if __name__ == "__main__":

@@ -30,21 +30,14 @@ from jax import lax
 from threadpoolctl import threadpool_limits
 
 from trustbo import Mission
-from trustbo.models import (
-    CoupledParams,
-    CoupledTrust,
-    HierarchicalTrust,
-    PooledTrust,
-    TrustFilter,
-    TrustParams,
-    fit,
-    sample_prior,
-    sample_statistics,
-)
-from trustbo.models.samplers.exact import _matched, _modes, _target
-from trustbo.models.samplers.reparam import reparametrise
-from trustbo.models.samplers.run import draw_posterior, nuts_data
-from trustbo.models.samplers.settings import NutsSettings
+from trustbo.inference import TrustFilter, fit, sample_prior, sample_statistics
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.samplers.exact import _matched, _modes, _target
+from trustbo.inference.samplers.reparam import reparametrise
+from trustbo.inference.samplers.run import draw_posterior, nuts_data
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.inference.updating import update_statistics
+from trustbo.models import CoupledParams, CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.stacking import stack_missions
 
 N_BOUNDS, N_ROBOTS, N_FEATURES = 10, 3, 2
@@ -122,7 +115,9 @@ def trustbo_exact(missions):
     model = PooledTrust()
 
     def sampler(seed):
-        found = sample_statistics(model, model.update(None, missions), n_draws=4000, seed=seed)
+        found = sample_statistics(
+            model, update_statistics(model, None, missions), n_draws=4000, seed=seed
+        )
         names = model.dims
         sites = {name: np.asarray(getattr(found.params, name))[None] for name in names}
         return Exact(sites, min(found.kish, 4000.0), found.k_hat)
@@ -449,11 +444,15 @@ def exact_cost(data):
     """Seconds of the log density at 4096 points, of gathering, and of that with stacking."""
     model, batch = PooledTrust(), stack_missions(data.missions)
     with threadpool_limits(limits=1):  # as the sampler does
-        target = _target(model.gather(batch)[0], model.priors)
+        target = _target(gather(model, batch)[0], model.priors)
         z = _matched(target, _modes(target), 0).draw(4096, 0)
         density = median_seconds(lambda: target.log_density(z), 7)
-    gather = median_seconds(lambda: model.gather(batch), 5)
-    return density, gather, median_seconds(lambda: model.update(None, data.missions), 5)
+    gathering = median_seconds(lambda: gather(model, batch), 5)
+    return (
+        density,
+        gathering,
+        median_seconds(lambda: update_statistics(model, None, data.missions), 5),
+    )
 
 
 def gradient_row(model, data, quick):
@@ -505,10 +504,10 @@ def latency(quick):
     print("\n## latency\n")
     print_header(("", "median ms", "target ms", "reached"))
     n, model, missions = 5 if quick else 20, PooledTrust(), pooled_data(21).missions
-    statistics = model.update(None, missions[:-1])
+    statistics = update_statistics(model, None, missions[:-1])
 
     def refit():
-        return sample_statistics(model, model.update(statistics, missions[-1:]))
+        return sample_statistics(model, update_statistics(model, statistics, missions[-1:]))
 
     latency_row("refit after one more mission, 20 before", median_seconds(refit, n), 50)
     whole = median_seconds(lambda: fit(missions, sampler="exact"), n)

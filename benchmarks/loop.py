@@ -14,7 +14,8 @@ import numpy as np
 from numpyro.infer import MCMC, NUTS
 
 import trustbo as tb
-from trustbo.models import PooledTrust, diagnostics, fit
+from trustbo.inference import diagnostics, fit
+from trustbo.models import PooledTrust
 
 
 def seconds_of(function):

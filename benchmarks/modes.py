@@ -18,7 +18,8 @@ from scipy import stats
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError
-from trustbo.models import PooledTrust, Priors, fit
+from trustbo.inference import fit
+from trustbo.models import PooledTrust, Priors
 
 FLOOR = 0.005  # of delta_v, where ticks are not known
 REAL = Priors(beta0=dist.Normal(0.5, 0.3))

@@ -22,7 +22,8 @@ import numpy as np
 from scipy.stats import binomtest
 
 import trustbo as tb
-from trustbo.models import PlaceEffect, PooledTrust, TrustParams, params_of, prior_from
+from trustbo.inference import params_of, prior_from
+from trustbo.models import PlaceEffect, PooledTrust, TrustParams
 from trustbo.simulation import ModelSimulator, Truth
 from trustbo.study.world import COURSES, REAL
 from trustbo.study.world_set import worlds
@@ -108,18 +109,18 @@ def times(_):
     ):
         workspace, missions = driven(side, n, random_ends, missing)
         given = {"workspace": workspace, "sampler": "exact", "whole": False}
-        earlier = tb.models.fit(missions[:-1], PLACES, **given)
-        cold = median_time(lambda m=missions, g=given: tb.models.fit(m, PLACES, **g), 3)
+        earlier = tb.fit(missions[:-1], PLACES, **given)
+        cold = median_time(lambda m=missions, g=given: tb.fit(m, PLACES, **g), 3)
         warm = median_time(
-            lambda m=missions, g=given, e=earlier: tb.models.fit(m, PLACES, earlier=e, **g), 3
+            lambda m=missions, g=given, e=earlier: tb.fit(m, PLACES, earlier=e, **g), 3
         )
-        posterior = tb.models.fit(missions, PLACES, earlier=earlier, **given)
+        posterior = tb.fit(missions, PLACES, earlier=earlier, **given)
         drawn = median_time(lambda p=posterior: params_of(p), 3)
         n_bounds = posterior["places"].sizes["bound"]
         print(f"| {name} | {n_bounds} | {cold:.3f} | {warm:.3f} | {drawn:.3f} |", flush=True)
     workspace, missions = driven(10, 8, False)
     started = time.perf_counter()
-    tb.models.fit(missions, PLACES, workspace=workspace, sampler="nuts", check=False)
+    tb.fit(missions, PLACES, workspace=workspace, sampler="nuts", check=False)
     taken = time.perf_counter() - started
     print(f"\nNUTS on the same marginal, 10 x 10, 8 missions: {taken:.0f} s")
 
@@ -230,11 +231,11 @@ def stopping(data):
 def nuts(_):
     workspace, missions = driven(6, 8, random_ends=False)
     seeds = [
-        moments(tb.models.fit(missions, PLACES, "exact", workspace=workspace, seed=seed))
+        moments(tb.fit(missions, PLACES, "exact", workspace=workspace, seed=seed))
         for seed in range(12)
     ]
     longer = {"n_warmup": 600, "n_draws": 6000, "check": False}
-    posterior = tb.models.fit(missions, PLACES, "nuts", workspace=workspace, **longer)
+    posterior = tb.fit(missions, PLACES, "nuts", workspace=workspace, **longer)
     print("largest differences: of means in sd; of sds, with NUTS's own error there and at most\n")
     for name, (mean, square) in moments(posterior).items():
         sd = np.sqrt(square - mean**2)

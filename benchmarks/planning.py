@@ -17,7 +17,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from trustbo.models import PooledTrust, TrustParams, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner
 from trustbo.planning.engines.buckets import best_stationary
 from trustbo.planning.paths import AdmissiblePaths

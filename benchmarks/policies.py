@@ -34,10 +34,11 @@ from scipy.spatial.distance import cdist
 from scipy.stats import binomtest, rankdata
 
 from trustbo.data import Mission
-from trustbo.models import PooledTrust, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.inference.samplers.run import draw_posterior
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.models import PooledTrust
 from trustbo.models.params import assemble_params
-from trustbo.models.samplers.run import draw_posterior
-from trustbo.models.samplers.settings import NutsSettings
 from trustbo.planning import POLICIES, Planner
 from trustbo.stacking import stack_missions
 from trustbo.workspace import AwarenessBelief, Workspace

@@ -13,7 +13,8 @@ import jax
 import numpy as np
 
 from trustbo import Mission
-from trustbo.models import PooledTrust, Priors, TrustParams, diagnostics, fit, params_of
+from trustbo.inference import diagnostics, fit, params_of
+from trustbo.models import PooledTrust, Priors, TrustParams
 
 N_MISSIONS, N_BOUNDS, N_ROBOTS = 8, 11, 3
 

@@ -16,7 +16,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import binomtest, rankdata
 
 import trustbo as tb
-from trustbo.models import PooledTrust, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.models import PooledTrust
 from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator
 

@@ -10,14 +10,9 @@ import jax
 import numpy as np
 
 from trustbo.data import Mission
-from trustbo.models import (
-    PooledTrust,
-    TrustParams,
-    fit,
-    moment_matched,
-    params_of,
-    sample_statistics,
-)
+from trustbo.inference import fit, moment_matched, params_of, sample_statistics
+from trustbo.inference.updating import update_statistics
+from trustbo.models import PooledTrust, TrustParams
 
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 CHECKED = (1, 2, 5, 10, 15, 20)
@@ -44,7 +39,7 @@ def main(n_missions=20):
     print("missions | refit, exact sampler    | moments passed on")
     worst = {"refit": [0.0, 1.0, 1.0], "moments": [0.0, 1.0, 1.0]}
     for j, mission in enumerate(missions, start=1):
-        statistics = model.update(statistics, [mission])
+        statistics = update_statistics(model, statistics, [mission])
         refit = columns(sample_statistics(model, statistics, seed=j).params)
         passed_on = fit([mission], replace(model, priors=priors), "exact", seed=j)
         priors = moment_matched(params_of(passed_on), model.priors)

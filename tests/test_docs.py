@@ -39,6 +39,9 @@ NAMESPACES = (
     "trustbo.workspace",
     "trustbo.logs",
     "trustbo.models",
+    "trustbo.inference",
+    "trustbo.hazard",
+    "trustbo.criticism",
     "trustbo.planning",
     "trustbo.simulation",
     "trustbo.study",
@@ -266,7 +269,7 @@ def built(folder, projects, page):
 def test_signatures_link_to_other_projects_where_these_can_be_reached(tmp_path):
     pytest.importorskip("sphinx", reason="needs the extra docs")
     (tmp_path / "objects.inv").write_bytes(inventory("xarray.DataTree"))
-    page = "Title\n=====\n\n.. autofunction:: trustbo.models.complete\n"
+    page = "Title\n=====\n\n.. autofunction:: trustbo.inference.complete\n"
     files = partial(SimpleHTTPRequestHandler, directory=tmp_path)
     with ThreadingHTTPServer(("127.0.0.1", 0), files) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -279,7 +282,7 @@ def test_signatures_link_to_other_projects_where_these_can_be_reached(tmp_path):
 
 def test_without_a_network_signatures_have_no_links_and_the_build_no_warning(tmp_path):
     pytest.importorskip("sphinx", reason="needs the extra docs")
-    page = "Title\n=====\n\n.. autofunction:: trustbo.models.complete\n"
+    page = "Title\n=====\n\n.. autofunction:: trustbo.inference.complete\n"
     html = built(tmp_path, {"xarray": "http://127.0.0.1:9/"}, page)
     assert "DataTree" in html
     assert "127.0.0.1" not in html

@@ -9,18 +9,8 @@ import xarray as xr
 
 import trustbo as tb
 from trustbo.export import write_csv, write_path
-from trustbo.models import (
-    PlaceEffect,
-    PooledTrust,
-    Priors,
-    TrustFilter,
-    TrustParams,
-    fit,
-    loo,
-    params_of,
-    prior_predictive,
-    sample_prior,
-)
+from trustbo.inference import TrustFilter, fit, loo, params_of, prior_predictive, sample_prior
+from trustbo.models import PlaceEffect, PooledTrust, Priors, TrustParams
 from trustbo.planning import Planner, roll_trust
 from trustbo.plots import regret_curves
 from trustbo.report import write_report

@@ -1,4 +1,18 @@
-from . import export, logs, models, planning, plots, report, simulation, study, terrain, workspace
+from . import (
+    criticism,
+    export,
+    hazard,
+    inference,
+    logs,
+    models,
+    planning,
+    plots,
+    report,
+    simulation,
+    study,
+    terrain,
+    workspace,
+)
 from .campaign import (
     Campaign,
     CampaignOptions,
@@ -10,8 +24,10 @@ from .campaign import (
     missions,
     resume,
 )
+from .criticism import criticise
 from .data import Bound, Mission
 from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
+from .inference import fit
 from .planning import NoPathError
 from .team import Robot, Team
 from .workspace import Workspace
@@ -33,7 +49,12 @@ __all__ = [
     "TerrainError",
     "TrustboError",
     "Workspace",
+    "criticise",
+    "criticism",
     "export",
+    "fit",
+    "hazard",
+    "inference",
     "iterate",
     "load_result",
     "logs",

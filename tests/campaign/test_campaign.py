@@ -14,7 +14,8 @@ from trustbo import (
     TrustboError,
     Workspace,
 )
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, fit, sample_prior
+from trustbo.inference import fit, sample_prior
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust
 from trustbo.planning import policies
 
 ENDS = ((3, 0), (0, 3))

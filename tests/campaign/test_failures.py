@@ -10,7 +10,7 @@ from simulators import ModelSimulator
 import trustbo as tb
 from trustbo.campaign.failures import to_avoid
 from trustbo.errors import PosteriorError
-from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.hazard import BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace.moves import moves_along
 

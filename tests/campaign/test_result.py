@@ -47,7 +47,7 @@ def test_its_plan_is_the_recommended_path(result):
 
 
 def test_its_planner_gives_its_trust_map(result):
-    mean = tb.models.params_of(result.posterior).mean()
+    mean = tb.inference.params_of(result.posterior).mean()
     np.testing.assert_allclose(result.planner.trust_map(mean), result.trust_map, rtol=1e-12)
 
 
@@ -57,7 +57,7 @@ def test_its_maps_are_over_the_posterior(result):
         "trust_mean", "trust_sd", "cost", "traversability", "visibility", "path_probability",
         "place_mean", "place_sd", "place_bounds_mean",
     ]  # fmt: skip
-    places = tb.models.place_maps(result.posterior)
+    places = tb.inference.place_maps(result.posterior)
     np.testing.assert_array_equal(maps["place_sd"], places["place_sd"].where(PASSABLE))
     into = places["place_bound_mean"][:, 3, 0].sel(move=["sw", "w", "s"])  # a corner
     np.testing.assert_allclose(maps["place_bounds_mean"][3, 0], into.mean())

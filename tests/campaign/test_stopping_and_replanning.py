@@ -14,8 +14,8 @@ from trustbo.campaign.replanning import better_rest, weighted_mean
 from trustbo.campaign.stopping import reason_to_stop
 from trustbo.data import Bound
 from trustbo.errors import TrustboError
-from trustbo.models import TrustFilter, sample_prior
-from trustbo.models.params import params_of
+from trustbo.inference import TrustFilter, sample_prior
+from trustbo.inference.draws import params_of
 from trustbo.planning import Planner
 
 ENDS = ((3, 0), (0, 3))

@@ -12,7 +12,7 @@ from simulators import ModelSimulator
 
 import trustbo as tb
 from trustbo.data import Mission
-from trustbo.models import fit, params_of
+from trustbo.inference import fit, params_of
 
 ENDS = ((3, 0), (0, 3))
 DIAGONAL = ((3, 0), (2, 1), (1, 2), (0, 3))
@@ -377,7 +377,7 @@ def test_a_damaged_file_is_named_with_what_can_still_be_read(folder, tmp_path, n
 def test_awareness_along_a_path_fits_missions_and_filters(workspace):
     campaign, path = begin(workspace), DIAGONAL[1:]
     np.testing.assert_array_equal(campaign.known_along(path), workspace.along(path))
-    live = tb.models.TrustFilter(campaign.belief, 3)
+    live = tb.inference.TrustFilter(campaign.belief, 3)
     assert live.predict(campaign.known_along(path), path).mean.shape == (2, 3)
     for off, said in {(4, 0): r"\(4, 0\) is outside", (1, 3): "no bound leads from"}.items():
         with pytest.raises(tb.TrustboError, match=said):
@@ -559,6 +559,6 @@ def test_a_long_campaign_keeps_the_parameters_alone(workspace, tmp_path):
     files = [file.stat().st_size for file in (tmp_path / "posteriors").glob("*.nc")]
     assert max(files) < 0.5e6
     assert result.posterior["latent"].sizes["mission"] == 4
-    again = tb.models.complete(result.posteriors[1], result.missions[:2])
+    again = tb.inference.complete(result.posteriors[1], result.missions[:2])
     direct = fit(result.missions[:2], sampler="exact", seed=int(result.posteriors[1].attrs["seed"]))
     np.testing.assert_array_equal(again["latent"]["trust"], direct["latent"]["trust"])

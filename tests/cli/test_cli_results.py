@@ -13,8 +13,8 @@ import yaml
 
 from trustbo.cli import app, main
 from trustbo.export import FORMATS
-from trustbo.models.likelihood.families import AUTO, FAMILIES
-from trustbo.models.samplers.choice import SAMPLERS
+from trustbo.inference.samplers.choice import SAMPLERS
+from trustbo.models.families import AUTO, FAMILIES
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.parts import NAMED_MODELS
 from trustbo.workspace import SIGHT_MODES

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from trustbo.data import Mission
-from trustbo.models import PooledTrust, TrustParams, fit
+from trustbo.inference import fit
+from trustbo.models import PooledTrust, TrustParams
 
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 

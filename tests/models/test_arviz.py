@@ -14,9 +14,9 @@ import xarray as xr
 from numpyro import handlers
 
 import trustbo as tb
+from trustbo.inference.log_prior import log_prior
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, Priors
 from trustbo.models.backend import call, own_settings
-from trustbo.models.log_prior import log_prior
 
 FEATURES = ("traversability", "line_of_sight")
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,7 +41,7 @@ def missions():
 
 @pytest.fixture(scope="module")
 def posterior(missions):
-    return tb.models.fit(missions, PooledTrust())
+    return tb.fit(missions, PooledTrust())
 
 
 # --- the prior ---
@@ -113,9 +113,9 @@ def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior
     """The data put the intercept at a half below; the prior says 3 +- .2."""
     assert set(posterior["log_prior"].data_vars) == {"beta0", "beta", "b", "delta_w", "delta_v"}
     wrong = PooledTrust(Priors(b=dist.Normal(3.0, 0.2)))
-    conflict = tb.models.fit(missions, wrong)
+    conflict = tb.fit(missions, wrong)
     calm = PooledTrust(Priors(b=dist.Normal(0.0, 5.0)))
-    vague = tb.models.fit(missions, calm)
+    vague = tb.fit(missions, calm)
     verdict, other = (
         az.psense_summary(p, var_names=["b"], prior_var_names=["b"]) for p in (conflict, vague)
     )
@@ -129,7 +129,7 @@ def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior
 
 
 def test_the_view_by_rate_is_the_mission_s_likelihood_in_pieces(missions, posterior):
-    view = tb.models.by_rate(posterior)
+    view = tb.inference.by_rate(posterior)
     pieces = view["log_likelihood"]["contact_rate"]
     rates = np.concatenate([m.contact_rate[np.isfinite(m.contact_rate)] for m in missions])
     np.testing.assert_array_equal(view["observed_data"]["contact_rate"].values, rates)
@@ -137,14 +137,14 @@ def test_the_view_by_rate_is_the_mission_s_likelihood_in_pieces(missions, poster
     summed = pieces.groupby("mission").sum("rate").transpose("chain", "draw", "mission")
     np.testing.assert_allclose(summed.values, whole, rtol=0, atol=1e-10)
     assert view["posterior_predictive"]["contact_rate"].shape == pieces.shape
-    alone = tb.models.fit(missions, PooledTrust(), whole=False)
-    again = tb.models.by_rate(alone, missions)["log_likelihood"]["contact_rate"]
+    alone = tb.fit(missions, PooledTrust(), whole=False)
+    again = tb.inference.by_rate(alone, missions)["log_likelihood"]["contact_rate"]
     np.testing.assert_array_equal(again.values, pieces.values)
 
 
 def test_each_rate_is_predicted_by_dense_conditioning_on_those_before(missions, posterior):
-    view = tb.models.by_rate(posterior)
-    draw = tb.models.params_of(posterior).draw(7)
+    view = tb.inference.by_rate(posterior)
+    draw = tb.inference.params_of(posterior).draw(7)
     robot, mission = 1, missions[2]
     y = mission.contact_rate[:, robot]
     u = mission.awareness[:, robot] @ draw.beta + draw.b
@@ -171,24 +171,24 @@ def test_each_rate_is_predicted_by_dense_conditioning_on_those_before(missions, 
 def test_the_view_by_rate_has_the_priors_and_of_weighted_missions_no_likelihood_for_loo(
     missions, posterior
 ):
-    sensitivity = az.psense_summary(tb.models.by_rate(posterior), var_names=["b"])
+    sensitivity = az.psense_summary(tb.inference.by_rate(posterior), var_names=["b"])
     expected = az.psense_summary(posterior, var_names=["b"])
     columns = ["prior", "likelihood"]
     np.testing.assert_allclose(sensitivity[columns], expected[columns], atol=2e-3)  # rounded
     within = float(posterior["posterior"]["b"].median())
     factor, same = (
         az.bayes_factor(tree, var_names=["b"], ref_vals=within)["b"]
-        for tree in (tb.models.by_rate(posterior), posterior)
+        for tree in (tb.inference.by_rate(posterior), posterior)
     )
     np.testing.assert_allclose(factor, same)
-    weighted = tb.models.fit(missions, PooledTrust(), weights=[0.5, 0.6, 0.7, 0.8, 0.9])
-    view = tb.models.by_rate(weighted)
+    weighted = tb.fit(missions, PooledTrust(), weights=[0.5, 0.6, 0.7, 0.8, 0.9])
+    view = tb.inference.by_rate(weighted)
     assert "log_likelihood" not in view.children
     assert view["rate_log_likelihood"]["contact_rate"].dims == ("chain", "draw", "rate")
     with pytest.raises(TypeError, match="log likelihood not found"):
         az.loo(view)
     with pytest.raises(tb.TrustboError, match=r"of a view by rate, give the posterior itself\.$"):
-        tb.models.loo(view)
+        tb.inference.loo(view)
 
 
 def test_predictions_by_rate_are_calibrated_under_the_model():
@@ -200,7 +200,7 @@ def test_predictions_by_rate_are_calibrated_under_the_model():
     path = [(k, 0) for k in range(7)]
     rates = np.clip(sample.contact_rate, 0.0, 1.0)
     missions = [tb.Mission.from_arrays(path, *pair) for pair in zip(z, rates, strict=True)]
-    view = tb.models.by_rate(tb.models.fit(missions, PooledTrust()))
+    view = tb.inference.by_rate(tb.fit(missions, PooledTrust()))
     drawn = view["posterior_predictive"]["contact_rate"]
     pit = (drawn < view["observed_data"]["contact_rate"]).mean(("chain", "draw")).values
     assert abs(pit.mean() - 0.5) < 4.0 / np.sqrt(12.0 * len(pit))
@@ -218,7 +218,7 @@ def test_what_has_no_single_predictions_is_named(missions):
     counted = xr.DataTree()
     counted.attrs = {"observation": "censored", "inter_robot": "none", "response": "level"}
     with pytest.raises(tb.TrustboError, match='observation "censored" and inter_robot="none"'):
-        tb.models.by_rate(counted)
+        tb.inference.by_rate(counted)
 
 
 @pytest.mark.slow  # 200 calls, most of them figures
@@ -232,8 +232,8 @@ def test_the_page_names_every_call_that_fails(missions, posterior):
     assert {"plot_energy", "plot_loo_pit"} <= named  # and groups
     given = {name: script[name] for name in ("written", "density")}
     given |= {"az": az, "np": np, "tb": tb, "names": ["beta0", "beta", "b"]}
-    given |= {"other": tb.models.fit(missions, CoupledTrust(inter_robot="none"))}
-    given |= {"half": tb.models.fit(missions[::2], PooledTrust())}
+    given |= {"other": tb.fit(missions, CoupledTrust(inter_robot="none"))}
+    given |= {"half": tb.fit(missions[::2], PooledTrust())}
     calls = script["CALLS"].split("\n")[1:-1]
     failed = {
         call: said for call in calls if (said := script["failure"](call, given | {"dt": posterior}))
@@ -242,5 +242,6 @@ def test_the_page_names_every_call_that_fails(missions, posterior):
     assert "az.plot_energy(dt)" in failed
     assert "az.plot_loo_pit(dt)" in failed
     assert (
-        script["failure"]("az.plot_loo_pit(dt)", given | {"dt": tb.models.by_rate(posterior)}) == ""
+        script["failure"]("az.plot_loo_pit(dt)", given | {"dt": tb.inference.by_rate(posterior)})
+        == ""
     )

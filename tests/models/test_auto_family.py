@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, fit
-from trustbo.models.samplers import run
+from trustbo.inference import fit
+from trustbo.inference.samplers import run
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 from trustbo.simulation import KinematicSimulator
 
 PATH = [(2, 0), (1, 1), (0, 2)]

@@ -8,8 +8,9 @@ from models.conftest import simulate_missions
 from numpyro.distributions import HalfCauchy
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, complete, fit
-from trustbo.models.prior_predictive import sample_prior
+from trustbo.inference import complete, fit
+from trustbo.inference.prior_predictive import sample_prior
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,12 @@ from scipy import stats
 
 import trustbo as tb
 from trustbo import Mission, TrustboError
+from trustbo.criticism import criticise
+from trustbo.criticism import joint_normal as dense
+from trustbo.criticism.departures import departures
+from trustbo.criticism.score import Innovations, Outcome, derivatives, holm
+from trustbo.inference import fit
+from trustbo.inference.evidence import kalman_numpy
 from trustbo.models import (
     CoupledParams,
     CoupledTrust,
@@ -19,13 +25,7 @@ from trustbo.models import (
     PlaceEffect,
     PooledTrust,
     TrustParams,
-    criticise,
-    fit,
 )
-from trustbo.models.criticism import joint_normal as dense
-from trustbo.models.criticism.departures import departures
-from trustbo.models.criticism.score import Innovations, Outcome, derivatives, holm
-from trustbo.models.likelihood import kalman_numpy
 
 _SOURCE = Path(__file__).resolve().parents[2] / "benchmarks" / "criticism.py"
 
@@ -196,7 +196,7 @@ def test_the_worth_of_the_parts_of_a_model(with_places, planted):
 
 def test_with_places_nothing_is_compared_that_needs_nuts(planted, monkeypatch):
     """It took minutes for what campaigns fit by default."""
-    by_nuts = importlib.import_module("trustbo.models.samplers.run")
+    by_nuts = importlib.import_module("trustbo.inference.samplers.run")
     monkeypatch.setattr(by_nuts, "_sample_nuts", lambda *_, **__: pytest.fail("NUTS was asked"))
     missions, place = planted("place")[:6], tb.models.PlaceEffect()
     worth = criticise(fit(missions, PooledTrust(place=place), "exact"), n_replicates=100).worth
@@ -206,7 +206,7 @@ def test_with_places_nothing_is_compared_that_needs_nuts(planted, monkeypatch):
 
 def test_what_cannot_be_criticised_says_why(with_places, planted):
     posterior, _ = with_places
-    with pytest.raises(TrustboError, match=r"takes a posterior of trustbo.models.fit; got dict"):
+    with pytest.raises(TrustboError, match=r"takes a posterior of trustbo.inference.fit; got dict"):
         criticise({})
     bare = posterior.copy()
     bare.attrs = {}
@@ -265,7 +265,7 @@ def test_the_finding_that_explains_the_others_is_named():
     }
     before = {name: outcome(p) for name, p in before.items()}
     left = {name: {n: outcome(p) for n, p in each.items()} for name, each in left.items()}
-    choose = importlib.import_module("trustbo.models.criticise")._most_explaining
+    choose = importlib.import_module("trustbo.criticism.criticise")._most_explaining
     assert choose(before, left) == "robot"
     assert choose(before, {}) == "none"
     # Of two that leave nothing, the one of least p.
@@ -290,7 +290,7 @@ def few(n, n_bounds):
 
 @pytest.mark.parametrize("missions", [few(1, 11), few(8, 1)], ids=["one mission", "one bound"])
 def test_one_mission_and_missions_of_one_bound_have_figures_too(missions):
-    found = tb.models.criticise(tb.models.fit(missions), compare=False, n_replicates=200)
+    found = tb.criticise(tb.fit(missions), compare=False, n_replicates=200)
     assert found.fault == "none"
     tb.plots.criticism(found)
     plt.close("all")
@@ -301,4 +301,4 @@ def test_rates_that_are_all_alike_are_refused():
     path = [(0, k) for k in range(6)]
     same = [Mission.from_arrays(path, np.full((5, 3, 2), 0.5), np.ones((5, 3))) for _ in range(3)]
     with pytest.raises(tb.TrustboError, match="the rates are all but equal"):
-        tb.models.criticise(tb.models.fit(same, model), compare=False)
+        tb.criticise(tb.fit(same, model), compare=False)

@@ -15,10 +15,7 @@ from references import dense_coupled
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import (
-    DriftTrust,
-    PlaceEffect,
-    PooledTrust,
+from trustbo.inference import (
     TrustFilter,
     diagnostics,
     fit,
@@ -27,8 +24,10 @@ from trustbo.models import (
     prior_predictive,
     sbc,
 )
+from trustbo.inference.samplers import drift_target
+from trustbo.inference.updating import update_statistics
+from trustbo.models import DriftTrust, PlaceEffect, PooledTrust
 from trustbo.models.drift_form import find_drift
-from trustbo.models.samplers import drift_target
 
 NOISES = {"delta_w": 0.05, "delta_v": 0.05}
 
@@ -428,7 +427,7 @@ def test_what_a_sampler_or_a_function_cannot_treat_says_so(missions, posterior):
     with pytest.raises(TrustboError, match=r'"exact" cannot treat .* not Gaussian. Use sampler'):
         fit(missions, counts, "exact")
     with pytest.raises(TrustboError, match="no sufficient statistics: its drift is a function of"):
-        OWN.update(None, missions)
+        update_statistics(OWN, None, missions)
     with pytest.raises(TrustboError, match=r"parameter 'own' is missing; .* needs beta0, top"):
         OWN.params({name: TRUTH[name] for name in TRUTH if name != "own"}, 2)
     params = params_of(posterior)

@@ -9,14 +9,8 @@ from scipy import stats
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import (
-    CoupledParams,
-    PooledTrust,
-    RobotParams,
-    TrustFilter,
-    TrustParams,
-    params_of,
-)
+from trustbo.inference import TrustFilter, params_of
+from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
 from trustbo.workspace import AwarenessBelief, Workspace
 
 

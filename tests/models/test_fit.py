@@ -12,10 +12,11 @@ from numpyro.infer import MCMC, NUTS
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
-from trustbo.models import PooledTrust, Priors, diagnostics, fit, params_of
-from trustbo.models.samplers import complaints, nuts, run
-from trustbo.models.samplers.nuts import _advance, run_nuts
-from trustbo.models.samplers.settings import NutsSettings
+from trustbo.inference import diagnostics, fit, params_of
+from trustbo.inference.samplers import complaints, nuts, run
+from trustbo.inference.samplers.nuts import _advance, run_nuts
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.models import PooledTrust, Priors
 from trustbo.stacking import stack_missions
 
 SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]

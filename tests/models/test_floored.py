@@ -11,17 +11,11 @@ from scipy import integrate, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import (
-    PooledTrust,
-    Priors,
-    fit,
-    prior_predictive,
-    sample_prior,
-    sample_statistics,
-    sbc,
-)
+from trustbo.inference import fit, prior_predictive, sample_prior, sample_statistics, sbc
+from trustbo.inference.updating import update_statistics
+from trustbo.models import PooledTrust, Priors
 from trustbo.models.backend import call
-from trustbo.models.samplers.priors_numpy import draw, floored, log_prob
+from trustbo.models.priors_numpy import draw, floored, log_prob
 from trustbo.models.ticks import resolution, weigh_ticks
 from trustbo.stacking import stack_missions
 
@@ -128,7 +122,9 @@ def test_nuts_has_the_floor_of_the_exact_sampler():
 
 def test_statistics_know_the_floor_of_their_missions():
     model, missions = PooledTrust(), constant_missions(1.0, n_ticks=40)
-    statistics = model.update(model.update(None, missions[:3]), missions[3:])
+    statistics = update_statistics(
+        model, update_statistics(model, None, missions[:3]), missions[3:]
+    )
     drawn = sample_statistics(model, statistics)
     assert drawn.params.delta_v.min() >= 0.025
     # Two sums over 4096 points.

@@ -8,9 +8,9 @@ from scipy import special, stats
 
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.models import BoundRisk, Hazard, LostMission, fit_hazard
-from trustbo.models.exposures import Exposures
-from trustbo.models.hazard_sampler import _Density, impute, sample
+from trustbo.hazard import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.hazard.exposures import Exposures
+from trustbo.hazard.sampler import _Density, impute, sample
 from trustbo.workspace.moves import MOVES
 
 
@@ -308,7 +308,7 @@ def test_a_bad_proposal_is_refused(monkeypatch):
         points = sample(*args)
         return points._replace(k_hat=0.93)
 
-    monkeypatch.setattr("trustbo.models.hazard.sample", unlucky)
+    monkeypatch.setattr("trustbo.hazard.model.sample", unlucky)
     with pytest.raises(PosteriorError, match=r"k-hat = 0.93 > 0.7"):
         fit_hazard([], workspace())
     assert fit_hazard([], workspace(), check=False).attrs["k_hat"] == 0.93

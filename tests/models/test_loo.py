@@ -7,7 +7,8 @@ from models.conftest import simulate_missions
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import PooledTrust, fit, loo, params_of
+from trustbo.inference import fit, loo, params_of
+from trustbo.models import PooledTrust
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Estimated shape parameter of Pareto"

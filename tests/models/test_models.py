@@ -13,6 +13,19 @@ from references import dense_coupled
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
+from trustbo.inference import (
+    TrustFilter,
+    diagnostics,
+    fit,
+    params_of,
+    prior_predictive,
+    sample_prior,
+)
+from trustbo.inference.evidence.statistics import require_statistics
+from trustbo.inference.samplers.laplace import newton
+from trustbo.inference.samplers.partial_centring import fit_robots
+from trustbo.inference.samplers.reparam import Coordinates, reparametrise
+from trustbo.inference.samplers.target import NutsData, innovations_shape
 from trustbo.models import (
     CoupledParams,
     CoupledTrust,
@@ -21,19 +34,9 @@ from trustbo.models import (
     PooledTrust,
     Priors,
     RobotParams,
-    TrustFilter,
     TrustParams,
-    diagnostics,
-    fit,
-    params_of,
-    prior_predictive,
-    sample_prior,
 )
 from trustbo.models.params import ordered_params
-from trustbo.models.samplers.laplace import newton
-from trustbo.models.samplers.partial_centring import fit_robots
-from trustbo.models.samplers.reparam import Coordinates, reparametrise
-from trustbo.models.samplers.target import NutsData, innovations_shape
 from trustbo.stacking import stack_missions
 
 N = 40
@@ -422,4 +425,4 @@ def test_covariances_and_sizes_that_do_not_fit_are_named():
 )
 def test_models_without_sufficient_statistics_say_why(model, reason):
     with pytest.raises(TrustboError, match=f"has no sufficient statistics: .*{reason}"):
-        model.require_statistics()
+        require_statistics(model)

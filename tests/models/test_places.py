@@ -14,32 +14,19 @@ from scipy.linalg import block_diag
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import (
-    HierarchicalTrust,
-    PlaceEffect,
-    PooledTrust,
-    TrustParams,
-    complete,
-    fit,
-    params_of,
-)
-from trustbo.models.likelihood import place_marginal
-from trustbo.models.likelihood.ep.chains import gather_chains
-from trustbo.models.likelihood.families import FAMILIES
-from trustbo.models.likelihood.place_rows import gather_rows
+from trustbo.inference import complete, fit, params_of
+from trustbo.inference.evidence import place_marginal
+from trustbo.inference.evidence.ep.chains import gather_chains
+from trustbo.inference.evidence.place_rows import gather_rows
+from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_group, place_maps_of
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.latent_target import LatentTarget
+from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.student import Student, log_mixture
+from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
+from trustbo.models.families import FAMILIES
 from trustbo.models.place import bounds_of, visited
-from trustbo.models.place_maps import (
-    PlaceScales,
-    draw_maps,
-    nowhere,
-    place_group,
-    place_maps_of,
-)
 from trustbo.models.priors import Priors
-from trustbo.models.samplers.importance import sample_scores
-from trustbo.models.samplers.latent_target import LatentTarget
-from trustbo.models.samplers.place_target import PlaceTarget
-from trustbo.models.samplers.student import Student, log_mixture
 
 SHAPE = (5, 5)
 PLACES = [
@@ -294,7 +281,7 @@ def test_place_maps_are_the_moments_of_the_drawn_maps(place):
             "observed_data": xr.Dataset(robots, {"robot": ["a", "b", "c"]}),
         }
     )
-    maps, drawn = tb.models.place_maps(posterior), place_maps_of(group, sites)
+    maps, drawn = tb.inference.place_maps(posterior), place_maps_of(group, sites)
     assert set(maps) == {f"{name}_{kind}" for name in draws for kind in ("mean", "sd")}
     assert ("robot" in maps.dims) is not place.shared
     for name, expected in drawn.items():
@@ -370,7 +357,7 @@ def test_a_filter_over_a_mission_follows_its_places(learned):
     _, missions, _, posterior = learned
     params, mission = params_of(posterior), missions[0]
     one = params.draw(np.array([7]))
-    live = tb.models.TrustFilter(one, 3)
+    live = tb.inference.TrustFilter(one, 3)
     for k in range(len(mission.bounds)):
         live.update(mission.awareness[k], mission.contact_rate[k], mission.path[k : k + 2])
     effect = one.of_places(bounds_of([mission])[0])[0, :, 0]
@@ -501,7 +488,7 @@ def test_families_have_effects_of_places(family):
 def test_places_that_cannot_be_are_named():
     bare = xr.DataTree.from_dict({"posterior": xr.Dataset()})
     with pytest.raises(TrustboError, match=r"no maps of them; fit a model with place=PlaceEffect"):
-        tb.models.place_maps(bare)
+        tb.inference.place_maps(bare)
     missions = random_missions(0)
     small = tb.Workspace.from_awareness(np.full((3, 2, 2, 2), 0.5))
     model = PooledTrust(place=PlaceEffect())
@@ -530,7 +517,7 @@ def test_places_by_nuts_are_said_to_take_minutes(monkeypatch):
     def begin(*args, **options):
         raise BegunError
 
-    monkeypatch.setattr(import_module("trustbo.models.fit"), "draw_posterior", begin)
+    monkeypatch.setattr(import_module("trustbo.inference.fit"), "draw_posterior", begin)
     missions, model = random_missions(0), HierarchicalTrust(place=PlaceEffect())
     said = pytest.warns(UserWarning, match=r"by NUTS, .* minutes .* PooledTrust\(place=...\)")
     with said, pytest.raises(BegunError):
@@ -621,7 +608,7 @@ def walks(n, start, goal, longest):
 def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(learned):
     _, missions, _, posterior = learned
     draws, base = posterior["posterior"], Priors()
-    model = tb.models.prior_from([posterior])
+    model = tb.inference.prior_from([posterior])
     b = draws["b"].values.ravel()
     center, spread = np.median(b), 0.5 * np.subtract(*np.quantile(b, [0.841, 0.159]))
     assert float(model.priors.b.loc) == pytest.approx(0.5 * center, rel=1e-5)
@@ -638,11 +625,11 @@ def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(lear
     assert again.attrs["k_hat"] < 0.7
     assert base.b.scale == 0.5
     with pytest.raises(TrustboError, match="there are no posteriors"):
-        tb.models.prior_from([])
+        tb.inference.prior_from([])
     wide = PooledTrust(Priors(b=dist.StudentT(4.0, 0.0, 0.5)))
     with pytest.raises(TrustboError, match="needs Normal priors of beta and b"):
-        tb.models.prior_from([posterior], wide)
+        tb.inference.prior_from([posterior], wide)
     other = fit(missions[:2], PooledTrust(), whole=False)
     other.attrs["model"] = "HierarchicalTrust"  # sampled in no time
     with pytest.raises(TrustboError, match="takes posteriors of PooledTrust"):
-        tb.models.prior_from([other])
+        tb.inference.prior_from([other])

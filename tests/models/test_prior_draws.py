@@ -10,6 +10,7 @@ from numpyro.infer import Predictive
 from scipy import special, stats
 
 from trustbo.errors import ShapeError, TrustboError
+from trustbo.inference import prior_predictive, sample_prior
 from trustbo.models import (
     CoupledTrust,
     DriftTrust,
@@ -17,12 +18,10 @@ from trustbo.models import (
     PlaceEffect,
     PooledTrust,
     Priors,
-    prior_predictive,
-    sample_prior,
 )
 from trustbo.models.backend import own_settings
-from trustbo.models.likelihood.generate import draw_missions
-from trustbo.models.samplers.priors_numpy import draw_lkj_cholesky
+from trustbo.models.priors_numpy import draw_lkj_cholesky
+from trustbo.models.state_space.generate import draw_missions
 
 SIGHTED = ("visibility", "line_of_sight")
 BY_FEATURE = Priors(beta=dist.Normal(np.array([1.0, -1.0]), np.array([0.1, 0.2])))

@@ -10,8 +10,9 @@ import pytest
 import xarray as xr
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors, sbc
-from trustbo.models.sbc import _uniformity
+from trustbo.inference import sbc
+from trustbo.inference.sbc import _uniformity
+from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors
 
 
 @pytest.mark.slow  # many data sets; others rank a few
@@ -31,7 +32,7 @@ def test_the_exact_sampler_is_calibrated():
 
 
 def test_a_posterior_of_another_prior_is_found_out(monkeypatch):
-    calibration = import_module("trustbo.models.sbc")  # the package's `sbc` is the function
+    calibration = import_module("trustbo.inference.sbc")  # the package's `sbc` is the function
     draw = calibration.draw_posterior
     wrong = PooledTrust(Priors(delta_v=dist.HalfNormal(0.02)))
 

@@ -10,11 +10,13 @@ from references import dense_log_likelihood
 from scipy import stats
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors, prior_predictive
-from trustbo.models.prior_predictive import sample_prior
+from trustbo.inference import prior_predictive
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.prior_predictive import sample_prior
+from trustbo.inference.samplers.exact import _target
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
+from trustbo.models.priors_numpy import log_prob
 from trustbo.models.record import model_from_record, model_to_record
-from trustbo.models.samplers.exact import _target
-from trustbo.models.samplers.priors_numpy import log_prob
 from trustbo.stacking import stack_missions
 
 FEATURES = ("traversability", "visibility", "line_of_sight")
@@ -25,7 +27,7 @@ def test_the_exact_sampler_integrates_weights_of_these_priors_out():
     rng = np.random.default_rng(0)
     missions = random_missions(rng, 4)
     priors = Priors.of(("traversability", "line_of_sight"))
-    target = _target(PooledTrust(priors).gather(stack_missions(missions))[0], priors)
+    target = _target(gather(PooledTrust(priors), stack_missions(missions))[0], priors)
     z = rng.normal([0.0, -1.5, 0.0], 0.5, (5, 3))
     found, mean, factor = target.evaluate(z)
     beta0, delta_w, delta_v, log_jacobian = target.constrain(z)

@@ -10,6 +10,10 @@ from references import dense_coupled
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
+from trustbo.inference import fit, moment_matched, params_of, sample_statistics
+from trustbo.inference.evidence.gram_jax import log_likelihood, spectrum
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.updating import update_statistics
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -17,12 +21,7 @@ from trustbo.models import (
     Priors,
     RobotParams,
     TrustParams,
-    fit,
-    moment_matched,
-    params_of,
-    sample_statistics,
 )
-from trustbo.models.likelihood.gram_jax import log_likelihood, spectrum
 from trustbo.stacking import stack_missions
 
 THETA = np.array([[0.5, 0.01, 0.02], [0.8, 0.03, 0.001], [-0.2, 0.2, 0.1]])
@@ -44,7 +43,7 @@ def test_the_quadratic_form_of_changes_is_the_dense_joint_normal(response):
     missions = simulate_missions(3)
     missions[0] = with_a_gap(missions[0])
     model = PooledTrust(response=response)
-    (statistics,) = model.update(None, missions)
+    (statistics,) = update_statistics(model, None, missions)
     q = statistics.evaluate(THETA, 0.5)
     c = np.array([0.3, 0.2, 0.05])
     for i, (beta0, Q, R) in enumerate(THETA):
@@ -69,7 +68,7 @@ def test_the_quadratic_form_of_changes_is_the_dense_joint_normal(response):
 @pytest.mark.parametrize("response", ["level", "change"])
 def test_what_nuts_sums_up_is_the_likelihood(response):
     model, missions = PooledTrust(response=response), simulate_missions(6)
-    sums = spectrum(model.update(None, missions)[0])
+    sums = spectrum(update_statistics(model, None, missions)[0])
     assert sums.mask.sum() == 7 + 5 + 8  # three lengths, padded to four of eight bounds
     assert sums.mask.shape == (4, 8)
     p = TrustParams(0.55, np.array([0.2, 0.3]), 0.07, 0.06, 0.08, 0.5, 0.5)
@@ -82,10 +81,10 @@ def test_what_nuts_sums_up_is_the_likelihood(response):
 def test_missions_add_up_in_any_order():
     missions = [with_a_gap(m) if j == 2 else m for j, m in enumerate(simulate_missions(6))]
     model = PooledTrust()
-    (whole,) = model.update(None, missions)
+    (whole,) = update_statistics(model, None, missions)
     statistics = None
     for mission in missions[::-1]:
-        statistics = model.update(statistics, [mission])
+        statistics = update_statistics(model, statistics, [mission])
     same(whole, statistics[0])
     assert whole.n_measured == statistics[0].n_measured
 
@@ -95,18 +94,18 @@ def test_a_weight_is_a_number_of_missions():
     model = PooledTrust()
     batch = stack_missions(missions)
     weight = np.r_[2.0, 1.0, 0.0, np.ones(len(batch.contact_rate) - 3)]
-    (weighted,) = model.gather(batch, weight)
-    (repeated,) = model.update(None, [missions[0], missions[0], missions[1]])
+    (weighted,) = gather(model, batch, weight)
+    (repeated,) = update_statistics(model, None, [missions[0], missions[0], missions[1]])
     same(weighted, repeated)
 
 
 def test_forgetting_is_a_weight_by_age():
     missions, model, statistics = simulate_missions(4), PooledTrust(), None
     for mission in missions:
-        statistics = model.update(statistics, [mission], forgetting=0.5)
+        statistics = update_statistics(model, statistics, [mission], forgetting=0.5)
     batch = stack_missions(missions)
     weight = np.r_[0.125, 0.25, 0.5, 1.0, np.ones(4)]
-    same(statistics[0], model.gather(batch, weight)[0])
+    same(statistics[0], gather(model, batch, weight)[0])
     drawn = sample_statistics(model, statistics, n_draws=4000)
     by_fit = fit(missions, model, "exact", weights=weight[:4])
     for name in ("beta0", "b", "delta_v"):
@@ -147,7 +146,7 @@ def test_robots_with_nothing_in_common_are_so_many_pooled_fits():
             one["latent"]["trust_mean"].isel(robot=0).values,
             equal_nan=True,
         )
-    statistics = CoupledTrust(inter_robot="none").update(None, missions)
+    statistics = update_statistics(CoupledTrust(inter_robot="none"), None, missions)
     drawn = sample_statistics(CoupledTrust(inter_robot="none"), statistics, n_draws=100)
     assert isinstance(drawn.params, RobotParams)
     assert drawn.params.beta.shape == (100, 3, 2)
@@ -169,23 +168,23 @@ def test_matched_priors_have_the_posterior_s_moments():
 
 def test_what_does_not_add_up_is_named():
     missions, model = simulate_missions(2), PooledTrust()
-    statistics = model.update(None, missions)
+    statistics = update_statistics(model, None, missions)
     with pytest.raises(TrustboError, match=r"forgetting must be in \(0, 1\]; got 0"):
-        model.update(statistics, missions, forgetting=0)
+        update_statistics(model, statistics, missions, forgetting=0)
     with pytest.raises(TrustboError, match=r"HierarchicalTrust.*share some parameters only"):
-        HierarchicalTrust().update(None, missions)
+        update_statistics(HierarchicalTrust(), None, missions)
     other = PooledTrust(Priors(x0_mean=0.2))
     with pytest.raises(TrustboError, match="different x0_mean or response do not add up"):
-        other.update(statistics, missions)
+        update_statistics(other, statistics, missions)
     one = [Mission.from_arrays(m.path, m.awareness[..., :1], m.contact_rate) for m in missions]
     with pytest.raises(ShapeError, match="statistics of 2 and 1 features do not add up"):
-        model.update(statistics, one)
+        update_statistics(model, statistics, one)
     apart = CoupledTrust(inter_robot="none")
     pair = [
         Mission.from_arrays(m.path, m.awareness[:, :2], m.contact_rate[:, :2]) for m in missions
     ]
     with pytest.raises(ShapeError, match="statistics are of 3 robots, the missions have 2"):
-        apart.update(apart.update(None, missions), pair)
+        update_statistics(apart, update_statistics(apart, None, missions), pair)
     with pytest.raises(ShapeError, match=r"weights must be \(2,\), one per mission; got \(3,\)"):
         fit(missions, weights=[1.0, 1.0, 1.0])
     with pytest.raises(TrustboError, match=r"weights must be in \[0, 1\]"):

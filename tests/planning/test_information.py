@@ -7,8 +7,9 @@ from scipy.special import expit
 from scipy.stats import multivariate_normal
 
 from trustbo.errors import ShapeError
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams, sample_prior
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.inference import sample_prior
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
+from trustbo.models.families import FAMILIES
 from trustbo.models.params import CoupledParams
 from trustbo.planning.dynamics import transition
 from trustbo.planning.information import information_gain, rate_noise

@@ -7,7 +7,8 @@ import pytest
 from references import walks
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import PooledTrust, TrustParams, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import NoPathError, Planner, policies, roll_trust
 from trustbo.planning.policies import resolve_policy
 from trustbo.workspace import Workspace

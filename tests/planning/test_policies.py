@@ -6,7 +6,8 @@ import pytest
 from references import of_bounds, path_values, walks
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.planning import POLICIES, Planner, policies
 from trustbo.planning.dynamics import drift
 from trustbo.planning.policies import resolve_policy

@@ -5,7 +5,8 @@ import pytest
 from references import walks
 
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import HierarchicalTrust, PooledTrust, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.models import HierarchicalTrust, PooledTrust
 from trustbo.planning import NoPathError, Planner, problem, roll_trust
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along

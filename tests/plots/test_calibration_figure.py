@@ -36,7 +36,7 @@ def test_curves_are_kolmogorov_smirnov_s_and_the_band_its_quantile(power, calibr
 
 
 def test_it_takes_what_sbc_returns():
-    ranks = tb.models.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
+    ranks = tb.inference.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
     curves, _ = tb.plots.calibration(ranks)
     assert len(curves.lines) == ranks.sizes["parameter"]
     (legend,) = curves.figure.legends

@@ -48,7 +48,7 @@ def test_robots_of_their_own_have_panels_of_their_own():
         for _ in range(2)
     ]
     model = tb.models.CoupledTrust(inter_robot="none")
-    posterior = tb.models.fit(missions, model, sampler="exact")
+    posterior = tb.fit(missions, model, sampler="exact")
     axes = tb.plots.parameter_history([posterior], names=["beta", "b"])
     titles = [ax.get_title() for ax in axes]
     features = "traversability", "visibility"

@@ -16,7 +16,7 @@ def found():
         z = rng.uniform(size=(6, 2, 2))
         rates = 0.3 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2)) + 0.1 * (j >= 4)
         missions.append(tb.Mission.from_arrays(path, z, rates))
-    return tb.models.criticise(tb.models.fit(missions, whole=False), compare=False)
+    return tb.criticise(tb.fit(missions, whole=False), compare=False)
 
 
 def test_the_fault_is_in_bold_and_groups_outside_their_band_are_marked(found):

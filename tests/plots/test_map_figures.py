@@ -10,7 +10,7 @@ import trustbo as tb
 
 
 def test_each_robot_has_its_map_in_the_same_colours(result):
-    mean = tb.models.params_of(result.posterior).mean()
+    mean = tb.inference.params_of(result.posterior).mean()
     cost = result.planner.cost_map(mean, per_robot=True)
     axes = tb.plots.robot_maps(cost, result.workspace, result.path, label="cost 1 - sigma(trust)")
     assert [ax.get_title() for ax in axes] == ["r1", "r2", "r3"]

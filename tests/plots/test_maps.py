@@ -10,7 +10,8 @@ from matplotlib.colors import to_hex
 from scipy.spatial import cKDTree
 
 import trustbo as tb
-from trustbo.models import PlaceEffect, PooledTrust, fit
+from trustbo.inference import fit
+from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.plots import LIGHT
 from trustbo.plots.maps import contour_interval, contours
 
@@ -112,7 +113,7 @@ def pixels_of(ax):
 
 def test_maps_have_the_colours_of_their_bar(result):
     """Of all pixels, path and scale included, 85 % are within 30 RGB units of the bar's."""
-    mean = tb.models.params_of(result.posterior).mean()
+    mean = tb.inference.params_of(result.posterior).mean()
     cost = result.planner.cost_map(mean, per_robot=True)
     share = result.planner.path_posterior(result.posterior, n_draws=200)
     p_fail = result.planner.problem.risk.p_fail
@@ -185,7 +186,7 @@ def test_contour_lines_are_at_round_heights_and_at_most_a_dozen(relief, interval
 
 
 def test_maps_of_places_have_the_mean_the_sd_and_an_arrow_for_each_bound_made(result):
-    maps = tb.models.place_maps(result.posterior)
+    maps = tb.inference.place_maps(result.posterior)
     axes = tb.plots.place_map(result.posterior, result.workspace)
     assert [ax.get_title() for ax in axes] == ["better (+) or worse (\N{MINUS SIGN})", "how sure"]
     for ax, kind in zip(axes, ("mean", "sd"), strict=True):

@@ -41,7 +41,7 @@ def test_a_short_mission_ends_where_it_ended():
         tb.Mission.from_arrays(path, rng.uniform(size=(n, 2, 2)), rng.uniform(0.4, 0.9, (n, 2)))
         for path, n in ((long, 6), (short, 1))
     ]
-    posterior = tb.models.fit(missions, sampler="exact")
+    posterior = tb.fit(missions, sampler="exact")
     ax = tb.plots.mission_trust(posterior, 1)[0]
     np.testing.assert_array_equal(ax.lines[1].get_xdata(), [1])
     # One bound's band is wide enough to be seen.

@@ -17,12 +17,12 @@ from trustbo.plots.style import luminance, theme
 def figures(result):
     """Every figure of a result as a function of its options, and its number of panels."""
     workspace, posterior = result.workspace, result.posterior
-    mean = tb.models.params_of(posterior).mean()
+    mean = tb.inference.params_of(posterior).mean()
     cost = result.planner.cost_map(mean, per_robot=True)
     share = result.planner.path_posterior(posterior, n_draws=100)
     p_fail = result.planner.problem.risk.p_fail
-    found = tb.models.criticise(posterior, result.missions, compare=False)
-    ranks = tb.models.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
+    found = tb.criticise(posterior, result.missions, compare=False)
+    ranks = tb.inference.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
     names = workspace.team.names
     drawn = {
         "trust_maps": (lambda **o: result.plot_maps(**o), 3),

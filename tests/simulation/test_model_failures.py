@@ -5,7 +5,8 @@ import pytest
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import Hazard, TrustParams
+from trustbo.hazard import Hazard
+from trustbo.models import TrustParams
 from trustbo.simulation import ModelSimulator, Truth
 
 PARAMS = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)

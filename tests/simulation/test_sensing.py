@@ -99,9 +99,7 @@ def test_a_lidar_that_degrades_is_noticed_by_the_model(flat):
         rates = np.clip(m.contact_rate - rng.uniform(0.0, 0.05, m.contact_rate.shape), 0.0, 1.0)
         noisy.append(tb.Mission.from_arrays(m.path, m.awareness, rates))
     model = tb.models.CoupledTrust(inter_robot="none")
-    posteriors = (
-        tb.models.fit(part, model, "exact", check=False) for part in (noisy[:6], noisy[6:])
-    )
+    posteriors = (tb.fit(part, model, "exact", check=False) for part in (noisy[:6], noisy[6:]))
     early, late = (p["latent"]["trust_mean"].mean(("mission", "bound")) for p in posteriors)
     drop = (early - late).values
     assert drop[1] > 0.2

@@ -9,7 +9,8 @@ from simulators import Steady
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TerrainError, TrustboError
-from trustbo.models import PooledTrust, fit
+from trustbo.inference import fit
+from trustbo.models import PooledTrust
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.sensing import detections
 from trustbo.team import Robot, Team

@@ -25,7 +25,9 @@ from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, as_path, interpreting
-from trustbo.models import CAUSES, TrustModel, params_of
+from trustbo.hazard import CAUSES
+from trustbo.inference import params_of
+from trustbo.models import TrustModel
 from trustbo.models.backend import VERSIONS
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
@@ -82,7 +84,7 @@ class Campaign(LearnedMissions, Displayed):
             model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
             policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
             objective: Objective of the paths; see `Planner`.
-            sampler: Sampler of the posterior; see `trustbo.models.fit`.
+            sampler: Sampler of the posterior; see `trustbo.fit`.
             seed: Seed of everything random.
             directory: Folder that the campaign is kept in as it goes. No other process may use it
                 until `close`, or the end of this one.

@@ -9,7 +9,7 @@ import xarray as xr
 from trustbo.data import Cell
 from trustbo.display.card import Card
 from trustbo.display.svg import curve_picture, map_picture
-from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_RHAT
+from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_RHAT
 from trustbo.workspace import Workspace
 
 _DIAGNOSTICS = ("k_hat", "kish", "r_hat", "ess_bulk", "divergences")

@@ -8,7 +8,7 @@ import xarray as xr
 
 from trustbo.campaign.result import Result
 from trustbo.data import Cell, Mission
-from trustbo.models import params_of, place_maps
+from trustbo.inference import params_of, place_maps
 from trustbo.planning import QUANTILES
 from trustbo.planning.posterior import choose_draws
 from trustbo.planning.values import team_trust

@@ -11,7 +11,7 @@ import xarray as xr
 from trustbo.campaign.told import never_to_be_learned
 from trustbo.data import Cell, Mission
 from trustbo.errors import PosteriorError, TrustboError, require_pair
-from trustbo.models import CAUSES, BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.hazard import CAUSES, BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 

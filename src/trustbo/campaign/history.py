@@ -14,10 +14,11 @@ from trustbo.campaign.failures import Failure
 from trustbo.data import Mission, path_text
 from trustbo.errors import DamagedFileError
 from trustbo.files import checksum
+from trustbo.inference import complete
+from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.logs.netcdf import read_tree
-from trustbo.models import TrustModel, complete
+from trustbo.models import TrustModel
 from trustbo.models.backend import VERSIONS
-from trustbo.models.posterior_groups import parameters_alone
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace import Workspace

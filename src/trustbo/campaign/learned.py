@@ -20,9 +20,11 @@ from trustbo.campaign.learning import CannotLearnError
 from trustbo.campaign.options import CampaignOptions
 from trustbo.data import Mission
 from trustbo.errors import require_kind, require_whole
-from trustbo.models import BoundRisk, TrustModel, diagnostics, fit_hazard, params_of
+from trustbo.hazard import BoundRisk, fit_hazard
+from trustbo.inference import diagnostics, params_of
+from trustbo.inference.posterior_groups import parameters_alone
+from trustbo.models import TrustModel
 from trustbo.models.params import Params
-from trustbo.models.posterior_groups import parameters_alone
 from trustbo.planning import Plan
 from trustbo.workspace import Workspace
 
@@ -40,7 +42,7 @@ class LearnedMissions:
         log: Missions as measured, their states, plans, posteriors and failures (a `History`).
         belief: Parameter draws that the next plan is made from: the posterior's, or, before the
             first mission, one from the prior.
-        progress: Whether fits show their progress, see `models.fit`; `iterate` and `missions` set
+        progress: Whether fits show their progress, see `tb.fit`; `iterate` and `missions` set
             it.
     """
 
@@ -102,7 +104,7 @@ class LearnedMissions:
 
     @property
     def hazard(self) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `models.fit_hazard`; of the prior at first."""
+        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
         if self._hazard is None:
             log, last = self.log, self.log.last_tree
             self._hazard = learn_hazard(

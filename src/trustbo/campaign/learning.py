@@ -11,19 +11,13 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display.bars import place_of, say
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.models import (
-    TrustModel,
-    TrustParams,
-    fit,
-    moment_matched,
-    params_of,
-    sample_prior,
-)
-from trustbo.models.likelihood.families import AUTO
+from trustbo.inference import fit, moment_matched, params_of, sample_prior
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.models import TrustModel, TrustParams
+from trustbo.models.families import AUTO
 from trustbo.models.model import require_model
 from trustbo.models.params import Params
-from trustbo.models.samplers.choice import resolve_sampler
-from trustbo.models.samplers.settings import NutsSettings
 from trustbo.workspace import Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
 
@@ -84,10 +78,10 @@ class Learning:
             last: Posterior of the others.
             seed: Seed of the sampler.
             workspace: Workspace of the missions, where places have effects.
-            progress: Whether NUTS and further attempts are shown, see `models.fit`.
+            progress: Whether NUTS and further attempts are shown, see `tb.fit`.
 
         Returns:
-            Posterior of the parameters, see `models.complete`.
+            Posterior of the parameters, see `inference.complete`.
 
         Raises:
             CannotLearnError: Every attempt failed.

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
     from trustbo.campaign.learning import Learning
     from trustbo.data import Mission
-    from trustbo.models import Hazard, TrustModel
+    from trustbo.hazard import Hazard
+    from trustbo.models import TrustModel
     from trustbo.planning import Planner
     from trustbo.workspace import AwarenessBelief, Location, Workspace
 
@@ -96,8 +97,8 @@ class CampaignOptions:
     callbacks: "Sequence[Callback]" = field(default=(), metadata=_of(RUNNING))
 
     def __post_init__(self) -> None:
-        from trustbo.models.likelihood.gram import require_forgetting
-        from trustbo.models.samplers.settings import NutsSettings
+        from trustbo.inference.evidence.gram import require_forgetting
+        from trustbo.inference.samplers.settings import NutsSettings
 
         for option in fields(self):
             choices = option.metadata["choices"]
@@ -144,7 +145,7 @@ class CampaignOptions:
 
     @property
     def sampling(self) -> dict[str, Any]:
-        """Number and care of draws, as far as they are given, by the names of `models.fit`."""
+        """Number and care of draws, as far as they are given, by the names of `tb.fit`."""
         names = ("n_chains", "warmup", "draws", "target_accept", "max_tree_depth")
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
@@ -227,7 +228,7 @@ def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
     Raises:
         TrustboError: An unknown name, or neither.
     """
-    from trustbo.models import Hazard
+    from trustbo.hazard import Hazard
 
     if isinstance(given, Hazard):
         return given

@@ -8,7 +8,7 @@ import numpy as np
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.models import TrustFilter, params_of
+from trustbo.inference import TrustFilter, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.simulation.protocol import takes

@@ -31,9 +31,10 @@ from trustbo.files import (
     write_checked,
     write_text,
 )
+from trustbo.hazard import BoundRisk
+from trustbo.hazard.model import measures_of
+from trustbo.inference import params_of, place_maps
 from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
-from trustbo.models import BoundRisk, params_of, place_maps
-from trustbo.models.hazard import measures_of
 from trustbo.planning import Plan, Planner
 from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
@@ -111,7 +112,7 @@ class Result(Displayed):
     def posterior(self) -> xr.DataTree:
         """Posterior after the last mission, with all groups, for ArviZ.
 
-        Its missions are labelled by their index in `missions`; see `models.complete` for those
+        Its missions are labelled by their index in `missions`; see `inference.complete` for those
         before.
 
         Raises:

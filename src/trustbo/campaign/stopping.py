@@ -10,7 +10,7 @@ import numpy as np
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_positive, require_whole
-from trustbo.models import params_of
+from trustbo.inference import params_of
 from trustbo.workspace.moves import bounds_along
 
 Stop = Callable[[Campaign], str | bool | None]

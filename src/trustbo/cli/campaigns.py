@@ -194,7 +194,7 @@ def _require_names(
     seed: int,
 ) -> None:
     """Refuse unknown names and numbers out of range (TrustboError) before a raster is read."""
-    from trustbo.models.samplers.choice import SAMPLERS
+    from trustbo.inference.samplers.choice import SAMPLERS
     from trustbo.planning import OBJECTIVES, POLICIES
     from trustbo.workspace import SIGHT_MODES
 
@@ -221,8 +221,8 @@ def _live_page(out: Path, iterations: int) -> "LivePage":
 
 def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: str) -> None:
     """Refuse settings of NUTS (TrustboError) for another sampler before a raster is read."""
-    from trustbo.models.samplers.choice import resolve_sampler
-    from trustbo.models.samplers.settings import NutsSettings
+    from trustbo.inference.samplers.choice import resolve_sampler
+    from trustbo.inference.samplers.settings import NutsSettings
 
     NutsSettings.of(options.sampling).require_sampler(resolve_sampler(model, sampler)[0])
 

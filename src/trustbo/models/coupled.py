@@ -13,7 +13,7 @@ from numpyro.distributions import Distribution, LKJCholesky
 from trustbo.errors import TrustboError, require_choice
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import CoupledParams, Params, RobotParams, ordered_params
-from trustbo.models.samplers.priors_numpy import draw, draw_lkj_cholesky
+from trustbo.models.priors_numpy import draw, draw_lkj_cholesky
 
 INTER_ROBOT = ("full", "none", "ordered")
 

@@ -26,7 +26,7 @@ from trustbo.models.drift_parameters import (
 )
 from trustbo.models.model import TrustModel, sample
 from trustbo.models.params import DriftParams
-from trustbo.models.samplers.priors_numpy import draw, quantile_at
+from trustbo.models.priors_numpy import draw, quantile_at
 
 
 @jax.tree_util.register_pytree_node_class
@@ -172,11 +172,10 @@ class DriftTrust(TrustModel):
             return "a prior of its drift's parameters has no quantiles, or is no scalar"
         return None
 
-    def require_statistics(self) -> None:
-        """See `TrustModel.require_statistics`: there are none."""
-        raise TrustboError(
-            f"{self.describe()} has no sufficient statistics: its drift is a function of your own."
-        )
+    @property
+    def why_no_statistics(self) -> str:
+        """See `TrustModel.why_no_statistics`."""
+        return "its drift is a function of your own"
 
     def n_scores(self, n_robots: int, n_features: int) -> int:
         """Number of scores of the drift's parameters, see `at_scores`."""

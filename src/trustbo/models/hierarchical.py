@@ -13,7 +13,7 @@ from numpyro.distributions.transforms import biject_to
 
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import RobotParams
-from trustbo.models.samplers.priors_numpy import bijection, draw
+from trustbo.models.priors_numpy import bijection, draw
 
 
 @register

@@ -16,14 +16,13 @@ from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
-from trustbo.models.likelihood.contact_rate import ContactRate, mission_log_likelihood
-from trustbo.models.likelihood.families import AUTO, FAMILIES, Family, choose, family_of
-from trustbo.models.likelihood.generate import TrustSample, draw_missions
-from trustbo.models.likelihood.gram import Statistics, require_forgetting, sufficient_statistics
+from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.params import Params, assemble_params, check_params
 from trustbo.models.place import PlaceEffect, bounds_of
 from trustbo.models.priors import Priors
-from trustbo.models.samplers.priors_numpy import draw
+from trustbo.models.priors_numpy import draw
+from trustbo.models.state_space.contact_rate import ContactRate, mission_log_likelihood
+from trustbo.models.state_space.generate import TrustSample, draw_missions
 from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution
 from trustbo.stacking import MissionBatch, stack_missions
 
@@ -349,58 +348,20 @@ class TrustModel(Displayed, ABC):
         drawn = draw_missions(self.family, one, self.lag, z, ticks, rng)
         return TrustSample(*(values[0] for values in drawn))
 
-    def update(
-        self,
-        statistics: Statistics | None,
-        missions: Sequence[Mission],
-        *,
-        forgetting: float = 1.0,
-    ) -> Statistics:
-        """Sufficient statistics with more missions, for `sample_statistics`.
+    @property
+    def why_no_statistics(self) -> str | None:
+        """Reason why missions have no sufficient statistics of fixed size; None if they have.
 
-        Those of earlier missions, None for none, have the weight `forgetting`, in (0, 1].
-        ShapeError: the number of robots or features changed. TrustboError: the model has no such
-        statistics, or the weight is outside (0, 1].
+        Observations are not Gaussian; robots share some parameters only, or influence each other;
+        or places have effects, which no sum over missions determines.
         """
-        self.require_statistics()
-        require_forgetting(forgetting)
-        new = self.gather(stack_missions(missions))
-        if statistics is None:
-            return new
-        if len(statistics) != len(new):
-            raise ShapeError(
-                f"the statistics are of {len(statistics)} robots, the missions have {len(new)}."
-            )
-        return tuple(
-            old.scaled(forgetting) + more for old, more in zip(statistics, new, strict=True)
-        )
-
-    def gather(self, batch: MissionBatch, weight: np.ndarray | None = None) -> Statistics:
-        """Sufficient statistics of a batch, each mission weighted."""
-        args = (self.priors.x0_mean, self.lag, weight)
-        return tuple(sufficient_statistics(one, *args) for one in self.robots_of(batch))
-
-    def robots_of(self, batch: MissionBatch) -> list[MissionBatch]:
-        """Missions of all robots together, or of each, if they have nothing in common."""
-        if self.robot_sets == "all":
-            return [batch]
-        n_robots = batch.contact_rate.shape[2]
-        return [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]
-
-    def require_statistics(self) -> None:
-        """Refuse a model that has no sufficient statistics.
-
-        Raises:
-            TrustboError: Observations are not Gaussian; robots share some parameters only, or
-                influence each other; or places have effects, which no sum over missions knows.
-        """
-        reason = self.why_not_exact or (self.place and "places have effects")
         if not self.family.integrates_out:
-            reason = "its observations are not Gaussian"
-        elif self.robot_sets is None and not reason:
-            reason = "its robots share some parameters only, or influence each other"
-        if reason:
-            raise TrustboError(f"{self.describe()} has no sufficient statistics: {reason}.")
+            return "its observations are not Gaussian"
+        if self.why_not_exact or self.place:
+            return self.why_not_exact or "places have effects"
+        if self.robot_sets is None:
+            return "its robots share some parameters only, or influence each other"
+        return None
 
     @property
     def why_not_exact(self) -> str | None:

@@ -5,17 +5,13 @@ from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import xarray as xr
 from jax import Array
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models.drift_form import Drift, find_drift
-from trustbo.models.likelihood.live import ApartFilter, CoupledFilter, DriftFilter
-from trustbo.models.likelihood.scalar import ScalarSSM
-from trustbo.models.likelihood.vector import VectorSSM
 from trustbo.models.parameter_draws import PLACES, Numbers, ParameterDraws
-from trustbo.models.place_maps import place_maps_of
-from trustbo.models.posterior_tree import require_posterior
+from trustbo.models.state_space.scalar import ScalarSSM
+from trustbo.models.state_space.vector import VectorSSM
 
 
 class _Apart(ParameterDraws):
@@ -32,10 +28,6 @@ class _Apart(ParameterDraws):
         p: Any = self
         drift = jnp.swapaxes(self._drift(awareness), 0, 1)
         return ScalarSSM(p.beta0, drift, p.delta_w, p.delta_v, p.x0_mean, p.x0_sd, lag)
-
-    def live(self, lag: float, n_robots: int) -> ApartFilter:
-        """One bound of the Kalman filter; the leading axis is (draw,)."""
-        return ApartFilter(self, lag, n_robots)  # pyright: ignore[reportArgumentType]
 
 
 class _Trust(NamedTuple):
@@ -130,10 +122,6 @@ class CoupledParams(ParameterDraws, _Coupled):
         p = self
         return VectorSSM(p.B0, drift, p.Delta_w, p.Delta_v, p.x0_mean, p.x0_sd, lag)
 
-    def live(self, lag: float, n_robots: int) -> CoupledFilter:
-        """One bound of the Kalman filter; the leading axis is (draw,)."""
-        return CoupledFilter(self, lag, n_robots)
-
 
 class _OwnDrift(NamedTuple):
     beta0: Numbers
@@ -164,10 +152,6 @@ class DriftParams(_Apart, _OwnDrift):
 
     def _drift(self, awareness: Array) -> Array:
         return self.drift.at(awareness) + self.b
-
-    def live(self, lag: float, n_robots: int) -> ApartFilter:
-        """One bound of the Kalman filter; the leading axis is (draw,)."""
-        return DriftFilter(self, lag, n_robots)
 
     def with_drift(self, awareness: np.ndarray) -> "TrustParams":
         """See `ParameterDraws.with_drift`: the drift of each bound is its intercept."""
@@ -212,38 +196,6 @@ def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Number
         x0_mean=x0_mean,
         x0_sd=x0_sd,
     )
-
-
-def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
-    """All draws of a posterior by name, chains joined: leading axis (draw,)."""
-    draws = posterior["posterior"].to_dataset()
-    n = draws.sizes["chain"] * draws.sizes["draw"]
-    # In one layout, whether they were just sampled or read from a file: sums over draws then round
-    # alike, and a campaign that resumes is the campaign it was.
-    arrays = {
-        str(name): each.transpose("chain", "draw", ...).values for name, each in draws.items()
-    }
-    return {name: np.ascontiguousarray(a).reshape(n, *a.shape[2:]) for name, a in arrays.items()}
-
-
-def params_of(posterior: xr.DataTree) -> Params:
-    """All draws of a posterior as parameters, chains joined: leading axis (draw,).
-
-    Args:
-        posterior: DataTree from `fit`.
-
-    Returns:
-        `TrustParams`, `RobotParams`, `CoupledParams` or `DriftParams`, according to the model.
-
-    Raises:
-        TrustboError: No posterior of `fit`; or one with the drift of a `DriftTrust` that this
-            process has not made.
-    """
-    sites = sites_of(require_posterior("params_of", posterior))
-    params = params_from(sites, posterior.attrs)
-    if "places" not in posterior.children:
-        return params
-    return params._replace(**place_maps_of(posterior["places"].to_dataset(), sites))  # pyright: ignore
 
 
 def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Params:

@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
-from trustbo.models.samplers.priors_numpy import log_prob
+from trustbo.models.priors_numpy import log_prob
 from trustbo.workspace.moves import MOVES, bounds_along
 
 N_MOVES = len(MOVES[8])

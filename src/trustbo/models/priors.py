@@ -16,9 +16,9 @@ from trustbo.data import is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
+from trustbo.models.families import family_of
 from trustbo.models.floored import Floored
-from trustbo.models.likelihood.families import family_of
-from trustbo.models.samplers.priors_numpy import floored, log_prob
+from trustbo.models.priors_numpy import floored, log_prob
 
 _SCALES = ("delta_w", "delta_v", "tau")
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.errors import TrustboError
-from trustbo.models.likelihood.families import Family
+from trustbo.models.families import Family
 from trustbo.stacking import MissionBatch
 
 NO_TICKS = (

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params
 from trustbo.planning.dynamics import rate_noise_sd, roll_trust, transition
 from trustbo.workspace.moves import along

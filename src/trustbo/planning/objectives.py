@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from trustbo.models.likelihood.families import FAMILIES, Family
+from trustbo.models.families import FAMILIES, Family
 from trustbo.planning.dynamics import Dynamics
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
 from trustbo.planning import search

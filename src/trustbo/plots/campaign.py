@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice
-from trustbo.models.posterior_tree import labelled_draws
+from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.planning import QUANTILES
 from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.models import Criticism
+from trustbo.criticism import Criticism
 from trustbo.plots.layout import (
     Panels,
     as_text,
@@ -39,13 +39,13 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
     the model is right; what lies outside is red, and framed on the map of cells.
 
     Args:
-        found: Criticism of `models.criticise`.
+        found: Criticism of `tb.criticise`.
         **style: Options of `Style`; `cmap` is that of the cells.
 
     Returns:
         Axes, shape (9,).
     """
-    require_kind("criticism", found, Criticism, "a Criticism, from models.criticise")
+    require_kind("criticism", found, Criticism, "a Criticism, from tb.criticise")
     look = Style.of(style)
     made = small_multiples(9, (2.5, 2.2), look, least=1.8)
     tests, pit, cover, correlation, *groups, cells = made.panels

@@ -24,7 +24,7 @@ def mission_trust(
     Dots are contact rates; bounds that were not measured have none.
 
     Args:
-        posterior: Posterior of `models.fit`, or `Result.posterior`.
+        posterior: Posterior of `tb.fit`, or `Result.posterior`.
         mission: Index of the mission, from 0; negative indices count from the last.
         **style: Options of `Style`.
 

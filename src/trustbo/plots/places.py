@@ -10,7 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 
 from trustbo.errors import ShapeError
-from trustbo.models import place_maps
+from trustbo.inference import place_maps
 from trustbo.plots.layout import colour_bar, extent_of, label_maps, map_panels, set_titles
 from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined, robust_limits
 from trustbo.plots.style import Style, StyleOptions, require_kind, theme

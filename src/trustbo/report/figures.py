@@ -4,8 +4,9 @@ import numpy as np
 
 from trustbo import plots
 from trustbo.campaign.result import Result
-from trustbo.models import Criticism, params_of, place_maps
-from trustbo.models.posterior_tree import labelled_draws
+from trustbo.criticism import Criticism
+from trustbo.inference import params_of, place_maps
+from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
 from trustbo.report.numbers import counted, joined, number

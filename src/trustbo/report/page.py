@@ -6,9 +6,9 @@ from pathlib import Path
 import jinja2
 
 from trustbo.campaign.result import Result
+from trustbo.criticism import criticise
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_file, write_text
-from trustbo.models import criticise
 from trustbo.models.backend import VERSIONS
 from trustbo.report import figures, tables
 from trustbo.report.blocks import Fact, Section

@@ -4,7 +4,7 @@ import numpy as np
 
 from trustbo.campaign.result import Result
 from trustbo.display.card import arrival
-from trustbo.models.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
+from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import PathRisk, Plan
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import cell_text, counted, joined, number

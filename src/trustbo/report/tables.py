@@ -4,9 +4,9 @@ import numpy as np
 from arviz_stats import sampling_diagnostics
 
 from trustbo.campaign.result import Result
+from trustbo.criticism import Criticism
 from trustbo.files import to_json
-from trustbo.models import Criticism
-from trustbo.models.posterior_tree import labelled_draws
+from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.report.blocks import Table
 from trustbo.report.numbers import NONE, cell_text, decimals_for, number
 

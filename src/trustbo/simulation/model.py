@@ -15,7 +15,8 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.models import CAUSES, PooledTrust, TrustModel
+from trustbo.hazard import CAUSES
+from trustbo.models import PooledTrust, TrustModel
 from trustbo.models.backend import own_settings
 from trustbo.models.params import Params, check_params
 from trustbo.simulation.protocol import DescribedSimulator

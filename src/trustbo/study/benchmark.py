@@ -13,7 +13,7 @@ import xarray as xr
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER
 from trustbo.errors import TrustboError, pip_install, require_choice, require_whole
 from trustbo.files import FilePath
-from trustbo.models.samplers.choice import resolve_sampler
+from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.study.conduct import run_runs
 from trustbo.study.contenders import BASELINES, Contender, contenders_of
 from trustbo.study.run import Run

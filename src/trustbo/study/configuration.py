@@ -10,7 +10,7 @@ from typing import Any, Self
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import FilePath, read_yaml
-from trustbo.models.samplers.choice import SAMPLERS, resolve_sampler
+from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.parts import MODELS, SIMULATORS, parts_of
 from trustbo.study.run import Run

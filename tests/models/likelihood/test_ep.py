@@ -6,11 +6,11 @@ from models.likelihood.test_families import PARAMS, N, on_a_grid, sequences
 from scipy import stats
 
 from trustbo.data import Mission
+from trustbo.inference.evidence import kalman_numpy
+from trustbo.inference.evidence.ep import draws, joint, trust
+from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.models import TrustParams
-from trustbo.models.likelihood import kalman_numpy
-from trustbo.models.likelihood.ep import draws, joint, terms, trust
-from trustbo.models.likelihood.ep.chains import gather_chains
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.models.families import FAMILIES, terms
 from trustbo.stacking import MissionBatch, stack_missions
 
 NO_COEFFICIENTS = np.zeros((0, 0)), np.zeros(0)

@@ -10,15 +10,9 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.models import (
-    CoupledParams,
-    CoupledTrust,
-    HierarchicalTrust,
-    PooledTrust,
-    TrustParams,
-    fit,
-)
-from trustbo.models.likelihood.families import FAMILIES, Observed
+from trustbo.inference import fit
+from trustbo.models import CoupledParams, CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
+from trustbo.models.families import FAMILIES, Observed
 
 N = 20
 PARAMS = {

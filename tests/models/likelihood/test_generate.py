@@ -9,8 +9,8 @@ from references import dense_joint
 
 from trustbo.models import ContactRate, CoupledParams, RobotParams, TrustParams
 from trustbo.models.backend import own_settings
-from trustbo.models.likelihood.families import FAMILIES
-from trustbo.models.likelihood.generate import draw_missions
+from trustbo.models.families import FAMILIES
+from trustbo.models.state_space.generate import draw_missions
 
 GAUSSIAN, N = FAMILIES["gaussian"], 40
 

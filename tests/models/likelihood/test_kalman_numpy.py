@@ -6,8 +6,9 @@ from models.conftest import simulate_missions
 from references import dense_posterior_of_trust
 
 from trustbo.data import Mission
-from trustbo.models import TrustParams, fit, params_of
-from trustbo.models.likelihood import kalman_numpy as trajectories
+from trustbo.inference import fit, params_of
+from trustbo.inference.evidence import kalman_numpy as trajectories
+from trustbo.models import TrustParams
 from trustbo.stacking import stack_missions
 
 

@@ -6,8 +6,9 @@ import pytest
 from scipy import integrate, stats
 
 import trustbo as tb
-from trustbo.models import PooledTrust, fit
-from trustbo.models.likelihood.families import FAMILIES
+from trustbo.inference import fit
+from trustbo.models import PooledTrust
+from trustbo.models.families import FAMILIES
 
 TRUTH = {"beta0": 0.5, "b": 0.1, "delta_w": 0.05, "delta_v": 0.03}
 

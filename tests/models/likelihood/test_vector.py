@@ -7,9 +7,9 @@ import pytest
 from references import dense_coupled
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
-from trustbo.models.likelihood import dense
-from trustbo.models.likelihood.scalar import ScalarSSM
-from trustbo.models.likelihood.vector import VectorSSM
+from trustbo.models.state_space import dense
+from trustbo.models.state_space.scalar import ScalarSSM
+from trustbo.models.state_space.vector import VectorSSM
 
 
 def random_covariance(rng, n, scale):

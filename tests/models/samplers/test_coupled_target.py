@@ -7,11 +7,12 @@ import pytest
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledParams, CoupledTrust, Priors, fit, params_of, sample_prior
+from trustbo.inference import fit, params_of, sample_prior
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference.samplers.coupled_target import CoupledTarget
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.models import CoupledParams, CoupledTrust, Priors
 from trustbo.models.params import ordered_params
-from trustbo.models.samplers.choice import resolve_sampler
-from trustbo.models.samplers.coupled_target import CoupledTarget
-from trustbo.models.samplers.importance import sample_scores
 from trustbo.stacking import stack_missions
 
 

@@ -14,12 +14,14 @@ from scipy.interpolate import PchipInterpolator
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams, diagnostics, fit
-from trustbo.models.likelihood.gram import sufficient_statistics
-from trustbo.models.samplers.exact import sample_exact
-from trustbo.models.samplers.nuts import run_nuts
-from trustbo.models.samplers.settings import NutsSettings
-from trustbo.models.samplers.target import NutsData
+from trustbo.inference import diagnostics, fit
+from trustbo.inference.evidence.gram import sufficient_statistics
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.samplers.exact import sample_exact
+from trustbo.inference.samplers.nuts import run_nuts
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.inference.samplers.target import NutsData
+from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams
 from trustbo.stacking import stack_missions
 
 
@@ -194,7 +196,7 @@ ODD = {
 @pytest.mark.parametrize("name", list(ODD))
 def test_odd_data_have_a_posterior(name, priors):
     floored = PooledTrust(priors).at_resolution({})
-    statistics = floored.gather(stack_missions(odd(ODD[name])))[0]
+    statistics = gather(floored, stack_missions(odd(ODD[name])))[0]
     exact = sample_exact(statistics, floored.priors, 1000, 0)
     assert exact.khat < 0.6
     for values in exact.params.values():
@@ -246,7 +248,9 @@ def test_priors_out_of_reach_are_named(missions, name, prior, what):
 @pytest.mark.slow  # compiles NUTS
 def test_uneven_weights_fall_back_on_nuts_and_say_so(missions, monkeypatch):
     # By its module: the package's `fit` is the function.
-    monkeypatch.setattr(importlib.import_module("trustbo.models.samplers.run"), "MAX_KHAT", -10.0)
+    monkeypatch.setattr(
+        importlib.import_module("trustbo.inference.samplers.run"), "MAX_KHAT", -10.0
+    )
     with pytest.warns(UserWarning, match=r"k-hat -?\d.\d\d, limit -10.0\); NUTS is used"):
         posterior = fit(missions, sampler="exact")
     assert posterior.attrs["sampler"] == "nuts"

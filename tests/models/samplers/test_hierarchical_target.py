@@ -8,11 +8,14 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import HierarchicalTrust, PlaceEffect, Priors, complete, diagnostics, fit
+from trustbo.inference import complete, diagnostics, fit
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.samplers import scores
+from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.updating import update_statistics
+from trustbo.models import HierarchicalTrust, PlaceEffect, Priors
 from trustbo.models.model import TrustModel
-from trustbo.models.samplers import scores
-from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
-from trustbo.models.samplers.importance import sample_scores
 from trustbo.stacking import stack_missions
 
 
@@ -27,7 +30,7 @@ def small(n_missions=2, n_bounds=3, n_robots=2, seed=0):
 
 
 def target_of(missions, model: TrustModel):
-    return HierarchicalTarget(model.gather(stack_missions(missions)), model.priors)
+    return HierarchicalTarget(gather(model, stack_missions(missions)), model.priors)
 
 
 @pytest.mark.parametrize("stationary", [False, True])
@@ -195,7 +198,7 @@ def test_what_it_cannot_treat_is_refused():
     with pytest.raises(TrustboError, match="places, and robots partially pooled"):
         fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
     with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
-        HierarchicalTrust().update(None, missions)
+        update_statistics(HierarchicalTrust(), None, missions)
 
 
 def test_half_normal_quantiles_are_scipy_s():

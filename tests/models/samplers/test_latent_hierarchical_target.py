@@ -6,11 +6,13 @@ from models.samplers.test_hierarchical_target import named
 from scipy import special, stats
 
 from trustbo.data import Mission
-from trustbo.models import HierarchicalTrust, complete, diagnostics, fit
-from trustbo.models.likelihood.ep.chains import gather_chains
-from trustbo.models.samplers.hierarchical_target import HierarchicalTarget
-from trustbo.models.samplers.importance import sample_scores
-from trustbo.models.samplers.latent_hierarchical_target import LatentHierarchicalTarget
+from trustbo.inference import complete, diagnostics, fit
+from trustbo.inference.evidence.ep.chains import gather_chains
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
+from trustbo.models import HierarchicalTrust
 from trustbo.stacking import stack_missions
 
 FAMILIES = ("censored", "beta_binomial")
@@ -40,7 +42,7 @@ def test_rates_within_the_limits_have_the_closed_form_s_density():
     missions = missions_of(y)
     latent = target_of(missions, HierarchicalTrust(observation="censored"))
     model = HierarchicalTrust(latent.priors)
-    exact = HierarchicalTarget(model.gather(stack_missions(missions)), model.priors)
+    exact = HierarchicalTarget(gather(model, stack_missions(missions)), model.priors)
     exact.look(np.zeros(10))
     z = 0.7 * rng.standard_normal((5, 10))
     theta, _ = exact.constrain(z)

@@ -10,19 +10,12 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.models import (
-    CoupledTrust,
-    PooledTrust,
-    Priors,
-    TrustParams,
-    complete,
-    diagnostics,
-    fit,
-)
-from trustbo.models.likelihood.ep.chains import gather_chains
-from trustbo.models.samplers.choice import resolve_sampler
-from trustbo.models.samplers.importance import sample_scores
-from trustbo.models.samplers.latent_target import LatentTarget
+from trustbo.inference import complete, diagnostics, fit
+from trustbo.inference.evidence.ep.chains import gather_chains
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.latent_target import LatentTarget
+from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams
 from trustbo.stacking import stack_missions
 
 FAMILIES = ("censored", "beta_binomial")

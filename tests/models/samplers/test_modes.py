@@ -10,13 +10,14 @@ import pytest
 from jax.scipy.special import logsumexp
 
 from trustbo.errors import PosteriorError
-from trustbo.models import PooledTrust, diagnostics, fit
+from trustbo.inference import diagnostics, fit
+from trustbo.inference.samplers import run
+from trustbo.inference.samplers.complaints import complaints_of_modes
+from trustbo.inference.samplers.modes import Modes, find_modes
+from trustbo.inference.samplers.nuts import NutsDraws
+from trustbo.inference.samplers.reparam import reparametrise
+from trustbo.models import PooledTrust
 from trustbo.models.backend import own_settings
-from trustbo.models.samplers import run
-from trustbo.models.samplers.complaints import complaints_of_modes
-from trustbo.models.samplers.modes import Modes, find_modes
-from trustbo.models.samplers.nuts import NutsDraws
-from trustbo.models.samplers.reparam import reparametrise
 from trustbo.models.ticks import weigh_ticks
 from trustbo.stacking import stack_missions
 

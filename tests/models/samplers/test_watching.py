@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from trustbo.display.bars import FILE, NOWHERE, TERMINAL
-from trustbo.models.samplers.settings import NutsSettings
-from trustbo.models.samplers.watching import Watch, about
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.inference.samplers.watching import Watch, about
 
 SETTINGS = NutsSettings(300, 1000, 4)  # 5200 draws
 

@@ -7,7 +7,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from trustbo.errors import TrustboError
-from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams, sample_prior
+from trustbo.inference import sample_prior
+from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
 from trustbo.planning import Planner
 from trustbo.planning.engines import compiled as engines
 from trustbo.planning.engines.buckets import best_stationary

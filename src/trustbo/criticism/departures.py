@@ -1,0 +1,141 @@
+"""Departures from a trust model that its residuals are tested for, one after another.
+
+A departure is either an effect in the drift, given as columns over the slots (mission, bound,
+robot), or a source of correlation, given as a covariance of the rates. Each has labels, such as
+robots, of which the one with the strongest evidence is named.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.criticism.joint_normal import Data, Normal, Point
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.inference.evidence.place_prior import correlation
+from trustbo.models.params import CoupledParams
+from trustbo.models.place import PlaceEffect, bounds_of, visited
+
+_LENGTH_SCALE = 2.0  # cells, the default of PlaceEffect
+_MEMORY = 0.7  # correlation of successive bounds, and of successive missions
+
+
+class Departure(NamedTuple):
+    """A departure and its labels."""
+
+    name: str
+    effects: Mapping[str, np.ndarray] = {}
+    """Columns (slot, direction) by label."""
+    sources: Mapping[str, np.ndarray] = {}
+    """Covariances (rate, rate) by label."""
+
+
+def departures(
+    missions: Sequence[Mission],
+    data: Data,
+    normal: Normal,
+    point: Point,
+    place: PlaceEffect | None,
+) -> tuple[list[Departure], dict[str, str]]:
+    """Departures to test for; and those that are not, with the reason."""
+    found, left_out = [], {}
+    mission, _, robot = data.slots.T
+    first = missions[0]
+    local = np.column_stack([np.ones(len(data.slots)), data.z])  # intercept and weights
+    if (sources := _places(missions, data, normal, place)) is None:
+        left_out["place"] = "paths jump between cells, so that bounds have no places."
+    elif sources:
+        found.append(Departure("place", sources=sources))
+    else:
+        left_out["place"] = "the model has effects of cells and bounds."
+    if data.n_robots == 1:
+        left_out["robot"] = "there is one robot."
+    elif point.params.n_robots is not None:
+        left_out["robot"] = "each robot has coefficients of its own in the model."
+    else:
+        of_robots = {r: local * (robot == i)[:, None] for i, r in enumerate(first.robots)}
+        found.append(Departure("robot", of_robots))
+    if len(missions) < 4:
+        left_out["change"] = f"{len(missions)} missions are fewer than 4."
+    else:
+        starts = range(2, len(missions) - 1)  # two missions on each side
+        steps = {str(j): local * (mission >= j)[:, None] for j in starts}
+        found.append(Departure("change", steps, {"drift": _drift(data, normal)}))
+    curves = {}
+    for m, feature in enumerate(first.features):
+        if len(np.unique(data.z[:, m])) > 2:
+            curves[feature] = (data.z[:, m : m + 1] - data.z[:, m].mean()) ** 2
+    if curves:
+        found.append(Departure("curvature", curves))
+    else:
+        left_out["curvature"] = "every feature has two values at most."
+    found.append(Departure("correlation", sources=_correlations(data, normal, point)))
+    return found, left_out
+
+
+def cell_columns(
+    missions: Sequence[Mission], data: Data
+) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """Cells entered, and the column of each over the slots, (slot, cell)."""
+    cells = np.array([missions[j].bounds[k].cell for j, k, _ in data.slots])
+    known, index = np.unique(cells, axis=0, return_inverse=True)
+    names = [(int(row), int(col)) for row, col in known]
+    return names, (index.ravel()[:, None] == np.arange(len(known))).astype(float)
+
+
+def _places(
+    missions: Sequence[Mission], data: Data, normal: Normal, place: PlaceEffect | None
+) -> dict[str, np.ndarray] | None:
+    try:
+        bounds = bounds_of(missions)
+    except TrustboError:
+        return None
+    places = visited(bounds, PlaceEffect(), data.n_robots)
+    mission, bound, _ = data.slots.T
+    unit = places.unit[mission, bound, 0]
+    of_units = normal.carry @ (unit[:, None] == np.arange(len(places.units)))
+    of_cells = normal.carry @ (places.cell_of[unit][:, None] == np.arange(len(places.cells)))
+    sources = {}
+    if place is None or not place.cells:
+        K = correlation(places.cells, places.cells, _LENGTH_SCALE)
+        sources["cells"] = of_cells @ K @ of_cells.T
+    if place is None or not place.bounds:
+        sources["bounds"] = of_units @ of_units.T
+    return sources
+
+
+def _correlations(data: Data, normal: Normal, point: Point) -> dict[str, np.ndarray]:
+    """Covariances of rates that the model takes as independent given trust."""
+    mission, bound, robot = data.slots.T
+    C = normal.carry
+    sources = {}
+    if data.n_robots > 1 and not isinstance(point.params, CoupledParams):
+        w, v = (np.mean(getattr(point.params, name)) for name in ("delta_w", "delta_v"))
+        together = (mission * (bound.max() + 1) + bound)[:, None]
+        shared = (together == np.unique(together)).astype(float)
+        of_rates = shared[data.seen]
+        sources["robots in one bound"] = (
+            w**2 * (C @ shared) @ (C @ shared).T + v**2 * of_rates @ of_rates.T
+        )
+    own = (mission * data.n_robots + robot)[data.seen]
+    gap = np.abs(np.subtract.outer(bound[data.seen], bound[data.seen]))
+    sources["successive bounds"] = _MEMORY**gap * np.equal.outer(own, own)
+    levels = C @ (own_columns(mission, robot, data.n_robots))
+    sources["a robot's rates of one mission"] = levels @ levels.T
+    of_mission = C @ (mission[:, None] == np.arange(len(data.n_bounds)))
+    sources["rates of one mission"] = of_mission @ of_mission.T
+    return sources
+
+
+def _drift(data: Data, normal: Normal) -> np.ndarray:
+    """Covariance of rates by a level that changes gradually from mission to mission."""
+    missions = np.arange(len(data.n_bounds))
+    levels = normal.carry @ (data.slots[:, :1] == missions)
+    return levels @ _MEMORY ** np.abs(np.subtract.outer(missions, missions)) @ levels.T
+
+
+def own_columns(mission: np.ndarray, robot: np.ndarray, n_robots: int) -> np.ndarray:
+    """Column of each robot in each mission, over the slots."""
+    own = mission * n_robots + robot
+    return (own[:, None] == np.unique(own)).astype(float)

@@ -1,0 +1,44 @@
+"""Inference of trust models: posteriors, predictions, comparison, and filters."""
+
+from trustbo.models import backend as backend  # first: it loads numpyro
+
+# isort: split
+from trustbo.inference.by_rate import by_rate
+from trustbo.inference.draws import params_of
+from trustbo.inference.filter import TrustFilter, TrustForecast, TrustState
+from trustbo.inference.fit import fit
+from trustbo.inference.loo import loo
+from trustbo.inference.place_maps import place_maps
+from trustbo.inference.posterior_groups import complete
+from trustbo.inference.prior_from import prior_from
+from trustbo.inference.prior_predictive import prior_predictive, sample_prior
+from trustbo.inference.samplers.convergence import diagnostics
+from trustbo.inference.sbc import sbc
+from trustbo.inference.updating import (
+    ExactPosterior,
+    moment_matched,
+    sample_statistics,
+    update_statistics,
+)
+
+__all__ = [
+    "ExactPosterior",
+    "TrustFilter",
+    "TrustForecast",
+    "TrustState",
+    "by_rate",
+    "complete",
+    "diagnostics",
+    "fit",
+    "loo",
+    "moment_matched",
+    "params_of",
+    "place_maps",
+    "prior_from",
+    "prior_predictive",
+    "sample_prior",
+    "sample_statistics",
+    "sbc",
+    "update_statistics",
+]
+__dir__ = __all__.copy  # completion lists public names alone

@@ -1,0 +1,396 @@
+"""Trust in real time, bound by bound or tick by tick of a running mission."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from trustbo.data import Cell, as_array, require_shares, require_unit_interval
+from trustbo.errors import (
+    ShapeError,
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_pair,
+    require_whole,
+)
+from trustbo.inference.draws import params_of
+from trustbo.inference.evidence.live import Effect, Rates, live_filter
+from trustbo.inference.posterior_tree import require_posterior
+from trustbo.models.families import FAMILIES, Family
+from trustbo.models.model import RESPONSES
+from trustbo.models.params import Params, check_params
+from trustbo.models.ticks import broadcast_ticks
+from trustbo.workspace.belief import AwarenessBelief
+from trustbo.workspace.moves import bounds_along, moves_along, require_on_grid
+
+
+class TrustState(NamedTuple):
+    """Mean and sd of trust, averaged over parameter draws."""
+
+    mean: np.ndarray
+    """Shape (robot,) now, or (bound, robot) ahead."""
+    sd: np.ndarray
+    """Standard deviation, of the same shape."""
+
+
+class TrustForecast(NamedTuple):
+    """Trust and contact rates along bounds to come, averaged over parameter draws."""
+
+    mean: np.ndarray
+    """Mean of trust, (bound, robot)."""
+    sd: np.ndarray
+    """Standard deviation of trust."""
+    rate: np.ndarray
+    """Mean contact rate."""
+    rate_low: np.ndarray
+    """5 % quantile of the contact rate."""
+    rate_high: np.ndarray
+    """95 % quantile of the contact rate."""
+
+
+class TrustFilter:
+    """Follows the trust of each robot during a mission (a Rao-Blackwellised filter).
+
+    Given a draw of the parameters, trust under Gaussian rates is Gaussian and the Kalman filter
+    exact; under other families its moments are matched after each rate (assumed-density filtering).
+    The draws themselves are reweighted by the density with which they predicted each contact rate.
+    So after bound k the filter holds p(trust, parameters | earlier missions, bounds 1..k), exactly
+    but for the number of draws and the moments.
+
+    A bound is taken in when it is over, by `update`; or while it runs, tick by tick, by
+    `begin_bound`, `update_tick` and `end_bound`: then `state` is that of the bound if it ended now.
+
+    Attributes:
+        params: Parameter draws, leading axis (draw,).
+        weights: Their weights now, shape (draw,), sum 1.
+        n_bounds: Bounds taken in since the last `reset`.
+    """
+
+    def __init__(
+        self,
+        posterior: xr.DataTree | Params,
+        n_robots: int | None = None,
+        *,
+        response: str | None = None,
+        observation: str | None = None,
+        max_draws: int = 1000,
+        belief: AwarenessBelief | None = None,
+    ) -> None:
+        """Start before the first bound of a mission.
+
+        Args:
+            posterior: DataTree from `fit`, or draws with leading axis (draw,).
+            n_robots: Number of robots; needed with `TrustParams`, others know their own.
+            response: `"level"` or `"change"`, of draws; `"level"` by default. A posterior knows
+                its own.
+            observation: Family of observations, of draws; `"gaussian"` by default. A posterior
+                knows its own.
+            max_draws: Largest number of draws to follow; they are evenly spaced.
+            belief: Belief about awareness: a map drawn from it goes with each draw, and gives what
+                was not measured in a bound.
+
+        Raises:
+            ShapeError: Draws, a posterior or a belief of another number of robots or features.
+            TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown response or
+                family, or one that is not the posterior's.
+        """
+        if isinstance(posterior, xr.DataTree):
+            require_posterior("TrustFilter", posterior)
+            own = _robots_of(posterior)
+            if n_robots is not None and own not in (None, n_robots):
+                raise ShapeError(
+                    f"the posterior is of {own} robots; got n_robots={n_robots!r}. Leave it out."
+                )
+            n_robots = n_robots if own is None else own
+            response = _of_posterior(posterior, "response", response)
+            observation = _of_posterior(posterior, "observation", observation)
+            posterior = params_of(posterior)
+        elif not isinstance(posterior, Params):
+            raise TrustboError(
+                f"a filter follows a posterior of fit, or draws of parameters; got {posterior!r}. "
+                "Before its first mission a campaign has no posterior: take its `belief`."
+            )
+        n_robots = posterior.n_robots if n_robots is None else n_robots
+        if n_robots is None:
+            raise TrustboError("with draws of the parameters, say how many robots: n_robots=.")
+        n_robots = require_whole("n_robots", n_robots, 1)
+        self._n_features = posterior.n_features
+        check_params(posterior, n_robots, self._n_features)
+        flat = posterior.flat()
+        n, most = len(flat.b), require_whole("max_draws", max_draws, 1)
+        kept = np.linspace(0, n - 1, min(n, most)).astype(int)
+        self.params = flat.draw(kept)  # pyright: ignore[reportArgumentType]
+        self._n_robots = n_robots
+        family = require_choice("observation", observation or "gaussian", FAMILIES)
+        self._family = FAMILIES[family]
+        lag = float(require_choice("response", response or "level", RESPONSES) == "change")
+        self._core = live_filter(self.params, lag, n_robots)
+        if belief is not None:
+            require_kind("belief", belief, AwarenessBelief, "give an AwarenessBelief")
+        self._maps = None if belief is None else belief.draw(len(kept))
+        self._grids = {np.shape(value)[-2:] for value in self.params.places.values()}
+        if self._maps is not None:
+            of_belief = self._maps.shape[1], self._maps.shape[-1]
+            if of_belief != (n_robots, self._n_features):
+                raise ShapeError(
+                    f"the belief is of {of_belief} (robot, feature), the parameters are of "
+                    f"{(n_robots, self._n_features)}; give the belief of the same workspace."
+                )
+            self._grids.add(self._maps.shape[2:4])
+        self.reset()
+
+    def reset(self) -> None:
+        """Go back to before the first bound of a new mission, all draws of equal weight."""
+        n = len(self.params.b)
+        self._mean, self._var = self._core.start()
+        self._log_weight = np.zeros(n)
+        self.weights = np.full(n, 1.0 / n)
+        self.n_bounds, self._running = 0, None
+
+    @property
+    def state(self) -> TrustState:
+        """Trust after the bounds so far, shapes (robot,)."""
+        return self._average(self._mean, self._var)
+
+    def update(
+        self,
+        awareness: ArrayLike,
+        contact_rate: ArrayLike,
+        bound: tuple[Cell, Cell] | None = None,
+        *,
+        n_ticks: ArrayLike | None = None,
+    ) -> TrustState:
+        """Take in one bound.
+
+        Args:
+            awareness: Shape (robot, feature); NaN, where there is a `belief`, if not measured.
+            contact_rate: Shape (robot,); NaN where not measured.
+            bound: Cell left and cell entered; needed where places have effects, or awareness is
+                NaN.
+            n_ticks: Ticks of the bound, () or (robot,); the beta-binomial family needs them.
+
+        Returns:
+            Trust after it, shapes (robot,).
+
+        Raises:
+            ShapeError: Another number of robots or features.
+            TrustboError: Awareness that is NaN, a value outside [0, 1], ticks that are missing or
+                that the rate is no share of, a bound that is missing, leaves the grid or is none,
+                or one that is running.
+        """
+        self._require_running(running=False)
+        z, effect = self._bound(awareness, bound)
+        y = self._by_robot("contact_rate", contact_rate)
+        if n_ticks is not None:
+            n_ticks = as_array("n_ticks", n_ticks)
+            n_ticks = n_ticks if n_ticks.ndim else np.full(y.shape, n_ticks)
+            require_shares(y, n_ticks)
+        ticks = broadcast_ticks(self._family, n_ticks, y.shape)
+        self._commit(z, effect, Rates(self._family, y, ticks))
+        return self.state
+
+    def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
+        """Begin a bound whose ticks `update_tick` takes in; arguments as those of `update`."""
+        self._require_running(running=False)
+        z, effect = self._bound(awareness, bound)
+        self._running = _Running(z, effect, *np.zeros((2, self._n_robots)))
+
+    def update_tick(self, in_contact: ArrayLike) -> TrustState:
+        """Take in one tick of the bound that runs.
+
+        Args:
+            in_contact: Whether each robot has contact, (robot,); NaN where it did not look.
+
+        Returns:
+            Trust after the bound if it ended now, with the rate so far; shapes (robot,).
+
+        Raises:
+            ShapeError: Another number of robots.
+            TrustboError: No bound was begun, or a value outside [0, 1].
+        """
+        running = self._require_running(running=True)
+        seen = self._by_robot("in_contact", in_contact)
+        running.contacts[:] += np.nan_to_num(seen)
+        running.ticks[:] += ~np.isnan(seen)
+        mean, var, increment = self._core.update(
+            self._mean, self._var, running.z, running.rates(self._family), running.effect
+        )
+        return self._average(mean, var, _normalised(self._log_weight + increment))
+
+    def end_bound(self) -> TrustState:
+        """End the bound that runs: its rate is taken in as `update` would.
+
+        Raises:
+            TrustboError: No bound was begun.
+        """
+        running = self._require_running(running=True)
+        self._running = None
+        self._commit(running.z, running.effect, running.rates(self._family))
+        return self.state
+
+    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
+        """Trust and contact rates along the bounds to come, none of them measured yet.
+
+        Rates are drawn, one for each parameter draw, in bounds of 200 ticks where these count.
+
+        Args:
+            awareness: Shape (bound, robot, feature); NaN as for `update`.
+            path: The cell where the team is and the cells to be entered; needed where places have
+                effects, or awareness is NaN.
+
+        Returns:
+            Shapes (bound, robot).
+
+        Raises:
+            ShapeError: Another number of robots or features.
+            TrustboError: Awareness that is NaN or outside [0, 1], or a path that is missing, of
+                another length, that jumps or that leaves the grid.
+        """
+        mean, var, ahead = self._mean, self._var, []
+        given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
+        cells = self._cells(path, len(given))
+        zs = [self._filled(z, None if cells is None else cells[k + 1]) for k, z in enumerate(given)]
+        x = self._core.draw(rng, mean, var)
+        for z, effect in zip(zs, self._effects(cells, len(zs)), strict=True):
+            mean, var = self._core.predict(mean, var, z, effect)
+            x, rates = self._core.roll(rng, self._family, x, z, effect)
+            order = np.argsort(rates, axis=0)
+            below = np.cumsum(self.weights[order], axis=0)
+            low, high = (np.argmax(below >= share, axis=0) for share in (0.05, 0.95))
+            ranked = np.take_along_axis(rates, order, axis=0)
+            each = np.arange(self._n_robots)
+            forecast = self.weights @ rates, ranked[low, each], ranked[high, each]
+            ahead.append((*self._average(mean, var), *forecast))
+        return TrustForecast(*(np.stack(column) for column in zip(*ahead, strict=True)))
+
+    def _commit(self, z: np.ndarray, effect: Effect, rates: Rates) -> None:
+        known = self._mean, self._var, z, rates, effect
+        self._mean, self._var, increment = self._core.update(*known)
+        self._log_weight += increment
+        self.weights = _normalised(self._log_weight)
+        self.n_bounds += 1
+
+    def _require_running(self, *, running: bool) -> Any:
+        """The bound that runs, or None; refused where it should be the other."""
+        if running and self._running is None:
+            raise TrustboError("no bound runs: call begin_bound(awareness) first.")
+        if not running and self._running is not None:
+            raise TrustboError("a bound runs: call end_bound() first.")
+        return self._running
+
+    def _cells(self, path: Sequence[Cell] | None, n_bounds: int) -> list[Cell] | None:
+        """The cells of a path of so many bounds, checked; None where there are none."""
+        if path is None:
+            return None
+        path = list(path) if isinstance(path, Iterable) else []
+        if len(path) != n_bounds + 1:
+            raise TrustboError(
+                f"say which {n_bounds + 1} cells the {n_bounds} bounds lead over, the cell left "
+                f"first; got {path!r}."
+            )
+        cells = [require_pair("a cell", cell) for cell in path]
+        for shape in self._grids:
+            require_on_grid(cells, shape)
+        moves_along(cells)
+        return cells
+
+    def _effects(self, cells: Sequence[Cell] | None, n_bounds: int) -> Sequence[np.ndarray | float]:
+        """Effect of each bound's place (draw, robot or 1); 0 where there are none."""
+        if not self.params.places:
+            return [0.0] * n_bounds
+        if cells is None:
+            raise TrustboError(
+                f"places have effects: say which {n_bounds + 1} cells the bounds lead over, the "
+                "cell left first."
+            )
+        return list(np.moveaxis(self.params.of_places(bounds_along(cells)), -2, 0))
+
+    def _average(
+        self, mean: np.ndarray, var: np.ndarray, weights: np.ndarray | None = None
+    ) -> TrustState:
+        """Mean and sd of the mixture over draws."""
+        weights = self.weights if weights is None else weights
+        var = var if var.ndim == 2 else np.diagonal(var, axis1=1, axis2=2)
+        center = weights @ mean
+        spread = weights @ (var + (mean - center) ** 2)
+        return TrustState(center, np.sqrt(spread))
+
+    def _checked(self, awareness: ArrayLike, n_axes: int) -> np.ndarray:
+        z = as_array("awareness", awareness)
+        expected = (self._n_robots, self._n_features)
+        if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
+            raise ShapeError(
+                f"awareness must be {'(bound, ' if n_axes == 3 else '('}{expected[0]} robots, "
+                f"{expected[1]} features); got shape {z.shape}."
+            )
+        if np.isnan(z).any() and self._maps is None:
+            raise TrustboError(
+                "awareness must not be NaN without a belief=; take unmeasured values from the map: "
+                "campaign.known_along(path), or workspace.along(path), (bound, robot, feature)."
+            )
+        require_unit_interval("awareness", z)
+        return z
+
+    def _by_robot(self, what: str, values: ArrayLike) -> np.ndarray:
+        """Values of the robots, in [0, 1] or NaN."""
+        array = as_array(what, values)
+        if array.shape != (self._n_robots,):
+            raise ShapeError(f"{what} must be ({self._n_robots},); got shape {array.shape}.")
+        require_unit_interval(what, array)
+        return array
+
+    def _bound(
+        self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None
+    ) -> tuple[np.ndarray, np.ndarray | float]:
+        """Awareness of one bound, (robot, feature) or, filled in, (draw, robot, feature); effect.
+
+        The effect is that of its place.
+        """
+        z, cells = self._checked(awareness, 2), self._cells(bound, 1)
+        return self._filled(z, None if cells is None else cells[1]), self._effects(cells, 1)[0]
+
+    def _filled(self, z: np.ndarray, cell: Cell | None) -> np.ndarray:
+        """Awareness with that of each draw's map in the place of NaN."""
+        missing = np.isnan(z)
+        if self._maps is None or not missing.any():
+            return z
+        if cell is None:
+            raise TrustboError("awareness is NaN: say which cells the bounds lead over.")
+        return np.where(missing, self._maps[:, :, *cell], z)
+
+
+class _Running(NamedTuple):
+    """A bound that runs."""
+
+    z: np.ndarray  # (robot, feature)
+    effect: Effect
+    contacts: np.ndarray  # (robot,), ticks in contact
+    ticks: np.ndarray  # (robot,)
+
+    def rates(self, family: Family) -> Rates:
+        """Rates so far."""
+        with np.errstate(invalid="ignore"):
+            return Rates(family, self.contacts / self.ticks, self.ticks)
+
+
+def _robots_of(posterior: xr.DataTree) -> int | None:
+    """Number of robots; None where version 0.2.0 kept parameters alone, which all share."""
+    if "constant_data" in posterior.children:
+        return posterior["constant_data"].sizes["robot"]
+    return posterior.attrs.get("n_robots")
+
+
+def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
+    """The posterior's own response or observation; TrustboError if another is given."""
+    own = posterior.attrs[name]
+    if given not in (None, own):
+        raise TrustboError(f"the posterior has {name}={own!r}; got {given!r}. Leave it out.")
+    return own
+
+
+def _normalised(log_weight: np.ndarray) -> np.ndarray:
+    weights = np.exp(log_weight - log_weight.max())
+    return weights / weights.sum()

@@ -1,0 +1,254 @@
+"""Groups of a posterior's DataTree: latent trust, likelihoods and predictions under its draws."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import xarray as xr
+from jax import random
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_whole
+from trustbo.inference.draws import params_of
+from trustbo.inference.evidence import kalman_numpy, latent
+from trustbo.inference.evidence.ep import trust
+from trustbo.inference.log_prior import log_prior_group
+from trustbo.inference.place_maps import prior_maps
+from trustbo.inference.posterior_tree import missions_of, require_posterior, to_datatree
+from trustbo.models.backend import own_settings
+from trustbo.models.families import FAMILIES, Family
+from trustbo.models.model import TrustModel
+from trustbo.models.params import Params, params_from
+from trustbo.models.place import bounds_of
+from trustbo.models.state_space.contact_rate import mission_log_likelihood
+from trustbo.models.state_space.generate import draw_missions
+from trustbo.stacking import MissionBatch, stack_missions
+
+LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
+"""Group of log p(rates of a mission | draw), without and with weights of missions."""
+_N_TRAJECTORIES = 200
+
+
+_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
+
+
+def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
+    """Posterior without the groups that grow with the number of missions; see `complete`."""
+    kept = [name for name in _KEPT if name in posterior.children]
+    alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
+    alone.attrs = posterior.attrs
+    return alone
+
+
+class Law(NamedTuple):
+    """Law of contact rates given parameters."""
+
+    family: Family
+    lag: float
+    by_numpy: bool
+    """Whether scalar recursions suffice, which run faster than JAX compiles them."""
+
+    @classmethod
+    def of(cls, posterior: xr.DataTree) -> Self:
+        """Law of a posterior."""
+        family = FAMILIES[posterior.attrs["observation"]]
+        apart = posterior.attrs["inter_robot"] == "none"
+        lag = float(posterior.attrs["response"] == "change")
+        return cls(
+            family, lag, apart and (family.integrates_out or (family.propagates and not lag))
+        )
+
+    @property
+    def keeps_trust(self) -> bool:
+        """Whether trust follows from the parameters, without what was sampled with them."""
+        return self.by_numpy or self.family.integrates_out
+
+
+def complete(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    *,
+    model: TrustModel | None = None,
+    n_trajectories: int = _N_TRAJECTORIES,
+    latents: latent.Latents | None = None,
+) -> xr.DataTree:
+    """Add latent trust, log-likelihoods and predictions to a posterior of parameters alone.
+
+    A campaign keeps the parameters of its posteriors; these groups grow with the number of
+    missions, and are the same whenever they are computed.
+
+    Args:
+        posterior: DataTree from `fit`, or one of `Result.posteriors`.
+        missions: Missions that it was fitted to; needed where it holds no data.
+        model: Its model, for `log_prior`; needed where the priors are your own.
+        n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust of.
+        latents: Innovations of latent trust, where they were sampled with the parameters.
+
+    Returns:
+        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
+        `log_prior` and `log_likelihood`; itself, if it has them. Where missions have weights, the
+        last is called `mission_log_likelihood`: `az.loo` would take it for that of an unweighted
+        posterior; use `trustbo.inference.loo`.
+
+    Raises:
+        TrustboError: The posterior holds no data and no missions are given; or its trust does not
+            integrate out, so that only `fit` can tell.
+    """
+    if "latent" in require_posterior("complete", posterior).children:
+        return posterior
+    law = Law.of(posterior)
+    if missions is None:
+        if "constant_data" not in posterior.children:
+            raise TrustboError(
+                "this posterior holds parameters alone: give the missions it was fitted to, such "
+                "as complete(result.posteriors[j], result.missions[: j + 1])."
+            )
+        missions = missions_of(posterior)
+    if not law.keeps_trust and latents is None:
+        raise TrustboError(
+            f'trust under observation "{law.family.name}" was sampled with the parameters and not '
+            "kept; fit these missions anew."
+        )
+    n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
+    groups, of = _groups(posterior, law, missions, n_trajectories, latents or latent.Latents())
+    added = to_datatree(groups, missions, {})
+    parts = {**posterior.children, **added.children}
+    whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
+    if (densities := log_prior_group(posterior, model)) is not None:
+        whole["log_prior"] = xr.DataTree(densities)
+    whole.attrs = posterior.attrs | {"log_likelihood_of": of}
+    if "weights" in posterior.attrs:
+        weight = xr.DataArray(np.atleast_1d(posterior.attrs["weights"]), dims="mission")
+        whole["constant_data"] = whole["constant_data"].assign(weight=weight)
+    return whole
+
+
+def _groups(
+    posterior: xr.DataTree,
+    law: Law,
+    missions: Sequence[Mission],
+    n_trajectories: int,
+    latents: latent.Latents,
+) -> tuple[dict[str, dict[str, Any]], str]:
+    """Arrays by group and name, (chain, draw) leading, and the data of the log-likelihoods."""
+    # NumPy needs no padding.
+    batch = stack_missions(missions, pad=not law.by_numpy)
+    n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
+    kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
+    every = params_of(posterior).flat()
+    bounds = bounds_of(missions, batch.contact_rate.shape[:2]) if every.places else None
+    every = every.on(bounds)
+    index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
+    few = every.map(lambda values, _: values[index])
+    seed = posterior.attrs["seed"]
+    if law.by_numpy:
+        n_bounds = np.array([len(mission.bounds) for mission in missions])
+        found = _trust_by_numpy(law, every, few, batch, n_bounds, seed)
+    else:
+        found = _trust_compiled(law, every, few, latents, kept, batch, seed)
+    prior = _prior_of(posterior).on(bounds)
+
+    rng = np.random.default_rng(seed + 3)
+
+    def by_chain(array: np.ndarray) -> np.ndarray:
+        return array.reshape(n_chains, -1, *array.shape[1:])
+
+    likelihood, of = _count_ticks(law.family, batch, found["log_likelihood"], len(missions))
+    return {
+        _likelihood_name(posterior): {"contact_rate": by_chain(likelihood)},
+        "latent": {
+            "trust": by_chain(found["trust"]),
+            "trust_mean": found["trust_mean"],
+            "trust_sd": found["trust_sd"],
+            "draw": kept,
+        },
+        "posterior_predictive": {"contact_rate": by_chain(found["predicted"])},
+        "prior_predictive": {"contact_rate": _predict(law, prior, batch, rng)[None]},
+    }, of
+
+
+def _likelihood_name(posterior: xr.DataTree) -> str:
+    """The name that `az.loo` reads, unless missions have weights, which it would not know of."""
+    return LIKELIHOODS[is_weighted(posterior)]
+
+
+def is_weighted(posterior: xr.DataTree) -> bool:
+    """Whether missions have weights other than 1."""
+    return bool((np.asarray(posterior.attrs.get("weights", 1.0)) != 1.0).any())
+
+
+def _prior_of(posterior: xr.DataTree) -> Params:
+    sites = {str(n): a.values[0] for n, a in posterior["prior"].data_vars.items()}
+    params = params_from(sites, posterior.attrs).flat()
+    if "places" not in posterior.children:
+        return params
+    return params._replace(**prior_maps(posterior["places"].to_dataset(), sites))  # pyright: ignore
+
+
+def _trust_by_numpy(
+    law: Law,
+    every: Params,
+    few: Params,
+    batch: MissionBatch,
+    n_bounds: np.ndarray,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """Latent trust, log-likelihood and predictions of robots apart, without JAX."""
+    rng = np.random.default_rng([seed, 1])
+    if law.family.integrates_out:
+        summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
+        trajectories = kalman_numpy.sample(few, law.lag, batch, rng, n_bounds)
+    else:
+        summary = trust.summarize(law.family, every, batch, n_bounds, rng)
+        trajectories = trust.sample(law.family, few, batch, n_bounds, rng)
+    return {
+        "log_likelihood": summary.log_likelihood,
+        "trust": trajectories,
+        "trust_mean": summary.mean,
+        "trust_sd": summary.sd,
+        "predicted": _predict(law, every, batch, rng),
+    }
+
+
+def _trust_compiled(
+    law: Law,
+    every: Params,
+    few: Params,
+    latents: latent.Latents,
+    kept: np.ndarray,
+    batch: MissionBatch,
+    seed: int,
+) -> dict[str, np.ndarray]:
+    """The same for coupled robots, and changes of trust that do not integrate out."""
+    few_latents = latents
+    if (innovations := latents.innovations) is not None:
+        shape = (-1, *innovations.shape[2:])
+        latents = latents._replace(innovations=innovations.reshape(shape))
+        few_latents = latents._replace(innovations=innovations[:, kept].reshape(shape))
+    with own_settings():
+        keys = random.split(random.fold_in(random.key(seed), 1))
+        moments = latent.trust_moments(law.family, law.lag, every, latents, batch)
+        found = {
+            "log_likelihood": mission_log_likelihood(law.family, law.lag, every, *batch, keys[0]),
+            "trust": latent.trust_draws(law.family, law.lag, few, few_latents, batch, keys[1]),
+            "trust_mean": moments.mean,
+            "trust_sd": moments.sd,
+            "predicted": _predict(law, every, batch, np.random.default_rng([seed, 1])),
+        }
+        return {name: np.asarray(array) for name, array in found.items()}
+
+
+def _predict(law: Law, params: Params, batch: MissionBatch, rng: np.random.Generator) -> np.ndarray:
+    """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
+    drawn = draw_missions(law.family, params, law.lag, batch.awareness, batch.n_ticks, rng)
+    return drawn.contact_rate
+
+
+def _count_ticks(
+    family: Family, batch: MissionBatch, likelihood: np.ndarray, n_missions: int
+) -> tuple[np.ndarray, str]:
+    """Log-likelihoods, of counts of ticks where these are known, and the name of their data."""
+    shift = family.log_resolution(batch.contact_rate, batch.n_ticks).sum((1, 2))
+    if np.isnan(shift[:n_missions]).any():
+        return likelihood, "contact_rate"
+    return likelihood + shift, "ticks"

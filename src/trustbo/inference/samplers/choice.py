@@ -1,0 +1,73 @@
+"""Choice of the sampler of a model's posterior."""
+
+from trustbo.errors import TrustboError, require_choice
+from trustbo.inference.samplers.exact import why_not_conjugate
+from trustbo.inference.samplers.scores import why_no_quantiles
+from trustbo.models.coupled import CoupledTrust
+from trustbo.models.drift import DriftTrust
+from trustbo.models.model import TrustModel
+
+SAMPLERS = ("auto", "exact", "nuts", "joint")
+
+
+def require_sampler(model: TrustModel, sampler: str) -> None:
+    """Refuse a sampler that cannot treat the model.
+
+    Raises:
+        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` says why it cannot
+            be; or it is `"joint"`, and trust integrates out.
+    """
+    if sampler == "exact" and (reason := model.why_not_exact):
+        raise TrustboError(
+            f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
+        )
+    if sampler == "joint" and model.family.integrates_out:
+        raise TrustboError(
+            'sampler "joint" is for observations that trust does not integrate out of; with '
+            'Gaussian ones use "nuts" or "exact".'
+        )
+
+
+def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
+    """The sampler to use, and why: for `"auto"` the exact one where it applies, else NUTS.
+
+    Raises:
+        TrustboError: See `require_sampler`.
+    """
+    require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
+    if sampler != "auto":
+        return sampler, "asked for"
+    pooling = model.partial_pooling is not None
+    own, coupled = isinstance(model, DriftTrust), is_coupled(model)
+    by_scores = model.place or pooling or own or coupled or not model.family.integrates_out
+    reason = model.why_not_exact or (
+        None if own else why_not_conjugate(model.priors, coupled=coupled)
+    )
+    reason = reason or (
+        why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
+    )
+    if reason is None:
+        by = "" if model.family.integrates_out else " by expectation propagation, and weights"
+        what = "trust integrates out" if own else "trust and coefficients integrate out"
+        return "exact", f"{what}{by}"
+    return ("nuts" if model.family.integrates_out else "joint"), reason
+
+
+def slow_places(reason: str) -> str:
+    """Warning that NUTS samples effects of places, for that reason."""
+    return (
+        f"effects of places are sampled by NUTS, as {reason}: minutes for some 10 missions. Fast "
+        "are PooledTrust(place=...) and the same model with place=None."
+    )
+
+
+def faster_than_nuts(model: TrustModel) -> str:
+    """Advice on what takes less time than NUTS on this model."""
+    if resolve_sampler(model, "auto")[0] == "exact":
+        return 'sampler "exact" takes seconds'
+    return "fewer draws or chains take less"
+
+
+def is_coupled(model: TrustModel) -> bool:
+    """Whether robots influence each other."""
+    return isinstance(model, CoupledTrust) and not model.robots_are_apart

@@ -1,0 +1,168 @@
+"""The posterior of coupled robots with Gaussian rates, their linear coefficients integrated out.
+
+Given B0, the noises and, of robots in order, gamma, all weights and intercepts integrate out
+(`coupled_marginal`), with the couplings among them. Left are scores of the priors: three robots
+have 9 numbers of B0 and 6 of each covariance, 21 in all (in order 3 + 2 + 6 = 11), whatever the
+number of features. beta0 and the noises are scored as in `scores`, size and angle robot by robot;
+couplings are normal; correlations are the partial ones of the LKJ prior. With b = concentration +
+(n - 2 - k) / 2, the correlation of robots i and k < i given those before k is 2 Beta(b, b) - 1, and
+row i of the factor of the correlations is p_0, p_1 (1 - p_0^2)^1/2, p_2 (1 - p_0^2)^1/2 (1 -
+p_1^2)^1/2, ..., and what is left of 1 last (Lewandowski, Kurowicka and Joe 2009).
+"""
+
+import numpy as np
+from scipy import optimize, special
+
+from trustbo.errors import TrustboError
+from trustbo.inference.evidence.coupled_marginal import (
+    Dynamics,
+    Sequences,
+    gather_sequences,
+    integrate,
+)
+from trustbo.inference.samplers import scores
+from trustbo.inference.samplers.exact import why_not_conjugate
+from trustbo.inference.samplers.laplace import laplace
+from trustbo.inference.samplers.student import Student
+from trustbo.models.coupled import CoupledTrust
+from trustbo.models.priors_numpy import numbers
+from trustbo.stacking import MissionBatch
+
+
+class CoupledTarget:
+    """Log posterior density of the scores."""
+
+    n_pilot, widths = 2048, (1.05, 1.1)
+    n_final = 8192
+    """Points of the last proposal."""
+    n_corrected = None
+
+    def __init__(self, model: CoupledTrust, batch: MissionBatch, weight: np.ndarray) -> None:
+        """Take missions and their weights.
+
+        Raises:
+            TrustboError: A prior is of another kind than integrates out.
+        """
+        priors, ordered = model.priors, model.inter_robot == "ordered"
+        if reason := why_not_conjugate(priors, coupled=True):
+            raise TrustboError(f'sampler "exact": {reason}. Use sampler="nuts", which takes any.')
+        _, _, n, n_features = batch.awareness.shape
+        self.priors, self.n, self.n_features, self.ordered = priors, n, n_features, ordered
+        n_inputs = n * n_features + 1
+        robot, source = np.divmod(np.arange(n * n_inputs), n_inputs)
+        own = source // n_features == robot
+        free = source == n_inputs - 1
+        if ordered:
+            robot, source, own, free = (a[own | free] for a in (robot, source, own, free))
+        self.data: Sequences = gather_sequences(
+            batch.awareness, batch.contact_rate, weight, robot, source,
+            (float(priors.x0_mean), float(priors.x0_sd)), model.lag,
+        )  # fmt: skip
+        self._own, self._feature = own | free, np.where(free, n_features, source % n_features)
+        pairs = n * (n - 1) // 2
+        sizes = (n, n - 1, n, n) if ordered else (n, 2 * pairs, n, n, pairs, pairs)
+        self._ends = np.cumsum(sizes)
+        self.n_scores = sum(sizes)
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Log posterior density of scores (point, score), shape (point,)."""
+        with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
+            value = integrate(self.data, self.constrain(z)[0])[0] + self.log_prior(z)
+        return np.where(np.isfinite(value), value, -np.inf)
+
+    def log_prior(self, z: np.ndarray) -> np.ndarray:
+        """Log prior density of scores (point, score): normal, but for the log sizes."""
+        size = z[:, self._ends[1] : self._ends[2]]
+        of_sizes = 2.0 * size - 0.5 * np.exp(2.0 * size) + 0.5 * size**2 + scores.LOG_ROOT_2PI
+        return scores.log_normal_density(z) + of_sizes.sum(1)
+
+    def first(self) -> Student:
+        """Gaussian fit at the mode that a quasi-Newton search finds."""
+        start = np.zeros(self.n_scores)
+        spread = np.std(self.data.y[self.data.seen])
+        start[self._ends[1] : self._ends[2]] = np.log(np.clip(spread / 0.2, 1e-2, 3.0)) - 1.0
+        steps = 1e-4 * np.vstack([np.eye(len(start)), -np.eye(len(start))])
+
+        def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
+            values = -self.log_density(np.vstack([z, z + steps]))
+            up, down = np.split(values[1:], 2)
+            with np.errstate(invalid="ignore"):  # beside a point without density
+                return values[0], np.nan_to_num((up - down) / 2e-4)
+
+        mode = optimize.minimize(cost, start, jac=True, method="BFGS", options={"maxiter": 60}).x
+        return Student(mode, laplace(self.log_density, mode[None], 0)[2][0])
+
+    def look(self, z: np.ndarray) -> None:
+        """Nothing: the density is exact everywhere."""
+
+    def defensive(self, proposal: Student) -> Student:
+        """Wider proposal."""
+        return proposal.widened(1.1)._replace(nu=4.0)
+
+    def draw(
+        self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
+    ) -> tuple[dict[str, np.ndarray], None]:
+        """Parameters at the points of sorted indices; these draws need no weights."""
+        unique, where = np.unique(chosen, return_inverse=True)
+        at, sites = self.constrain(z[unique])
+        factor = integrate(self.data, at)[1]
+        F, half = factor[where, :-1, :-1], factor[where, -1, :-1]
+        right = (half + rng.standard_normal(half.shape))[..., None]
+        c = np.linalg.solve(np.swapaxes(F, 1, 2), right)[..., 0]
+        sites = {name: values[where] for name, values in sites.items()}
+        shape = (len(c), self.n, -1)
+        if self.ordered:
+            of_robots = c.reshape(shape)
+            return sites | {"beta": of_robots[..., :-1], "b": of_robots[..., -1]}, None
+        B = c.reshape(shape)[..., :-1].reshape(len(c), self.n, self.n, -1)
+        named = {"B0": at.B0[where], "B": np.moveaxis(B, -1, 1), "b": c.reshape(shape)[..., -1]}
+        return named | {"Delta_w": at.Q[where], "Delta_v": at.R[where]}, None
+
+    def constrain(self, z: np.ndarray) -> tuple[Dynamics, dict[str, np.ndarray]]:
+        """Dynamics of scores (point, score); with them, of robots in order, their parameters."""
+        n, eye = self.n, np.eye(self.n)
+        beta0, coupling, size, angle, *partial = np.split(z, self._ends[:-1], axis=1)
+        each = np.stack([beta0, size, angle], axis=2).reshape(-1, 3)
+        of_robots = scores.beta0_and_noises(self.priors, each).reshape(-1, n, 3)
+        beta0, sd_w, sd_v = np.moveaxis(of_robots, 2, 0)
+        coupling = scores.quantile(self.priors.coupling, coupling)
+        prior = self._prior(beta0)
+        if self.ordered:
+            follows = np.zeros((len(z), n, n))
+            follows[:, np.arange(1, n), np.arange(n - 1)] = coupling
+            G = np.linalg.inv(eye - follows)
+            Q = (G * sd_w[:, None] ** 2) @ np.swapaxes(G, 1, 2)
+            R = np.where(eye, sd_v[:, :, None] ** 2, 0.0)
+            sites = {"beta0": beta0, "gamma": coupling, "delta_w": sd_w, "delta_v": sd_v}
+            return Dynamics(G * beta0[:, None], G, Q, R, *prior), sites
+        B0 = np.where(eye, beta0[:, :, None], 0.0)
+        B0[:, ~np.eye(n, dtype=bool)] = coupling
+        w, v = (self._correlations(of) for of in partial)
+        w, v = w * sd_w[:, :, None], v * sd_v[:, :, None]
+        Q, R = w @ np.swapaxes(w, 1, 2), v @ np.swapaxes(v, 1, 2)
+        return Dynamics(B0, np.broadcast_to(eye, B0.shape), Q, R, *prior), {}
+
+    def _prior(self, beta0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Means and precisions of the coefficients (point, coefficient) given beta0."""
+        priors, robot = self.priors, self.data.robot
+        rest = 1.0 - beta0[:, robot] if priors.stationary else np.ones((len(beta0), len(robot)))
+
+        def each(name: str) -> np.ndarray:
+            of_features = np.broadcast_to(numbers(priors.beta, name), self.n_features)
+            own = np.append(of_features, numbers(priors.b, name))[self._feature]
+            return np.where(self._own, own * rest, numbers(priors.coupling, name))
+
+        return each("loc"), each("scale") ** -2.0
+
+    def _correlations(self, z: np.ndarray) -> np.ndarray:
+        """Factors of correlations (point, robot, robot') of scores (point, pair)."""
+        L, columns = np.zeros((len(z), self.n, self.n)), iter(z.T)
+        for i in range(self.n):
+            left = np.ones(len(z))
+            for k in range(i):
+                b, score = self.priors.concentration + 0.5 * (self.n - 2 - k), next(columns)
+                r = 1.0 - 2.0 * special.betaincinv(b, b, special.ndtr(-np.abs(score)))
+                r = np.copysign(r, score)
+                L[:, i, k], left = r * left, left * np.sqrt(1.0 - r**2)
+            L[:, i, i] = left
+        return L

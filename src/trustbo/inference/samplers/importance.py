@@ -1,0 +1,246 @@
+"""Importance sampling of a few scores of hyperparameters, all else drawn given them.
+
+A target integrates out coefficients, effects of places and trust: exactly where rates are Gaussian
+(`place_target`), by expectation propagation where they are not (`latent_target`). Three to six
+scores are left (`scores`). They are drawn in rounds:
+
+1. A first proposal: a Student-t density with the moments of an earlier posterior, or else around
+   the mode that Newton's searches find.
+2. Rounds of 256 points, or more in ten dimensions, give the mean and covariance of the next
+   proposal, until their effective number is fair. Half of the points are drawn from the target's
+   defensive proposal: it covers what moments do not tell of, such as a second mode far out, or a
+   noise's thin tail to 0.
+3. Points of the last rounds and 512 to 4096 more are pooled, the mixture of all their proposals
+   being the density that weights are relative to, and the weights Pareto-smoothed. Where k-hat says
+   that they are uneven, more points follow.
+4. Systematic resampling makes points equally weighted. The target draws the coefficients at each;
+   where its density was EP's, with weights that average to what EP left out, by which the draws
+   are resampled once more.
+
+Invariant: weights are target over proposal density whatever the proposals are, and unbiased ones in
+4 leave the posterior exact (importance sampling squared). Their means' product is the evidence.
+"""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT
+from trustbo.inference.samplers.exact import ExactDraws
+from trustbo.inference.samplers.student import Proposal, Student, log_mixture
+from trustbo.inference.samplers.weights import smoothed_weights, systematic
+from trustbo.parallel import one_blas_thread
+
+_MAX_ROUNDS, _MAX_FINAL = 4, 3
+_MAX_LAST = 8  # rounds of the last proposal where weights would be refused after fewer
+_FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
+_RIDGE = 1e-3
+_MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
+_MORE, _MORE_LAST = 3, 12  # times that uneven draws are added to; that refused ones are
+_EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
+
+
+class ScoreTarget(Protocol):
+    """Posterior of scores, and of all else given them."""
+
+    @property
+    def n_pilot(self) -> int:
+        """Number of points of a round, half of them defensive."""
+        ...
+
+    @property
+    def n_final(self) -> int:
+        """Number of points of the last proposal."""
+        ...
+
+    @property
+    def widths(self) -> tuple[float, float]:
+        """Scale of the proposals in units of the points' covariance: in rounds, and of the last."""
+        ...
+
+    @property
+    def n_corrected(self) -> int | None:
+        """Most draws to weigh, where the density is approximate."""
+        ...
+
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Log posterior density of scores (point, score), perhaps approximate; shape (point,)."""
+        ...
+
+    def first(self) -> Student:
+        """Gaussian fit at the best mode."""
+        ...
+
+    def look(self, z: np.ndarray) -> None:
+        """Take a point (score,) as the middle of the posterior, to approximate the density from."""
+        ...
+
+    def defensive(self, proposal: Student) -> Proposal:
+        """Proposal that covers what the given one may miss."""
+        ...
+
+    def draw(
+        self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Parameters at the points of sorted indices, by name, each (draw, ...).
+
+        With them the log weight of each draw, where the density is approximate: its exponential
+        averages to the ratio of the posterior density to the approximate one, `log_p`.
+        """
+        ...
+
+
+class ScoreDraws(NamedTuple):
+    """Draws of parameters, and what the next fit starts from."""
+
+    draws: ExactDraws
+    proposal: Student
+
+
+class _Points(NamedTuple):
+    """Weighted points of all proposals so far."""
+
+    z: np.ndarray
+    log_p: np.ndarray
+    log_w: np.ndarray  # smoothed and normalised
+    khat: float
+    log_evidence: float
+
+    @property
+    def kish(self) -> float:
+        return _kish(self.log_w)
+
+
+def sample_scores(
+    target: ScoreTarget, n_draws: int, seed: int, start: Student | None = None
+) -> ScoreDraws:
+    """Draw from the posterior of a target; the same seed and start give the same draws.
+
+    Args:
+        target: Posterior of the scores.
+        n_draws: Number of equally weighted draws.
+        seed: Seed.
+        start: Proposal of an earlier posterior to begin with.
+    """
+    # Matrices are small: a second BLAS thread costs more than it brings.
+    with one_blas_thread():
+        points, proposal = _weigh(target, seed, start)
+        rng = np.random.default_rng(seed)
+        n = min(n_draws, target.n_corrected or n_draws)
+        chosen, params, found = _draw(target, points, n, rng)
+    khat, kish, log_evidence = points.khat, points.kish, points.log_evidence
+    at = np.arange(n)
+    if found is not None:
+        smoothed, worst, log_mean = found
+        inner, log_evidence = _kish(smoothed), log_evidence + log_mean
+        khat = max(khat, worst) if inner < _EVEN * len(chosen) else khat
+        kish = 1.0 / (1.0 / kish + 1.0 / inner)
+        at = systematic(np.exp(smoothed), n_draws, rng)
+    order = at[rng.permutation(n_draws)]
+    return ScoreDraws(
+        ExactDraws(
+            {name: values[order] for name, values in params.items()},
+            points.log_w[chosen][order],
+            points.log_p[chosen][order],
+            khat,
+            kish,
+            log_evidence,
+        ),
+        proposal,
+    )
+
+
+def _draw(
+    target: ScoreTarget, points: _Points, n: int, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[np.ndarray, float, float] | None]:
+    """Indices of resampled points, parameters there, and what `smoothed_weights` makes of theirs.
+
+    Where n weights are uneven more are drawn: the k-hat of a few is one of chance.
+    """
+    chosen = np.sort(systematic(np.exp(points.log_w), n, rng))
+    params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
+    if log_weight is None:
+        return chosen, params, None
+    found = smoothed_weights(log_weight)
+    for k in range(_MORE_LAST):
+        enough = found[1] < (GOOD_KHAT if k < _MORE else MAX_KHAT)
+        if enough or _kish(found[0]) > _EVEN * len(chosen):
+            break
+        more = np.sort(systematic(np.exp(points.log_w), n, rng))
+        others, added = target.draw(points.z, points.log_p, more, rng)
+        chosen, log_weight = np.append(chosen, more), np.append(log_weight, added)  # pyright: ignore
+        params = {name: np.concatenate([of, others[name]]) for name, of in params.items()}
+        found = smoothed_weights(log_weight)
+    return chosen, params, found
+
+
+def _kish(log_w: np.ndarray) -> float:
+    """Effective number of points of normalised weights."""
+    return float(np.exp(-np.logaddexp.reduce(2.0 * log_w)))
+
+
+def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Points, Student]:
+    """Weighted points, and the Student-t with their moments."""
+    cloud = _Cloud(target)
+    proposal, warm = start, start is not None
+    if proposal is None:
+        proposal = target.first()
+    else:
+        target.look(proposal.center)
+    for k in range(1, _MAX_ROUNDS + 1):
+        cloud.add(proposal.widened(target.widths[0]), target.n_pilot // 2, seed + k)
+        cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)
+        points = cloud.points()
+        proposal = _fitted(points)
+        if k == 1 and not warm:  # a curvature's proposal only serves to be replaced
+            cloud = _Cloud(target)
+        elif points.kish > _FAIR * target.n_pilot:
+            break
+        elif k == 2 and points.kish < _LOST and warm:  # the posterior has moved far
+            cloud, proposal, warm = _Cloud(target), target.first(), False
+    cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77)
+    points = cloud.points()
+    for k in range(1, _MAX_LAST):
+        if points.khat < (GOOD_KHAT if k < _MAX_FINAL else MAX_KHAT):
+            break
+        proposal = _fitted(points)
+        cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77 + k)
+        points = cloud.points()
+    return points, Student.of(points.z, points.log_w, 1e-9)
+
+
+def _fitted(points: _Points) -> Student:
+    """Student-t with the moments of weighted points.
+
+    With many axes those of few effective points are far too narrow in some direction: weights are
+    then raised to a power below 1, which leaves the moments between the proposals' and the
+    posterior's.
+    """
+    log_w, n_axes = points.log_w, points.z.shape[1]
+    while n_axes > _MANY and _kish(log_w) < _PER_AXIS * n_axes:
+        log_w = 0.75 * log_w
+        log_w = log_w - np.logaddexp.reduce(log_w)
+    return Student.of(points.z, log_w, _RIDGE)
+
+
+class _Cloud:
+    """Points of several proposals."""
+
+    def __init__(self, target: ScoreTarget) -> None:
+        self._target = target
+        self._proposals: list[Proposal] = []
+        self._z: list[np.ndarray] = []
+        self._log_p: list[np.ndarray] = []
+
+    def add(self, proposal: Proposal, n: int, seed: int) -> None:
+        z = proposal.draw(n, seed)
+        self._proposals.append(proposal)
+        self._z.append(z)
+        self._log_p.append(self._target.log_density(z))
+
+    def points(self) -> _Points:
+        z, log_p = np.concatenate(self._z), np.concatenate(self._log_p)
+        raw = log_p - log_mixture(self._proposals, [len(each) for each in self._z], z)
+        if not np.isfinite(raw).any():
+            return _Points(z, log_p, np.full(len(z), -np.log(len(z))), np.inf, -np.inf)
+        return _Points(z, log_p, *smoothed_weights(raw))

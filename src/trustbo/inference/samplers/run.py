@@ -1,0 +1,291 @@
+"""Draws from a model's posterior by the chosen sampler."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from jax import Array, random
+
+from trustbo.inference.evidence.ep.chains import gather_chains
+from trustbo.inference.evidence.gram_jax import spectrum
+from trustbo.inference.evidence.latent import Latents
+from trustbo.inference.evidence.place_marginal import PlaceIndex
+from trustbo.inference.evidence.place_rows import gather_rows
+from trustbo.inference.evidence.statistics import gather, split_robots
+from trustbo.inference.samplers.choice import is_coupled
+from trustbo.inference.samplers.complaints import complaints_of, complaints_of_modes
+from trustbo.inference.samplers.convergence import MAX_KHAT
+from trustbo.inference.samplers.coupled_target import CoupledTarget
+from trustbo.inference.samplers.drift_target import DriftTarget
+from trustbo.inference.samplers.exact import ExactDraws, sample_exact
+from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
+from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
+from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
+from trustbo.inference.samplers.latent_target import LatentTarget
+from trustbo.inference.samplers.nuts import run_nuts
+from trustbo.inference.samplers.place_draws import split_units
+from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.inference.samplers.student import Student
+from trustbo.inference.samplers.target import NutsData
+from trustbo.inference.samplers.watching import SILENT, Watch
+from trustbo.models.backend import own_settings
+from trustbo.models.coupled import CoupledTrust
+from trustbo.models.drift import DriftTrust
+from trustbo.models.model import TrustModel
+from trustbo.models.place import PlaceEffect, Visited
+from trustbo.stacking import MissionBatch
+
+
+class Draws(NamedTuple):
+    """Draws and statistics with leading axes (chain, draw), and a summary of all."""
+
+    params: dict[str, np.ndarray]
+    stats: dict[str, np.ndarray]
+    summary: dict[str, Any]
+    sampler: str
+    latents: Latents = Latents()
+    """Innovations of latent trust, with the same leading axes, if it was sampled."""
+    places: Mapping[str, np.ndarray] = {}
+    """Effects of visited places, see `place_maps.place_group`."""
+    fallback: str = ""
+    """Failure of the exact sampler, where NUTS was used for it."""
+
+
+class UnevenWeightsError(Exception):
+    """The exact sampler's weights are too uneven, or leave out a mode."""
+
+
+def draw_posterior(
+    model: TrustModel,
+    sampler: str,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray | None = None,
+    places: Visited | None = None,
+    start: Student | None = None,
+    *,
+    check: bool,
+    fallback: bool = True,
+    watch: Watch = SILENT,
+) -> tuple[Draws, list[str]]:
+    """Draws given a batch, and complaints about them.
+
+    Args:
+        model: Trust model.
+        sampler: `"nuts"`, `"exact"` or `"joint"`.
+        settings: Length of the run.
+        seed: Seed; the same seed gives the same draws.
+        batch: Missions, padded.
+        weight: Weight of each mission, shape (mission,); 1 by default.
+        places: Visited places, where these have effects.
+        start: First proposal of the exact sampler with places or coupled robots, from an earlier
+            posterior.
+        check: Whether to check the diagnostics, and try again for longer if they are bad.
+        fallback: Whether NUTS takes over, with a warning, where the exact sampler fails.
+        watch: Observer of the progress of NUTS.
+
+    Raises:
+        UnevenWeightsError: The exact sampler fails, and there is no fallback.
+    """
+    weight = np.ones(len(batch.contact_rate)) if weight is None else weight
+    failure = ""
+    if sampler == "exact":
+        try:
+            if places is None and model.family.integrates_out and model.robot_sets:
+                return _sample_exact(model, settings, seed, batch, weight), []
+            return _sample_scores(model, settings, seed, batch, weight, places, start), []
+        except UnevenWeightsError as error:
+            if not fallback:
+                raise
+            failure = str(error)
+            warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
+    data = nuts_data(model, batch, weight, places)
+    with own_settings():
+        draws, complaints = _sample_nuts(
+            model, settings, random.key(seed), data, watch, check=check
+        )
+    if places is not None:
+        draws = _with_effects(model, draws, places, seed)
+    return draws._replace(fallback=failure), complaints
+
+
+def nuts_data(
+    model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None = None
+) -> NutsData:
+    """Data for NUTS: sums alone for the pooled Gaussian model without gaps and places."""
+    if places is not None:
+        return NutsData(*batch, weight, places=PlaceIndex.of(places))
+    if model.robot_sets == "all" and model.family.integrates_out:
+        (statistics,) = gather(model, batch, weight)
+        if not statistics.gaps:
+            seen = ~np.isnan(batch.contact_rate)
+            rates = batch.contact_rate[seen]
+            means = (
+                np.asarray(rates.mean()),
+                batch.awareness[seen].mean(0),
+                np.asarray(rates.std()),
+            )
+            # One bound and robot that measured nothing: the shape tells the number of features.
+            nothing = np.full((1, 1, 1), np.nan)
+            awareness = np.zeros((1, 1, 1, batch.awareness.shape[3]))
+            return NutsData(awareness, nothing, nothing, np.ones(1), spectrum(statistics), means)
+    return NutsData(*batch, weight)
+
+
+def _sample_exact(
+    model: TrustModel,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray | None,
+) -> Draws:
+    """Draws by importance sampling; UnevenWeightsError: its weights are too uneven."""
+    shape = (settings.n_chains, settings.draws)
+    each = [
+        sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
+        for i, statistics in enumerate(gather(model, batch, weight))
+    ]
+    _require_even(each)
+    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
+    return Draws(params, stats, _summarize(each), "exact")
+
+
+def _sample_scores(
+    model: TrustModel,
+    settings: NutsSettings,
+    seed: int,
+    batch: MissionBatch,
+    weight: np.ndarray,
+    places: Visited | None,
+    start: Student | None,
+) -> Draws:
+    """The same for places, partial pooling, coupled robots, and rates that are not Gaussian."""
+    shape = (settings.n_chains, settings.draws)
+    targets = _targets(model, batch, weight, places)
+    coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
+    if start is not None and coupled and len(start.center) != coupled.n_scores:
+        start = None  # of another team
+    found = [sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)]
+    each = [one.draws for one in found]
+    _require_even(each)
+    if any(getattr(target, "has_modes", False) for target in targets):
+        raise UnevenWeightsError(
+            "weights do not tell the shares of modes, of which the posterior has more than one"
+        )
+    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
+    effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
+    summary = _summarize(each)
+    if places is not None or coupled is not None:
+        proposal = found[0].proposal
+        summary["proposal_center"] = proposal.center.tolist()
+        summary["proposal_scale"] = proposal.scale.ravel().tolist()
+    return Draws(params, stats, summary, "exact", places=effects)
+
+
+def _targets(
+    model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None
+) -> list[ScoreTarget]:
+    """Posterior of the scores of all robots, or of each where they have nothing in common."""
+    priors, family = model.priors, model.family
+    if isinstance(model, DriftTrust):
+        return [DriftTarget(model, batch, weight, places)]
+    if places is not None:
+        place = cast(PlaceEffect, model.place)
+        if not family.integrates_out:
+            gathered = gather_chains(family, batch, places=places)
+            return [LatentTarget(*gathered, priors, (place, places))]
+        rates = batch.awareness, batch.contact_rate
+        rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
+        return [PlaceTarget(rows, places, priors, place)]
+    if model.partial_pooling is not None and not family.integrates_out:
+        gathered = gather_chains(family, batch, apart=True)
+        return [LatentHierarchicalTarget(*gathered, priors, batch.contact_rate.shape[2])]
+    if model.partial_pooling is not None:
+        return [HierarchicalTarget(gather(model, batch, weight), priors)]
+    if is_coupled(model):
+        return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
+    return [LatentTarget(*gather_chains(family, one), priors) for one in split_robots(model, batch)]
+
+
+def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
+    """Diagnostics of independent posteriors together."""
+    return {
+        "k_hat": max(exact.khat for exact in each),
+        "kish": min(exact.kish for exact in each),
+        "log_evidence": sum(exact.log_evidence for exact in each),
+    }
+
+
+def _require_even(each: list[ExactDraws]) -> None:
+    """Refuse importance weights that are too uneven to be used."""
+    khat = max(exact.khat for exact in each)
+    if not khat <= MAX_KHAT:
+        raise UnevenWeightsError(f"weights are too uneven (k-hat {khat:.2f}, limit {MAX_KHAT})")
+
+
+def _join(each: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
+    """Draws of all robots side by side; their weights multiply."""
+
+    def join(columns: list[np.ndarray]) -> np.ndarray:
+        joined = np.stack(columns, axis=1) if per_robot else columns[0]
+        return joined.reshape(*shape, *joined.shape[1:])
+
+    params = {name: join([e.params[name] for e in each]) for name in each[0].params}
+    stats = {
+        "lp": np.sum([e.lp for e in each], axis=0).reshape(shape),
+        "log_weight": np.sum([e.log_weight for e in each], axis=0).reshape(shape),
+    }
+    return params, stats
+
+
+def _sample_nuts(
+    model: TrustModel,
+    settings: NutsSettings,
+    key: Array,
+    data: NutsData,
+    watch: Watch,
+    *,
+    check: bool,
+) -> tuple[Draws, list[str]]:
+    """Draws by NUTS, longer ones if the first are bad, and complaints about the last."""
+    complete = _is_complete(np.asarray(data.contact_rate))
+    name = "nuts" if model.family.integrates_out else "joint"
+
+    def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
+        own = random.fold_in(key, retries)
+        raw = run_nuts(tried, own, model, data, complete=complete, watch=watch)
+        params, stats = ({k: np.asarray(v) for k, v in g.items()} for g in (raw.params, raw.stats))
+        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
+        innovations = None if raw.innovations is None else np.asarray(raw.innovations)
+        latents = Latents(innovations, raw.linearisation)
+        draws = Draws(params, stats, {"retries": retries}, name, latents)
+        return draws, [*complaints_of(params, stats), *complaints_of_modes(raw)] if check else []
+
+    draws, complaints = attempt(settings, 0)
+    if not complaints:
+        return draws, complaints
+    longer = settings.longer(collapse=data.places is None)
+    watch.retry(longer, complaints)
+    return attempt(longer, 1)
+
+
+def _with_effects(model: TrustModel, draws: Draws, places: Visited, seed: int) -> Draws:
+    """Draws with the effects of visited places, of cells and bounds apart."""
+    params = dict(draws.params)
+    units = params.pop("place_unit")[..., : len(places.units)]
+    flat = units.reshape(-1, units.shape[-1])
+    hyper = {name: params[name].ravel() for name in model.place_dims}
+    rng = np.random.default_rng([seed, 3])
+    effects = split_units(flat, hyper, places, cast(PlaceEffect, model.place), rng)
+    shaped = {n: of.reshape(*units.shape[:2], -1) for n, of in effects.items()}
+    return draws._replace(params=params, places=shaped)
+
+
+def _is_complete(contact_rate: np.ndarray) -> bool:
+    """Whether no rate is missing before the last of a mission, the same bound for all robots."""
+    seen = ~np.isnan(contact_rate)
+    together = (seen.any(2) == seen.all(2)).all()
+    return bool(together and (np.diff(seen.any(2).astype(int), axis=1) <= 0).all())

@@ -1,0 +1,105 @@
+"""Progress of NUTS: a bar of its chains, and the time it will take, from its first draws.
+
+A trial of its own would be thrown away, so the trial is the start of the first chain. Its very
+first draws, while the step size is still sought, may take a hundred times the usual number of
+leapfrog steps: the time of a step is that of all, and their number a draw the median of the trial's
+second half. The estimate is a rough one all the same, and the bar corrects it.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Self
+
+import numpy as np
+
+from trustbo.display.bars import NOWHERE, bar_in, say
+from trustbo.inference.samplers.settings import NutsSettings
+
+LONG = 10.0
+"""Seconds from which on it is said what a run will take."""
+_TRIAL_DRAWS, _TRIAL_SECONDS = 30, 1.0
+
+
+class Watch:
+    """Shows the runs of NUTS that a posterior takes."""
+
+    def __init__(self, place: str = NOWHERE, faster: str = "", *, estimates: bool = True) -> None:
+        """Show nothing yet.
+
+        Args:
+            place: Place of `display.bars`.
+            faster: Advice on what takes less time than NUTS, for the estimate.
+            estimates: Whether to say what a run will take.
+        """
+        self._place, self._faster, self._estimates = place, faster, estimates
+        self._name = "NUTS"
+
+    @contextmanager
+    def running(self, settings: NutsSettings) -> Iterator[Self]:
+        """Show the bar of a run while it lasts."""
+        self._settings, self._draws, self._n_divergences = settings, 0, 0
+        self._seconds, self._n_steps = 0.0, np.zeros(0)
+        self._of_chain = settings.warmup + settings.draws
+        self._total, self._estimated = settings.n_chains * self._of_chain, not self._estimates
+        label = f"{self._name}, compiling"
+        with bar_in(self._place, total=self._total, desc=label, unit="draw", leave=False) as bar:
+            self._bar = bar
+            yield self
+
+    def compiled(self) -> None:
+        """Start the clock of the bar."""
+        if not self._draws:
+            self._bar.unpause()
+
+    def advanced(self, seconds: float, stats: Mapping[str, np.ndarray]) -> None:
+        """Show more draws of the chain, or of the next one.
+
+        Args:
+            seconds: Time that they took.
+            stats: Statistics of each, `n_steps` and `diverging` among them.
+        """
+        n = len(stats["n_steps"])
+        chain, at = divmod(self._draws, self._of_chain)
+        phase = "warm-up" if at < self._settings.warmup else "draws"
+        label = f"{self._name}, chain {chain + 1} of {self._settings.n_chains}, {phase}"
+        self._bar.set_description_str(label, refresh=False)
+        self._n_divergences += int(stats["diverging"].sum()) if phase == "draws" else 0
+        if self._n_divergences:
+            self._bar.set_postfix_str(f"{self._n_divergences} divergences", refresh=False)
+        self._bar.update(n)
+        self._draws += n
+        if self._estimated:
+            return
+        self._seconds += seconds
+        self._n_steps = np.append(self._n_steps, stats["n_steps"])
+        if self._draws >= _TRIAL_DRAWS and self._seconds >= _TRIAL_SECONDS:
+            self._estimate()
+
+    def retry(self, settings: NutsSettings, complaints: Sequence[str]) -> None:
+        """Tell that NUTS runs again, and why."""
+        more = f" and {len(complaints) - 1} more" if len(complaints) > 1 else ""
+        self._say(
+            f"{self._name} again, for longer ({settings}, target_accept "
+            f"{settings.target_accept:g}): {complaints[0]}{more}."
+        )
+        self._name, self._faster = "NUTS, second run", ""
+
+    def _estimate(self) -> None:
+        usual = float(np.median(self._n_steps[self._draws // 2 :]))
+        self._estimated, seconds = True, self._seconds / self._n_steps.sum() * usual * self._total
+        if seconds > LONG:
+            faster = f" Faster: {self._faster}." if self._faster else ""
+            self._say(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
+
+    def _say(self, line: str) -> None:
+        say(self._place, line)
+
+
+def about(seconds: float) -> str:
+    """Describe a rough time in words."""
+    if seconds < 95.0:
+        return f"about {max(10, 10 * round(seconds / 10))} s"
+    return f"about {round(seconds / 60)} min" if seconds < 5700 else f"about {seconds / 3600:.0f} h"
+
+
+SILENT = Watch()

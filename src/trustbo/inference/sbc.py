@@ -1,0 +1,171 @@
+"""Simulation-based calibration of posteriors (Talts et al. 2018)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from jax import random
+from scipy import stats
+from tqdm import tqdm
+
+from trustbo.errors import TrustboError, require_whole
+from trustbo.files import FilePath, read_record, write_text
+from trustbo.inference.prior_predictive import draw_sites
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference.samplers.run import draw_posterior
+from trustbo.inference.samplers.settings import NutsSettings
+from trustbo.inference.sbc_places import Walks
+from trustbo.models.backend import own_settings
+from trustbo.models.model import TrustModel
+from trustbo.models.pooled import PooledTrust
+from trustbo.stacking import MissionBatch
+
+_CHAINS = 4
+_INTERVALS = (0.5, 0.9)
+
+
+def sbc(
+    model: TrustModel | None = None,
+    sampler: str = "exact",
+    *,
+    n_datasets: int = 100,
+    shape: tuple[int, int, int, int] = (4, 8, 3, 2),
+    n_ticks: int = 40,
+    n_draws: int = 1000,
+    n_ranked: int = 396,
+    seed: int = 0,
+    checkpoint: FilePath | None = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Rank each true parameter among posterior draws, over data sets simulated from the prior.
+
+    If prior, likelihood and sampler fit together, ranks are uniform. Awareness is uniform in
+    [0, 1]; contact rates are the model's, for Gaussian observations not cut to [0, 1]. Where places
+    have effects, missions walk at random over a grid of 4 x 4 cells, and the effects of the first
+    two bounds, of the mission's first cell and of the last cell of the grid are ranked too.
+
+    Args:
+        model: Trust model; by default `PooledTrust()`.
+        sampler: `"exact"`, `"nuts"` or `"joint"`.
+        n_datasets: Number of data sets.
+        shape: Missions, bounds, robots and features of each.
+        n_ticks: Ticks per bound: what the beta-binomial family counts, and the resolution that
+            is the least delta_v of the others.
+        n_draws: Draws of each of the 4 chains of NUTS.
+        n_ranked: Draws each truth is ranked among, a multiple of 4; NUTS is thinned to these.
+        seed: Seed; the same seed gives the same ranks.
+        checkpoint: A file that keeps the ranks after each data set; with it, a call goes on where
+            one with the same arguments stopped.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Dataset with `rank` (dataset, parameter), in 0..n_ranked; `pit`, the ranks in (0, 1), which
+        `az.plot_ecdf_pit` draws; `p_value` (parameter) of a chi-squared test of uniformity in 20
+        bins; and `coverage` (interval, parameter), the share of truths in the central interval.
+
+    Raises:
+        TrustboError: The sampler is unknown or does not suit the model, there are no data sets, or
+            the checkpoint is of other arguments.
+    """
+    model = PooledTrust() if model is None else model
+    sampler, _ = resolve_sampler(model, sampler)
+    require_whole("n_datasets", n_datasets, 1)
+    kept = require_whole("n_ranked", n_ranked, _CHAINS) // _CHAINS
+    settings = NutsSettings(draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)
+    thinned = np.linspace(0, settings.draws - 1, kept).astype(int)
+    awareness = np.random.default_rng(seed).uniform(size=shape)
+    ticks = np.full(shape[:3], float(n_ticks))
+    asked = f"{model.describe()}, {model.priors.describe()}, {sampler}, {shape}, {n_ticks}, "
+    asked += f"{settings!r}, {n_ranked}, {seed}"
+    ranks = _read(checkpoint, asked)
+    walks = None if model.place is None else Walks.random(shape[:2], seed)
+    model = model.at_resolution({float(n_ticks): 1.0})
+    for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
+        if j < len(ranks):
+            continue
+        # Not seed + j, whose random numbers the sampler draws.
+        own = int(np.random.SeedSequence([seed, j]).generate_state(1)[0])
+        if walks is None:
+            simulated = _simulate(model, awareness, ticks, own)
+        else:
+            simulated = walks.simulate(model, awareness, ticks, own)
+        batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
+        places = None if walks is None else walks.places(model)
+        draws, _ = draw_posterior(
+            model, sampler, settings, seed + j, batch, places=places, check=False
+        )
+        found = draws.params
+        if walks is not None:
+            found = found | walks.effects(model, draws, seed + j)
+        rank = {}
+        for name in found:
+            below = (found[name][:, thinned] < simulated[name]).sum((0, 1))
+            free = np.ptp(found[name], axis=(0, 1)) > 0.0
+            for index in map(tuple, np.argwhere(free)):
+                rank[_label(name, index)] = int(below[index])
+        ranks.append(rank)
+        _write(checkpoint, asked, ranks)
+    return _summary(ranks[:n_datasets], kept * _CHAINS, sampler)
+
+
+def _simulate(
+    model: TrustModel, awareness: np.ndarray, ticks: np.ndarray, seed: int
+) -> dict[str, np.ndarray]:
+    """Parameters and contact rates drawn from the prior, by name."""
+    sites = draw_sites(model, awareness.shape[2:], 1, seed)
+    params = model.params(sites, awareness.shape[3]).draw(0)
+    with own_settings():
+        key = random.key(seed)
+    rates = model.simulate(key, params, awareness, ticks).contact_rate
+    return {name: value[0] for name, value in sites.items()} | {"contact_rate": rates}
+
+
+def _label(name: str, index: tuple[int, ...]) -> str:
+    return f"{name}[{','.join(map(str, index))}]" if index else name
+
+
+def _summary(ranks: list[dict[str, int]], n_ranked: int, sampler: str) -> xr.Dataset:
+    names = list(ranks[0])
+    table = np.array([[rank[name] for name in names] for rank in ranks])
+    pit = (table + 0.5) / (n_ranked + 1)
+    coverage = [(np.abs(pit - 0.5) < 0.5 * width).mean(0) for width in _INTERVALS]
+    return xr.Dataset(
+        {
+            "rank": (("dataset", "parameter"), table),
+            "pit": (("dataset", "parameter"), pit),
+            "p_value": ("parameter", [_uniformity(column, n_ranked) for column in table.T]),
+            "coverage": (("interval", "parameter"), coverage),
+        },
+        {"parameter": names, "interval": list(_INTERVALS)},
+        {"sampler": sampler, "n_ranked": n_ranked},
+    )
+
+
+def _uniformity(ranks: np.ndarray, n_ranked: int) -> float:
+    """P-value of a chi-squared test; bins hold as many of the n_ranked + 1 ranks as they can."""
+    n_bins = min(20, max(2, len(ranks) // 5))  # five ranks to a bin, for the test to hold
+    edges = np.linspace(0, n_ranked + 1, n_bins + 1).astype(int)
+    counts, _ = np.histogram(ranks, edges - 0.5)
+    expected = len(ranks) * np.diff(edges) / (n_ranked + 1)
+    return float(stats.chisquare(counts, expected).pvalue)
+
+
+def _read(checkpoint: FilePath | None, asked: str) -> list[dict[str, int]]:
+    if checkpoint is None or not Path(checkpoint).exists():
+        return []
+    kept = read_record(checkpoint, checked=False)
+    if not isinstance(kept, dict) or not {"asked", "ranks"} <= kept.keys():
+        raise TrustboError(f"{str(checkpoint)!r} holds no ranks; give another file, or delete it.")
+    if kept["asked"] != asked:
+        raise TrustboError(
+            f"{str(checkpoint)!r} holds ranks of other arguments: {kept['asked']}. Give another "
+            "file, or delete it."
+        )
+    return kept["ranks"]
+
+
+def _write(checkpoint: FilePath | None, asked: str, ranks: list[dict[str, int]]) -> None:
+    if checkpoint is None:
+        return
+    write_text(checkpoint, json.dumps({"asked": asked, "ranks": ranks}))

@@ -1,0 +1,118 @@
+"""Learning mission by mission: statistics that add up, and, for comparison, matched moments."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.data import Mission
+from trustbo.errors import ShapeError, require_whole
+from trustbo.inference.evidence.gram import Statistics, require_forgetting
+from trustbo.inference.evidence.statistics import gather, require_statistics
+from trustbo.inference.samplers.exact import sample_exact
+from trustbo.models.backend import own_settings
+from trustbo.models.model import TrustModel
+from trustbo.models.params import Params, TrustParams
+from trustbo.models.priors import Priors
+from trustbo.models.ticks import add_ticks
+from trustbo.stacking import stack_missions
+from trustbo.zheng2023 import match_moments
+
+
+class ExactPosterior(NamedTuple):
+    """Equally weighted draws of the parameters and their importance-sampling diagnostics."""
+
+    params: Params
+    """Leading axis (draw,)."""
+    k_hat: float
+    """Pareto shape of the weights: good below 0.5, not to be used above 0.7."""
+    kish: float
+    """Effective number of the sampler's points (Kish)."""
+    log_evidence: float
+    """Log p(all contact rates), nats."""
+
+
+def update_statistics(
+    model: TrustModel,
+    statistics: Statistics | None,
+    missions: Sequence[Mission],
+    *,
+    forgetting: float = 1.0,
+) -> Statistics:
+    """Add missions to sufficient statistics, for `sample_statistics`.
+
+    Args:
+        model: Model of all of them.
+        statistics: Statistics of earlier missions; None for none.
+        missions: New missions.
+        forgetting: Weight of the earlier statistics, in (0, 1].
+
+    Raises:
+        ShapeError: The number of robots or features changed.
+        TrustboError: The model has no such statistics, or the weight is outside (0, 1].
+    """
+    require_statistics(model)
+    require_forgetting(forgetting)
+    new = gather(model, stack_missions(missions))
+    if statistics is None:
+        return new
+    if len(statistics) != len(new):
+        raise ShapeError(
+            f"the statistics are of {len(statistics)} robots, the missions have {len(new)}."
+        )
+    return tuple(old.scaled(forgetting) + more for old, more in zip(statistics, new, strict=True))
+
+
+def sample_statistics(
+    model: TrustModel, statistics: Statistics, *, n_draws: int = 4000, seed: int = 0
+) -> ExactPosterior:
+    """Draws of the parameters from the statistics of `update_statistics`, by the exact sampler.
+
+    Args:
+        model: Model that gathered them.
+        statistics: Statistics of all missions.
+        n_draws: Number of near-independent, equally weighted draws.
+        seed: Seed; the same seed gives the same draws.
+
+    Raises:
+        TrustboError: The model has no such statistics, or its priors are not conjugate.
+    """
+    require_statistics(model)
+    require_whole("n_draws", n_draws, 1)
+    model = model.at_resolution(add_ticks([s.ticks for s in statistics]))
+    each = [sample_exact(s, model.priors, n_draws, seed + i) for i, s in enumerate(statistics)]
+    pooled = model.robot_sets == "all"
+    sites = {
+        name: each[0].params[name] if pooled else np.stack([e.params[name] for e in each], axis=1)
+        for name in each[0].params
+    }
+    return ExactPosterior(
+        model.params(sites, statistics[0].n_features),
+        max(e.khat for e in each),
+        min(e.kish for e in each),
+        sum(e.log_evidence for e in each),
+    )
+
+
+def moment_matched(params: TrustParams, priors: Priors) -> Priors:
+    """Priors with the mean and sd of posterior draws, as in the later code; not exact.
+
+    Each parameter keeps its own moments only: dependence and skewness of the posterior are lost,
+    and means are off by up to 1.15 posterior sd over 20 missions.
+
+    Args:
+        params: Draws of the last posterior, leading axis (draw,).
+        priors: Priors of that posterior; `x0_mean` and others that are not learned stay.
+    """
+    flat = params.flat()
+    with own_settings():
+        return replace(
+            priors,
+            beta0=match_moments(flat.beta0, priors.beta0),
+            beta=match_moments(flat.beta, priors.beta),
+            b=match_moments(flat.b, priors.b),
+            delta_w=match_moments(flat.delta_w, priors.delta_w),
+            delta_v=match_moments(flat.delta_v, priors.delta_v),
+            stationary=False,
+        )

@@ -1,1 +1,0 @@
-"""Tests of a fitted trust model against what may be wrong with it."""

@@ -1,0 +1,167 @@
+"""Counts of ticks: n in contact out of N, n ~ BetaBinomial(N, sigma(x)), concentration delta_v^-2.
+
+Trust is a logit. The ticks of a bound are not independent: delta_v^2 is the ratio of the excess to
+the binomial variance.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jax import Array, lax, random
+from jax.scipy.special import gammaln
+from scipy.special import expit
+
+from trustbo.models.backend import own_settings
+from trustbo.models.families.family import SSM, Observed
+from trustbo.models.families.linearised import Data, Linearised
+from trustbo.models.families.terms import COUNT, NONE, Terms, count_moments
+
+_N_TICKS = 200.0  # of missions to come, whose ticks nobody knows
+
+
+@dataclass(frozen=True)
+class BetaBinomial(Linearised):
+    """Ticks in contact out of all ticks of a bound."""
+
+    name: ClassVar[str] = "beta_binomial"
+    needs_ticks: ClassVar[bool] = True
+    allows_change: ClassVar[bool] = False
+    rounds: ClassVar[bool] = False
+    correlates: ClassVar[bool] = False
+    observes_trust: ClassVar[bool] = True
+    expected_rate: ClassVar[str] = "logistic"
+
+    @property
+    def line_of_sight(self) -> tuple[float, float]:
+        """See `Family.line_of_sight`: the logit, a line through it at .5 and at .92."""
+        return 5.0, 0.5
+
+    def priors(self) -> dict[str, Any]:
+        """See `Family.priors`: trust is a logit, so all are wider."""
+        with own_settings():
+            return {
+                "beta": dist.Normal(0.0, 2.0),
+                "b": dist.Normal(0.0, 1.0),
+                "delta_w": dist.HalfNormal(0.5),
+                "x0_mean": 0.0,
+                "x0_sd": 1.5,
+            }
+
+    def mean_level(self, y: Array) -> tuple[Array, Array]:
+        """See `Family.mean_level`: a logit, and the binomial variance there."""
+        p = jnp.clip(y, 0.02, 0.98)
+        return jax.scipy.special.logit(p), -0.5 * jnp.log(p * (1.0 - p))
+
+    def log_prob(self, ssm: SSM, data: Data, trust: Array) -> Array:
+        """See `Linearised.log_prob`."""
+        (n, N), phi = data, _concentration(ssm)
+        a, b = phi * jax.nn.sigmoid(trust), phi * jax.nn.sigmoid(-trust)
+        choose = gammaln(N + 1.0) - gammaln(n + 1.0) - gammaln(N - n + 1.0)
+        total = gammaln(N + phi) - gammaln(phi)
+        return choose + gammaln(n + a) - gammaln(a) + gammaln(N - n + b) - gammaln(b) - total
+
+    def derivatives(self, ssm: SSM, data: Data, trust: Array) -> tuple[Array, Array]:
+        """See `Linearised.derivatives`.
+
+        digamma(n + a) - digamma(a) is a sum of 1 / (a + j): its first term, and the midpoint rule
+        for the others. Special functions would take ten times as long.
+        """
+        (n, N), phi = data, _concentration(ssm)
+        p = jax.nn.sigmoid(trust)
+
+        def sums(n: Array, a: Array) -> tuple[Array, Array]:
+            n, some = jnp.maximum(n, 1.0), jnp.where(n > 0.0, 1.0, 0.0)
+            first = jnp.log((n + a - 0.5) / (a + 0.5)) + 1.0 / a
+            second = 1.0 / (a + 0.5) - 1.0 / (n + a - 0.5) + 1.0 / a**2
+            return some * first, some * second
+
+        A, A2 = sums(n, phi * p)
+        B, B2 = sums(N - n, phi * (1.0 - p))
+        rate = p * (1.0 - p) * phi
+        slope = rate * (A - B)
+        return slope, (1.0 - 2.0 * p) * slope - rate**2 * (A2 + B2)
+
+    def start(self, observed: Observed) -> Array:
+        """See `Linearised.start`: empirical logits."""
+        n, N = self.read(observed)
+        return jnp.log((n + 0.5) / (N - n + 0.5))
+
+    def read(self, observed: Observed) -> Data:
+        """See `Linearised.read`: ticks in contact, and ticks."""
+        measured = ~jnp.isnan(observed.y) & (observed.n_ticks > 0.0)
+        N = jnp.where(measured, observed.n_ticks, 0.0)
+        return jnp.where(measured, jnp.round(observed.y * N), 0.0), N
+
+    def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
+        """See `Family.measure`."""
+        key_p, key_n = random.split(key)
+        phi = _concentration(ssm)
+        p = random.beta(key_p, phi * jax.nn.sigmoid(trust), phi * jax.nn.sigmoid(-trust))
+        N = lax.stop_gradient(jnp.where(n_ticks > 0.0, n_ticks, jnp.nan))
+        return random.binomial(key_n, jnp.where(jnp.isnan(N), 0.0, N), p).astype(p.dtype) / N
+
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.rate_moments`."""
+        p, N = expit(trust), _N_TICKS
+        excess = 1.0 / (1.0 + 1.0 / (noise_sd**2 + 1e-6))  # correlation of two ticks of a bound
+        return p, p * (1.0 - p), p * (1.0 - p) * (1.0 + (N - 1.0) * excess) / N
+
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """See `Family.draw_rates`."""
+        phi = 1.0 / (noise_sd**2 + 1e-6)
+        p = rng.beta(phi * expit(trust), phi * expit(-trust))
+        N = np.where(n_ticks > 0.0, n_ticks, np.nan)
+        return rng.binomial(np.where(np.isnan(N), 0.0, N).astype(int), p) / N
+
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.observe`; by Gauss-Hermite nodes around the mode."""
+        args = np.broadcast_arrays(mean, var, y, n_ticks, noise_sd)
+        shape = args[0].shape
+        flat = (np.array(a, dtype=float).ravel() for a in args)  # a broadcast one cannot be written
+        found = count_moments(*flat)
+        return found[0].reshape(shape), found[1].reshape(shape), found[2].reshape(shape)
+
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """See `Family.terms`; each distinct count is a case."""
+        seen = ~np.isnan(y) & (n_ticks > 0.0)
+        N = np.where(seen, n_ticks, 1.0)
+        n = np.where(seen, np.round(np.where(seen, y, 0.0) * N), 0.0)
+        # An empirical logit and its variance, that of trust at one bound of typical noise added.
+        lam = np.where(seen, 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2), 0.0)
+        counts, case = np.unique(np.stack([n, N], -1).reshape(-1, 2), axis=0, return_inverse=True)
+        kind = np.where(seen, COUNT, NONE)
+        return Terms.of(
+            kind, lam, lam * np.log((n + 0.5) / (N - n + 0.5)), case.reshape(y.shape), counts
+        )
+
+    def is_density(self, y: np.ndarray) -> np.ndarray:
+        """See `Family.is_density`: counts have probabilities."""
+        return np.zeros(y.shape, dtype=bool)
+
+
+def _concentration(ssm: SSM) -> Array:
+    """Concentration of the beta distribution, shape (1, 1, robot or 1).
+
+    At most 1e6, where counts are binomial for all purposes and log-gamma still has digits to give.
+    """
+    return 1.0 / (jnp.reshape(ssm.rate_variance, (1, 1, -1)) + 1e-6)

@@ -1,0 +1,101 @@
+"""Censored rates (Tobit): y = x + v cut to [0, 1], so rates of 0 and 1 are known as limits only.
+
+Trust is Gaussian given the censored rates, which are drawn beyond their limits bound by bound from
+the filter's predictions (GHK), as functions of the innovations.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy import special
+from scipy.stats import norm
+
+from trustbo.models.families.family import SSM, Observed
+from trustbo.models.families.gaussian import Gaussian
+from trustbo.models.families.terms import AT_ONE, AT_ZERO, Terms
+from trustbo.models.state_space.scalar import Censoring, Filtered
+
+
+@dataclass(frozen=True)
+class Censored(Gaussian):
+    """Gaussian rates that pile up at 0 and 1."""
+
+    name: ClassVar[str] = "censored"
+    integrates_out: ClassVar[bool] = False
+    expected_rate: ClassVar[str] = "clipped"
+
+    def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
+        """See `Family.log_density`."""
+        filtered = self.filter(ssm, observed, e, complete)
+        return ssm.per_sequence(filtered.log_likelihood)
+
+    def filter(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Filtered:
+        """Moments of trust given the rates so far, the censored ones drawn."""
+        side = jnp.where(observed.y >= 1.0, 1.0, jnp.where(observed.y <= 0.0, -1.0, 0.0))
+        return ssm.filter(observed.y, complete=complete, censoring=Censoring(side, e))
+
+    def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
+        """See `Family.measure`: `y` cut to [0, 1]."""
+        return jnp.clip(y, 0.0, 1.0)
+
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.rate_moments`: of a normal variable cut to [0, 1] (Tobin 1958)."""
+        low, high = -trust / noise_sd, (1.0 - trust) / noise_sd
+        inside = norm.cdf(high) - norm.cdf(low)
+        first = norm.pdf(low) - norm.pdf(high)
+        second = inside + low * norm.pdf(low) - high * norm.pdf(high)
+        above = norm.sf(high)
+        mean = trust * inside + noise_sd * first + above
+        square = trust**2 * inside + 2.0 * trust * noise_sd * first + noise_sd**2 * second + above
+        return mean, inside, np.maximum(square - mean**2, 1e-12)
+
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """See `Family.draw_rates`."""
+        return np.clip(y, 0.0, 1.0)
+
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.observe`: of a normal cut at a limit (Tobin 1958)."""
+        value, zero, density = super().observe(mean, var, y, n_ticks, noise_sd)
+        at_one, cut, S = y >= 1.0, (y >= 1.0) | (y <= 0.0), np.sqrt(var)
+        side, limit = np.where(at_one, 1.0, -1.0), np.where(at_one, 1.0, 0.0)
+        h = side * (mean - limit) / S
+        log_p = special.log_ndtr(h)
+        ratio = np.exp(-0.5 * h**2 - 0.5 * np.log(2.0 * np.pi) - log_p)
+        left = np.clip(1.0 - ratio * (ratio + h), 0.0, 1.0)
+        # On the scale of the densities of the others, which lack their constant.
+        log_p = log_p + 0.5 * np.log(2.0 * np.pi)
+        return (
+            np.where(cut, mean + side * S * ratio, value),
+            np.where(cut, var * left, zero),
+            np.where(cut, log_p, density),
+        )
+
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """See `Family.terms`."""
+        inside = super().terms(y, n_ticks).kind
+        kind = np.where(y >= 1.0, AT_ONE, np.where(y <= 0.0, AT_ZERO, inside))
+        lam = np.where(kind >= AT_ONE, 10.0, 0.0)
+        return Terms.of(kind, lam, lam * np.where(kind == AT_ONE, 1.1, -0.1))
+
+    def is_density(self, y: np.ndarray) -> np.ndarray:
+        """See `Family.is_density`: rates of 0 and 1 have a probability."""
+        return (y > 0.0) & (y < 1.0)

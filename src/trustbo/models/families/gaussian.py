@@ -1,0 +1,77 @@
+"""Gaussian rates, the paper's equation (4): y = x + v, latent trust integrated out exactly."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from jax import Array, random
+
+from trustbo.models.families.family import SSM, Family, Observed
+from trustbo.models.families.terms import GAUSSIAN, NONE, Terms
+from trustbo.models.state_space.scalar import Filtered
+
+
+@dataclass(frozen=True)
+class Gaussian(Family):
+    """Rates that are trust plus normal noise."""
+
+    name: ClassVar[str] = "gaussian"
+    integrates_out: ClassVar[bool] = True
+
+    def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
+        """See `Family.log_density`; innovations are not read."""
+        return ssm.log_likelihood(observed.y, complete=complete)
+
+    def filter(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Filtered:
+        """Moments of trust given the rates so far."""
+        return ssm.filter(observed.y, complete=complete)
+
+    def draw_trust(self, ssm: SSM, observed: Observed, e: Array, key: Array) -> Array:
+        """See `Family.draw_trust`; a draw of its own, from `key`."""
+        filtered = self.filter(ssm, observed, e)
+        return ssm.sample_backward(filtered, random.normal(key, e.shape, e.dtype))
+
+    def trust_moments(self, ssm: SSM, observed: Observed, e: Array) -> tuple[Array, Array]:
+        """See `Family.trust_moments`; by the smoother."""
+        return ssm.smooth(self.filter(ssm, observed, e))
+
+    def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
+        """See `Family.measure`: `y` as it is, which may leave [0, 1]."""
+        return y
+
+    def rate_moments(
+        self, trust: np.ndarray, noise_sd: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.rate_moments`."""
+        return trust, np.ones(trust.shape), np.broadcast_to(noise_sd**2, trust.shape)
+
+    def draw_rates(
+        self,
+        rng: np.random.Generator,
+        trust: np.ndarray,
+        y: np.ndarray,
+        noise_sd: np.ndarray,
+        n_ticks: np.ndarray,
+    ) -> np.ndarray:
+        """See `Family.draw_rates`."""
+        return y
+
+    def observe(
+        self,
+        mean: np.ndarray,
+        var: np.ndarray,
+        y: np.ndarray,
+        n_ticks: np.ndarray,
+        noise_sd: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `Family.observe`; the density without its constant."""
+        value = np.broadcast_to(y, mean.shape)
+        return value, np.zeros(mean.shape), -0.5 * ((y - mean) ** 2 / var + np.log(var))
+
+    def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
+        """See `Family.terms`."""
+        return Terms.of(np.where(np.isnan(y), NONE, GAUSSIAN))
+
+    def is_density(self, y: np.ndarray) -> np.ndarray:
+        """See `Family.is_density`: all have."""
+        return np.ones(y.shape, dtype=bool)

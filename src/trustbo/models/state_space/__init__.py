@@ -1,0 +1,1 @@
+"""The state space that trust models share, filtered, smoothed and simulated."""

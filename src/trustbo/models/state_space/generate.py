@@ -1,0 +1,106 @@
+"""Missions drawn from the model in NumPy, under many draws at once: nothing is compiled.
+
+Robots that influence each other are drawn as one vector, others as groups that share parameters.
+Draws of the parameters are the last, contiguous axis.
+"""
+
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from trustbo.models.families import Family
+from trustbo.models.params import CoupledParams, Params
+
+
+class TrustSample(NamedTuple):
+    """Draws of latent trust and contact rate, each of shape (mission, bound, robot).
+
+    Under many draws of the parameters, (draw, mission, bound, robot).
+    """
+
+    trust: np.ndarray
+    contact_rate: np.ndarray
+
+
+def draw_missions(
+    family: Family,
+    params: Params,
+    lag: float,
+    awareness: np.ndarray,
+    n_ticks: np.ndarray,
+    rng: np.random.Generator,
+) -> TrustSample:
+    """Latent trust and contact rates of missions drawn anew, one set per draw of the parameters.
+
+    Args:
+        family: Family of observations.
+        params: Draws with leading axis (draw,).
+        lag: 0 where rates measure trust, 1 where they measure its change.
+        awareness: Shape (mission, bound, robot, feature).
+        n_ticks: Ticks, broadcast to (mission, bound, robot).
+        rng: Random number generator.
+    """
+    n_missions, n_bounds, n_robots = shape = awareness.shape[:3]
+    n_ticks = np.broadcast_to(n_ticks, shape)
+    params = params.with_drift(awareness)
+    trust, rates = np.empty((2, len(params.b), *shape))
+    coupled = isinstance(params, CoupledParams)
+    for robots in [list(range(n_robots))] if coupled else params.alike(n_robots):
+        law = _Law.coupled(params) if coupled else _Law.apart(params, robots)
+        w, v = rng.standard_normal((2, n_bounds, n_missions, len(robots), len(params.b)))
+        x = law.x0_mean + law.x0_sd * rng.standard_normal(w.shape[1:])
+        for k in range(n_bounds):
+            before, drift = x, law.drift(awareness[:, k, robots], k)
+            x = _times(law.B0, x) + drift + _times(law.w, w[k])
+            y = x - lag * before + _times(law.v, v[k])
+            y = family.draw_rates(rng, x, y, law.delta_v, n_ticks[:, k, robots, None])
+            trust[:, :, k, robots] = np.moveaxis(x, -1, 0)
+            rates[:, :, k, robots] = np.moveaxis(y, -1, 0)
+    return TrustSample(trust, rates)
+
+
+class _Law(NamedTuple):
+    """Parameters of robots that share them, or that influence each other, draws last."""
+
+    B0: np.ndarray  # (draw,), or (robot, robot', draw)
+    B: np.ndarray  # (feature, draw), or (feature, robot, robot', draw)
+    b: np.ndarray  # (bound or 1, mission or 1, robot or 1, draw)
+    w: np.ndarray  # what standard normal noise is multiplied by, as B0
+    v: np.ndarray
+    delta_v: np.ndarray  # (draw,), or (robot, draw)
+    x0_mean: np.ndarray  # (draw,)
+    x0_sd: np.ndarray
+
+    @classmethod
+    def apart(cls, params: Params, robots: list[int]) -> Self:
+        """Law of robots with the same parameters; b may be of bounds, see `Params.on`."""
+        p: Any = params.of_robot(robots[0])
+        b = np.asarray(p.b)
+        b = b.reshape(*b.shape, *(1,) * (4 - b.ndim)).transpose(2, 1, 3, 0)
+        return cls(p.beta0, p.beta.T, b, p.delta_w, p.delta_v, p.delta_v, p.x0_mean, p.x0_sd)
+
+    @classmethod
+    def coupled(cls, p: CoupledParams) -> Self:
+        """Law of robots that influence each other."""
+        w, v = (np.linalg.cholesky(_regular(covariance)) for covariance in (p.Delta_w, p.Delta_v))
+        sd = np.sqrt(np.einsum("dii->id", p.Delta_v))
+        matrices = (np.ascontiguousarray(np.moveaxis(m, 0, -1)) for m in (p.B0, p.B, w, v))
+        B0, B, w, v = matrices
+        return cls(B0, B, p.b.T[None, None], w, v, sd, p.x0_mean, p.x0_sd)
+
+    def drift(self, z: np.ndarray, k: int) -> np.ndarray:
+        """Increment of trust by bound k at awareness z (mission, robot, feature)."""
+        b = self.b[k % len(self.b)]
+        if self.B.ndim == 2:
+            return np.tensordot(z, self.B, 1) + b
+        return np.einsum("jim,maid->jad", z, self.B) + b
+
+
+def _times(M: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Product with x (mission, robot, draw); M is (draw,) or (robot, robot', draw)."""
+    return M * x if M.ndim == 1 else np.einsum("abd,jbd->jad", M, x)
+
+
+def _regular(covariance: np.ndarray) -> np.ndarray:
+    """Covariances (draw, robot, robot'), positive definite in spite of the error of rounding."""
+    return covariance * (1.0 + 1e-15 * covariance.shape[-1] * np.eye(covariance.shape[-1]))
