@@ -1,5 +1,6 @@
 """Settings of every test, and fixtures that several rooms share."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -8,10 +9,10 @@ import matplotlib as mpl
 import pytest
 from matplotlib.figure import Figure
 
+from trustbo.terrain.example import EXAMPLES, example_files
+
 mpl.use("Agg")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
@@ -54,13 +55,24 @@ def chromium():
     browser.quit()
 
 
-@pytest.fixture
-def real_terrain():
-    """Paths of a real DEM and DSM by name; skips where the shared data are absent."""
+@pytest.fixture(scope="session")
+def real_data():
+    """The folder of real surveys (CONTRIBUTING says what is in it), without which tests skip."""
+    if "TRUSTBO_DATA" not in os.environ:
+        pytest.skip("set TRUSTBO_DATA to a folder of real surveys; see CONTRIBUTING.md")
+    folder = Path(os.environ["TRUSTBO_DATA"])
+    assert folder.is_dir(), f"TRUSTBO_DATA={folder} is no folder"
+    return folder
+
+
+@pytest.fixture(scope="session")
+def real_terrain(request):
+    """Paths of a real DEM and DSM by name; that of the package needs no other data."""
 
     def paths(name):
-        if not DATA.exists():
-            pytest.skip(f"no shared data at {DATA}")
-        return DATA / name / "dem.tif", DATA / name / "dsm.tif"
+        if name in EXAMPLES:
+            return example_files(name)
+        folder = request.getfixturevalue("real_data") / name
+        return folder / "dem.tif", folder / "dsm.tif"
 
     return paths

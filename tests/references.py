@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
+from scipy import special, stats
 from scipy.stats import norm
 
 
@@ -282,6 +283,65 @@ def pooled_posterior(missions, n_points=(60, 30), reach=0.12, floor=0.0, power=1
     weight /= weight.sum()
     marginals = [weight.sum(axes) for axes in ((1, 2), (0, 2), (0, 1))]
     return list(zip((beta0, deltas, floor + deltas), marginals, strict=True)), (mean, sd, weight)
+
+
+def on_a_grid(family, p, z, y, n_points=1201, *, n_ticks=20, last_trust=False):
+    """p(y) of one robot by filtering point masses of trust: the trapezoid rule, bound by bound.
+
+    Log p(y), or the mean and sd of trust at the last bound.
+    """
+    width = 9.0 if family == "beta_binomial" else 2.5
+    x = np.linspace(0.5 - width, 0.5 + width, n_points)
+    step = x[1] - x[0]
+    likelihood = np.ones(n_points)
+    weights = norm.pdf(x, p.x0_mean, p.x0_sd) * step
+    scale = 1.0 / (p.delta_w * np.sqrt(2.0 * np.pi))  # a normal density over all pairs, by hand
+    log_total = 0.0
+    for k in range(len(y)):
+        mean = p.beta0 * x + z[k] @ p.beta + p.b
+        move = scale * np.exp(-0.5 * ((x[:, None] - mean[None]) / p.delta_w) ** 2)
+        weights = move @ weights * step
+        if np.isnan(y[k]):
+            likelihood = np.ones(n_points)
+        elif family == "beta_binomial":
+            phi = p.delta_v**-2.0
+            share = special.expit(x)
+            likelihood = stats.betabinom.pmf(
+                round(y[k] * n_ticks), n_ticks, phi * share, phi * (1 - share)
+            )
+        elif family == "student_t":
+            likelihood = stats.t.pdf(y[k], 4, x, p.delta_v)
+        elif y[k] <= 0.0:
+            likelihood = norm.cdf(0.0, x, p.delta_v)
+        elif y[k] >= 1.0:
+            likelihood = norm.sf(1.0, x, p.delta_v)
+        else:
+            likelihood = norm.pdf(y[k], x, p.delta_v)
+        weights = weights * likelihood
+        log_total += np.log(weights.sum())
+        weights /= weights.sum()
+    if last_trust:
+        mean = weights @ x
+        return mean, np.sqrt(weights @ (x - mean) ** 2)
+    return log_total
+
+
+def named(mean, mu, taus, delta_w, delta_v, own):
+    """Parameters of partially pooled robots by name.
+
+    Args:
+        mean: Mean of beta0, shape (draw,).
+        mu: Means of the two weights and of b, shape (draw, 3).
+        taus: Spreads of beta0, the weights and b, shape (draw, 4).
+        delta_w: Process noise, shape (draw,).
+        delta_v: Noise of the rates, shape (draw,).
+        own: For each robot its beta0 and coefficients, shape (draw, 4).
+    """
+    own = np.stack(own, axis=1)
+    return {"mean_beta0": mean, "mean_beta": mu[:, :2], "mean_b": mu[:, 2], "delta_w": delta_w,
+            "delta_v": delta_v, "tau_beta0": taus[:, 0], "tau_beta": taus[:, 1:3],
+            "tau_b": taus[:, 3], "beta0": own[..., 0],
+            "beta": own[..., 1:3].reshape(len(own), -1), "b": own[..., 3]}  # fmt: skip
 
 
 def geometry_of_blob(blob):

@@ -118,3 +118,14 @@ def test_the_command_that_installs_a_package_names_the_python_that_runs(tmp_path
     assert pip_install("laspy[lazrs]") == ".venv/bin/python -m pip install 'laspy[lazrs]'"
     monkeypatch.setenv("PATH", str(python.parent))  # as an activated environment does
     assert pip_install("rosbags") == "python -m pip install rosbags"
+
+
+def test_helpers_of_tests_are_not_in_test_files():
+    """They are in references.py, missions.py and worlds.py, also for programs that tests start."""
+    imported = re.compile(r"^\s*(?:from|import) +(?:\w+\.)*(?:test_\w+|conftest)\b", re.MULTILINE)
+    guilty = {
+        str(path.relative_to(ROOT)): found
+        for path in (ROOT / "tests").rglob("*.py")
+        if (found := imported.findall(path.read_text()))
+    }
+    assert not guilty

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulators import ModelSimulator
+from worlds import ModelSimulator, random_cells
 
 from trustbo import (
     Campaign,
@@ -23,7 +23,7 @@ ENDS = ((3, 0), (0, 3))
 
 @pytest.fixture(scope="module")
 def workspace():
-    return Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    return random_cells()
 
 
 def test_ask_is_the_same_until_told(workspace):
@@ -196,7 +196,7 @@ def test_a_campaign_with_censored_rates(workspace):
 @pytest.mark.parametrize("initial", ["prior_draw", "prior_mean"])
 @pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
 def test_every_model_can_be_planned_with(model, initial):
-    workspace = Workspace.from_awareness(np.random.default_rng(0).uniform(size=(2, 4, 4, 2)))
+    workspace = random_cells(2)
     campaign = Campaign(
         workspace, *ENDS, model=model, objective="terminal", team="min", initial=initial
     )

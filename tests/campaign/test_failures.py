@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from simulators import ModelSimulator
+from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
 from trustbo.campaign.failures import to_avoid
@@ -19,7 +19,7 @@ ENDS = ((3, 0), (0, 3))
 
 @pytest.fixture(scope="module")
 def workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    return random_cells()
 
 
 class Trap:

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
-from simulators import TRUTH, ModelSimulator
+from missions import TRUTH
+from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
 from trustbo.planning import Planner
@@ -15,7 +16,7 @@ ENDS = ((3, 0), (0, 3))
 
 @pytest.fixture(scope="module")
 def workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    return random_cells()
 
 
 def run(workspace, **options):
@@ -34,7 +35,7 @@ def result(workspace):
 
 @pytest.fixture(scope="module")
 def on_terrain():
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     return from_corner_to_corner(tb.Workspace.from_terrain(terrain, (3, 3)))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulators import ModelSimulator
+from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
 from trustbo.campaign import replacing
@@ -22,13 +22,9 @@ FOREIGN = (
 )  # fmt: skip
 
 
-def make_workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(2, 3, 3, 2)))
-
-
 @pytest.fixture(scope="module")
 def workspace():
-    return make_workspace()
+    return random_cells(2, 3)
 
 
 def run(workspace, folder, seed=0, n=2, **options):
@@ -294,7 +290,7 @@ def test_a_folder_of_version_0_1_is_replaced_and_what_has_gone_is_gone(workspace
 
 def test_a_replacement_cut_off_in_a_process_that_goes_on_loses_no_mission(tmp_path, monkeypatch):
     """The successor is read from its name on: what is told then must not be written beside it."""
-    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 3, 3, 2)))
+    workspace = random_cells(3, 3)
     truth = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
     simulator = tb.simulation.ModelSimulator(workspace, truth)
     folder = tmp_path / "kept"
@@ -332,7 +328,7 @@ def test_a_replacement_cut_off_in_a_process_that_goes_on_loses_no_mission(tmp_pa
 
 
 def test_saving_to_its_own_folder_keeps_hold_of_it_when_it_fails(tmp_path, monkeypatch):
-    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 3, 3, 2)))
+    workspace = random_cells(3, 3)
     campaign = tb.Campaign(workspace, (2, 0), (0, 2), directory=tmp_path / "kept")
 
     def refuse(*args, **kwargs):

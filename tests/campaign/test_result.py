@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 import rasterio
 from scipy.special import expit
+from worlds import hillside
 
 import trustbo as tb
 
@@ -89,7 +90,7 @@ def test_its_table_has_a_row_for_each_mission(result, tmp_path):
 
 
 def test_maps_on_terrain_are_rasters_of_their_place(tmp_path):
-    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    terrain = hillside(90.0, 120.0)
     workspace = tb.Workspace.from_terrain(terrain, (3, 4))
     options = {"n_iterations": 1, "sampler": "exact", "progress": False}
     maps = tb.iterate(workspace, (2, 0), (0, 3), **options).maps(n_draws=20)

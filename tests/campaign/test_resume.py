@@ -14,24 +14,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulators import ModelSimulator
+from worlds import ModelSimulator, begin, random_cells, resume_or_begin
 
 import trustbo as tb
 import trustbo.files
 from trustbo.models import PooledTrust, Priors
 
 ENDS = ((3, 0), (0, 3))
-OPTIONS = {"sampler": "exact", "policy": "thompson", "awareness": "belief", "progress": False}
-N = 6
-
-
-def make_workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
 
 
 @pytest.fixture
 def workspace():
-    return make_workspace()
+    return random_cells()
 
 
 def same(a, b):
@@ -55,13 +49,6 @@ def same(a, b):
     for one, other in zip(a.missions, b.missions, strict=True):
         np.testing.assert_array_equal(one.awareness, other.awareness)
         np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
-
-
-def run(workspace, folder, n=N):
-    return tb.iterate(
-        workspace, *ENDS, n_iterations=n, simulator=ModelSimulator(workspace, blind=True),
-        checkpoint=folder, **OPTIONS,
-    )  # fmt: skip
 
 
 def moments_of(folder, copies, monkeypatch):
@@ -96,7 +83,7 @@ def test_whichever_write_it_dies_at_it_comes_to_the_same(workspace, tmp_path, mo
     copies = [tmp_path / "moment0"]
     with monkeypatch.context() as patch:
         names = moments_of(tmp_path / "whole", copies, patch)
-        whole = run(workspace, tmp_path / "whole", 2)
+        whole = begin(workspace, tmp_path / "whole", 2)
     copies[0].mkdir()  # and when nothing is there yet
     assert len(copies) == len(names) > 40
     # Of the first and the second mission alike: a file is one whatever its number.
@@ -108,28 +95,20 @@ def test_whichever_write_it_dies_at_it_comes_to_the_same(workspace, tmp_path, mo
         same(tb.load_result(folder), whole)
 
 
-def resume_or_begin(workspace, folder, n):
-    if not (folder / "campaign.json").exists():
-        return run(workspace, folder, n)
-    simulator = ModelSimulator(workspace, blind=True)
-    return tb.resume(folder, simulator=simulator, n_iterations=n, progress=False)
-
-
 PROGRAM = """
 import sys
-sys.path[:0] = [{tests!r}, {here!r}]
-from pathlib import Path
-from test_resume import make_workspace, resume_or_begin
-resume_or_begin(make_workspace(), Path({folder!r}), 8)
+sys.path.insert(0, {tests!r})
+from worlds import random_cells, resume_or_begin
+resume_or_begin(random_cells(), {folder!r}, 8)
 """
 
 
 @pytest.mark.slow  # processes start for long; in one, it dies at every write
 def test_killed_twice_it_comes_to_the_same(workspace, tmp_path):
-    whole = run(workspace, tmp_path / "whole", 8)
+    whole = begin(workspace, tmp_path / "whole", 8)
     assert {"places", "hazard"} <= set(whole.posterior.children)  # effects and failures, too
-    folder, here = tmp_path / "killed", Path(__file__).parent
-    program = PROGRAM.format(tests=str(here.parent), here=str(here), folder=str(folder))
+    folder, tests = tmp_path / "killed", Path(__file__).parents[1]
+    program = PROGRAM.format(tests=str(tests), folder=str(folder))
     command = [sys.executable, "-W", "ignore", "-c", program]
     for seed in (1, 2):
         # Sets of names are in another order in each process, and in this one.
@@ -156,7 +135,7 @@ def _wait_for_work(process, folder):
 
 def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, tmp_path, monkeypatch):
     simulator = ModelSimulator(workspace, blind=True)
-    whole = run(workspace, tmp_path / "whole", 2)
+    whole = begin(workspace, tmp_path / "whole", 2)
     campaign = tb.Campaign(
         workspace, *ENDS, sampler="exact", policy="thompson", awareness="belief",
         directory=tmp_path / "half",
@@ -248,28 +227,28 @@ def test_resuming_with_another_simulator_is_refused(workspace, tmp_path):
     class Other(ModelSimulator):
         pass
 
-    run(workspace, tmp_path, 2)
+    begin(workspace, tmp_path, 2)
     with pytest.raises(tb.TrustboError, match="begun with simulator = 'ModelSimulator', not 'Ot"):
         tb.resume(tmp_path, simulator=Other(workspace), progress=False)
 
 
 def test_a_finished_campaign_goes_on_if_asked_to(workspace, tmp_path):
-    run(workspace, tmp_path / "short", 2)
+    begin(workspace, tmp_path / "short", 2)
     simulator = ModelSimulator(workspace, blind=True)
     longer = tb.resume(tmp_path / "short", simulator=simulator, n_iterations=3, progress=False)
-    same(longer, run(workspace, tmp_path / "long", 3))
+    same(longer, begin(workspace, tmp_path / "long", 3))
 
 
 def test_nothing_half_written_is_read(workspace, tmp_path):
     """Whatever of the last mission's files is there already, the state decides."""
-    run(workspace, tmp_path, 3)
+    begin(workspace, tmp_path, 3)
     state = json.loads((tmp_path / "campaign.json").read_text())
     state["n_missions"] = 2
     for name in ("plans", "rows", "posterior_after"):
         state[name] = state[name][:2]
     (tmp_path / "campaign.json").write_text(json.dumps(state))
     (tmp_path / ".campaign.json.sha256").unlink()  # it was changed by hand, and that is noticed
-    whole = run(workspace, tmp_path / "whole", 3)
+    whole = begin(workspace, tmp_path / "whole", 3)
     simulator = ModelSimulator(workspace, blind=True)
     again = tb.resume(tmp_path, simulator=simulator, n_iterations=3, progress=False)
     same(again, whole)

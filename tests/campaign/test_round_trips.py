@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from simulators import ModelSimulator
+from worlds import ModelSimulator
 
 import trustbo as tb
 from trustbo.data import Bound

@@ -6,7 +6,8 @@ import time
 
 import numpy as np
 import pytest
-from simulators import TRUTH, ModelSimulator
+from missions import TRUTH
+from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
 from trustbo import simulation
@@ -26,7 +27,7 @@ TERMINAL = {"objective": "terminal"}
 
 @pytest.fixture(scope="module")
 def workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    return random_cells()
 
 
 def iterate(workspace, **options):
@@ -186,7 +187,7 @@ def test_missions_are_replanned_between_bounds(workspace):
 
 
 def test_kinematic_missions_can_be_replanned_too():
-    terrain = tb.terrain.synthetic_terrain((120.0, 120.0), seed=5, relief=6.0)
+    terrain = hillside(120.0, 120.0)
     workspace = tb.Workspace.from_terrain(terrain, (4, 4))
     result = tb.iterate(workspace, *ENDS, n_iterations=2, replan="bound", **QUIET)
     assert all(mission.status == "ok" for mission in result.missions)

@@ -8,7 +8,7 @@ import warnings
 import jax
 import numpy as np
 import pytest
-from simulators import ModelSimulator
+from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
 from trustbo.data import Mission
@@ -20,7 +20,7 @@ DIAGONAL = ((3, 0), (2, 1), (1, 2), (0, 3))
 
 @pytest.fixture
 def workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    return random_cells()
 
 
 def begin(workspace, folder=None, **options):
@@ -235,7 +235,7 @@ def test_robots_and_features_are_put_in_order_by_their_names(workspace):
 
 
 def test_poses_and_states_follow_their_robots():
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
     simulator = tb.simulation.KinematicSimulator(workspace, record_states=True)
     mission = simulator.run([(2, 0), (1, 1)], seed=0)
@@ -324,7 +324,7 @@ def test_the_caller_s_jax_flags_do_not_change_a_campaign(workspace, policy):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    workspace = tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    workspace = random_cells()
     path = tmp_path_factory.mktemp("campaign") / "kept"
     simulator = ModelSimulator(workspace, blind=True)
     tb.iterate(
@@ -519,7 +519,7 @@ def test_settings_of_a_simulator_survive_a_file(workspace, tmp_path):
     ],
 )
 def test_the_description_of_the_simulator_is_complete(changed):
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
     before = {
         "threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.5)],

@@ -2,9 +2,9 @@
 
 import pytest
 from typer.testing import CliRunner
+from worlds import hillside
 
 from trustbo.cli import app
-from trustbo.terrain import synthetic_terrain
 
 RUN = ("--start", "2,0", "--goal", "0,2", "--shape", "3,3", "--sampler", "exact")
 
@@ -23,7 +23,7 @@ def invoke():
 def rasters(tmp_path_factory):
     """A folder with dem.tif and dsm.tif."""
     folder = tmp_path_factory.mktemp("rasters")
-    terrain = synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     for name in ("dem", "dsm"):
         terrain[name].astype("float32").rio.to_raster(folder / f"{name}.tif")
     return folder

@@ -2,21 +2,16 @@
 
 import dataclasses
 
-import numpy as np
 import pytest
+from worlds import unequal_robots
 
 import trustbo as tb
 
 
 @pytest.fixture(scope="session")
 def result():
-    """Of 3 rows and 4 columns, the north-western cell impassable, and robots that differ."""
-    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
-    workspace = tb.Workspace.from_terrain(terrain, (3, 4))
-    passable = workspace.passable.copy()
-    passable[0, 0] = False
-    awareness = workspace.awareness * np.array([1.0, 0.8, 0.5])[:, None, None, None]
-    workspace = dataclasses.replace(workspace, passable=passable, awareness=awareness)
+    """Of a workspace whose north-western cell is impassable."""
+    workspace = unequal_robots(blocked=[(0, 0)])
     return tb.iterate(
         workspace, (2, 0), (0, 3), objective="terminal", n_iterations=2, sampler="exact", seed=3,
         progress=False,

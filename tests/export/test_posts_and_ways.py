@@ -14,7 +14,7 @@ import shapely
 import yaml
 from pyproj import Transformer
 from references import geometry_of_blob
-from simulators import Steady
+from worlds import Steady, hillside
 
 import trustbo as tb
 from trustbo.errors import TrustboError
@@ -27,7 +27,7 @@ MILLIMETRE = 2e-3  # the last of eight digits of a degree, and rounding
 
 @pytest.fixture(scope="module")
 def workspace():
-    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    terrain = hillside(90.0, 120.0)
     return tb.Workspace.from_terrain(terrain, (3, 4))
 
 

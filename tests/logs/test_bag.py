@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import xarray as xr
+from worlds import hillside
 
 import trustbo as tb
 from trustbo.data import Bound, Mission
@@ -28,7 +29,7 @@ S = 1_000_000_000  # ns
 
 @pytest.fixture(scope="module")
 def workspace():
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     return tb.Workspace.from_terrain(terrain, (3, 3))
 
 

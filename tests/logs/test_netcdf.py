@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from worlds import hillside
 
 import trustbo as tb
 from trustbo.data import Mission
@@ -17,7 +18,7 @@ from trustbo.logs.netcdf import read_tree, write_tree
 @pytest.fixture(scope="module")
 def driven():
     """Two missions with ticks, the first with states too, and one of a log without."""
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3), tb.Team(n_robots=2))
     simulators = [
         tb.simulation.KinematicSimulator(workspace, record_states=keep) for keep in (True, False)

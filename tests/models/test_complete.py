@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from models.conftest import simulate_missions
+from missions import simulate_missions
 from numpyro.distributions import HalfCauchy
 
 from trustbo.errors import TrustboError

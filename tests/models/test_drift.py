@@ -12,6 +12,7 @@ import numpyro.distributions as dist
 import pytest
 import xarray as xr
 from references import dense_coupled
+from worlds import random_cells
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
@@ -243,13 +244,9 @@ def test_ranks_of_the_truth_are_uniform():
 # --- campaigns ---
 
 
-def make_workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
-
-
 @pytest.mark.slow  # its programs compile for this alone
 def test_a_campaign_that_was_killed_comes_to_the_same(tmp_path, monkeypatch):
-    workspace = make_workspace()
+    workspace = random_cells()
     simulator = tb.simulation.ModelSimulator(workspace, OWN.params(TRUTH, 2), OWN)
     assert json.dumps(simulator.describe())
     truth = tb.simulation.Truth.of(simulator)
@@ -287,7 +284,7 @@ SMALL = dist.HalfNormal(0.1)
 
 @pytest.mark.parametrize("policy", ["greedy", "information", "ucb"])
 def test_policies_plan_with_it(policy, posterior):
-    workspace = make_workspace()
+    workspace = random_cells()
     planner = tb.planning.Planner(workspace, (3, 0), (0, 3))
     plan = tb.planning.POLICIES[policy](jax.random.key(0), params_of(posterior), planner)
     assert plan.path[-1] == (0, 3)
@@ -295,7 +292,7 @@ def test_policies_plan_with_it(policy, posterior):
 
 def test_places_are_added_to_it_in_every_room():
     """A linear drift with effects of places equals the pooled model with them."""
-    rng, workspace = np.random.default_rng(3), make_workspace()
+    rng, workspace = np.random.default_rng(3), random_cells()
     n = 4
     maps = {
         "place": rng.normal(0.0, 0.3, (n, 1, 4, 4)),
@@ -419,7 +416,7 @@ def test_a_drift_that_is_none_is_refused_before_work_starts(drift, error, messag
     with pytest.raises(error, match=message):
         fit(missions, model)
     with pytest.raises(error, match=message):
-        tb.Campaign(make_workspace(), (3, 0), (0, 3), model=model)
+        tb.Campaign(random_cells(), (3, 0), (0, 3), model=model)
 
 
 def test_what_a_sampler_or_a_function_cannot_treat_says_so(missions, posterior):

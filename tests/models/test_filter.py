@@ -2,16 +2,16 @@
 
 import numpy as np
 import pytest
-from models.likelihood.test_families import PARAMS, N, on_a_grid, sequences
-from models.likelihood.test_scalar import random_params
-from references import dense_log_likelihood, dense_posterior_of_trust
+from missions import N_TICKS, OF_FAMILY, counted_missions, random_params
+from references import dense_log_likelihood, dense_posterior_of_trust, on_a_grid
 from scipy import stats
+from worlds import random_cells
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference import TrustFilter, params_of
 from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
-from trustbo.workspace import AwarenessBelief, Workspace
+from trustbo.workspace import AwarenessBelief
 
 
 def mixture(n_draws=4, seed=0):
@@ -151,7 +151,7 @@ def test_bounds_that_cannot_be_are_named():
 @pytest.mark.parametrize("kind", ["pooled", "apart", "coupled"])
 def test_awareness_that_was_not_measured_is_integrated_over_its_belief(kind):
     """A filter for each map of the belief, and the mixture of them all."""
-    workspace = Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 3, 3, 2)))
+    workspace = random_cells(3, 3)
     belief, n, cell = AwarenessBelief(workspace, sd=0.2), 40, (1, 2)
     rng = np.random.default_rng(1)
     if kind == "pooled":
@@ -191,13 +191,13 @@ def constant(p, n=2):
 @pytest.mark.parametrize("family", ["censored", "beta_binomial", "student_t"])
 def test_families_are_followed_to_the_trust_of_a_grid(family):
     """Moments are matched bound by bound: within .05 sd of the exact posterior."""
-    p = PARAMS[family]
-    z, y, _ = sequences(family)
+    p = OF_FAMILY[family]
+    z, y, _ = counted_missions(family)
     live = TrustFilter(constant(p), n_robots=1, observation=family)
     for j in range(len(y)):
         live.reset()
         for k in range(5):
-            state = live.update(z[j, k], y[j, k], n_ticks=N)
+            state = live.update(z[j, k], y[j, k], n_ticks=N_TICKS)
         mean, sd = on_a_grid(family, p, z[j, :, 0], y[j, :, 0], 1201, last_trust=True)
         assert abs(state.mean[0] - mean) < 0.05 * sd
         assert abs(state.sd[0] / sd - 1.0) < 0.05
@@ -211,7 +211,7 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
 def test_ticks_add_up_to_the_bound(family):
-    p, rng = PARAMS[family], np.random.default_rng(0)
+    p, rng = OF_FAMILY[family], np.random.default_rng(0)
     params = constant(p, 3)._replace(b=p.b + np.array([-0.1, 0.0, 0.1]))
     ticks, bounds = rng.uniform(size=(4, 25, 3)) < 0.8, rng.uniform(size=(4, 3, 2))
     by_tick, by_bound = (TrustFilter(params, 3, observation=family) for _ in range(2))
@@ -229,7 +229,7 @@ def test_ticks_add_up_to_the_bound(family):
 
 
 def test_a_robot_that_did_not_look_is_not_measured():
-    params = constant(PARAMS["censored"])
+    params = constant(OF_FAMILY["censored"])
     live, other = (TrustFilter(params, 2, observation="censored") for _ in range(2))
     live.begin_bound(np.full((2, 2), 0.5))
     live.update_tick([1.0, np.nan])
@@ -243,14 +243,14 @@ def test_a_robot_that_did_not_look_is_not_measured():
         live.update(np.full((2, 2), 0.5), [1.0, 1.0])
     with pytest.raises(ShapeError, match=r"in_contact must be \(2,\); got shape \(3,\)"):
         live.update_tick([1.0, 1.0, 0.0])
-    counting = TrustFilter(constant(PARAMS["beta_binomial"]), 2, observation="beta_binomial")
+    counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2, observation="beta_binomial")
     with pytest.raises(TrustboError, match="The beta-binomial family counts ticks"):
         counting.update(np.full((2, 2), 0.5), [1.0, 1.0])
 
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
 def test_coupled_robots_without_a_coupling_are_robots_apart(family):
-    p, rng, eye = PARAMS[family], np.random.default_rng(1), np.eye(2)[None]
+    p, rng, eye = OF_FAMILY[family], np.random.default_rng(1), np.eye(2)[None]
     coupled = CoupledParams(
         p.beta0 * eye,
         np.stack([b * np.eye(2) for b in p.beta])[None],
@@ -264,7 +264,7 @@ def test_coupled_robots_without_a_coupling_are_robots_apart(family):
     apart = TrustFilter(constant(p, 1), 2, observation=family)
     for y in ([1.0, 0.5], [0.0, np.nan], [0.9, 1.0]):
         z = rng.uniform(size=(2, 2))
-        one, other = (live.update(z, y, n_ticks=N) for live in (together, apart))
+        one, other = (live.update(z, y, n_ticks=N_TICKS) for live in (together, apart))
         np.testing.assert_allclose(one.mean, other.mean, rtol=1e-7)
         np.testing.assert_allclose(one.sd, other.sd, rtol=1e-7)
     ahead = together.predict(rng.uniform(size=(3, 2, 2)))
@@ -273,7 +273,7 @@ def test_coupled_robots_without_a_coupling_are_robots_apart(family):
 
 def test_rates_ahead_have_the_interval_of_the_model():
     rng, n = np.random.default_rng(3), 4000
-    p = PARAMS["gaussian"]
+    p = OF_FAMILY["gaussian"]
     live = TrustFilter(constant(p, n), 2, max_draws=n)
     live.update(rng.uniform(size=(2, 2)), [0.4, 0.8])
     ahead = live.predict(rng.uniform(size=(3, 2, 2)))
@@ -283,7 +283,7 @@ def test_rates_ahead_have_the_interval_of_the_model():
     assert (np.abs(ahead.rate - ahead.mean) < error).all()
     assert (np.abs(ahead.rate_low - law.ppf(0.05)) < 2.2 * error).all()
     assert (np.abs(ahead.rate_high - law.ppf(0.95)) < 2.2 * error).all()
-    cut = TrustFilter(constant(PARAMS["censored"], n), 2, observation="censored", max_draws=n)
+    cut = TrustFilter(constant(OF_FAMILY["censored"], n), 2, observation="censored", max_draws=n)
     for _ in range(6):
         cut.update(np.ones((2, 2)), [1.0, 1.0])
     assert (cut.predict(np.ones((1, 2, 2))).rate_high == 1.0).all()

@@ -7,7 +7,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
-from models.conftest import simulate_missions
+from missions import simulate_missions
 from numpyro.infer import MCMC, NUTS
 
 from trustbo.data import Mission

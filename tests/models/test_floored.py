@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.conftest import simulate_missions
+from missions import simulate_missions
 from numpyro.distributions.transforms import biject_to
 from references import pooled_posterior
 from scipy import integrate, stats

@@ -3,7 +3,7 @@
 import arviz as az
 import numpy as np
 import pytest
-from models.conftest import simulate_missions
+from missions import simulate_missions
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError

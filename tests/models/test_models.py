@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.conftest import simulate_missions
-from models.likelihood.test_vector import random_covariance
+from missions import random_covariance, simulate_missions
 from numpyro.infer.util import potential_energy
 from references import dense_coupled
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.likelihood.test_scalar import random_missions
+from missions import random_missions
 from references import dense_log_likelihood
 from scipy import stats
 

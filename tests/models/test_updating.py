@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.conftest import simulate_missions
+from missions import simulate_missions
 from references import dense_coupled
 
 from trustbo.data import Mission

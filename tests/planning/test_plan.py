@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from worlds import hillside
 
 import trustbo as tb
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -14,7 +15,7 @@ PARAMS = tb.models.TrustParams(0.5, np.array([0.1, 0.1, 0.4]), 0.1, 0.1, 0.1, 0.
 
 @pytest.fixture(scope="module")
 def workspace():
-    terrain = tb.terrain.synthetic_terrain((90.0, 120.0), seed=5, relief=6.0)
+    terrain = hillside(90.0, 120.0)
     return tb.Workspace.from_terrain(terrain, (3, 4), tb.Team(n_robots=2))
 
 

@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from worlds import hillside
 
 import trustbo as tb
 from trustbo.models import CoupledTrust, TrustParams
@@ -56,7 +57,7 @@ class Page(html.parser.HTMLParser):
 
 @pytest.fixture(scope="module")
 def result():
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
     return tb.iterate(
         workspace, (2, 0), (0, 2), n_iterations=2, sampler="exact", seed=1, progress=False

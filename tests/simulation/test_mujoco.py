@@ -6,7 +6,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
-import xarray as xr
+from worlds import CORNER, hillside, terrain_of
 
 import trustbo as tb
 from trustbo.errors import TrustboError
@@ -14,24 +14,16 @@ from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.mujoco import MujocoSimulator
 from trustbo.simulation.vehicle import WHEEL_RADIUS, Ground, Physics, center_of_mass, crop, grip_of
 from trustbo.team import Robot, Team
-from trustbo.terrain import assemble_terrain, synthetic_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import detection_probability, optics
 from trustbo.workspace.surface import Surface
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 HUSKY = Robot()
-CORNER = np.array([100.0, 500.0])  # of the terrains made here: x of the left edge, y of the top
 
 
 def workspace_of(dem, team=None, resolution=1.0, shape=(3, 3)):
-    rows, cols = dem.shape
-    coords = {
-        "y": CORNER[1] - (np.arange(rows) + 0.5) * resolution,
-        "x": CORNER[0] + (np.arange(cols) + 0.5) * resolution,
-    }
-    dem = xr.DataArray(dem.astype(float), coords, ("y", "x")).rio.write_crs("EPSG:32633")
-    return Workspace.from_terrain(assemble_terrain(dem, dem + 0.0), shape, team)
+    return Workspace.from_terrain(terrain_of(dem, resolution=resolution), shape, team)
 
 
 def surface_with(ground, gradient, pixel=(1.0, 1.0), origin=(0.0, 0.0)):
@@ -57,7 +49,7 @@ def flat():
 
 @pytest.fixture(scope="module")
 def wooded():
-    return Workspace.from_terrain(synthetic_terrain((90.0, 90.0), seed=5, relief=6.0), (3, 3))
+    return Workspace.from_terrain(hillside(), (3, 3))
 
 
 def drive(workspace, surface, starts, goals, *, robot=HUSKY, heading=0.0, seconds=120.0, **options):

@@ -6,29 +6,23 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
+from worlds import hillside, terrain_of
 
 from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator
 from trustbo.team import Robot, Team
-from trustbo.terrain import assemble_terrain, synthetic_terrain
 from trustbo.workspace import Sight, Workspace
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 
 
 def workspace_of(dem, height, shape=(3, 3), team=None, resolution=1.0):
-    rows, cols = dem.shape
-    coords = {
-        "y": 500.0 - (np.arange(rows) + 0.5) * resolution,
-        "x": 100.0 + (np.arange(cols) + 0.5) * resolution,
-    }
-    dem = xr.DataArray(dem.astype(float), coords, ("y", "x")).rio.write_crs("EPSG:32633")
-    return Workspace.from_terrain(assemble_terrain(dem, dem + height), shape, team)
+    return Workspace.from_terrain(terrain_of(dem, height, resolution), shape, team)
 
 
 @pytest.fixture(scope="module")
 def wooded():
-    return Workspace.from_terrain(synthetic_terrain((90.0, 90.0), seed=5, relief=6.0), (3, 3))
+    return Workspace.from_terrain(hillside(), (3, 3))
 
 
 def test_open_flat_ground_gives_full_contact():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from simulators import ModelSimulator
+from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
 from trustbo.data import Mission
@@ -23,7 +23,7 @@ def mission(path, rate=0.5, n_bounds=None, status="ok"):
 
 @pytest.fixture(scope="module")
 def workspace():
-    return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 4, 4, 2)))
+    return random_cells()
 
 
 def run(workspace, **options):
@@ -144,7 +144,7 @@ def test_a_replayed_result_gives_its_posterior_again(workspace, recorded, tmp_pa
 
 @pytest.mark.parametrize("with_states", [False, True])
 def test_a_saved_mission_comes_back_with_its_ticks(with_states, tmp_path):
-    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     workspace = tb.Workspace.from_terrain(terrain, (3, 3))
     simulator = tb.simulation.KinematicSimulator(workspace, record_states=with_states)
     result = tb.iterate(

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from worlds import hillside
 
 import trustbo as tb
 from trustbo.errors import TrustboError
@@ -30,7 +31,7 @@ def flat():
 
 @pytest.fixture(scope="module")
 def wooded():
-    return Workspace.from_terrain(synthetic_terrain((90.0, 90.0), seed=5, relief=6.0), (3, 3))
+    return Workspace.from_terrain(hillside(), (3, 3))
 
 
 def track_by_hand(looks, acquire, drop):

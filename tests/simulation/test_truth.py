@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from worlds import hillside
 
 from trustbo.data import Bound
 from trustbo.errors import TrustboError
@@ -30,7 +31,7 @@ def grid(shape=(3, 3), walls=(), n_robots=1, n_features=2, seed=0):
 
 
 def wooded_simulator(**options):
-    terrain = synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    terrain = hillside()
     return KinematicSimulator(Workspace.from_terrain(terrain, (3, 3)), **options)
 
 
@@ -95,7 +96,7 @@ def test_the_standard_error_is_as_asked_for_and_that_of_other_seeds(wooded, of_w
 
 def test_tracks_that_outlast_misses_are_simulated(tmp_path):
     robot = Robot(acquire=2, drop=3)
-    terrain = synthetic_terrain((60.0, 60.0), seed=5, relief=6.0)
+    terrain = hillside(60.0, 60.0)
     team = Team(robots=(robot,), lead=robot)
     simulator = KinematicSimulator(Workspace.from_terrain(terrain, (2, 2), team))
     found = Truth.of(simulator, standard_error=0.02, folder=tmp_path)

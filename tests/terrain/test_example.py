@@ -9,8 +9,6 @@ import pytest
 import trustbo as tb
 from trustbo.terrain.example import EXAMPLES, example_files
 
-DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
-
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_is_ground_and_canopy_with_its_owner(name):
@@ -25,12 +23,10 @@ def test_an_example_is_ground_and_canopy_with_its_owner(name):
     assert sum(file.stat().st_size for file in folder.iterdir()) < 1e6
 
 
-def test_an_example_s_files_are_those_whose_origin_is_stated():
-    if not DATA.is_dir():
-        pytest.skip("../shared/data is absent")
+def test_an_example_s_files_are_those_whose_origin_is_stated(real_data):
     for file in map(Path, example_files("wellington")):
         digest = hashlib.sha256(file.read_bytes()).hexdigest()
-        assert f"{digest}  wellington/{file.name}" in (DATA / "SHA256SUMS").read_text()
+        assert f"{digest}  wellington/{file.name}" in (real_data / "SHA256SUMS").read_text()
 
 
 def test_an_example_that_there_is_not_is_named():

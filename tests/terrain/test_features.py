@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
+from worlds import terrain_of
 
 from trustbo.errors import ShapeError, TerrainError, TrustboError
 from trustbo.terrain import (
@@ -29,16 +30,6 @@ SHORT = {name: f for name, f in FEATURES.items() if name not in ("openness", "as
 INSIDE = (slice(1, -1), slice(1, -1))
 
 
-def make_terrain(dem, height=0.0, resolution=1.0):
-    rows, cols = dem.shape
-    coords = {
-        "y": 1000.0 - (np.arange(rows) + 0.5) * resolution,
-        "x": 2000.0 + (np.arange(cols) + 0.5) * resolution,
-    }
-    dem = xr.DataArray(dem.astype(float), coords, ("y", "x")).rio.write_crs("EPSG:32633")
-    return assemble_terrain(dem, dem + height)
-
-
 def tilted(a=0.3, b=-0.2, resolution=1.0, n=12):
     row, col = np.mgrid[:n, :n]
     return a * col * resolution + b * row * resolution
@@ -46,12 +37,12 @@ def tilted(a=0.3, b=-0.2, resolution=1.0, n=12):
 
 def rough_terrain(seed=0, n=24):
     rng = np.random.default_rng(seed)
-    return make_terrain(rng.normal(size=(n, n)), rng.uniform(0.0, 6.0, (n, n)))
+    return terrain_of(rng.normal(size=(n, n)), rng.uniform(0.0, 6.0, (n, n)))
 
 
 @pytest.mark.parametrize("resolution", [0.5, 1.0, 3.0])
 def test_a_plane_has_its_own_slope_everywhere_inside(resolution):
-    terrain = make_terrain(tilted(resolution=resolution), resolution=resolution)
+    terrain = terrain_of(tilted(resolution=resolution), resolution=resolution)
     # The polynomial arctangent is 1e-8 rad off at most.
     np.testing.assert_allclose(
         slope(terrain).values[INSIDE], np.arctan(np.hypot(0.3, 0.2)), atol=2e-8
@@ -60,7 +51,7 @@ def test_a_plane_has_its_own_slope_everywhere_inside(resolution):
 
 @pytest.mark.parametrize("rise", [0.0, 0.1, 0.414, 0.415, 1.0, 2.41, 2.42, 10.0, 1e6])
 def test_slope_is_the_arctangent_of_the_rise(rise):
-    inside = slope(make_terrain(tilted(rise, 0.0))).values[INSIDE]
+    inside = slope(terrain_of(tilted(rise, 0.0))).values[INSIDE]
     np.testing.assert_allclose(inside, np.arctan(rise), atol=2e-8)
 
 
@@ -70,13 +61,13 @@ def test_slope_is_the_arctangent_of_the_rise(rise):
 )
 def test_aspect_is_the_compass_direction_of_descent(a, b, north):
     """Ground rises by a per column to the east and b per row to the south."""
-    down = aspect(make_terrain(tilted(a, -b))).values[INSIDE]
+    down = aspect(terrain_of(tilted(a, -b))).values[INSIDE]
     np.testing.assert_allclose(np.rad2deg(down), north, atol=1e-9)
-    assert np.isnan(aspect(make_terrain(np.zeros((8, 8))))).all()
+    assert np.isnan(aspect(terrain_of(np.zeros((8, 8))))).all()
 
 
 def test_a_plane_s_roughness_tri_tpi_and_step_have_closed_forms():
-    terrain = make_terrain(tilted())
+    terrain = terrain_of(tilted())
     np.testing.assert_allclose(roughness(terrain).values[INSIDE], 2 * 0.5, rtol=1e-12)
     np.testing.assert_allclose(step_height(terrain).values[INSIDE], 0.5, rtol=1e-12)
     squares = 6 * 0.3**2 + 6 * 0.2**2  # each of the 8 steps is +-0.3 i +- 0.2 j
@@ -87,7 +78,7 @@ def test_a_plane_s_roughness_tri_tpi_and_step_have_closed_forms():
 
 def test_a_paraboloid_has_its_own_curvature():
     row, col = np.mgrid[:12, :12] * 2.0
-    terrain = make_terrain(-0.05 * col**2 - 0.02 * row**2, resolution=2.0)
+    terrain = terrain_of(-0.05 * col**2 - 0.02 * row**2, resolution=2.0)
     np.testing.assert_allclose(curvature(terrain).values[INSIDE], 2 * 0.05 + 2 * 0.02)
 
 
@@ -109,7 +100,7 @@ def test_gdaldem_says_the_same(name, feature, atol):
         dem, resolution = source.read(1).astype(float), source.res[0]
     with rasterio.open(GDAL / f"{name}.tif") as source:
         gdal = source.read(1, masked=True).filled(np.nan)
-    ours = feature(make_terrain(dem, resolution=resolution)).values
+    ours = feature(terrain_of(dem, resolution=resolution)).values
     if name == "slope":
         ours = np.rad2deg(ours)
     assert np.isfinite(gdal[INSIDE]).all()
@@ -117,7 +108,7 @@ def test_gdaldem_says_the_same(name, feature, atol):
 
 
 def test_float32_heights_give_what_float64_gives():
-    terrain = make_terrain(500.0 + np.random.default_rng(0).normal(size=(20, 20)))
+    terrain = terrain_of(500.0 + np.random.default_rng(0).normal(size=(20, 20)))
     single = terrain.astype(np.float32)
     double = single.astype(float)  # the same heights
     for feature in (slope, roughness, tri, tpi, step_height, curvature):
@@ -128,7 +119,7 @@ def test_float32_heights_give_what_float64_gives():
 def test_canopy_height_and_cover():
     height = np.zeros((40, 40))
     height[:, 20:] = 8.0
-    terrain = make_terrain(np.zeros((40, 40)), height)
+    terrain = terrain_of(np.zeros((40, 40)), height)
     np.testing.assert_allclose(canopy_height(terrain), height)
     cover = canopy_cover(terrain, radius=5.0).values
     np.testing.assert_allclose(cover[:, :14], 0.0, atol=1e-12)
@@ -141,14 +132,14 @@ def test_canopy_height_and_cover():
 )
 def test_vegetation_density_is_the_share_of_the_lowest_metres(height, share):
     """Crowns fill the upper 70 %: 6 m ones from 1.8 m on, 12 m ones from 3.6 m on."""
-    density = vegetation_density(make_terrain(np.zeros((20, 20)), height))
+    density = vegetation_density(terrain_of(np.zeros((20, 20)), height))
     np.testing.assert_allclose(density, share, atol=1e-12)
 
 
 def test_openness_of_flat_ground_and_of_uniform_shrubs():
-    flat = make_terrain(np.zeros((60, 60)))
+    flat = terrain_of(np.zeros((60, 60)))
     np.testing.assert_allclose(openness(flat, reach=20.0), 1.0)
-    shrubs = make_terrain(np.zeros((60, 60)), 2.0)
+    shrubs = terrain_of(np.zeros((60, 60)), 2.0)
     # Rays at 1 m, inside the layer from 0.6 m to 2 m all the way; float32 inside.
     through = openness(shrubs, reach=20.0, eye=1.0, target=1.0).values
     np.testing.assert_allclose(through, np.exp(-0.1 * 20.0), rtol=1e-6)
@@ -198,7 +189,7 @@ def test_openness_is_the_mean_of_single_rays(pixel, reach, n_rays):
 def test_exposure_is_the_share_of_observers_that_see_a_pixel():
     dem = np.zeros((30, 30))
     dem[:, 15] = 10.0  # a wall
-    terrain = make_terrain(dem)
+    terrain = terrain_of(dem)
     west, east = (2002.5, 985.5), (2027.5, 985.5)
     seen = exposure(terrain, [west, east], eye=2.0, target=1.0).values
     np.testing.assert_allclose(seen[:, :14], 0.5)
@@ -217,7 +208,7 @@ def test_exposure_is_the_share_of_observers_that_see_a_pixel():
 def test_features_keep_missing_pixels_missing():
     dem = tilted(n=30)
     dem[5, 6] = np.nan
-    terrain = make_terrain(dem, 1.0)
+    terrain = terrain_of(dem, 1.0)
     for name, values in pixel_features(terrain, SHORT).items():
         assert np.isnan(values.values[5, 6]), name
         assert np.isfinite(values.values[15, 15]), name
@@ -227,7 +218,7 @@ def test_features_keep_missing_pixels_missing():
 @pytest.mark.parametrize("turn", [np.rot90, np.fliplr, np.flipud])
 def test_turning_the_terrain_turns_every_feature(turn):
     before = rough_terrain()
-    after = make_terrain(turn(before["dem"].values), turn((before["dsm"] - before["dem"]).values))
+    after = terrain_of(turn(before["dem"].values), turn((before["dsm"] - before["dem"]).values))
     a, b = pixel_features(before, SHORT), pixel_features(after, SHORT)
     for name in SHORT:
         np.testing.assert_allclose(
@@ -239,7 +230,7 @@ def test_turning_the_terrain_turns_every_feature(turn):
 
 def test_a_constant_height_changes_nothing():
     before = rough_terrain(1)
-    after = make_terrain(before["dem"].values + 64.0, (before["dsm"] - before["dem"]).values)
+    after = terrain_of(before["dem"].values + 64.0, (before["dsm"] - before["dem"]).values)
     a, b = pixel_features(before, SHORT), pixel_features(after, SHORT)
     for name in SHORT:
         np.testing.assert_allclose(b[name], a[name], rtol=1e-9, atol=1e-12, err_msg=name)
@@ -248,7 +239,7 @@ def test_a_constant_height_changes_nothing():
 
 def test_heights_and_pixels_scaled_together_keep_slope_and_aspect():
     before = rough_terrain(2)
-    after = make_terrain(3.0 * before["dem"].values, resolution=3.0)
+    after = terrain_of(3.0 * before["dem"].values, resolution=3.0)
     np.testing.assert_allclose(slope(after), slope(before), rtol=1e-12)
     np.testing.assert_allclose(aspect(after), aspect(before), rtol=1e-12)
     np.testing.assert_allclose(tri(after), 3.0 * tri(before).values, rtol=1e-12)
@@ -273,7 +264,7 @@ def test_a_feature_of_one_s_own():
 
 
 def test_a_hole_in_the_surface_leaves_the_means_around_it():
-    terrain = make_terrain(tilted(n=30), 1.0)
+    terrain = terrain_of(tilted(n=30), 1.0)
     surface = terrain["dsm"].values.copy()
     surface[5, 6] = np.nan
     holed = terrain.assign(dsm=terrain["dsm"].copy(data=surface))

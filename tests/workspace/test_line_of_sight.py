@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulators import Steady
+from worlds import Steady
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TerrainError, TrustboError

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from models.likelihood.test_families import PARAMS, N, on_a_grid, sequences
+from missions import N_TICKS, OF_FAMILY, counted_missions
+from references import on_a_grid
 from scipy import stats
 
 from trustbo.data import Mission
@@ -23,15 +24,15 @@ def known(p):
 
 def given_coefficients(family, p, z, y):
     """Chains of rates (chain, bound) whose drift is known, and their sites."""
-    batch = MissionBatch(z[:, :, None], y[:, :, None], np.full((*y.shape, 1), N))
+    batch = MissionBatch(z[:, :, None], y[:, :, None], np.full((*y.shape, 1), N_TICKS))
     chains, sites = gather_chains(FAMILIES[family], batch)
     return chains._replace(u=chains.u[..., :0], of=chains.of[:, :0], drift=z @ p.beta + p.b), sites
 
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial"])
 def test_weights_average_to_the_integral_over_trust(family):
-    p = PARAMS[family]
-    z, y, _ = sequences(family)
+    p = OF_FAMILY[family]
+    z, y, _ = counted_missions(family)
     z, y = z[:, :, 0], y[:, :, 0]
     args = *known(p), *NO_COEFFICIENTS
     for j in range(len(y)):
@@ -133,8 +134,8 @@ def test_the_table_of_counts_is_that_of_scipy(n_ticks):
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial"])
 def test_trust_given_parameters_is_that_of_a_grid(family):
-    p, n = PARAMS[family], 1000
-    _, _, missions = sequences(family)
+    p, n = OF_FAMILY[family], 1000
+    _, _, missions = counted_missions(family)
     many = TrustParams(*(np.broadcast_to(np.asarray(v), (n, *np.shape(v))).copy() for v in p[:7]))
     many = many._replace(b=many.b + 1e-9 * np.arange(n))  # draws that repeat are looked at once
     batch, rng = stack_missions(missions, pad=False), np.random.default_rng(0)
@@ -155,8 +156,8 @@ def test_trust_given_parameters_is_that_of_a_grid(family):
 
 
 def test_gaussian_terms_give_the_smoother_s_moments():
-    _, _, missions = sequences("gaussian", low=0.1)
-    p = PARAMS["gaussian"]
+    _, _, missions = counted_missions("gaussian", low=0.1)
+    p = OF_FAMILY["gaussian"]
     n = 500
     rng = np.random.default_rng(1)
     many = TrustParams(
@@ -178,9 +179,9 @@ def test_gaussian_terms_give_the_smoother_s_moments():
 
 
 def test_a_mission_without_a_rate_leaves_the_evidence_as_it_is():
-    _, _, missions = sequences("censored")
+    _, _, missions = counted_missions("censored")
     none = Mission.from_arrays([(0, 0), (0, 1)], np.full((1, 1, 2), 0.5), [[np.nan]])
-    args = *(np.asarray(a)[None] for a in known(PARAMS["censored"])[:3]), np.array([0.5, 0.5])
+    args = *(np.asarray(a)[None] for a in known(OF_FAMILY["censored"])[:3]), np.array([0.5, 0.5])
     prior = np.eye(3)[None], np.zeros((1, 3))
     found = [
         joint.log_evidence(*args, *prior, *gather_chains(FAMILIES["censored"],

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from missions import N_TICKS, OF_FAMILY, counted_missions
+from references import on_a_grid
 from scipy import special, stats
 
 from trustbo.data import Mission
@@ -14,72 +16,12 @@ from trustbo.inference import fit
 from trustbo.models import CoupledParams, CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.models.families import FAMILIES, Observed
 
-N = 20
-PARAMS = {
-    "gaussian": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
-    "censored": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.15, 0.1),
-    "beta_binomial": TrustParams(0.6, np.array([2.0, 1.0]), -0.6, 0.4, 0.25, 0.0, 1.5),
-    "student_t": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.1, 0.1),
-}
-
-
-def on_a_grid(family, p, z, y, n_points=1201, *, last_trust=False):
-    """p(y) of one robot by filtering point masses of trust: the trapezoid rule, bound by bound.
-
-    Log p(y), or the mean and sd of trust at the last bound.
-    """
-    width = 9.0 if family == "beta_binomial" else 2.5
-    x = np.linspace(0.5 - width, 0.5 + width, n_points)
-    step = x[1] - x[0]
-    likelihood = np.ones(n_points)
-    weights = stats.norm.pdf(x, p.x0_mean, p.x0_sd) * step
-    scale = 1.0 / (p.delta_w * np.sqrt(2.0 * np.pi))  # a normal density over all pairs, by hand
-    log_total = 0.0
-    for k in range(len(y)):
-        mean = p.beta0 * x + z[k] @ p.beta + p.b
-        move = scale * np.exp(-0.5 * ((x[:, None] - mean[None]) / p.delta_w) ** 2)
-        weights = move @ weights * step
-        if np.isnan(y[k]):
-            likelihood = np.ones(n_points)
-        elif family == "beta_binomial":
-            phi = p.delta_v**-2.0
-            share = special.expit(x)
-            likelihood = stats.betabinom.pmf(round(y[k] * N), N, phi * share, phi * (1 - share))
-        elif family == "student_t":
-            likelihood = stats.t.pdf(y[k], 4, x, p.delta_v)
-        elif y[k] <= 0.0:
-            likelihood = stats.norm.cdf(0.0, x, p.delta_v)
-        elif y[k] >= 1.0:
-            likelihood = stats.norm.sf(1.0, x, p.delta_v)
-        else:
-            likelihood = stats.norm.pdf(y[k], x, p.delta_v)
-        weights = weights * likelihood
-        log_total += np.log(weights.sum())
-        weights /= weights.sum()
-    if last_trust:
-        mean = weights @ x
-        return mean, np.sqrt(weights @ (x - mean) ** 2)
-    return log_total
-
-
-def sequences(family, seed=0, n=6, low=0.0):
-    rng = np.random.default_rng(seed)
-    z = rng.uniform(size=(n, 5, 1, 2))
-    model = PooledTrust(observation=family)
-    y = model.simulate(jax.random.key(seed), PARAMS[family], z, n_ticks=N).contact_rate
-    y = np.round(np.clip(y, low, 1.0 - low) * N) / N
-    y[0, 2] = np.nan
-    path = [(0, k) for k in range(6)]
-    n_ticks = np.full((5, 1), N)
-    missions = [Mission.from_arrays(path, a, b, n_ticks=n_ticks) for a, b in zip(z, y, strict=True)]
-    return z, y, missions
-
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial", "student_t"])
 def test_importance_sampling_finds_the_integral_over_trust(family):
-    z, y, missions = sequences(family)
+    z, y, missions = counted_missions(family)
     assert ((y == 0.0) | (y == 1.0)).any()  # odd ones, for Student-t rates
-    model, p = PooledTrust(observation=family), PARAMS[family]
+    model, p = PooledTrust(observation=family), OF_FAMILY[family]
     expected = [on_a_grid(family, p, z[j, :, 0], y[j, :, 0]) for j in range(len(y))]
     found = np.array([model.log_likelihood(p, missions, seed=s) for s in range(60)])
     estimate = special.logsumexp(found, axis=0) - np.log(len(found))
@@ -92,17 +34,17 @@ def test_importance_sampling_finds_the_integral_over_trust(family):
 
 def test_a_grid_agrees_with_the_exact_gaussian_likelihood():
     """The reference of the test above, checked where the answer is known."""
-    z, y, missions = sequences("gaussian", low=0.1)
-    p = PARAMS["gaussian"]._replace(delta_w=0.2, delta_v=0.2)
+    z, y, missions = counted_missions("gaussian", low=0.1)
+    p = OF_FAMILY["gaussian"]._replace(delta_w=0.2, delta_v=0.2)
     expected = [on_a_grid("gaussian", p, z[j, :, 0], y[j, :, 0]) for j in range(len(y))]
     np.testing.assert_allclose(PooledTrust().log_likelihood(p, missions), expected, atol=1e-6)
 
 
 def test_rates_that_are_not_at_the_ends_are_not_censored():
-    _, _, missions = sequences("gaussian", low=0.1)
+    _, _, missions = counted_missions("gaussian", low=0.1)
     np.testing.assert_allclose(
-        PooledTrust(observation="censored").log_likelihood(PARAMS["gaussian"], missions),
-        PooledTrust().log_likelihood(PARAMS["gaussian"], missions),
+        PooledTrust(observation="censored").log_likelihood(OF_FAMILY["gaussian"], missions),
+        PooledTrust().log_likelihood(OF_FAMILY["gaussian"], missions),
         rtol=1e-10,
     )
 
@@ -143,21 +85,23 @@ def test_counts_have_the_beta_binomial_s_moments():
     p = TrustParams(0.0, np.array([1.0]), 0.3, 1e-9, 0.3)
     n = 20_000
     z = np.full((n, 1, 1, 1), 0.5)
-    sample = PooledTrust(observation="beta_binomial").simulate(jax.random.key(0), p, z, n_ticks=N)
+    sample = PooledTrust(observation="beta_binomial").simulate(
+        jax.random.key(0), p, z, n_ticks=N_TICKS
+    )
     share, phi = special.expit(0.8), 0.3**-2.0
-    law = stats.betabinom(N, phi * share, phi * (1.0 - share))
-    counts = sample.contact_rate.ravel() * N
+    law = stats.betabinom(N_TICKS, phi * share, phi * (1.0 - share))
+    counts = sample.contact_rate.ravel() * N_TICKS
     assert abs(counts.mean() - law.mean()) < 5 * law.std() / np.sqrt(n)
     assert abs(counts.var() / law.var() - 1.0) < 5 * np.sqrt(3.0 / n)
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
 
 
 def test_a_linearisation_point_at_the_mode_evens_the_weights():
-    z, y, _ = sequences("beta_binomial", seed=2)
+    z, y, _ = counted_missions("beta_binomial", seed=2)
     with jax.enable_x64(True):
-        params = PARAMS["beta_binomial"].map(lambda v, _: jnp.asarray(v, dtype=float))
+        params = OF_FAMILY["beta_binomial"].map(lambda v, _: jnp.asarray(v, dtype=float))
         family, ssm = FAMILIES["beta_binomial"], params.ssm(jnp.asarray(z))
-        rough = Observed.of(jnp.asarray(y), jnp.full(y.shape, float(N)))
+        rough = Observed.of(jnp.asarray(y), jnp.full(y.shape, float(N_TICKS)))
         fine = jax.jit(family.refine)(ssm, rough)
         innovations = np.random.default_rng(0).normal(size=(400, *rough.y.shape))
         weigh = jax.jit(jax.vmap(family.log_density, in_axes=(None, None, 0)))
@@ -181,7 +125,7 @@ def test_the_resolution_of_a_rate_is_one_tick():
 
 
 def test_families_that_do_not_suit_are_refused():
-    _, _, missions = sequences("gaussian")
+    _, _, missions = counted_missions("gaussian")
     bare = [Mission.from_arrays(m.path, m.awareness, m.contact_rate) for m in missions]
     counted = PooledTrust(observation="beta_binomial")
     expected = "mission 0, bound 1, robot 0 has a contact rate but no n_ticks. .* give n_ticks"

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from models.likelihood.test_vector import random_covariance
+from missions import random_covariance
 from references import dense_joint
 
 from trustbo.models import ContactRate, CoupledParams, RobotParams, TrustParams

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models.conftest import simulate_missions
+from missions import simulate_missions
 from references import dense_posterior_of_trust
 
 from trustbo.data import Mission

@@ -3,35 +3,13 @@
 import jax
 import numpy as np
 import pytest
+from missions import random_missions, random_params
 from references import dense_log_likelihood, dense_posterior_of_trust
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.stacking import stack_missions
-
-
-def random_params(rng):
-    return TrustParams(
-        beta0=rng.uniform(-0.9, 1.1),
-        beta=rng.normal(0.0, 1.0, 2),
-        b=rng.normal(0.0, 0.5),
-        delta_w=rng.uniform(0.01, 0.5),
-        delta_v=rng.uniform(0.01, 0.5),
-        x0_mean=rng.normal(0.5, 0.3),
-        x0_sd=rng.uniform(0.0, 0.7),
-    )
-
-
-def random_missions(rng, n_missions=3, n_robots=3, missing=0.2):
-    missions = []
-    for _ in range(n_missions):
-        n_bounds = int(rng.integers(1, 12))
-        rates = rng.uniform(size=(n_bounds, n_robots))
-        rates[rng.uniform(size=rates.shape) < missing] = np.nan
-        path = [(0, k) for k in range(n_bounds + 1)]
-        missions.append(Mission.from_arrays(path, rng.uniform(size=(n_bounds, n_robots, 2)), rates))
-    return missions
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -4,17 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from missions import random_covariance
 from references import dense_coupled
 from statsmodels.tsa.statespace.kalman_filter import KalmanFilter
 
 from trustbo.models.state_space import dense
 from trustbo.models.state_space.scalar import ScalarSSM
 from trustbo.models.state_space.vector import VectorSSM
-
-
-def random_covariance(rng, n, scale):
-    A = rng.normal(size=(n, n))
-    return scale**2 * (A @ A.T / n + 0.3 * np.eye(n))
 
 
 def random_vector_ssm(rng, n_bounds=6, n_missions=3, n_robots=3, lag=0.0):

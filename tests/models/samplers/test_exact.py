@@ -6,8 +6,7 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.conftest import TRUTH, simulate_missions
-from models.likelihood.test_scalar import random_missions, random_params
+from missions import TRUTH, random_missions, random_params, simulate_missions
 from references import dense_log_likelihood, pooled_posterior
 from scipy import stats
 from scipy.interpolate import PchipInterpolator

@@ -3,7 +3,8 @@
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.conftest import simulate_missions
+from missions import simulate_missions
+from references import named
 from scipy import special, stats
 
 from trustbo.data import Mission
@@ -98,15 +99,6 @@ def test_coordinates_leave_the_priors_as_they_are():
         expected += stats.halfnorm.logpdf(tau, scale=0.3) + np.log(tau)
     log_det = np.linalg.slogdet(jacobian)[1]
     assert abs(log_prior[0] - expected - log_det) < 1e-6
-
-
-def named(mean, mu, taus, delta_w, delta_v, own):
-    """Parameters by name; `own` has beta0 and coefficients (draw, 4) of each robot."""
-    own = np.stack(own, axis=1)
-    return {"mean_beta0": mean, "mean_beta": mu[:, :2], "mean_b": mu[:, 2], "delta_w": delta_w,
-            "delta_v": delta_v, "tau_beta0": taus[:, 0], "tau_beta": taus[:, 1:3],
-            "tau_b": taus[:, 3], "beta0": own[..., 0],
-            "beta": own[..., 1:3].reshape(len(own), -1), "b": own[..., 3]}  # fmt: skip
 
 
 def from_the_prior(missions, n, rng):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models.samplers.test_hierarchical_target import named
+from references import named
 from scipy import special, stats
 
 from trustbo.data import Mission

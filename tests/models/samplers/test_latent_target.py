@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from models.conftest import simulate_missions
+from missions import simulate_missions
 from references import pooled_posterior
 from scipy import special, stats
 
