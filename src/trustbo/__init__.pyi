@@ -27,7 +27,7 @@ from .campaign import (
 from .criticism import criticise
 from .data import Bound, Mission
 from .errors import DamagedFileError, PosteriorError, ShapeError, TerrainError, TrustboError
-from .inference import fit
+from .inference import compare, fit
 from .planning import NoPathError
 from .team import Robot, Team
 from .workspace import Workspace
@@ -49,6 +49,7 @@ __all__ = [
     "TerrainError",
     "TrustboError",
     "Workspace",
+    "compare",
     "criticise",
     "criticism",
     "export",

@@ -7,8 +7,8 @@ from missions import simulate_missions
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference import fit, loo, params_of
-from trustbo.models import PooledTrust
+from trustbo.inference import compare, fit, loo, params_of
+from trustbo.models import PooledTrust, Priors
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Estimated shape parameter of Pareto"
@@ -68,3 +68,18 @@ def test_a_mission_without_rates_is_left_out_of_the_sum():
     alone = fit(missions[1:3], sampler="exact")
     with pytest.raises(TrustboError, match="one of several missions; 1 of 2 have rates"):
         loo(alone)
+
+
+def test_compare_ranks_as_arviz_does_and_refuses_other_missions():
+    missions = simulate_missions(8)
+    fits = {
+        "level": fit(missions, sampler="exact"),
+        "wide": fit(missions, PooledTrust(Priors(x0_sd=3.0)), sampler="exact"),
+    }
+    table, theirs = compare(fits), az.compare(fits)
+    assert list(table.index) == list(theirs.index)
+    np.testing.assert_allclose(table["elpd_diff"], theirs["elpd_diff"], atol=1e-9)
+    with pytest.raises(TrustboError, match="'fewer' and 'level' are posteriors of different"):
+        compare({"level": fits["level"], "fewer": fit(missions[:5], sampler="exact")})
+    with pytest.raises(TrustboError, match="two or more posteriors by name"):
+        compare({"level": fits["level"]})

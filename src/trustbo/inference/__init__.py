@@ -4,6 +4,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
 from trustbo.inference.by_rate import by_rate
+from trustbo.inference.compare import compare
 from trustbo.inference.draws import params_of
 from trustbo.inference.filter import TrustFilter, TrustForecast, TrustState
 from trustbo.inference.fit import fit
@@ -27,6 +28,7 @@ __all__ = [
     "TrustForecast",
     "TrustState",
     "by_rate",
+    "compare",
     "complete",
     "diagnostics",
     "fit",
