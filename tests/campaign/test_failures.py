@@ -4,6 +4,7 @@ import itertools
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 from worlds import ModelSimulator, random_cells
 
@@ -149,6 +150,55 @@ def test_a_mission_that_arrived_did_not_fail(workspace):
     with pytest.raises(tb.TrustboError, match="its status is 'ok', and 'stuck' is a failure"):
         campaign.fail("stuck", mission)
     assert campaign.missions == []
+
+
+def test_a_mission_is_not_given_up_twice_unless_it_is_asked_for_again(workspace):
+    campaign = begin(workspace)
+    campaign.ask()
+    campaign.fail("stuck")
+    with pytest.raises(tb.TrustboError, match=r"given up already: 'stuck'. Ask .* again=True"):
+        campaign.fail("tipped")
+    assert [failure.reason for failure in campaign.log.failures] == ["stuck"]
+    campaign.fail("stuck", again=True)
+    campaign.ask()
+    campaign.fail("rain")
+    assert [failure.reason for failure in campaign.log.failures] == ["stuck", "stuck", "rain"]
+
+
+def test_a_failure_that_was_told_may_be_given_up_again_where_it_is_another(workspace):
+    campaign = begin(workspace)
+    stuck = ModelSimulator(workspace, fail_at=2).run(campaign.ask().path, seed=0)
+    campaign.fail("stuck", stuck)
+    with pytest.raises(tb.TrustboError, match="told already"):
+        campaign.fail("stuck", stuck, other_path=True)
+    campaign.fail("stuck", stuck, other_path=True, again=True)
+    assert len(campaign.missions) == len(campaign.log.failures) == 2
+
+
+def test_tables_have_a_row_for_each_mission_that_failed(workspace, tmp_path):
+    with begin(workspace, directory=tmp_path / "kept") as campaign:
+        path = campaign.ask().path
+        campaign.fail("stuck", where=path[2])
+        assert campaign.table()["where"].tolist() == [f"{path[2][0]},{path[2][1]}"]
+        simulator = ModelSimulator(workspace)
+        campaign.tell(simulator.run(campaign.ask().path, seed=0))
+        simulator.fail_at = 2
+        part = simulator.run(campaign.ask().path, seed=1)
+        campaign.fail("the wheel broke", part)
+        campaign.ask()
+        campaign.fail("rain")
+        table = campaign.table()
+        saved = tb.load_result(tmp_path / "kept").table()
+    assert table.index.isna().tolist() == [True, False, False, True]
+    assert table.loc[2, "where"] == ",".join(map(str, part.path[-1]))
+    assert table["reason"].tolist() == ["stuck", "", "the wheel broke", "rain"]
+    assert table["state"].tolist() == ["given up", "learned", "learned", "given up"]
+    assert table["status"].tolist() == ["stuck", "ok", part.status, "aborted"]
+    n_bounds = [2, len(campaign.missions[0].bounds), 2]
+    assert table["n_bounds"].tolist()[:3] == n_bounds
+    pd.testing.assert_frame_equal(saved[table.columns], table)
+    written = pd.read_csv(tmp_path / "kept" / "history.csv", keep_default_na=False)
+    assert written["reason"].tolist() == table["reason"].tolist()
 
 
 def test_where_is_checked(workspace):

@@ -268,7 +268,7 @@ def test_failing_keeps_the_bounds_there_are(workspace):
     posterior = campaign.fail("tipped", replace(part))
     np.testing.assert_array_equal(posterior["posterior"]["b"], campaign.posterior["posterior"]["b"])
     assert len(campaign.missions[0].bounds) == 2
-    assert campaign.log.failures[-1] == (1, "tipped", (), None)
+    assert campaign.log.failures[-1] == (1, "tipped", (), None, True)
 
 
 def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):

@@ -13,7 +13,7 @@ import xarray as xr
 from jax import random
 
 from trustbo.campaign.card import campaign_card
-from trustbo.campaign.failures import Failure, require_reason, to_avoid, under_risk
+from trustbo.campaign.failures import Failure, require_another, require_reason, to_avoid, under_risk
 from trustbo.campaign.folder import CampaignFolder
 from trustbo.campaign.history import SET_ASIDE, TOLD, Entry, History
 from trustbo.campaign.learned import LearnedMissions
@@ -287,6 +287,7 @@ class Campaign(LearnedMissions, Displayed):
         *,
         where: Cell | None = None,
         other_path: bool = False,
+        again: bool = False,
     ) -> xr.DataTree | None:
         """Give up the mission that was asked for; the next plan knows.
 
@@ -296,27 +297,36 @@ class Campaign(LearnedMissions, Displayed):
             mission: Bounds that were run, to learn from; None if there are none.
             where: Cell that it failed to enter, where it did not report but that is known.
             other_path: Whether it is known to have followed another path, as for `tell`.
+            again: Whether another mission failed alike, with no `ask` in between; or one equal to
+                an earlier one in every number, as for `tell`.
 
         Returns:
             Posterior of the parameters, if there was something to learn.
 
         Raises:
             TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
-                a cause; a reason that is empty, or nearly a cause; or a `where` that the plan does
-                not enter, beside a mission, or for another reason.
+                a cause; a reason that is empty, or nearly a cause; a `where` that the plan does
+                not enter, beside a mission, or for another reason; or a second failure of the
+                mission that was asked for.
         """
         if mission is not None and where is not None:
             raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
         require_reason(reason, mission)
         posterior, path = None, ()
         if mission is not None:
-            posterior = self.tell(mission, other_path=other_path)
-        elif where is not None or reason in CAUSES:
-            path = self.ask().path
-        self.log.failures.append(Failure.of(len(self.missions), reason, path, where))
+            posterior = self.tell(mission, other_path=other_path, again=again)
+        else:
+            if not again and self._plan is None:
+                require_another(self.log.failures, len(self.missions))
+            path = self.ask().path if where is not None or reason in CAUSES else ()
+        failure = Failure.of(len(self.missions), reason, path, where)
+        self.log.failures.append(failure._replace(told=mission is not None))
         self._plan = self._believed = None
-        self._write_state()
         self._forget_risk()
+        if self.log.entries:
+            self._write()
+        else:  # there is no result yet
+            self._write_state()
         return posterior
 
     def recommend(self) -> Plan:
@@ -350,6 +360,7 @@ class Campaign(LearnedMissions, Displayed):
             {**self.settings, **self.log.notes, "trustbo_version": VERSIONS["trustbo"]},
             self.log.stop_reason,
             self._believed_awareness(),
+            tuple(self.log.failures),
         )
 
     # --- the folder ---
@@ -475,8 +486,8 @@ class Campaign(LearnedMissions, Displayed):
         """
         if self._folder is None:
             raise TrustboError(
-                'progress="page" writes report.html into the campaign\'s folder; give directory=, '
-                "or checkpoint= to iterate."
+                "a page is report.html in the campaign's folder; give directory=, or checkpoint= "
+                "to iterate."
             )
         return self._folder.path
 

@@ -32,6 +32,7 @@ _PLAN = {
         "p_arrive_band": [float, float], "by_cause": {str: [float]}, "p_reach": [float],
     }),
 }  # fmt: skip
+_FAILURES = [[int, str, _PATH, ([int, int], None), bool]]
 _COLUMNS = "objective", "path_changed", "contact_rate", "status"
 _ROW = {"status": str, "state": str, "reason": str, str: (float, bool)}
 _NEEDED = {
@@ -46,7 +47,7 @@ _FIELDS: dict[str, dict[Any, Any]] = {
         "plans": [_PLAN],
         "rows": [_ROW],
         "posterior_after": _AFTER,
-        "failures": [[int, str, _PATH, ([int, int], None)]],
+        "failures": _FAILURES,
         "notes": {"simulator": str, "n_iterations": _COUNT, "stop": [dict]},
         "stop_reason": str,
     },
@@ -57,6 +58,7 @@ _FIELDS: dict[str, dict[Any, Any]] = {
         "value": float,
         "settings": _CHOSEN | {"model": str, "simulator": str, "response": str},
         "posterior_after": _AFTER,
+        "failures": _FAILURES,
         "stop_reason": str,
     },
 }

@@ -46,8 +46,20 @@ def require_reason(reason: object, mission: Mission | None) -> None:
         )
 
 
+def require_another(failures: "Sequence[Failure]", n_told: int) -> None:
+    """Refuse to give up a mission that was given up already, when no other was asked for since.
+
+    Raises TrustboError.
+    """
+    if failures and failures[-1].after == n_told:
+        raise TrustboError(
+            f"the mission that was asked for was given up already: {failures[-1].reason!r}. Ask "
+            "for the next one; or, if another really failed too, fail(reason, again=True)."
+        )
+
+
 class Failure(NamedTuple):
-    """A mission that was given up without a report to learn from."""
+    """A mission that was given up."""
 
     after: int
     """Number of missions told before."""
@@ -56,6 +68,8 @@ class Failure(NamedTuple):
     """Path that was asked for, start first; empty where its failure says nothing of the bounds."""
     where: Cell | None = None
     """Cell that it failed to enter, where that is known."""
+    told: bool = False
+    """Whether the bounds that were run were told, as a mission that has a row of the history."""
 
     @classmethod
     def of(cls, after: int, reason: str, path: Sequence[Cell], where: Cell | None = None) -> Self:
@@ -80,9 +94,12 @@ class Failure(NamedTuple):
     def restore(cls, record: Sequence[Any]) -> Self:
         """Failure of a record, one of version 0.1 without a path."""
         after, reason, *rest = record
-        path, where = rest or ((), None)
+        path, where, *told = rest or ((), None)
         cells = tuple((row, col) for row, col in path)
-        return cls(after, reason, cells, None if where is None else (where[0], where[1]))
+        cell = None if where is None else (where[0], where[1])
+        if cell is not None and cell not in cells[1:]:
+            raise ValueError(f"no path enters {cell}")
+        return cls(after, reason, cells, cell, *told)
 
 
 def learn_hazard(

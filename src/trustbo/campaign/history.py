@@ -25,6 +25,8 @@ from trustbo.workspace import Workspace
 
 TOLD, LEARNED, SET_ASIDE = "told", "learned", "set aside"
 """States of a mission: on disk, in the posterior, or never to be."""
+GIVEN_UP = "given up"
+"""State of a mission without a report, in tables."""
 
 
 class Posterior:
@@ -106,25 +108,62 @@ def whole_posterior(
 
 
 _FIRST = (
-    "status", "state", "reason", "contact_rate", "objective", "n_bounds", "path_changed", "path"
+    "status", "state", "reason", "where", "contact_rate", "objective", "n_bounds", "path_changed",
+    "path",
 )  # fmt: skip
 """First columns of a table of missions."""
 
 
-def table_of(history: xr.Dataset, missions: Sequence[Mission]) -> pd.DataFrame:
+def table_of(
+    history: xr.Dataset, missions: Sequence[Mission], failures: Sequence[Failure] = ()
+) -> pd.DataFrame:
     """Table with a row for each mission of a history, labelled by its number, from 1.
 
-    Columns are the scalars of `Result.history`, `n_bounds`, the number of bounds that were run, and
-    the `path` as text, "9,0 8,1"; first those of the outcome, then diagnostics and seconds.
+    Columns are the scalars of `Result.history`, `n_bounds`, the number of bounds that were run, the
+    cell `where` one failed, and the `path` as text, "9,0 8,1"; first those of the outcome, then
+    diagnostics and seconds. A mission given up without a report has a row too, without a number,
+    after the missions told before it.
     """
-    index = pd.RangeIndex(1, len(missions) + 1, name="mission")
-    columns = {n: a.values for n, a in history.data_vars.items() if a.dims == ("iteration",)}
+    reasons = {f.after: f.reason for f in failures if f.told}
+    columns: dict[str, Any] = {
+        str(n): a.values.tolist() for n, a in history.data_vars.items() if a.dims == ("iteration",)
+    }
     if missions:
-        paths = [path_text(path[path[:, 0] >= 0].tolist()) for path in history["path"].values]
-        columns |= {"n_bounds": [len(mission.bounds) for mission in missions], "path": paths}
-    names = [name for name in _FIRST if name in columns]
+        states = columns.get("reason", [""] * len(missions))
+        columns |= {
+            "reason": [said or reasons.get(n, "") for n, said in enumerate(states, start=1)],
+            "where": ["" if m.status == "ok" else path_text([m.path[-1]]) for m in missions],
+            "n_bounds": [len(mission.bounds) for mission in missions],
+            "path": [path_text(p[p[:, 0] >= 0].tolist()) for p in history["path"].values],
+        }
+    told = zip(*columns.values(), strict=True)
+    rows = [(n, dict(zip(columns, row, strict=True))) for n, row in enumerate(told, start=1)]
+    lost = [failure for failure in failures if not failure.told]
+    for failure in reversed(lost):  # a later one does not move the place of those before
+        rows.insert(failure.after, (None, _row_of(failure)))
+    names = [name for name in _FIRST if name in columns or lost]
     names += [name for name in columns if name not in names]
-    return pd.DataFrame({name: columns[name] for name in names}, index)
+    numbers = [number for number, _ in rows]
+    index = pd.Index(numbers, dtype="Int64", name="mission") if lost else None
+    if index is None:
+        index = pd.RangeIndex(1, len(missions) + 1, name="mission")
+    return pd.DataFrame([row for _, row in rows], index, names)
+
+
+def _row_of(failure: Failure) -> dict[str, Any]:
+    """Row of a mission that was given up without a report, as far as it is known."""
+    path, where = list(failure.path), failure.where
+    return {
+        "status": failure.reason if failure.path else "aborted",
+        "state": GIVEN_UP,
+        "reason": failure.reason,
+        "where": "" if where is None else path_text([where]),
+        "contact_rate": np.nan,
+        "objective": np.nan,
+        "n_bounds": np.nan if where is None else path.index(where, 1),
+        "path_changed": False,
+        "path": path_text(path),
+    }
 
 
 @dataclass(eq=False)

@@ -137,7 +137,7 @@ class LearnedMissions:
 
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, as `Result.table`."""
-        return table_of(self.history, self.missions)
+        return table_of(self.history, self.missions, self.log.failures)
 
     def summary(self) -> pd.DataFrame:
         """Return `table`, by the name that it had in version 0.2."""

@@ -14,7 +14,7 @@ import xarray as xr
 
 from trustbo.campaign.card import campaign_card
 from trustbo.campaign.damage import naming_what_is_left, read_fields
-from trustbo.campaign.failures import under_risk
+from trustbo.campaign.failures import Failure, under_risk
 from trustbo.campaign.history import Kept, Posterior, Posteriors, table_of, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
 from trustbo.campaign.replacing import RESULT, STATE, WORKSPACE, current, held, replacing
@@ -76,6 +76,7 @@ class Result(Displayed):
         stop_reason: Reason of the end.
         believed: Belief about the awareness at the end, for `awareness="belief"`: its `mean`
             (robot, row, col, feature) and `draws` of it (draw, robot, row, col, feature).
+        failures: Missions that were given up, see `Campaign.fail`.
     """
 
     workspace: Workspace
@@ -89,6 +90,7 @@ class Result(Displayed):
     settings: dict[str, Any]
     stop_reason: str
     believed: xr.Dataset | None = None
+    failures: Sequence[Failure] = ()
 
     def _card(self) -> Card:
         rows = [
@@ -129,11 +131,13 @@ class Result(Displayed):
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, labelled by its number, from 1; also `history.csv`.
 
-        Columns are its `status`, `state` and the `reason` of that, mean `contact_rate`, the plan's
-        `objective`, `n_bounds` that were run, `path_changed` and the `path` as text, "9,0 8,1";
-        then the posterior's diagnostics and seconds, as in `history`.
+        Columns are its `status`, `state` and the `reason` of that, or that it was given up for, the
+        cell `where` it failed, mean `contact_rate`, the plan's `objective`, `n_bounds` that were
+        run, the last of which failed, `path_changed` and the `path` as text, "9,0 8,1"; then the
+        posterior's diagnostics and seconds, as in `history`. A mission given up without a report,
+        see `Campaign.fail`, has a row without a number and the state "given up".
         """
-        return table_of(self.history, self.missions)
+        return table_of(self.history, self.missions, self.failures)
 
     @cached_property
     def planner(self) -> Planner:
@@ -326,6 +330,7 @@ class Result(Displayed):
                 "settings": self.settings,
                 "stop_reason": self.stop_reason,
                 "posterior_after": [kept and kept.after for kept in self._kept],
+                **({"failures": self.failures} if self.failures else {}),  # as version 0.2 had it
             }
         )
 
@@ -371,6 +376,7 @@ def load_result(directory: FilePath) -> Result:
             path = require_on_grid(record["path"], workspace.grid.shape)
             if trust.shape != (len(path) - 1, workspace.awareness.sizes["robot"]):
                 raise ValueError(f"trust of shape {trust.shape} along {len(path)} cells")
+            failures = tuple(Failure.restore(one) for one in record.get("failures", ()))
         return Result(
             workspace,
             missions,
@@ -383,6 +389,7 @@ def load_result(directory: FilePath) -> Result:
             record["settings"],
             record["stop_reason"],
             believed,
+            failures,
         )
 
 

@@ -96,7 +96,11 @@ def _print_table(result: "Result") -> None:
     table = result.table()
     name, label = ("r_hat", "R-hat") if "r_hat" in table else ("k_hat", "k-hat")
     print(f"mission  status  contact  objective  {label}  path")
-    for i, row in enumerate(table.to_dict("records"), start=1):
+    for i, lost, row in zip(table.index, table.index.isna(), table.to_dict("records"), strict=True):
+        if lost:
+            at = f" at {row['where']}" if row["where"] else ""
+            print(f"      -  given up: {row['reason']}{at}")
+            continue
         change = "first" if i == 1 else "changed" if row["path_changed"] else "same"
         print(
             f"{i:7d}  {row['status']:6s}  {row['contact_rate']:7.3f}  "

@@ -1,8 +1,12 @@
 """Tables of a page."""
 
+from collections.abc import Hashable
+from typing import Any
+
 import numpy as np
 from arviz_stats import sampling_diagnostics
 
+from trustbo.campaign.history import GIVEN_UP
 from trustbo.campaign.result import Result
 from trustbo.criticism import Criticism
 from trustbo.files import to_json
@@ -73,10 +77,19 @@ def history_table(result: Result) -> Table:
     """Tabulate the missions, one per row."""
     table = result.table()
     columns = {
-        "status": [status.replace("_", " ") for status in table["status"]],
+        "status": [_outcome(row) for row in table.to_dict("records")],
         "contact rate": [number(rate, 2) for rate in table["contact_rate"]],
         "objective": [number(value, 3) for value in table["objective"]],
-        "path": ["first", *("new" if new else "same" for new in table["path_changed"][1:])],
+        "path": [
+            NONE
+            if np.isnan(row["objective"])
+            else "first"
+            if label == 1
+            else "new"
+            if row["path_changed"]
+            else "same"
+            for label, row in zip(table.index, table.to_dict("records"), strict=True)
+        ],
     }
     for name, label, places in (
         ("regret", "regret (%)", 1), ("r_hat", "R-hat", 3), ("ess_bulk", "bulk ESS", 0),
@@ -87,16 +100,26 @@ def history_table(result: Result) -> Table:
     seconds = table.filter(regex="^seconds_").sum(axis=1, skipna=False)
     columns["seconds"] = [number(value, 1) for value in seconds]
     rows = [
-        [str(i), *row]
-        for i, row in zip(table.index, zip(*columns.values(), strict=True), strict=True)
+        [NONE if lost else str(i), *row]
+        for i, lost, row in zip(
+            table.index, table.index.isna(), zip(*columns.values(), strict=True), strict=True
+        )
     ]
     return Table(
-        "Each mission: how it ended, the mean contact rate measured, the objective when it was "
-        "planned, the posterior's diagnostics, and the seconds for all of it.",
+        "Each mission: how it ended, and on entering which cell it failed, the mean contact rate "
+        "measured, the objective when it was planned, the posterior's diagnostics, and the seconds "
+        "for all of it.",
         ("mission", *columns),
         rows,
         text_columns=(1, 4),
     )
+
+
+def _outcome(row: dict[Hashable, Any]) -> str:
+    """Text of how a mission ended, and where it failed."""
+    status = str(row["status"]).replace("_", " ")
+    at = f" at {row['where']}" if row["where"] else ""
+    return f"given up: {row['reason']}{at}" if row["state"] == GIVEN_UP else f"{status}{at}"
 
 
 def criticism_table(found: Criticism) -> Table:
