@@ -6,7 +6,7 @@ from typing import Any
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.campaign.progress import Progress
+from trustbo.campaign.progress import PAGE, PAGE_ALONE, Progress, continued
 from trustbo.campaign.replanning import run_replanning
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import (
@@ -18,7 +18,7 @@ from trustbo.campaign.stopping import (
 )
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.files import FilePath, to_json
+from trustbo.files import FilePath, as_path, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
@@ -69,7 +69,7 @@ def iterate(
         seed: Seed of everything random.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
             missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
-            too, a page that reloads itself while the campaign runs.
+            too, a page that reloads itself while the campaign runs; `"page_alone"` for it alone.
         **options: Fields of `CampaignOptions`, or a whole one as `options`.
 
     Returns:
@@ -80,8 +80,10 @@ def iterate(
         NoPathError: The goal cannot be reached.
     """
     n_iterations = require_whole("n_iterations", n_iterations, 1)
-    if progress == "page" and checkpoint is None:
-        raise TrustboError('progress="page" writes report.html into the checkpoint; give one.')
+    if progress in (PAGE, PAGE_ALONE) and checkpoint is None:
+        raise TrustboError(
+            f'progress="{progress}" writes report.html into the checkpoint; give one.'
+        )
     campaign = Campaign(
         workspace,
         start,
@@ -131,7 +133,8 @@ def resume(
         stop: Rules in place of those that it was begun with; needed where one was your own.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
             missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
-            too, a page that reloads itself while the campaign runs.
+            too, a page that reloads itself while the campaign runs; `"page_alone"` for it alone.
+            A page that the run before left is renewed in any case.
         **own: The same `awareness` and `callbacks`; see `Campaign.load`.
 
     Raises:
@@ -147,8 +150,9 @@ def resume(
             return campaign.result()
         rules = rules_of(log.notes.get("stop", [])) if stop is None else require_stops(stop)
         before = dict(log.notes)
+        shown = continued(progress, as_path(directory))
         steps = missions(
-            campaign, simulator, n_iterations=total, truth=truth, stop=rules, progress=progress
+            campaign, simulator, n_iterations=total, truth=truth, stop=rules, progress=shown
         )
         _require_same(before, log.notes)
         log.stop_reason = "interrupted"
@@ -176,7 +180,7 @@ def missions(
         stop: Rules as in `iterate`.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
             missions; `"bar"` for the bar alone; `"page"` for report.html in the campaign's folder
-            too, a page that reloads itself while the campaign runs.
+            too, a page that reloads itself while the campaign runs; `"page_alone"` for it alone.
 
     Yields:
         Plan of each mission, and the mission, learned from already.

@@ -2,6 +2,7 @@
 
 import logging
 from importlib import import_module
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,6 +14,10 @@ if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
 
 _log = logging.getLogger(__name__)
+PAGE, PAGE_ALONE = "page", "page_alone"
+_KINDS = ("bar", PAGE, PAGE_ALONE)
+_NOT_ENDED = b'<meta name="trustbo-campaign" content="not ended">'
+"""Line in the head of the page of a campaign that did not end."""
 
 
 class _Nothing:
@@ -30,20 +35,21 @@ class Progress:
 
     Under `progress=True` a notebook also shows the campaign itself, its map of trust and the
     contact of its missions, renewed after each and gone at the end; `"bar"` leaves it out.
-    `"page"` keeps a page of it in the campaign's folder, which becomes the report.
+    `"page"` keeps a page of it in the campaign's folder, which becomes the report, and
+    `"page_alone"` shows nothing else.
     """
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
         """Show nothing yet, and nothing at all if `progress` is False."""
         if isinstance(progress, str):
-            require_choice("progress", progress, ("bar", "page"))
+            require_choice("progress", progress, _KINDS)
         self._campaign, self._total = campaign, total
-        self._place = place_of(bool(progress))
+        self._place = place_of(bool(progress) and progress != PAGE_ALONE)
         self._map: Any = None
         self._page: Any = None
-        if progress == "page":
+        if progress in (PAGE, PAGE_ALONE):
             live = import_module("trustbo.report.live")  # by name: it lies above
-            self._page = live.LivePage(campaign.folder_of_page() / "report.html", total)
+            self._page = live.LivePage(page_in(campaign.folder_of_page()), total)
         if self._place == NOTEBOOK and progress is True:
             from IPython.display import display
 
@@ -53,9 +59,10 @@ class Progress:
         done = len(self._campaign.missions)
         self._before, self._campaign.progress = self._campaign.progress, bool(self._place)
         if self._page is not None:
-            self._page.__enter__()
             if done:
                 self._page(self._campaign)
+            else:
+                self._page.__enter__()
             say(self._place, f"follow the campaign at {self._page.path.resolve().as_uri()}")
         self._bar = bar_in(self._place, total=self._total, initial=done, desc="missions")
         return self
@@ -87,6 +94,22 @@ class Progress:
             self._map.update(self._campaign)
         if self._page is not None:
             self._page(self._campaign)
+
+
+def page_in(folder: Path) -> Path:
+    """Page of the campaign that is kept in a folder."""
+    return folder / "report.html"
+
+
+def continued(progress: bool | str, folder: Path) -> bool | str:
+    """Progress of a campaign that goes on, with its page, if the run before left one not ended."""
+    page = page_in(folder)
+    if progress in (PAGE, PAGE_ALONE) or not page.is_file():
+        return progress
+    with page.open("rb") as file:
+        if _NOT_ENDED not in file.read(2000):
+            return progress
+    return PAGE if progress else PAGE_ALONE
 
 
 def report_of(campaign: "Campaign") -> str:

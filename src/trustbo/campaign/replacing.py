@@ -147,9 +147,7 @@ def warn_of_others(folder: Path) -> None:
     """Warn of what lies in a folder that no campaign or result was kept in before."""
     if not folder.is_dir() or _is_ours(folder):
         return
-    own = (
-        {f.relative_to(folder).parts[0] for f in own_files(folder)} | set(_INPUTS) | {"report.html"}
-    )  # that of --page
+    own = {f.relative_to(folder).parts[0] for f in own_files(folder)} | set(_INPUTS)
     names = sorted(f.name for f in folder.iterdir())
     names = [name for name in names if name not in own and not name.startswith(".")]
     if names:

@@ -1,7 +1,5 @@
 """`trustbo run`, `demo` and `resume`: campaigns on your own or a real terrain of ours."""
 
-from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shutil import copyfile
@@ -15,7 +13,6 @@ from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
     from trustbo.models import TrustModel
-    from trustbo.report import LivePage
     from trustbo.simulation import KinematicSimulator
 
 
@@ -77,23 +74,21 @@ def run(
         rasters = Rasters(dem, dsm, crs, resolution, nodata)
         found = rasters.found((start, goal), pair("shape", shape), team, progress=not quiet)
         workspace = Workspace.from_terrain(found.ground, found.grid.shape, team, sight=sight)
-        with _live_page(out, iterations) if page else nullcontext() as live:
-            chosen = chosen if live is None else replace(chosen, callbacks=(live,))
-            result = iterate(
-                workspace,
-                *found.ends,
-                n_iterations=iterations,
-                model=trust_model,
-                policy=policy,
-                objective=objective,
-                sampler=sampler,
-                simulator=simulation.KinematicSimulator(workspace),
-                stop=stop,
-                checkpoint=out,
-                seed=seed,
-                progress=not quiet,
-                options=chosen,
-            )
+        result = iterate(
+            workspace,
+            *found.ends,
+            n_iterations=iterations,
+            model=trust_model,
+            policy=policy,
+            objective=objective,
+            sampler=sampler,
+            simulator=simulation.KinematicSimulator(workspace),
+            stop=stop,
+            checkpoint=out,
+            seed=seed,
+            progress=_progress(page, quiet),
+            options=chosen,
+        )
         write_outputs(result, out, table=not quiet)
 
 
@@ -149,6 +144,7 @@ def resume(
     folder: Path,
     iterations: int | None = None,
     stop_regret: float | None = None,
+    page: bool = False,
     quiet: bool = False,
     debug: bool = False,
 ) -> None:
@@ -157,7 +153,8 @@ def resume(
     Example: trustbo resume out/demo
     More missions, 12 in all: trustbo resume out/demo --iterations 12
 
-    The result is the same as without the interruption. The folder keeps all flags.
+    The result is the same as without the interruption. The folder keeps all flags, and a page of
+    --page is renewed again.
     A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
     before anything is driven.
     """
@@ -178,7 +175,7 @@ def resume(
             simulator=_simulator(folder, state["notes"]),
             n_iterations=iterations,
             stop=stop,
-            progress=not quiet,
+            progress=_progress(page, quiet),
         )
         write_outputs(result, folder, table=not quiet)
 
@@ -210,13 +207,11 @@ def _require_names(
     require_whole("seed", seed, 0)
 
 
-def _live_page(out: Path, iterations: int) -> "LivePage":
-    """Page of the campaign while it runs; its address is printed."""
-    from trustbo.report import LivePage
-
-    page = LivePage(out / "report.html", iterations)
-    print(f"follow the campaign at {page.path.resolve().as_uri()}", flush=True)
-    return page
+def _progress(page: bool, quiet: bool) -> bool | str:
+    """Kind of progress that flags ask for, as of `iterate`."""
+    if page:
+        return "page_alone" if quiet else "page"
+    return not quiet
 
 
 def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: str) -> None:

@@ -25,7 +25,7 @@ class LivePage:
     """Page of a campaign under way: a callback of campaigns, renewed after each mission.
 
     The file is replaced as a whole, so that there is a page to be read at any time, after a crash
-    too: it tells as of which mission and what time it is.
+    too: it tells as of which mission and what time it is, and what it means if that is long ago.
     """
 
     def __init__(self, path: FilePath, total: int) -> None:
@@ -66,10 +66,24 @@ class LivePage:
             result, n = campaign.result(), len(campaign.missions)
             facts = facts_of(result, campaign.recommend())[:-1]  # but the reason of the end
             sections = _sections(result)
-        said = f"{state}: as of mission {n} of {self.total}, at {time.strftime('%H:%M')}."
+        now = time.strftime("%H:%M on %d %B %Y")
+        said = f"{state}: as of mission {n} of {self.total}, at {now}."
+        if refresh:
+            said += f" {_if_long_ago(campaign)}"
         title = f"A campaign after {counted(n, 'mission')} of {self.total}"
         page = render(title, [Fact("State", said), *facts], sections, refresh=refresh)
         write_text(self.path, page)
+
+
+def _if_long_ago(campaign: Campaign | None) -> str:
+    """Sentence that tells the page of a run that was killed, which no process renews any more."""
+    last = {} if campaign is None else campaign.log.entries[-1].row
+    seconds = sum(value for name, value in last.items() if name.startswith("seconds_"))
+    took = f", of which the last took {max(seconds, 1.0):.0f} s" if last else ""
+    return (
+        f"This page is renewed after each mission{took}. If its time is long ago, the run has "
+        "died: trustbo resume, or trustbo.resume in Python, goes on and takes the page over."
+    )
 
 
 def _sections(result: Result) -> list[Section]:

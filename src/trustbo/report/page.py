@@ -58,7 +58,7 @@ def render(
     sections: Sequence[Section],
     *,
     explorer: str | None = None,
-    refresh: int = 0,
+    refresh: int | None = None,
     version: str = VERSIONS["trustbo"],
 ) -> str:
     """Fill the page.
@@ -68,7 +68,8 @@ def render(
         facts: Facts of the summary.
         sections: Sections below it.
         explorer: Name of the interactive page beside it; None without one.
-        refresh: Seconds after which the page reloads itself; 0 for never.
+        refresh: Seconds after which the page of a campaign that did not end reloads itself, 0 for
+            never; None for the report of one that did.
         version: Version that made the result.
     """
     environment = jinja2.Environment(
