@@ -139,7 +139,7 @@ def test_without_a_terrain_the_corner_is_that_of_the_grid(workspace, cost, tmp_p
         ({"origin": (0.0,)}, r"origin must be two finite numbers \(x, y\); got \(0\.0,\)"),
         ({"origin": "here"}, "origin must be two finite numbers"),
         ({"origin": "auto"}, "is the start of a path; a map alone has none"),
-        ({"origin": (0.0, 3e5)}, r"origin \(0.0, 300000.0\) is 300 km from the grid"),
+        ({"origin": (0.0, 3e5)}, r"y 300000\.0 m in no CRS\) is 300 km from the grid"),
         ({"rotation": np.nan}, "rotation must be a finite angle; got nan"),
         ({"frame": "my map"}, "frame must be a name of ROS such as 'map' .* got 'my map'"),
         ({"origin": (0.0, np.inf)}, "origin must be two finite numbers"),

@@ -13,7 +13,7 @@ from trustbo.errors import TrustboError
 from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator, Truth
 from trustbo.workspace import Grid, Workspace, survey
-from trustbo.workspace.location import named
+from trustbo.workspace.location import cell_of, named, position_near
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,32 @@ def test_every_user_of_a_cell_takes_a_position(walled):
     model = tb.models.PooledTrust()
     result = tb.iterate(walled, start, goal, sampler="exact", model=model, **options)
     assert (result.path[0], result.path[-1]) == ((3, 0), (0, 3))
+
+
+def test_an_origin_is_refused_in_the_words_of_an_end(grid):
+    lon, lat = grid.lonlat((3, 4))
+    swapped = f"lon={lat:.6f},lat={lon:.6f}"
+    said = []
+    for find, reach in ((cell_of, ()), (position_near, (1e5,))):
+        with pytest.raises(TrustboError, match=r"longitude .*no place of the CRS") as error:
+            find("it", swapped, grid, *reach)
+        said.append(str(error.value).partition("Were lon and lat swapped? ")[2])
+    assert said[0] == said[1]
+    assert "is in cell (3, 4)" in said[0]
+    assert position_near("it", f"lon={lon:.9f},lat={lat:.9f}", grid, 1e5) == pytest.approx(
+        grid.center((3, 4)), abs=0.01
+    )
+
+
+def test_row_and_col_are_asked_for_of_cells_only(grid):
+    lon, lat = grid.lonlat((3, 4))
+    with pytest.raises(TrustboError, match=r"Were lon and lat swapped\? .* in cell \(3, 4\)"):
+        cell_of("start", f"{lat:.6f},{lon:.6f}", grid)
+    x, y = grid.center((3, 4))
+    with pytest.raises(TrustboError, match=r"Were x and y swapped\? .* in cell \(3, 4\)"):
+        cell_of("start", f"{y},{x}", grid)
+    with pytest.raises(TrustboError, match=r"Were row and col swapped\? 7,1 is in cell"):
+        cell_of("start", "1,7", grid)
 
 
 def test_swapped_coordinates_are_said_with_the_cell_that_was_meant(grid):

@@ -13,7 +13,7 @@ from trustbo.errors import TrustboError
 from trustbo.export.checks import find_crs
 from trustbo.files import require_file, write_text
 from trustbo.workspace import Grid, Location, Workspace
-from trustbo.workspace.location import METRES, crs_name, extent, lonlat_of, named, position_of
+from trustbo.workspace.location import crs_name, lonlat_of, position_near
 
 AUTO = "auto"
 """Origin at the centre of the first cell of the path."""
@@ -109,26 +109,15 @@ def _origin(grid: Grid, origin: Origin, start: tuple[int, int] | None) -> tuple[
             raise TrustboError('origin="auto" is the start of a path; a map alone has none.')
         return grid.center(start)
     given = origin.split(",") if isinstance(origin, str) and "=" not in origin else origin
-    if isinstance(given, Mapping | str):
-        found = named("origin", given)
-        position = position_of(grid, found.names, found.values)
-    else:
+    if not isinstance(given, Mapping | str):  # a bare pair is of metres here
         try:
             x, y = (float(value) for value in given)
         except (TypeError, ValueError):
             x = y = math.nan
-        position = (x, y) if math.isfinite(x + y) else None
-    if position is None:
-        raise TrustboError(
-            f"origin must be two finite numbers (x, y); got {origin!r}. In degrees, it is "
-            "lon=174.7,lat=-41.3; the start of the path is 'auto'."
-        )
-    left, bottom, right, top = grid.bounds
-    x, y = position
-    far = math.hypot(max(left - x, x - right, 0.0), max(bottom - y, y - top, 0.0))
-    if far > _FAR:
-        raise TrustboError(
-            f"origin {origin!r} is {far / 1e3:.0f} km from the grid{extent(grid, ', ')}: it is the "
-            f"position in the CRS that becomes (0, 0) of the frame, {METRES[0]} and {METRES[1]}."
-        )
-    return float(x), float(y)
+        if not math.isfinite(x + y):
+            raise TrustboError(
+                f"origin must be two finite numbers (x, y); got {origin!r}. In degrees, it is "
+                "lon=174.7,lat=-41.3; the start of the path is 'auto'."
+            )
+        given = {"x": x, "y": y}
+    return position_near("origin", given, grid, _FAR)

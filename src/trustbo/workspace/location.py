@@ -97,10 +97,7 @@ def cell_of(
         TrustboError: The location is none, off the grid, or impassable; degrees on a grid without a
             CRS. The message has what was typed and understood, the extent, and the nearest cell.
     """
-    try:
-        found = named(what, location)
-    except TrustboError as error:
-        raise TrustboError(f"{error}{_names_for(location, grid)}") from None
+    found = _named_on(grid, what, location)
     cell = _cell(grid, found.names, found.values)
     shown = _understood(found, grid)
     if cell is None:
@@ -119,6 +116,34 @@ def cell_of(
             f"{extent(grid, '. The grid has ')}."
         )
     return cell
+
+
+def position_near(what: str, location: object, grid: "Grid", reach: float) -> tuple[float, float]:
+    """X and y of a location in CRS metres, at most `reach` metres from a grid.
+
+    TrustboError: it is none, or farther; the message has the same parts as that of `cell_of`.
+    """
+    found = _named_on(grid, what, location)
+    position = position_of(grid, found.names, found.values)
+    far, (left, bottom, right, top) = math.inf, grid.bounds
+    if position is not None:
+        x, y = position
+        far = math.hypot(max(left - x, x - right, 0.0), max(bottom - y, y - top, 0.0))
+    if position is None or far > reach:
+        away = "not near the grid" if position is None else f"{far / 1e3:.0f} km from the grid"
+        raise TrustboError(
+            f"{what} {_understood(found, grid)} is {away}{extent(grid, ', ')}."
+            f"{_otherwise(found, grid)}{_nearest(found, grid, None)}"
+        )
+    return float(position[0]), float(position[1])
+
+
+def _named_on(grid: "Grid", what: str, location: object) -> Named:
+    """Numbers of a location with their names; the error has the spelling that is on the grid."""
+    try:
+        return named(what, location)
+    except TrustboError as error:
+        raise TrustboError(f"{error}{_names_for(location, grid)}") from None
 
 
 def extent(grid: "Grid", before: str = "") -> str:
@@ -146,7 +171,12 @@ def crs_name(grid: "Grid") -> str:
     """Short name of a grid's CRS, such as EPSG:2193."""
     if grid.crs is None:
         return "no CRS"
-    crs = CRS.from_user_input(grid.crs)
+    return name_of_crs(grid.crs)
+
+
+def name_of_crs(given: object) -> str:
+    """Short name of a CRS, such as EPSG:2193."""
+    crs = CRS.from_user_input(given)
     code = crs.to_epsg()
     return f"EPSG:{code}" if code else re.findall(r'"(.*?)"', crs.to_wkt())[0]
 
@@ -248,8 +278,7 @@ def _otherwise(found: Named, grid: "Grid") -> str:
             cell = _cell(grid, names, values)
             if cell is None or (names == CELL and any(v % 1.0 for v in values)):
                 continue
-            swapped = "swapped" if values != (a, b) else ""
-            was = f"Were {found.names[0]} and {found.names[1]} {swapped}? " if swapped else ""
+            was = f"Were {names[0]} and {names[1]} swapped? " if values != (a, b) else ""
             return f" {was}{Named(names, values, '').text} is in cell {cell}."
     return ""
 
