@@ -1,11 +1,16 @@
 """`trustbo info`, and ends of `trustbo run` as positions: refused before anything is computed."""
 
+import matplotlib.pyplot as plt
 import pytest
 import rasterio
+import rioxarray
 from pyproj import Transformer
 from rasterio.transform import rowcol
 
 from trustbo.cli.config import flags_of
+from trustbo.plots.grid import grid_map
+from trustbo.terrain import synthetic_terrain
+from trustbo.workspace import survey
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +43,28 @@ def test_info_takes_a_steeper_team_and_refuses_other_pictures(invoke, rasters, t
     done = invoke("info", rasters / "dem.tif", "--out", tmp_path / "g.pdf")
     assert done.exit_code == 2
     assert "must end in .png" in done.output
+
+
+@pytest.mark.parametrize(("size", "shape"), [((60.0, 60.0), (20, 5)), ((240.0, 40.0), (20, 5))])
+def test_the_grid_fills_its_picture_and_its_cells_are_named(size, shape):
+    ax = grid_map(survey(synthetic_terrain(size, seed=5, relief=6.0), shape))
+    ax.figure.canvas.draw()
+    assert {text.get_text() for text in ax.texts} >= {"0,0", "19,4"}
+    area, whole = ax.get_window_extent(), ax.figure.bbox
+    assert area.width > 0.5 * whole.width
+    assert area.height > 0.5 * whole.height
+    plt.close(ax.figure)
+
+
+def test_info_says_from_which_crs_heights_were_warped(invoke, rasters, tmp_path):
+    for name in ("dem", "dsm"):
+        with rioxarray.open_rasterio(rasters / f"{name}.tif", masked=True) as raster:
+            raster.rio.reproject("EPSG:4326").rio.to_raster(tmp_path / f"{name}.tif")
+    ask = ("--shape", "3,3", "--out", tmp_path / "grid.png")
+    done = invoke("info", tmp_path / "dem.tif", tmp_path / "dsm.tif", *ask)
+    assert ", to which are warped: dem from EPSG:4326, dsm from EPSG:4326\n" in done.output
+    assert "e.g. goal" in done.output
+    assert "warped" not in invoke("info", rasters / "dem.tif", *ask).output
 
 
 @pytest.mark.usefixtures("blank_figures")

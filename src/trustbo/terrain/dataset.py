@@ -86,13 +86,13 @@ def read_terrain(
         if lazy:
             terrain = _dataset(ground.array(np.float32), surface.array(np.float32))
             terrain.set_close(closing.pop_all().close)
-            return _noted(terrain, rasters)
+            return _noted(terrain, rasters, ground.crs)
         heights = _load(list({ground: 0, surface: 0}), limited=max_pixels is None)
     for raster, array in zip((ground, surface), heights, strict=False):
         if not np.isfinite(array).any():
             where = "" if raster is ground else " in the area of the DEM"
             raise TerrainError(f"{raster.name} is all nodata{where}.")
-    return _noted(assemble_terrain(heights[0], heights[-1]), rasters)
+    return _noted(assemble_terrain(heights[0], heights[-1]), rasters, ground.crs)
 
 
 def _say(rasters: list[Raster]) -> None:
@@ -177,11 +177,13 @@ def _side(raster: Raster) -> float:
     return -raster.transform.e * (_DEGREE if raster.crs.is_geographic else 1.0)
 
 
-def _noted(terrain: xr.Dataset, rasters: list[Raster]) -> xr.Dataset:
-    """Note in the attributes of a terrain the things that `_say` says."""
+def _noted(terrain: xr.Dataset, rasters: list[Raster], crs: CRS) -> xr.Dataset:
+    """Note in the attributes of a terrain the things that `_say` says, and CRSs warped from."""
     for name, raster in zip(("dem", "dsm"), (rasters[0], rasters[-1]), strict=True):
         if raster.unit != METRE:
             terrain[name].attrs["stored_units"] = raster.unit.name
+        if raster.crs != crs:
+            terrain[name].attrs["warped_from"] = raster.crs.to_string()
     if len(rasters) == 1:
         terrain.attrs["surface"] = "the ground, as no DSM is known"
     return terrain

@@ -15,7 +15,7 @@ from trustbo.terrain.dataset import is_lazy, pixel_size, require_terrain
 from trustbo.terrain.pixel_feature import FEATURES
 from trustbo.terrain.strips import Strip, strip_of, strips
 from trustbo.workspace.grid import CellMeans, Grid
-from trustbo.workspace.location import Location, cell_of, crs_name, spans
+from trustbo.workspace.location import Location, cell_of, crs_name, name_of_crs, spans
 
 MAX_MISSING = 0.5
 """Largest share of missing or too steep pixels in a passable cell."""
@@ -37,6 +37,8 @@ class Survey(Displayed):
         heights: Least and greatest height, m.
         pixel: Height and width of a pixel, m.
         shape: Rows and columns of pixels.
+        warped: CRSs that heights were warped from, "dem from EPSG:4326"; none where both rasters
+            are in that of the grid.
     """
 
     grid: Grid
@@ -45,6 +47,7 @@ class Survey(Displayed):
     heights: tuple[float, float]
     pixel: tuple[float, float]
     shape: tuple[int, int]
+    warped: tuple[str, ...] = ()
 
     @property
     def passable(self) -> np.ndarray:
@@ -86,8 +89,9 @@ class Survey(Displayed):
         grid, (low, high), free = self.grid, self.heights, self.passable
         (height, width), (rows, cols) = self.pixel, grid.shape
         x, y, longitude, latitude = spans(grid)
+        warped = f", to which are warped: {', '.join(self.warped)}" if self.warped else ""
         rows_of = [
-            ("CRS", crs_name(grid)),
+            ("CRS", crs_name(grid) + warped),
             ("extent", f"{x}, {y} m"),
             ("", f"{longitude}, {latitude}"),
             ("pixels", f"{self.shape[0]} x {self.shape[1]} of {height:.3g} m x {width:.3g} m"),
@@ -152,7 +156,10 @@ def survey(
         {"y": ("row", grid.y, {"units": "m"}), "x": ("col", grid.x, {"units": "m"})},
     )
     pixels = terrain.sizes["y"], terrain.sizes["x"]
-    return Survey(grid, team, found, (float(low), float(high)), pixel_size(terrain), pixels)
+    heights = float(low), float(high)
+    sources = {str(name): of.attrs.get("warped_from") for name, of in terrain.data_vars.items()}
+    warped = tuple(f"{name} from {name_of_crs(crs)}" for name, crs in sources.items() if crs)
+    return Survey(grid, team, found, heights, pixel_size(terrain), pixels, warped)
 
 
 def reason_impassable(missing: float, team: Team) -> str:
