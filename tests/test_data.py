@@ -45,7 +45,9 @@ def test_a_failed_mission_keeps_its_bounds():
 @pytest.mark.parametrize("n_rows", [2, 1, 0])
 def test_a_mission_that_failed_needs_no_bounds_after_that(n_rows):
     z, y = arrays(n_rows)
-    mission = Mission.from_arrays(PATH, z, y, np.ones(n_rows), failed_at=1, reason="stuck")
+    y[1:], duration = np.nan, np.ones(n_rows)
+    duration[1:] = np.nan
+    mission = Mission.from_arrays(PATH, z, y, duration, failed_at=1, reason="stuck")
     assert mission.status == mission.bounds[0].status == "stuck"
     assert mission.path == tuple(PATH)
     assert mission.contact_rate.shape == (1, 3)
@@ -66,6 +68,23 @@ def test_a_mission_that_failed_needs_no_bounds_after_that(n_rows):
 def test_a_failure_that_cannot_be_is_refused(options, message):
     with pytest.raises(TrustboError, match=message):
         Mission.from_arrays(PATH, *arrays(), **options)
+
+
+@pytest.mark.parametrize("name", ["contact_rate", "duration", "n_ticks"])
+def test_measurements_after_the_failure_are_refused_not_cut(name):
+    z, y = arrays()
+    options = {"duration": np.ones(2), "n_ticks": np.full(2, np.nan)}
+    options |= {"contact_rate": y, name: np.ones(y.shape)}
+    for other in {*options} - {name}:
+        options[other] = options[other].copy()
+        options[other][1:] = np.nan
+    with pytest.raises(TrustboError, match=rf"failed_at = 1, but {name} has values of bound 2 too"):
+        Mission.from_arrays(PATH, z, failed_at=1, **options)
+
+
+def test_a_mission_without_durations_does_not_take_0_s():
+    assert "takes         not measured" in repr(Mission.from_arrays(PATH, *arrays()))
+    assert "takes         2 s" in repr(Mission.from_arrays(PATH, *arrays(), np.ones(2)))
 
 
 def test_bounds_before_the_failure_must_be_there():

@@ -173,6 +173,7 @@ class Mission(Displayed):
         rates = self.contact_rate
         measured = np.isfinite(rates)
         mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
+        took = self.bounds[-1].t1
         first, last = path_text(self.path[:1]), path_text(self.path[-1:])
         with np.errstate(all="ignore"):
             each = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
@@ -181,7 +182,7 @@ class Mission(Displayed):
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
             ("contact rate", f"{mean} on average; {(~measured).sum()} of {rates.size} missing"),
             *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, each, strict=True)),
-            ("takes", number(self.bounds[-1].t1, "s", 4)),
+            ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
         ]
 
         def picture() -> str:
@@ -222,8 +223,8 @@ class Mission(Displayed):
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: Outcome of the mission.
-            failed_at: Number of the bound, from 1, that ended the mission. Rows after it are left
-                out; where the arrays end before it, nothing was measured of it.
+            failed_at: Number of the bound, from 1, that ended the mission. Nothing may be measured
+                after it; where the arrays end before it, nothing was measured of it.
             reason: Outcome of that bound, by default "aborted".
             n_ticks: Number of ticks, shape (bound, robot) or (bound,), of which `contact_rate` is
                 the share with contact; None where not recorded.
@@ -234,11 +235,16 @@ class Mission(Displayed):
         Raises:
             ShapeError: Axes that do not fit together.
             TrustboError: A value outside [0, 1]; an unknown status or reason; or `failed_at` beyond
-                the path, more than a bound after the arrays, or beside a status.
+                the path, more than a bound after the arrays, before measurements, or beside a
+                status.
         """
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
         if failed_at is not None or reason:
             last, status = _failure(failed_at, reason, status, len(path) - 1)
+            measured = {"contact_rate": y, "duration": duration, "n_ticks": n_ticks}
+            for name, values in measured.items():
+                if values is not None:
+                    _require_none_after(last, name, as_array(name, values))
             z, y = _until(last, z), _until(last, y)
             duration, n_ticks = (
                 None if values is None else _until(last, as_array(name, values))
@@ -388,6 +394,19 @@ def _until(last: int, values: np.ndarray) -> np.ndarray:
         )
     rest = np.full((max(last - len(values), 0), *values.shape[1:]), np.nan)
     return np.concatenate([values[:last], rest])
+
+
+def _require_none_after(last: int, what: str, values: np.ndarray) -> None:
+    """Refuse measurements of bounds after the one that ended the mission: TrustboError."""
+    if not values.ndim:
+        return
+    after = np.isfinite(values[last:])
+    later = np.flatnonzero(after.any(tuple(range(1, after.ndim))))
+    if later.size:
+        raise TrustboError(
+            f"failed_at = {last}, but {what} has values of bound {last + 1 + later[0]} too; leave "
+            f"the rows after bound {last} out or NaN, or give the bound that really failed."
+        )
 
 
 def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
