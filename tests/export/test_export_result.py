@@ -20,7 +20,7 @@ FILES = {
     "geojson": ["path.geojson"],
     "gpx": ["path.gpx"],
     "geopackage": ["path.gpkg"],
-    "csv": ["bounds.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
+    "csv": ["missions.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm"],
     "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],

@@ -31,9 +31,9 @@ def campaign_card(
 
         def area() -> str:
             cells = path()
-            trust = trust_map().values.copy()
-            trust[cells[0]] = np.nan  # assumed there, and would set the limits of the colours
-            return map_picture(trust, cells, aspect=aspect, label="expected trust")
+            trust = trust_map().values  # assumed in the first cell
+            label = "expected trust"
+            return map_picture(trust, cells, aspect=aspect, label=label, apart=cells[0])
 
         pictures.append(area)
         rates = history["contact_rate"].values

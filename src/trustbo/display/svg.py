@@ -18,6 +18,7 @@ def map_picture(
     aspect: float = 1.0,
     label: str = "",
     line: bool = True,
+    apart: tuple[int, int] | None = None,
 ) -> str:
     """Draw cells (row, col) in colours, those without a value grey, with a path over them.
 
@@ -27,13 +28,17 @@ def map_picture(
         aspect: Height of a cell over its width.
         label: Name of the values, written below with the least and the largest.
         line: False for the ends of the path alone.
+        apart: Cell whose value does not set the limits of the colours.
     """
     cells = np.asarray(values, dtype=float)
     rows, cols = cells.shape
     scale = min(_WIDTH / cols, _WIDTH / (rows * aspect))
     width, height = cols * scale, rows * aspect * scale
-    known = cells[np.isfinite(cells)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    known = np.isfinite(cells)
+    if apart is not None:
+        known[apart] = False
+    limits = cells[known]
+    low, high = (float(limits.min()), float(limits.max())) if limits.size else (0.0, 0.0)
     parts = [
         f'<image width="{width:.0f}" height="{height:.0f}" preserveAspectRatio="none" '
         f'style="image-rendering:pixelated" href="{_png(cells, low, high)}"/>'
@@ -123,7 +128,7 @@ def _png(cells: np.ndarray, low: float, high: float) -> str:
     from PIL import Image
 
     share = (cells - low) / (high - low) if high > low else np.where(np.isfinite(cells), 0.5, cells)
-    pixels = mpl.colormaps["viridis"](np.nan_to_num(share), bytes=True)
+    pixels = mpl.colormaps["viridis"](np.nan_to_num(np.clip(share, 0.0, 1.0)), bytes=True)
     pixels[~np.isfinite(cells)] = _UNKNOWN
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "PNG")

@@ -226,7 +226,7 @@ _FORMATS = {
     ),
     "csv": _Format(
         "tables of all bounds, of the path, its posts and its ways",
-        ("bounds.csv", "path.csv"),
+        ("missions.csv", "path.csv"),
         _write_tables,
         on_terrain=tuple(file.name for file in tables_beside(Path("path.csv"))),
     ),

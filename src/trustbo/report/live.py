@@ -4,8 +4,6 @@ import time
 from types import TracebackType
 from typing import Self
 
-import numpy as np
-
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.result import Result
 from trustbo.data import Mission
@@ -88,10 +86,13 @@ def _if_long_ago(campaign: Campaign | None) -> str:
 
 def _sections(result: Result) -> list[Section]:
     """Sections of the first screen, drawn without figures that take seconds."""
-    grid, trust = result.workspace.grid, result.trust_map.values.copy()
-    trust[result.path[0]] = np.nan  # assumed there, and would set the limits of the colours
+    grid, start = result.workspace.grid, result.path[0]  # where trust is assumed
     area = map_picture(
-        trust, result.path, aspect=grid.cell_height / grid.cell_width, label="expected trust"
+        result.trust_map.values,
+        result.path,
+        aspect=grid.cell_height / grid.cell_width,
+        label="expected trust",
+        apart=start,
     )
     rates = curve_picture(
         result.history["contact_rate"].values, label="contact rate", x_label="missions"
