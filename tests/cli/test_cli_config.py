@@ -35,7 +35,7 @@ def test_what_must_be_a_number_is_one(invoke, rasters):
     ends = ("--dem", rasters / "dem.tif", "--start", "2,0", "--goal", "0,2")
     done = invoke("run", *ends, "--max-failure", "ten")
     assert done.exit_code == 2
-    assert "'ten' is no number" in done.output
+    assert "must be a number; got 'ten'" in done.output
 
 
 KNOWN = ("dem", "dsm", "start", "max_slope", "max_bounds", "crs", "quiet", "policy")
@@ -95,7 +95,7 @@ def test_a_number_that_is_none_is_refused_with_its_file(tmp_path, capsys):
     file.write_text("iterations: three")
     for words, message in {
         (): f"error: {file}: iterations cannot be 'three': ",
-        ("--iterations", "four"): "error: Invalid value for '--iterations': ",
+        ("--iterations", "four"): "error: --iterations must be a whole number; got 'four'.",
     }.items():
         with pytest.raises(SystemExit) as caught:
             main(["demo", "--config", str(file), *words, "--out", str(never)])

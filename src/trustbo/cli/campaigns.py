@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.cli.errors import one_line_errors
+from trustbo.cli.options import choices_of
 from trustbo.cli.outputs import require_outputs, write_outputs
 from trustbo.cli.terrains import Rasters, pair, team_of
 from trustbo.errors import TrustboError, require_choice, require_whole
@@ -60,11 +61,12 @@ def run(
     """
     with one_line_errors(debug, campaign=out):
         _require_names(policy, objective, model, sampler, sight, iterations=iterations, seed=seed)
+        require_choice("observation", observation, choices_of("observation"))
+        cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
         chosen = CampaignOptions(**options)
         require_outputs(out, overwrite=overwrite)
         trust_model = _models()[model](observation=observation).model()
         _require_sampling(chosen, trust_model, sampler)
-        team = team_of(max_slope, robots, lidar_range)
         from trustbo import simulation
         from trustbo.campaign.loop import iterate
         from trustbo.campaign.stopping import RegretBound
@@ -72,7 +74,7 @@ def run(
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
         rasters = Rasters(dem, dsm, crs, resolution, nodata)
-        found = rasters.found((start, goal), pair("shape", shape), team, progress=not quiet)
+        found = rasters.found((start, goal), cells, team, progress=not quiet)
         workspace = Workspace.from_terrain(found.ground, found.grid.shape, team, sight=sight)
         result = iterate(
             workspace,
@@ -169,7 +171,12 @@ def resume(
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
         total = iterations or state["notes"]["n_iterations"]
         if state["n_missions"] >= total and not quiet:
-            print(f"all {state['n_missions']} missions are done; for more, give --iterations.")
+            n = state["n_missions"]
+            done = f"all {n} missions are" if n > 1 else "the one mission is"
+            print(
+                f"{done} done; for more, give --iterations. Figures and report are drawn again.",
+                flush=True,
+            )
         result = go_on(
             folder,
             simulator=_simulator(folder, state["notes"]),
@@ -190,19 +197,15 @@ def _require_names(
     iterations: int,
     seed: int,
 ) -> None:
-    """Refuse unknown names and numbers out of range (TrustboError) before a raster is read."""
-    from trustbo.inference.samplers.choice import SAMPLERS
-    from trustbo.planning import OBJECTIVES, POLICIES
-    from trustbo.workspace import SIGHT_MODES
-
-    for what, name, choices in (
-        ("policy", policy, POLICIES),
-        ("objective", objective, OBJECTIVES),
-        ("model", model, _models()),
-        ("sampler", sampler, SAMPLERS),
-        ("sight mode", sight, SIGHT_MODES),
+    """Refuse unknown names and numbers out of range (TrustboError) before heavy imports."""
+    for flag, name in (
+        ("policy", policy),
+        ("objective", objective),
+        ("model", model),
+        ("sampler", sampler),
+        ("sight", sight),
     ):
-        require_choice(what, name, choices)
+        require_choice("sight mode" if flag == "sight" else flag, name, choices_of(flag))
     require_whole("n_iterations", iterations, 1)
     require_whole("seed", seed, 0)
 

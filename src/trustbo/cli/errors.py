@@ -93,17 +93,17 @@ def complain(error: str, hint: str = "") -> None:
 def _way_on(campaign: Path | None) -> str:
     if campaign is None:
         return "the same command runs the rest."
-    if (campaign / "campaign.json").exists():
+    from trustbo.campaign.replacing import STATE
+
+    if (campaign / STATE).exists():
         return f"all missions so far are kept: trustbo resume {campaign} goes on."
     return "nothing was begun yet."
 
 
 def _after_refusal(campaign: Path | None) -> str:
-    kept = (
-        ""
-        if campaign is None
-        else f"the measured missions are kept in {campaign / 'measured.nc'}. "
-    )
+    from trustbo.campaign.replacing import MEASURED
+
+    kept = "" if campaign is None else f"the measured missions are kept in {campaign / MEASURED}. "
     return (
         f"{kept}Run again with a model of fewer parameters (--model pooled), longer paths (more "
         "cells: --shape), or another --seed, and another --out or --overwrite."

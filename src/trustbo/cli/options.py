@@ -3,6 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable
+from copy import copy
 from dataclasses import fields
 from typing import Annotated, Any
 
@@ -74,7 +75,7 @@ Program
   export.out FOLDER: Folder for the files; by default the result's.
   info.out FILE: Picture of the grid, a .png.
   page: Keep report.html up to date while the campaign runs; it reloads itself in a browser.
-  overwrite: Replace the campaign that the folder holds.
+  overwrite: Replace the campaign that the folder holds; files of your own in it are kept.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
   title TEXT: Title of the page.
@@ -143,6 +144,11 @@ def _beginning(text: str) -> Callable[[str], list[str]]:
 _FLAGS = _flags()
 
 
+def choices_of(flag: str) -> list[str]:
+    """Names that the help of a flag lists, which are all that it takes; nothing is imported."""
+    return _FLAGS[flag].autocompletion("")
+
+
 def with_flags[Command: Callable[..., None]](command: Command) -> Command:
     """Give a command's parameters their flags, and `**options` those of `CampaignOptions`."""
     signature = inspect.signature(command, eval_str=True)
@@ -152,6 +158,9 @@ def with_flags[Command: Callable[..., None]](command: Command) -> Command:
             parameters += _campaign_flags()
         else:
             flag = _FLAGS.get(f"{command.__name__}.{p.name}") or _FLAGS[p.name]
+            if p.annotation in _PARSERS:
+                flag = copy(flag)
+                flag.parser = _PARSERS[p.annotation]
             parameters.append(p.replace(annotation=Annotated[p.annotation, flag]))
     command.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
     return command
@@ -184,7 +193,15 @@ def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no number.") from None
+        raise typer.BadParameter(f"must be a number{_share(text)}; got {text!r}.") from None
+
+
+def _share(text: str) -> str:
+    """Remedy of a percentage."""
+    try:
+        return f", such as {float(text.removesuffix('%')) / 100.0:g}" if "%" in text else ""
+    except ValueError:
+        return ""
 
 
 def _whole_or_name(text: str) -> int | str:
@@ -195,9 +212,13 @@ def _whole(text: str) -> int:
     try:
         return int(text)
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is no whole number.") from None
+        raise typer.BadParameter(f"must be a whole number; got {text!r}.") from None
 
 
+_PARSERS: dict[Any, Callable[[str], Any]] = {
+    float: _number, float | None: _number, int: _whole, int | None: _whole
+}  # fmt: skip
+"""Parsers of numbers, by the annotations of commands; Typer's own speak of its insides."""
 _OPTIONAL: dict[Any, tuple[type, Callable[[str], Any]]] = {
     float | None: (float, _number),
     int | None: (int, _whole),

@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        said = _missing(error) or _of_file(error) or _unknown_option(error)
+        said = _missing(error) or _of_file(error) or _unknown_option(error) or _no_number(error)
         complain(said or str(error.format_message()), f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)
@@ -123,10 +123,22 @@ def _unknown_option(error: Any) -> str:
     near = getattr(error, "possibilities", None)  # the nearest first
     if near is None or not hasattr(error, "option_name"):
         return ""
-    typed = error.option_name
+    typed, context = error.option_name, error.ctx
+    if typed == "--out" and context is not None:
+        places = [p for p in context.command.params if p.param_type_name == "argument"]
+        if places:
+            return f"unknown option --out; give the folder alone: {context.command_path} FOLDER"
     swapped = [name for name in near if sorted(name) == sorted(typed)]  # the usual slip
     advice = f"; did you mean {(swapped or near)[0]}?" if near else "."
     return f"unknown option {typed}{advice}"
+
+
+def _no_number(error: Any) -> str:
+    """Name the flag and its value where a number was to be given; else nothing."""
+    param, message = getattr(error, "param", None), str(getattr(error, "message", ""))
+    return (
+        f"{param.opts[0]} {message}" if param is not None and message.startswith("must be ") else ""
+    )
 
 
 def _of_file(error: Any) -> str:
@@ -138,4 +150,6 @@ def _of_file(error: Any) -> str:
     if source is None or source.name != "DEFAULT_MAP":
         return ""
     flag, value = param.name.replace("_", "-"), context.default_map[param.name]
-    return f"{context.params['config']}: {flag} cannot be {value!r}: {error.message}"
+    message = str(error.message)
+    said = message if message.startswith("must be ") else f"cannot be {value!r}: {message}"
+    return f"{context.params['config']}: {flag} {said}"

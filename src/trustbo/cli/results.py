@@ -6,7 +6,7 @@ from pathlib import Path
 
 from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import use_no_screen
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice
 
 
 def report(
@@ -21,6 +21,7 @@ def report(
     interactive page beside it, explore.html (demo-explore.html for demo.html).
     """
     with one_line_errors(debug):
+        _require_result(folder)
         from trustbo.campaign.result import load_result
 
         result = load_result(folder)
@@ -54,6 +55,7 @@ def export(
     for by name is an error then.
     """
     with one_line_errors(debug):
+        _require_result(folder)
         from trustbo.campaign.result import load_result
         from trustbo.export import FORMATS, export_result
         from trustbo.export.everything import left_out
@@ -74,3 +76,14 @@ def export(
             print(f"left out {name}: {why}", file=sys.stderr)
         for file in files:
             print(file)
+
+
+def _require_result(folder: Path) -> None:
+    """Refuse a folder without a result (TrustboError) before heavy imports."""
+    from trustbo.campaign.replacing import RESULT, current
+
+    if not (current(folder) / RESULT).exists():
+        raise TrustboError(
+            f"{str(folder)!r} holds no result; give the --out of trustbo run or trustbo demo, once "
+            "a mission is done."
+        )

@@ -1,6 +1,7 @@
 """`trustbo info`, and rasters with a start and a goal on them, checked before awareness."""
 
 import warnings
+from math import radians
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -38,12 +39,12 @@ def info(
     cells, and a start and a goal in each spelling of --start and --goal.
     """
     with one_line_errors(debug):
+        cells, team = pair("shape", shape), team_of(max_slope)
         from trustbo.cli.outputs import use_no_screen, write_figure
         from trustbo.files import require_file
         from trustbo.workspace import survey
 
         require_file(out, ".png")
-        team, cells = team_of(max_slope), pair("shape", shape)
         ground = Rasters(dem, dsm, crs, resolution, nodata).read(lazy=True)
         found = survey(ground, cells, team)
         ground.close()
@@ -117,18 +118,18 @@ def pair(what: str, text: str) -> tuple[int, int]:
     try:
         first, second = (int(part) for part in text.split(","))
     except ValueError:
-        raise TrustboError(f"--{what} must be two whole numbers as 9,0; got {text!r}.") from None
+        raise TrustboError(
+            f"--{what} must be rows and columns, such as 10,12; got {text!r}."
+        ) from None
     return first, second
 
 
 def team_of(max_slope: float, n_robots: int = 3, lidar_range: float = 100.0) -> "Team":
     """Make a team of equal robots; the slope is in degrees."""
-    from math import radians
-
-    from trustbo.team import Robot, Team
-
     if not 0.0 < max_slope < 90.0:
         raise TrustboError(f"--max-slope must be between 0 and 90 degrees; got {max_slope:g}.")
     require_whole("n_robots", n_robots, 1)
+    from trustbo.team import Robot, Team
+
     robot = Robot(max_slope=radians(max_slope), lidar_range=lidar_range)
     return Team(robots=(robot,) * n_robots, lead=robot)
