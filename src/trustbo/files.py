@@ -239,6 +239,14 @@ def interpreting(path: FilePath) -> Iterator[None]:
         ) from error
 
 
+def not_ours(path: Path, remedy: str = "another folder") -> TrustboError:
+    """Error of a file of another program in the place of one of ours."""
+    return TrustboError(
+        f"{str(path)!r} was not written by trustbo, and would be replaced; move it, or choose "
+        f"{remedy}."
+    )
+
+
 def checksum(path: Path) -> str | None:
     """Return the sum that `write_checked` kept of a file; None where there is none."""
     return next(iter(_sums(path)), None)

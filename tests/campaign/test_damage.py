@@ -82,7 +82,8 @@ def look(folder, n_commands):
 
     def go_on():
         with tb.Campaign.load(folder) as campaign:
-            assert len(campaign.summary()) == 1
+            assert len(campaign.missions) == 1
+            assert repr(campaign.table())
             assert campaign.ask().path
 
     def resume():

@@ -190,7 +190,7 @@ def test_tables_have_a_row_for_each_mission_that_failed(workspace, tmp_path):
         table = campaign.table()
         saved = tb.load_result(tmp_path / "kept").table()
     assert table.index.isna().tolist() == [True, False, False, True]
-    assert table.loc[2, "where"] == ",".join(map(str, part.path[-1]))
+    assert table.loc[2, "where"] == ",".join(map(str, part.path[2]))
     assert table["reason"].tolist() == ["stuck", "", "the wheel broke", "rain"]
     assert table["state"].tolist() == ["given up", "learned", "learned", "given up"]
     assert table["status"].tolist() == ["stuck", "ok", part.status, "aborted"]

@@ -115,7 +115,7 @@ class Campaign(LearnedMissions, Displayed):
         }
         record = named | self.options.to_record()
         self.settings = record | {
-            "model": type(self.model).__name__,
+            "model": type(self.model).__name__ + " with places" * (self.model.place is not None),
             "observation": self.model.observation,
             "response": self.model.response,
             "max_bounds": self.planner.max_bounds,
@@ -427,7 +427,12 @@ class Campaign(LearnedMissions, Displayed):
             state, measured, extras, kept = folder.read()
             workspace = folder.read_workspace()
             with interpreting(folder.path / STATE):
-                campaign = cls._restored(state, workspace, model, policy, **own)
+                given, kind = _read_options(state, policy, **own)
+                learner = model_from_record(kind) if model is None else None
+            # Not within: an error of the user's own model is none of the file.
+            learner = model_from_record(kind, model) if learner is None else learner
+            campaign = cls(workspace, model=learner, **given)
+            with interpreting(folder.path / STATE):
                 campaign.log = History.from_state(state, measured, extras, kept, workspace)
                 if (suggested := state.get("suggested")) is not None:
                     campaign._plan = plan_from_record(suggested, workspace)
@@ -445,26 +450,6 @@ class Campaign(LearnedMissions, Displayed):
             folder.close()
             raise
         return campaign
-
-    @classmethod
-    def _restored(
-        cls,
-        state: dict[str, Any],
-        workspace: Workspace,
-        model: TrustModel | None,
-        policy: Policy | None,
-        **own: Any,
-    ) -> Self:
-        """Campaign with the options of a state, see `load`; without its missions."""
-        record = dict(state["options"])
-        if "replan" in state["notes"]:  # of version 0.1
-            record.setdefault("replan", state["notes"]["replan"])
-        start, goal = (tuple(record.pop(name)) for name in ("start", "goal"))
-        chosen = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
-        learner = model_from_record(record.pop("model"), model)
-        named = {name: record.pop(name) for name in ("objective", "sampler", "seed")}
-        options = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
-        return cls(workspace, start, goal, model=learner, policy=chosen, options=options, **named)
 
     def stop(self, reason: str) -> Result:
         """End the campaign, which may still go on later, and return its result.
@@ -601,3 +586,18 @@ class Campaign(LearnedMissions, Displayed):
         maps = problem.cells[:_N_KEPT].astype(np.float32)
         draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
         return xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
+
+
+def _read_options(
+    state: dict[str, Any], policy: Policy | None, **own: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arguments of `Campaign` that a state holds, see `load`, and the record of its model."""
+    record = dict(state["options"])
+    if "replan" in state["notes"]:  # of version 0.1
+        record.setdefault("replan", state["notes"]["replan"])
+    given: dict[str, Any] = {name: tuple(record.pop(name)) for name in ("start", "goal")}
+    given["policy"] = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
+    given |= {name: record.pop(name) for name in ("objective", "sampler", "seed")}
+    model = record.pop("model")
+    given["options"] = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
+    return given, model

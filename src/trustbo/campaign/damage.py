@@ -5,11 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from trustbo.campaign.replacing import MEASURED, RESULT, STATE
+from trustbo.campaign.replacing import MEASURED, MISSIONS, RESULT, STATE
 from trustbo.errors import DamagedFileError
 from trustbo.files import read_record
 
-_FILLED = "missions.nc"
 _TELL = "tell them, in order, to a new campaign in another folder, with other_path=True"
 
 # Kinds of values: a type (float for any number), alternatives in a tuple, a list of one kind or of
@@ -122,7 +121,7 @@ def naming_what_is_left(folder: Path) -> Iterator[None]:
     try:
         yield
     except DamagedFileError as error:
-        for name, described in ((MEASURED, salvage), (_FILLED, _salvage_filled)):
+        for name, described in ((MEASURED, salvage), (MISSIONS, _salvage_filled)):
             if str(folder / name) not in str(error) and (folder / name).exists():
                 raise DamagedFileError(f"{error} {described(folder / name)}") from None
         raise

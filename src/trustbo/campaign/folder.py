@@ -11,7 +11,9 @@ from trustbo.campaign.damage import naming_what_is_left, read_fields, salvage
 from trustbo.campaign.history import Kept
 from trustbo.campaign.replacing import (
     MEASURED,
+    POSTERIOR,
     STATE,
+    TICKS,
     WORKSPACE,
     current,
     finish_replacing,
@@ -144,9 +146,9 @@ class CampaignFolder:
         if result is not None:
             result.write(self._at, whole=whole, home=self.path)
             if ended and result.has_posterior:
-                write_tree(self._at / "posterior.nc", result.posterior)
+                write_tree(self._at / POSTERIOR, result.posterior)
             elif not whole:
-                remove_checked(self._at / "posterior.nc")  # of the missions before
+                remove_checked(self._at / POSTERIOR)  # of the missions before
         write_checked(self._at / STATE, to_json(state).encode())
 
     def read(self) -> Contents:
@@ -170,7 +172,7 @@ class CampaignFolder:
                     f"{str(self.path / MEASURED)!r} holds {len(measured)} missions of {n}."
                 )
             kept = read_kept(self.path, state) if n else None
-        self._n_ticks = len(measured) if (self.path / "ticks").exists() else 0
+        self._n_ticks = len(measured) if (self.path / TICKS).exists() else 0
         return Contents(state, measured, extras, kept)
 
 
@@ -180,4 +182,5 @@ def _extras(tree: xr.DataTree, n: int) -> list[dict[str, float]]:
     extras = [{} for _ in range(n)] if text is None else json.loads(text)
     if len(extras) != n:
         raise ValueError(f"{len(extras)} extras of {n} missions")
-    return [require_extra(extra) for extra in extras]
+    # Names that are reserved by now were free once.
+    return [require_extra(extra, reserved=()) for extra in extras]

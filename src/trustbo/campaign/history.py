@@ -132,7 +132,7 @@ def table_of(
         states = columns.get("reason", [""] * len(missions))
         columns |= {
             "reason": [said or reasons.get(n, "") for n, said in enumerate(states, start=1)],
-            "where": ["" if m.status == "ok" else path_text([m.path[-1]]) for m in missions],
+            "where": ["" if m.status == "ok" else path_text([m.bounds[-1].cell]) for m in missions],
             "n_bounds": [len(mission.bounds) for mission in missions],
             "path": [path_text(p[p[:, 0] >= 0].tolist()) for p in history["path"].values],
         }
@@ -263,6 +263,9 @@ class History:
         names = {name: None for row in rows for name in row}
         scalars = {name: [row.get(name, np.nan) for row in rows] for name in names}
         trust_map = self.entries[0].trust_map
+        # Older campaigns have numbers by names that are those of axes.
+        axes = {*map(str, trust_map.coords), *map(str, trust_map.dims), "axis", "step", "iteration"}
+        scalars = {f"told_{n}" if n in axes else n: values for n, values in scalars.items()}
         maps = np.stack([entry.trust_map.values for entry in self.entries])
         return xr.Dataset(
             {

@@ -25,6 +25,7 @@ from trustbo.files import (
     defer_interrupt,
     folder_to_disk,
     naming_refusal,
+    not_ours,
     read_record,
     remove_checked,
     remove_leftovers,
@@ -34,11 +35,12 @@ from trustbo.files import (
 )
 
 STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
+MISSIONS, HISTORY, TABLE = "missions.nc", "history.nc", "history.csv"
+BELIEVED, POSTERIOR = "believed.nc", "posterior.nc"
 _RECORDS = (STATE, RESULT)
-_OTHERS = ("missions.nc", "history.nc", "history.csv", "believed.nc", "posterior.nc")
-_NAMES = (*_OTHERS, MEASURED, WORKSPACE, RESULT, STATE)
+_NAMES = (MISSIONS, HISTORY, TABLE, BELIEVED, POSTERIOR, MEASURED, WORKSPACE, RESULT, STATE)
 """Names of our files, the records last: what they describe is removed before them."""
-_ROOMS = ("posteriors", "ticks")
+POSTERIORS, TICKS = _ROOMS = ("posteriors", "ticks")
 """Folders of numbered files."""
 _NEXT, _NEW, _OLD = ".trustbo-next", ".trustbo-new-", ".trustbo-old-"
 _MARKED = re.compile(r"\.trustbo-(new|old)-\w+")
@@ -137,10 +139,7 @@ def require_ours(folder: Path, *others: str) -> None:
     more = [] if ours else [folder / name for name in others]
     for file in (*_files(folder), *more):
         if os.path.lexists(file) and file not in known:
-            raise TrustboError(
-                f"{str(file)!r} was not written by trustbo, and would be replaced; move it, or "
-                "choose another folder."
-            )
+            raise not_ours(file)
 
 
 def warn_of_others(folder: Path) -> None:

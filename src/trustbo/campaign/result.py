@@ -17,7 +17,20 @@ from trustbo.campaign.damage import naming_what_is_left, read_fields
 from trustbo.campaign.failures import Failure, under_risk
 from trustbo.campaign.history import Kept, Posterior, Posteriors, table_of, whole_posterior
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
-from trustbo.campaign.replacing import RESULT, STATE, WORKSPACE, current, held, replacing
+from trustbo.campaign.replacing import (
+    BELIEVED,
+    HISTORY,
+    MISSIONS,
+    POSTERIOR,
+    POSTERIORS,
+    RESULT,
+    STATE,
+    TABLE,
+    WORKSPACE,
+    current,
+    held,
+    replacing,
+)
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import DamagedFileError, TrustboError
@@ -43,10 +56,6 @@ from trustbo.workspace.moves import require_on_grid
 
 if TYPE_CHECKING:
     from trustbo.plots import Explorer
-
-_MISSIONS, _HISTORY, _BELIEVED = "missions.nc", "history.nc", "believed.nc"
-_POSTERIOR = "posterior.nc"
-
 
 _NEW = ("max_failure", "failure_cost")
 """Options of planning that results of version 0.1 lack."""
@@ -275,7 +284,7 @@ class Result(Displayed):
                     f"{str(folder)!r} holds a campaign, with missions as they were told, which a "
                     "result does not have; give another folder."
                 )
-            whole = held_there / _POSTERIOR
+            whole = held_there / POSTERIOR
             if self.has_posterior and not whole.exists():  # written when a campaign ends
                 write_tree(whole, self.posterior)
             return
@@ -283,7 +292,7 @@ class Result(Displayed):
             write_tree(new / WORKSPACE, archive.workspace_to_tree(self.workspace))
             self.write(new, whole=True, home=folder)
             if self.has_posterior:
-                write_tree(new / _POSTERIOR, self.posterior)
+                write_tree(new / POSTERIOR, self.posterior)
         self.kept_in(folder)
 
     def kept_in(self, home: Path) -> None:
@@ -310,12 +319,12 @@ class Result(Displayed):
                 if folder == home:
                     kept.file = home / name  # it is there from now on
         since = 0 if whole else len(self.missions)  # whose ticks are there
-        write_missions(folder / _MISSIONS, self.missions, since=since)
+        write_missions(folder / MISSIONS, self.missions, since=since)
         history = self.history.assign(final_trust_map=self.trust_map)
-        write_tree(folder / _HISTORY, xr.DataTree(history))
+        write_tree(folder / HISTORY, xr.DataTree(history))
         if self.believed is not None:
-            write_tree(folder / _BELIEVED, xr.DataTree(self.believed))
-        write_text(folder / "history.csv", frame_as_csv(self.table()))
+            write_tree(folder / BELIEVED, xr.DataTree(self.believed))
+        write_text(folder / TABLE, frame_as_csv(self.table()))
         # Written last: its presence means that the rest is complete.
         write_checked(folder / RESULT, self._record().encode())
 
@@ -367,8 +376,8 @@ def load_result(directory: FilePath) -> Result:
         missions, posteriors, history = read_kept(folder, record)
         workspace, believed = read_workspace(folder), None
         if record["settings"].get("awareness") == "belief":
-            believed = read_tree(folder / _BELIEVED).to_dataset()
-        with interpreting(folder / _HISTORY):
+            believed = read_tree(folder / BELIEVED).to_dataset()
+        with interpreting(folder / HISTORY):
             trust_map = history["final_trust_map"].rename("trust")
             history = history.drop_vars("final_trust_map")
         with interpreting(folder / RESULT):
@@ -403,8 +412,8 @@ def read_kept(folder: Path, record: dict[str, Any]) -> Kept:
         if not file.exists():
             raise DamagedFileError(f"{str(file)!r} is missing.")
         kept[after] = Posterior(after, file=file)
-    history, missions = read_tree(folder / _HISTORY).to_dataset(), folder / _MISSIONS
-    with interpreting(folder / _HISTORY):
+    history, missions = read_tree(folder / HISTORY).to_dataset(), folder / MISSIONS
+    with interpreting(folder / HISTORY):
         history = history.isel(iteration=slice(n))
         if (rows := history.sizes["iteration"]) != n:
             raise ValueError(f"{rows} missions of {n}")
@@ -427,4 +436,4 @@ def _cell(pair: Any) -> Cell:
 
 
 def _posterior_file(after: int) -> Path:
-    return Path("posteriors") / f"{after:04d}.nc"
+    return Path(POSTERIORS) / f"{after:04d}.nc"

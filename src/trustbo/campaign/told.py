@@ -1,7 +1,7 @@
 """Checks of a mission that is told to a campaign, before anything is done with it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -56,8 +56,14 @@ def require_new(mission: Mission, earlier: Sequence[Mission]) -> None:
             )
 
 
-def require_extra(extra: Mapping[str, Any]) -> dict[str, float]:
+def require_extra(
+    extra: Mapping[str, Any], reserved: Collection[str] = RESERVED
+) -> dict[str, float]:
     """Return more numbers of a mission as floats.
+
+    Args:
+        extra: Numbers by name.
+        reserved: Names that are taken; none for those of an older file.
 
     Raises:
         TrustboError: Not a number, NaN for one that is not known; infinite; or a name that is no
@@ -65,7 +71,7 @@ def require_extra(extra: Mapping[str, Any]) -> dict[str, float]:
     """
     checked = {}
     for name, value in extra.items():
-        if name in RESERVED:
+        if name in reserved:
             raise TrustboError(f"{name!r} is a column of the history; give {value!r} another name.")
         if not name.isidentifier():
             raise TrustboError(f"{name!r} cannot name a column; use letters, digits and _.")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import FilePath, read_record, require_file, require_folder, write_text
+from trustbo.files import FilePath, not_ours, read_record, require_file, require_folder, write_text
 from trustbo.study.run import Run
 
 
@@ -27,10 +27,7 @@ class Store:
         for name in names:
             file = require_file(self.folder / name)
             if file.exists() and not (self.folder / "study.json").is_file():
-                raise TrustboError(
-                    f"{str(file)!r} was not written by trustbo, and would be replaced; move it, "
-                    "or choose another folder."
-                )
+                raise not_ours(file)
 
     def write_study(self, settings: dict[str, Any], runs: list[Run]) -> None:
         """Write `study.json`: the settings, and the table of runs by key."""
