@@ -94,7 +94,7 @@ def test_a_number_that_is_none_is_refused_with_its_file(tmp_path, capsys):
     file, never = tmp_path / "a.yaml", tmp_path / "never"
     file.write_text("iterations: three")
     for words, message in {
-        (): f"error: {file}: iterations cannot be 'three': ",
+        (): f"error: {file}: iterations must be a whole number; got 'three'.",
         ("--iterations", "four"): "error: --iterations must be a whole number; got 'four'.",
     }.items():
         with pytest.raises(SystemExit) as caught:
