@@ -18,12 +18,8 @@ from trustbo.inference import complete, fit, params_of
 from trustbo.inference.evidence import place_marginal
 from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.inference.evidence.place_rows import gather_rows
-from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_group, place_maps_of
-from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.latent_target import LatentTarget
-from trustbo.inference.samplers.place_target import PlaceTarget
-from trustbo.inference.samplers.student import Student, log_mixture
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
+from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.place import bounds_of, visited
 from trustbo.models.priors import Priors
@@ -217,7 +213,8 @@ def test_what_nuts_sees_is_the_same_marginal(place):
     assert inside.shape == dense.T.shape
     batch = tb.stacking.stack_missions(missions)
     shape = batch.contact_rate.shape[:2]
-    index = place_marginal.PlaceIndex.of(visited(bounds_of(missions, shape), place, 3, SHAPE))
+    there = visited(bounds_of(missions, shape), place, 3, SHAPE)
+    index = place_marginal.PlaceIndex.of(there, batch.contact_rate)
     with jax.enable_x64(True):
         as64 = params.map(lambda value, _: jax.numpy.asarray(value, dtype=float))
         hyper = place_marginal.PlaceHyper(*(jax.numpy.asarray(float(t)) for t in theta[3:]))
@@ -226,6 +223,40 @@ def test_what_nuts_sees_is_the_same_marginal(place):
             as64.ssm(batch.awareness), batch.contact_rate, weight, hyper, index
         )
     assert float(found) == pytest.approx(expected, rel=1e-9 if place.bounds else 1e-5)
+
+
+@pytest.mark.parametrize("place", PLACES[:1] + PLACES[3:], ids=str)
+def test_gradient_that_nuts_takes_is_that_of_its_marginal(place):
+    """By central differences, with gaps in rates, robots alike and not, and a mission half used."""
+    missions = random_missions(2)
+    batch = tb.stacking.stack_missions(missions)
+    there = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
+    index = place_marginal.PlaceIndex.of(there, batch.contact_rate)
+    weight = np.append(0.5, np.ones(len(batch.awareness) - 1))
+
+    def value(at, each):
+        own = at[0] + each * np.array([0.0, 0.05, -0.1])
+        params = TrustParams(own, at[6:8], at[8], at[1], at[2])
+        hyper = place_marginal.PlaceHyper(*at[3:6])
+        ssm = params.ssm(batch.awareness)
+        return place_marginal.log_likelihood(ssm, batch.contact_rate, weight, hyper, index)
+
+    at = np.array([0.4, 0.1, 0.2, 0.3, 1.7, 0.2, 0.3, -0.2, 0.1])
+    with own_settings():
+        call = jax.jit(jax.value_and_grad(value))
+        for each in (0.0, 1.0):
+            found = call(at, each)[1]
+            steps = 1e-5 * np.eye(len(at))
+            by_steps = [(call(at + h, each)[0] - call(at - h, each)[0]) / 2e-5 for h in steps]
+            np.testing.assert_allclose(found, by_steps, rtol=1e-5, atol=1e-5)
+        together = jax.jit(value)(at, 0.0)
+        shared = at[0] * np.ones(())
+        params = TrustParams(shared, at[6:8], at[8], at[1], at[2])
+        apart = place_marginal.log_likelihood(
+            params.ssm(batch.awareness), batch.contact_rate, weight,
+            place_marginal.PlaceHyper(*at[3:6]), index,
+        )  # fmt: skip
+    assert float(together) == pytest.approx(float(apart), rel=1e-12)
 
 
 def test_maps_are_those_of_dense_conditioning():

@@ -5,6 +5,11 @@ one robot in one mission, rates are y = H x + v, H = (0 I) - lag (I 0), and the 
 bounds enter x by T, T_kj = beta0^(k - j). Whitened by the covariance of its rates, the T of all
 missions and robots add up to the precision W that the data lend to g, and then, with L_g L_g' the
 prior covariance of g, det(V + T K T') = det(V) det(I + L_g' W L_g).
+
+NUTS asks for ten thousands of gradients, so that little is done twice. V and T depend on awareness
+in nothing, and those of a short mission lead those of a long one: there is one whitening of each
+pattern of gaps, not of each mission and robot. The part of all units has its gradient in closed
+form, which takes no derivative of a Cholesky factor.
 """
 
 from typing import NamedTuple
@@ -28,15 +33,30 @@ class PlaceIndex(NamedTuple):
     cells: Array | np.ndarray  # (cell, 3): effect, row, col
     cell_of: Array | np.ndarray  # (unit,)
     unit: Array | np.ndarray  # (mission, bound, effect)
+    patterns: Array | np.ndarray  # (pattern, bound), whether a rate was measured
+    pattern_of: Array | np.ndarray  # (mission, robot)
 
     @classmethod
-    def of(cls, places: Visited) -> "PlaceIndex":
-        """Pad cells, each an effect of its own, and units, which nobody measured."""
+    def of(cls, places: Visited, contact_rate: np.ndarray) -> "PlaceIndex":
+        """Pad cells, each an effect of its own, and units, which nobody measured.
+
+        Rates (mission, bound, robot) have the pattern of their gaps, the end of a mission being
+        none. Patterns without gaps pad to a power of four.
+        """
         more = -len(places.cells) % _BUCKET
         apart = np.column_stack([-1 - np.arange(more), np.zeros((more, 2), dtype=int)])
         cells = np.concatenate([places.cells, apart])
         cell_of = np.concatenate([places.cell_of, np.zeros(-len(places.units) % _BUCKET, int)])
-        return cls(cells, cell_of, np.maximum(places.unit, 0))
+        seen = np.swapaxes(~np.isnan(contact_rate), 1, 2)  # (mission, robot, bound)
+        over = ~np.logical_or.accumulate(seen[..., ::-1], axis=2)[..., ::-1]
+        each = (seen | over).reshape(-1, seen.shape[2])
+        patterns, pattern_of = np.unique(each, axis=0, return_inverse=True)
+        n = 4 ** int(np.ceil(np.log2(len(patterns)) / 2.0))
+        padding = np.ones((n - len(patterns), seen.shape[2]), dtype=bool)
+        return cls(
+            cells, cell_of, np.maximum(places.unit, 0),
+            np.concatenate([patterns, padding]), pattern_of.reshape(seen.shape[:2]),
+        )  # fmt: skip
 
 
 class PlaceHyper(NamedTuple):
@@ -49,13 +69,16 @@ class PlaceHyper(NamedTuple):
 
 def prior_factor(hyper: PlaceHyper, places: PlaceIndex) -> Array:
     """Cholesky's factor of the prior covariance of the units' effects g, (unit, unit)."""
+    return jnp.linalg.cholesky(_prior_covariance(hyper, places))
+
+
+def _prior_covariance(hyper: PlaceHyper, places: PlaceIndex) -> Array:
     gap = places.cells[:, None] - places.cells[None]
     h = jnp.sqrt(3.0) * jnp.hypot(*jnp.moveaxis(gap[..., 1:] * 1.0, -1, 0)) / hyper.length_scale
     K = hyper.tau_s**2 * (1.0 + h) * jnp.exp(-h) * (gap[..., 0] == 0)
     own = hyper.tau_e**2 + _JITTER * hyper.tau_s**2 + 1e-14
-    return jnp.linalg.cholesky(
-        K[places.cell_of][:, places.cell_of] + own * jnp.eye(len(places.cell_of))
-    )
+    same = places.cell_of
+    return K[same][:, same] + own * jnp.eye(len(same))
 
 
 def log_likelihood(
@@ -63,9 +86,7 @@ def log_likelihood(
 ) -> Array:
     """Log density of all rates y (mission, bound, robot), each mission weighted."""
     W, h, rest = _statistics(ssm, y, weight, places)
-    L = prior_factor(hyper, places)
-    root, half = _posterior(L, W, h)
-    return rest + 0.5 * (half**2).sum() - jnp.log(jnp.diagonal(root)).sum()
+    return rest + _log_marginal(_prior_covariance(hyper, places), W, h)
 
 
 def draw_effects(
@@ -79,62 +100,98 @@ def draw_effects(
     """Effects g of the units given all rates, one exact draw, (unit,)."""
     W, h, _ = _statistics(ssm, y, weight, places)
     L = prior_factor(hyper, places)
-    root, half = _posterior(L, W, h)
+    root = _root(L, W)
+    half = solve_triangular(root, L.T @ h, lower=True)
     z = half + jax.random.normal(key, half.shape, half.dtype)
     return L @ solve_triangular(root, z, lower=True, trans=1)
 
 
-def _posterior(L: Array, W: Array, h: Array) -> tuple[Array, Array]:
-    """Factor of I + L' W L, and its inverse times L' h."""
-    root = jnp.linalg.cholesky(jnp.eye(len(L)) + L.T @ W @ L)
-    return root, solve_triangular(root, L.T @ h, lower=True)
+@jax.custom_vjp
+def _log_marginal(K: Array, W: Array, h: Array) -> Array:
+    """Log of the mean of exp(h'g - g'Wg / 2) over g ~ N(0, K)."""
+    return _with_posterior(K, W, h)[0]
+
+
+def _with_posterior(K: Array, W: Array, h: Array) -> tuple[Array, tuple[Array, ...]]:
+    """The same; and W, the mean m and covariance C of g under that weight, and h - W m."""
+    L = jnp.linalg.cholesky(K)
+    root = _root(L, W)
+    X = solve_triangular(root, L.T, lower=True)
+    half = X @ h
+    m, C = X.T @ half, X.T @ X
+    value = 0.5 * (half**2).sum() - jnp.log(jnp.diagonal(root)).sum()
+    return value, (W, m, C, h - W @ m)
+
+
+def _gradient(known: tuple[Array, ...], ahead: Array) -> tuple[Array, Array, Array]:
+    """Gradients in K, W and h: (K + W^-1)^-1 = W - W C W."""
+    W, m, C, left = known
+    of_K = jnp.outer(left, left) - W + W @ C @ W
+    return 0.5 * ahead * of_K, -0.5 * ahead * (C + jnp.outer(m, m)), ahead * m
+
+
+_log_marginal.defvjp(_with_posterior, _gradient)
+
+
+def _root(L: Array, W: Array) -> Array:
+    """Factor of I + L' W L."""
+    return jnp.linalg.cholesky(jnp.eye(len(L)) + L.T @ W @ L)
 
 
 def _statistics(
     ssm: ScalarSSM, y: Array, weight: Array, places: PlaceIndex
 ) -> tuple[Array, Array, Array]:
     """Precision W and right side h of g, and the log density of the rates at g = 0."""
-    n_missions, n_bounds, n_robots = y.shape
-    drift = jnp.swapaxes(ssm.drift, 0, 1)  # (mission, bound, robot)
-
-    def each(value: Array) -> Array:
-        return jnp.broadcast_to(value, (n_robots,))
-
-    def robot(y: Array, u: Array, beta0: Array, w: Array, v: Array) -> tuple[Array, ...]:
-        return _whiten(ssm, y, u, beta0, w, v)
-
-    over_robots = jax.vmap(robot, in_axes=(1, 1, 0, 0, 0))
-    over_missions = jax.vmap(over_robots, in_axes=(0, 0, None, None, None))
-    noises = (each(ssm.beta0), each(ssm.delta_w), each(ssm.delta_v))
-    T, r, log_det, n = over_missions(y, drift, *noises)  # (mission, robot, bound, bound), ...
+    n_bounds, n_robots = y.shape[1:]
+    seen = jnp.swapaxes(~jnp.isnan(y), 1, 2)  # (mission, robot, bound)
+    # Robots that share their parameters share the whitening too.
+    alike = max(jnp.ndim(each) for each in (ssm.beta0, ssm.delta_w, ssm.delta_v)) == 0
+    sets = [jnp.broadcast_to(v, 1 if alike else n_robots) for v in ssm[:1] + ssm[2:4]]
+    whiten = jax.vmap(lambda *of: _whitening(ssm, places.patterns, *of))
+    carried, start, inverse, log_scale, T = whiten(*sets)
+    robot = jnp.arange(n_robots)[None] * (not alike)
+    H = jnp.eye(n_bounds, n_bounds + 1, 1) - ssm.lag * jnp.eye(n_bounds, n_bounds + 1)
+    mean = start[robot] * ssm.x0_mean + jnp.einsum("ikj,jmi->mik", carried[robot[0]], ssm.drift)
+    r = jnp.where(seen, jnp.nan_to_num(jnp.swapaxes(y, 1, 2)) - mean @ H.T, 0.0)
+    pattern = places.pattern_of
+    # What comes after the end of a mission moves nothing before it, and is left out here.
+    r = seen * jnp.einsum("mikj,mij->mik", inverse[robot, pattern], r)
+    T = seen[..., None] * T[robot, pattern]  # (mission, robot, bound, bound)
     w = weight[:, None]
-    S = jnp.einsum("jikm,jikn->jimn", T, T) * w[..., None, None]
-    h = jnp.einsum("jikm,jik->jim", T, r) * w[..., None]
-    unit = jnp.broadcast_to(places.unit, (n_missions, n_bounds, n_robots)).swapaxes(1, 2)
+    S = jnp.einsum("mikj,mikl->mijl", T, T) * w[..., None, None]
+    h = jnp.einsum("mikj,mik->mij", T, r) * w[..., None]
+    unit = jnp.swapaxes(jnp.asarray(places.unit), 1, 2)
+    if unit.shape[1] == 1:
+        S, h = S.sum(1, keepdims=True), h.sum(1, keepdims=True)
     size = len(places.cell_of)
     W = jnp.zeros((size, size)).at[unit[..., :, None], unit[..., None, :]].add(S)
     right = jnp.zeros(size).at[unit].add(h)
-    rest = -0.5 * ((r**2).sum(-1) + log_det + n * jnp.log(2.0 * jnp.pi))
-    return W, right, (rest * w).sum()
+    rest = r**2 + seen * (2.0 * log_scale[robot, pattern] + jnp.log(2.0 * jnp.pi))
+    return W, right, -0.5 * (rest.sum(-1) * w).sum()
 
 
-def _whiten(
-    ssm: ScalarSSM, y: Array, u: Array, beta0: Array, delta_w: Array, delta_v: Array
-) -> tuple[Array, Array, Array, Array]:
-    """T and residuals of one robot in one mission, whitened, the log determinant, the number."""
-    n = len(y)
+def _whitening(
+    ssm: ScalarSSM, patterns: Array, beta0: Array, delta_w: Array, delta_v: Array
+) -> tuple[Array, ...]:
+    """Whitening of the rates of one robot, for each pattern.
+
+    Returns:
+        What a bound adds to each x_k (bound + 1, bound); what x_0 does; and of each pattern the
+        inverse of the factor of V, the log of its diagonal, and its product with T.
+    """
+    n = patterns.shape[1]
     step = jnp.arange(n + 1)
     ahead = step[:, None] - step[None, 1:]  # of x_k after the bound j
-    carried = jnp.where(ahead >= 0, beta0 ** jnp.maximum(ahead, 0), 0.0)  # (n + 1, n)
+    carried = jnp.where(ahead >= 0, beta0 ** jnp.maximum(ahead, 0), 0.0)
     start = beta0**step
-    mean = start * ssm.x0_mean + carried @ u
-    covariance = ssm.x0_sd**2 * jnp.outer(start, start) + delta_w**2 * carried @ carried.T
     H = jnp.eye(n, n + 1, 1) - ssm.lag * jnp.eye(n, n + 1)
-    seen = ~jnp.isnan(y)
-    both = seen[:, None] & seen[None]
-    V = jnp.where(both, H @ covariance @ H.T, 0.0)
-    L = jnp.linalg.cholesky(V + jnp.diag(jnp.where(seen, delta_v**2, 1.0)))
-    r = jnp.where(seen, y - H @ mean, 0.0)
-    T = jnp.where(seen[:, None], H @ carried, 0.0)
-    white = solve_triangular(L, jnp.column_stack([T, r]), lower=True)
-    return white[:, :-1], white[:, -1], 2.0 * jnp.log(jnp.diagonal(L)).sum(), seen.sum()
+    T, first = H @ carried, H @ start
+    V = ssm.x0_sd**2 * jnp.outer(first, first) + delta_w**2 * T @ T.T
+
+    def one(seen: Array) -> tuple[Array, Array, Array]:
+        own = jnp.diag(jnp.where(seen, delta_v**2, 1.0))
+        L = jnp.linalg.cholesky(jnp.where(seen[:, None] & seen[None], V, 0.0) + own)
+        inverse = solve_triangular(L, jnp.eye(n), lower=True)
+        return inverse, jnp.log(jnp.diagonal(L)), inverse @ jnp.where(seen[:, None], T, 0.0)
+
+    return carried, start, *jax.vmap(one)(jnp.asarray(patterns))

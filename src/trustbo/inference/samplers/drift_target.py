@@ -51,7 +51,7 @@ class DriftTarget:
     ) -> None:
         """Take the model, the missions, the weight of each, and the places visited."""
         self.model, self._visited = model, places
-        index = None if places is None else PlaceIndex.of(places)
+        index = None if places is None else PlaceIndex.of(places, batch.contact_rate)
         self._data = batch.awareness, batch.contact_rate, weight, index
         self._shape = batch.awareness.shape[2:]
         self._n_given = 3 + len(() if model.place is None else model.place.names)

@@ -35,6 +35,7 @@ from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
+from trustbo.parallel import one_blas_thread
 from trustbo.stacking import MissionBatch
 
 
@@ -103,7 +104,7 @@ def draw_posterior(
             failure = str(error)
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
     data = nuts_data(model, batch, weight, places)
-    with own_settings():
+    with own_settings(), one_blas_thread():
         draws, complaints = _sample_nuts(
             model, settings, random.key(seed), data, watch, check=check
         )
@@ -117,7 +118,7 @@ def nuts_data(
 ) -> NutsData:
     """Data for NUTS: sums alone for the pooled Gaussian model without gaps and places."""
     if places is not None:
-        return NutsData(*batch, weight, places=PlaceIndex.of(places))
+        return NutsData(*batch, weight, places=PlaceIndex.of(places, batch.contact_rate))
     if model.robot_sets == "all" and model.family.integrates_out:
         (statistics,) = gather(model, batch, weight)
         if not statistics.gaps:
