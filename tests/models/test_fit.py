@@ -9,11 +9,12 @@ import pytest
 import xarray as xr
 from missions import simulate_missions
 from numpyro.infer import MCMC, NUTS
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, ShapeError, TrustboError
 from trustbo.inference import diagnostics, fit, params_of
-from trustbo.inference.samplers import complaints, nuts, run
+from trustbo.inference.samplers import complaints, nuts, run, watching
 from trustbo.inference.samplers.nuts import _advance, run_nuts
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models import PooledTrust, Priors
@@ -108,11 +109,47 @@ def test_the_same_seed_gives_the_same_posterior(posterior, missions):
 
 
 def test_draws_do_not_depend_on_how_often_the_clock_is_looked_at(missions, monkeypatch, capsys):
-    few = {"sampler": "nuts", "draws": 30, "check": False, "whole": False}
+    few = {"sampler": "nuts", "draws": 30, "check": False, "whole": False, "progress": False}
     usual = fit(missions, **few)["posterior"].to_dataset()
     monkeypatch.setattr(nuts, "_SECONDS", 0.0)  # one draw at a time
     xr.testing.assert_identical(fit(missions, **few)["posterior"].to_dataset(), usual)
     assert capsys.readouterr().err == ""
+
+
+def test_a_long_run_and_its_retry_are_said_in_a_file_unless_progress_is_off(
+    missions, monkeypatch, capsys
+):
+    monkeypatch.setattr(watching, "LONG", 0.0)
+    monkeypatch.setattr(watching, "_TRIAL_SECONDS", 0.0)
+    few = {"sampler": "nuts", "warmup": 20, "draws": 20, "whole": False}
+    for options in ({}, {"progress": False}):
+        with pytest.raises(PosteriorError, match="refused after a longer retry"):
+            fit(missions, **few, **options)
+        said = capsys.readouterr().err
+        if options:
+            assert said == ""
+        else:
+            assert said.startswith("NUTS: 4 chains of 20 + 20 draws, about ")
+            assert "\nNUTS again, for longer (4 chains of 40 + 40 draws" in said
+            assert "\r" not in said
+
+
+def test_nuts_keeps_blas_to_one_thread(missions, monkeypatch):
+    seen = []
+
+    def look(_):
+        seen.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+
+    monkeypatch.setattr(watching.Watch, "compiled", look)
+    with threadpool_limits(2, user_api="blas"):
+        fit(missions, sampler="nuts", n_chains=1, draws=5, check=False, whole=False)
+    assert set(seen) == {1}
+
+
+def test_a_setting_by_its_former_and_its_present_name_is_refused(missions):
+    expected = "n_warmup is the former name of warmup: give one of n_warmup=5 and warmup=700"
+    with pytest.raises(TrustboError, match=expected):
+        fit(missions, sampler="nuts", n_warmup=5, warmup=700)
 
 
 def test_settings_have_the_names_of_before_too_and_those_of_nuts_are_for_nuts(missions):

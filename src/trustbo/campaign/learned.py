@@ -46,7 +46,7 @@ class LearnedMissions:
             it.
     """
 
-    progress: bool | None = None
+    progress: bool = True
 
     def __init__(
         self,

@@ -68,7 +68,7 @@ class Learning:
         last: xr.DataTree | None,
         seed: int,
         workspace: Workspace | None = None,
-        progress: bool | None = None,
+        progress: bool = True,
     ) -> xr.DataTree:
         """Fit the posterior of missions; one that is refused is tried again in other ways.
 

@@ -12,15 +12,13 @@ NOWHERE, TERMINAL, NOTEBOOK, FILE = "", "terminal", "notebook", "file"
 """Places of progress; a file gets lines alone, as carriage returns are for a terminal."""
 
 
-def place_of(progress: bool | None) -> str:
-    """Place that progress is shown in; None is True, but leaves a file as it is."""
-    if progress is not None and not progress:
+def place_of(progress: bool) -> str:
+    """Place that progress is shown in, if it is at all."""
+    if not progress:
         return NOWHERE
     if in_notebook():
         return NOTEBOOK
-    if sys.stderr.isatty():
-        return TERMINAL
-    return NOWHERE if progress is None else FILE
+    return TERMINAL if sys.stderr.isatty() else FILE
 
 
 def in_notebook() -> bool:

@@ -44,7 +44,7 @@ def fit(
     earlier: xr.DataTree | None = None,
     weights: ArrayLike | None = None,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: bool = True,
     n_chains: int = 4,
     warmup: int = 300,
     draws: int = 1000,
@@ -78,7 +78,7 @@ def fit(
             observations.
         seed: Seed; the same seed gives the same posterior.
         progress: Whether NUTS shows its chains in a bar, and first what they will take if that is
-            long. By default in a terminal and in a notebook; True prints lines into a file too.
+            long. A file, which has no bar, gets the line about a long run, and one about a retry.
         n_chains: Number of chains; the exact sampler's draws are divided among them.
         warmup: Warm-up draws per chain of NUTS, not kept.
         draws: Draws kept per chain.

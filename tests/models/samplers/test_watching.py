@@ -47,6 +47,14 @@ def test_the_bar_names_the_chain_the_phase_and_divergences_after_the_warm_up(cap
     assert "9 divergences" in shown
 
 
+def test_divergences_of_a_piece_across_the_end_of_the_warm_up_are_counted_by_draw(capsys):
+    with Watch(TERMINAL).running(SETTINGS) as seen:
+        seen.advanced(0.2, stats_of(290, n_divergences=290))
+        seen.advanced(0.2, stats_of(20, n_divergences=20))
+        seen._bar.refresh()
+    assert ", 10 divergences" in capsys.readouterr().err
+
+
 def test_a_second_run_says_that_it_is_one_and_why(capsys):
     watch = Watch(FILE)
     run(watch, 0.0)

@@ -147,7 +147,7 @@ def _statistics(
     # Robots that share their parameters share the whitening too.
     alike = max(jnp.ndim(each) for each in (ssm.beta0, ssm.delta_w, ssm.delta_v)) == 0
     sets = [jnp.broadcast_to(v, 1 if alike else n_robots) for v in ssm[:1] + ssm[2:4]]
-    whiten = jax.vmap(lambda *of: _whitening(ssm, places.patterns, *of))
+    whiten = jax.vmap(lambda *of: _whitening(ssm, jnp.asarray(places.patterns), *of))
     carried, start, inverse, log_scale, T = whiten(*sets)
     robot = jnp.arange(n_robots)[None] * (not alike)
     H = jnp.eye(n_bounds, n_bounds + 1, 1) - ssm.lag * jnp.eye(n_bounds, n_bounds + 1)
@@ -194,4 +194,4 @@ def _whitening(
         inverse = solve_triangular(L, jnp.eye(n), lower=True)
         return inverse, jnp.log(jnp.diagonal(L)), inverse @ jnp.where(seen[:, None], T, 0.0)
 
-    return carried, start, *jax.vmap(one)(jnp.asarray(patterns))
+    return carried, start, *jax.vmap(one)(patterns)

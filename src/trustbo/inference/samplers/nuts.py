@@ -28,7 +28,7 @@ from trustbo.inference.samplers.watching import SILENT, Watch
 from trustbo.models.model import TrustModel
 
 _DRAWS_PER_UNKNOWN = 10  # of the warm-up, to learn a covariance from
-_FIRST, _MOST = 10, 100
+_FIRST, _MOST = 1, 100
 """Draws between two looks at the clock: of the first, and of any."""
 _SECONDS = 0.5
 """Time between two looks that the number of draws aims at."""

@@ -42,7 +42,12 @@ class NutsSettings(NamedTuple):
         for name, value in (former or {}).items():
             if name not in _FORMER:
                 raise unknown("argument of fit", name, (*SETTINGS, *_OTHERS))
-            values[_FORMER[name]] = value
+            if values.get(now := _FORMER[name], _DEFAULTS[now]) != _DEFAULTS[now]:
+                raise TrustboError(
+                    f"{name} is the former name of {now}: give one of {name}={value!r} and "
+                    f"{now}={values[now]!r}, not both."
+                )
+            values[now] = value
         settings = cls(**values)
         accept = settings.target_accept
         if not isinstance(accept, Real) or isinstance(accept, bool) or not 0.0 < accept < 1.0:

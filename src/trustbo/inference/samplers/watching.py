@@ -63,7 +63,8 @@ class Watch:
         phase = "warm-up" if at < self._settings.warmup else "draws"
         label = f"{self._name}, chain {chain + 1} of {self._settings.n_chains}, {phase}"
         self._bar.set_description_str(label, refresh=False)
-        self._n_divergences += int(stats["diverging"].sum()) if phase == "draws" else 0
+        kept = np.arange(at, at + n) % self._of_chain >= self._settings.warmup
+        self._n_divergences += int((kept & stats["diverging"]).sum())
         if self._n_divergences:
             self._bar.set_postfix_str(f"{self._n_divergences} divergences", refresh=False)
         self._bar.update(n)
