@@ -18,6 +18,11 @@ from trustbo.inference import complete, fit, params_of
 from trustbo.inference.evidence import place_marginal
 from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.inference.evidence.place_rows import gather_rows
+from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_group, place_maps_of
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.latent_target import LatentTarget
+from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.student import Student, log_mixture
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES

@@ -137,7 +137,9 @@ def table_of(
             "path": [path_text(p[p[:, 0] >= 0].tolist()) for p in history["path"].values],
         }
     told = zip(*columns.values(), strict=True)
-    rows = [(n, dict(zip(columns, row, strict=True))) for n, row in enumerate(told, start=1)]
+    rows: list[tuple[int | None, dict[str, Any]]] = [
+        (n, dict(zip(columns, row, strict=True))) for n, row in enumerate(told, start=1)
+    ]
     lost = [failure for failure in failures if not failure.told]
     for failure in reversed(lost):  # a later one does not move the place of those before
         rows.insert(failure.after, (None, _row_of(failure)))
