@@ -35,7 +35,7 @@ def test_probabilities_of_cells_go_from_0_to_1(result):
 
 def test_columns_can_be_chosen_and_are_whole_numbers(result):
     axes = result.plot_maps(n_columns=1)
-    assert len({ax.get_position().x0 for ax in axes}) == 1
+    assert np.ptp([ax.get_position().x0 for ax in axes]) < 1e-9
     assert [ax.get_xlabel() for ax in axes] == ["", "", "east (m)"]
     with pytest.raises(tb.TrustboError, match="n_columns must be a whole number from 1 on; got 0"):
         result.plot_maps(n_columns=0)
@@ -50,7 +50,8 @@ def test_fonts_are_the_user_s_and_sizes_the_figure_s(result):
             figure.canvas.draw()
         texts = [text for text in figure.findobj(Text) if text.get_text()]
         sizes.append(([text.get_fontsize() for text in texts], *figure.get_size_inches()))
-    assert sizes[0] == sizes[1]
+    assert sizes[0][:2] == sizes[1][:2]  # texts, and the width
+    assert sizes[0][2] == pytest.approx(sizes[1][2], abs=0.1)  # letters differ in height
     assert {8.0, 9.0} == set(sizes[0][0])
     assert {text.get_fontfamily()[0] for text in texts} == {"serif"}
 

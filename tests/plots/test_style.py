@@ -1,10 +1,14 @@
 """Options that every figure takes, and colours that follow the paper."""
 
+import inspect
+import itertools
 import re
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import xarray as xr
+from matplotlib.axis import Axis
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
 
@@ -24,6 +28,15 @@ def figures(result):
     found = tb.criticise(posterior, result.missions, compare=False)
     ranks = tb.inference.sbc(n_datasets=5, shape=(2, 4, 2, 2), n_ranked=40, progress=False)
     names = workspace.team.names
+    rng = np.random.default_rng(0)
+    study = xr.Dataset(
+        {"regret": (("run", "mission"), 10.0 * rng.uniform(size=(8, 4)))},
+        {
+            "policy": ("run", ["thompson", "posterior_mean"] * 4),
+            "terrain": ("run", ["hill"] * 4 + ["plain"] * 4),
+            "mission": np.arange(1, 5),
+        },
+    )
     drawn = {
         "trust_maps": (lambda **o: result.plot_maps(**o), 3),
         "robot_maps": (lambda **o: plots.robot_maps(cost, workspace, result.path, **o), 3),
@@ -39,6 +52,7 @@ def figures(result):
         "campaign_history": (lambda **o: plots.campaign_history(result.history, **o), 2),
         "criticism": (lambda **o: plots.criticism(found, **o), 9),
         "calibration": (lambda **o: plots.calibration(ranks, **o), 2),
+        "regret_curves": (lambda **o: plots.regret_curves(study, panels="terrain", **o), 2),
     }
     return drawn
 
@@ -46,9 +60,87 @@ def figures(result):
 NAMES = (
     "trust_maps", "robot_maps", "path_posterior", "hazard_map", "terrain_maps", "loadings",
     "place_map", "plan_map", "plan_trust", "mission_trust", "parameter_history",
-    "campaign_history", "criticism", "calibration",
+    "campaign_history", "criticism", "calibration", "regret_curves",
 )  # fmt: skip
 MAPS = NAMES[:5]
+
+
+def test_all_figures_with_options_are_tried_here():
+    with_options = [
+        name
+        for name in plots.__all__
+        if inspect.isfunction(getattr(plots, name))
+        and "style" in inspect.signature(getattr(plots, name)).parameters
+    ]
+    assert sorted(with_options) == sorted(NAMES)
+
+
+def texts_of(artist):
+    """All pieces of text that are drawn, of the ticks too."""
+    if not artist.get_visible():
+        return []
+    if isinstance(artist, Text):
+        return [artist] if artist.get_text().strip() else []
+    parts = artist.get_children()
+    if isinstance(artist, Axis):
+        ticks = artist._update_ticks()  # only these are drawn
+        parts = [artist.label, artist.offsetText, *(t.label1 for t in ticks)]
+        parts += [t.label2 for t in ticks]
+    return [text for part in parts for text in texts_of(part)]
+
+
+def complaints_of(figure):
+    """Sentences on what leaves the figure, and on pieces of text over others."""
+    figure.canvas.draw()
+    renderer, whole = figure.canvas.get_renderer(), figure.bbox
+    box = figure.get_tightbbox(renderer).transformed(figure.dpi_scale_trans)
+    said = []
+    if box.x0 < whole.x0 or box.y0 < whole.y0 or box.x1 > whole.x1 or box.y1 > whole.y1:
+        said.append(f"{box.extents} leaves {whole.extents}")
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in texts_of(figure)]
+    for (one, a), (other, b) in itertools.combinations(boxes, 2):
+        width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+        if min(width, height) > 1.0:  # boxes are larger than letters
+            said.append(f"{one!r} is over {other!r}")
+    return said
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("width", [None, 3.5])
+def test_all_of_a_figure_is_inside_it_and_no_text_is_over_other_text(figures, name, width):
+    figure = np.ravel(figures[name][0](width=width))[0].figure
+    assert complaints_of(figure) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_legends_and_bars_have_room_on_the_user_s_axes(figures, name):
+    draw, n = figures[name]
+    rows, columns = -(-n // 4), min(n, 4)
+    size = 2.6 * columns, 2.4 * rows
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    draw(ax=axes.ravel()[:n])
+    assert complaints_of(figure) == []
+
+
+@pytest.mark.parametrize("name", ["trust_maps", "robot_maps", "path_posterior", "terrain_maps"])
+@pytest.mark.parametrize("options", [{}, {"width": 3.5}, {"title": "all maps"}])
+def test_maps_leave_no_blank_strip_above_or_below(figures, name, options):
+    figure = np.ravel(figures[name][0](**options))[0].figure
+    figure.canvas.draw()
+    content = figure.get_tightbbox()
+    assert content.y0 < 0.1
+    assert figure.get_figheight() - content.y1 < 0.1
+
+
+@pytest.mark.parametrize(("shape", "rows"), [((1, 3), 1), ((3, 1), 3), ((2, 2), 2)])
+def test_a_bar_of_the_user_s_axes_is_as_tall_as_their_rows(figures, shape, rows):
+    figure, axes = plt.subplots(*shape, figsize=(7.0, 7.0))
+    figures["trust_maps"][0](ax=axes.ravel()[:3])
+    (bar,) = keys_of(figure)
+    assert bar.get_box_aspect() == 14 * rows
+    longest = max(map(len, bar.get_ylabel().splitlines()))
+    height = sum({ax.get_position(original=True).height for ax in axes.ravel()[:3]}) * 7.0 * rows
+    assert longest <= max(18, 11 * height)
 
 
 def keys_of(figure):
@@ -134,8 +226,8 @@ def test_no_two_colours_of_a_theme_are_alike():
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ({"titel": "a"}, r"unknown option titel=; did you mean title=\?"),
-        ({"colour": "a"}, "unknown option colour=; choose of ax, n_columns"),
+        ({"titel": "a"}, r"unknown option 'titel'; did you mean title\?"),
+        ({"font": "a"}, "unknown option 'font'; choose one of ax, n_columns"),
         ({"width": -1.0}, "width must be positive and finite; got -1.0"),
         ({"legend": "no"}, "legend must be True or False; got 'no'"),
         ({"title": 3}, "title must be text; got 3"),
@@ -161,9 +253,10 @@ def test_a_wrong_argument_is_said_in_a_line(result):
         "loadings": (result.workspace,),
         "criticism": (result,),
         "calibration": (result,),
+        "regret_curves": (result,),
         "animate_mission": (result.workspace, result.missions[0]),
     }
     for name, arguments in wrong.items():
-        said = rf"plots\.{name} takes .*; got a {type(arguments[0]).__name__}\.$"
+        said = rf"^plots\.{name}: got {type(arguments[0]).__name__} .*; give [^\n]*\.$"
         with pytest.raises(tb.TrustboError, match=said):
             getattr(plots, name)(*arguments)

@@ -14,11 +14,11 @@ from matplotlib.patches import Patch, Rectangle
 from scipy.ndimage import uniform_filter1d
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, pip_install, require_choice, require_positive
+from trustbo.errors import TrustboError, pip_install, require_choice, require_kind, require_positive
 from trustbo.files import FilePath, write_file
 from trustbo.plots.layout import as_text, extent_of, plain
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
-from trustbo.plots.style import MEDIUM, SMALL, require_kind, theme
+from trustbo.plots.style import MEDIUM, SMALL, theme
 from trustbo.workspace import Workspace
 
 SEEN, UNSEEN = "#009e73", "#d55e00"
@@ -73,8 +73,8 @@ def animate_mission(
         TrustboError: The mission has no poses, the suffix is another, a number is not positive, or
             there is no ffmpeg.
     """
-    require_kind("animate_mission", mission, Mission, "a Mission and its Workspace")
-    require_kind("animate_mission", workspace, Workspace, "a Mission and its Workspace")
+    require_kind("plots.animate_mission", mission, Mission, "give a Mission and its Workspace")
+    require_kind("plots.animate_mission", workspace, Workspace, "give a Mission and its Workspace")
     target = None if path is None else Path(path)
     if target is not None:
         require_choice("suffix", target.suffix.lower(), SUFFIXES)

@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.lines import Line2D
 from scipy import stats
 
+from trustbo.errors import require_kind
 from trustbo.plots.layout import (
     DASHES,
     MARKERS,
@@ -16,7 +17,7 @@ from trustbo.plots.layout import (
     set_titles,
     small_multiples,
 )
-from trustbo.plots.style import SMALL, Style, StyleOptions, curve_colours, require_kind, theme
+from trustbo.plots.style import SMALL, Style, StyleOptions, curve_colours, theme
 
 _PROBABILITY = 0.95
 
@@ -36,7 +37,7 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
     Returns:
         Axes, shape (2,).
     """
-    require_kind("calibration", ranks, xr.Dataset, "the Dataset of models.sbc")
+    require_kind("plots.calibration", ranks, xr.Dataset, "give the Dataset of models.sbc")
     look, colours = Style.of(style), theme()
     made = small_multiples(2, (3.6, 2.9), look, least=2.4)
     curves, cover = made.panels
@@ -65,7 +66,7 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
         keys.append(Line2D([], [], label=as_text(name), **drawn | marker))
     curves.set(xlim=(0.0, 1.0))
     curves.set_xlabel("rank of the truth among the draws, as a share", fontsize=SMALL)
-    curves.set_ylabel("share of ranks below, less uniform", fontsize=SMALL)
+    curves.set_ylabel("share of ranks below,\nless uniform", fontsize=SMALL)
     expected = np.array([stats.binom.ppf((0.025, 0.975), n, width) / n for width in widths])
     cover.vlines(widths, *expected.T, color=colours.band, linewidth=16.0, zorder=0)
     cover.plot([0.0, 1.0], [0.0, 1.0], color=colours.quiet, linewidth=0.8)

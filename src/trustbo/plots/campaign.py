@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.planning import QUANTILES
 from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
-from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 MOST_PANELS = 64
 _TRUE = (0, (4, 2))
@@ -42,8 +42,8 @@ def parameter_history(
         TrustboError: There are no posteriors, a parameter or label is unknown, or there are too
             many parameters to be legible.
     """
-    such = "a list of posteriors, such as Result.posteriors"
-    require_kind("parameter_history", posteriors, Sequence, such)
+    such = "give a list of posteriors, such as Result.posteriors"
+    require_kind("plots.parameter_history", posteriors, Sequence, such)
     look, colours = Style.of(style), theme()
     if not posteriors:
         raise TrustboError("there are no posteriors; give one for each mission.")
@@ -104,7 +104,9 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
     Raises:
         TrustboError: The history has no mission.
     """
-    require_kind("campaign_history", history, xr.Dataset, "a history, such as Result.history")
+    require_kind(
+        "plots.campaign_history", history, xr.Dataset, "give a history, such as Result.history"
+    )
     look, colours = Style.of(style), theme()
     if not history.sizes.get("iteration"):
         raise TrustboError("the history has no mission yet; tell the campaign one first.")

@@ -11,6 +11,7 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.criticism import Criticism
+from trustbo.errors import require_kind
 from trustbo.plots.layout import (
     Panels,
     as_text,
@@ -21,7 +22,7 @@ from trustbo.plots.layout import (
     small_multiples,
 )
 from trustbo.plots.places import BETTER_WORSE
-from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 _LEVEL = 0.05
 _LEAST_P = 1e-6
@@ -45,7 +46,7 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
     Returns:
         Axes, shape (9,).
     """
-    require_kind("criticism", found, Criticism, "a Criticism, from tb.criticise")
+    require_kind("plots.criticism", found, Criticism, "give a Criticism, from tb.criticise")
     look = Style.of(style)
     made = small_multiples(9, (2.5, 2.2), look, least=1.8)
     tests, pit, cover, correlation, *groups, cells = made.panels

@@ -7,7 +7,10 @@ from typing import Any, NamedTuple
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.transforms import Bbox
 
 from trustbo.plots.style import MEDIUM, SMALL, Style
 from trustbo.workspace import Grid
@@ -16,6 +19,10 @@ PAGE = 7.6
 """Width of a page, inches: figures of several panels are no wider by default."""
 _KEY, _LETTER = 0.45, 0.068
 """Widths of a legend's key with its margins, and of a letter of its text, inches."""
+_LINE = 0.18
+"""Height of a line of a legend, inches; a figure is higher by them, for panels to keep theirs."""
+_PAD = 0.04
+"""Margin around a figure, inches."""
 _LETTERS = 11
 """Letters of a colour bar's label for each inch of the figure's height."""
 
@@ -34,7 +41,6 @@ class Panels(NamedTuple):
     """Those at the left edge."""
     lower: list[Axes]
     """Those with no panel below."""
-    columns: int
 
 
 def small_multiples(
@@ -64,7 +70,7 @@ def small_multiples(
     """
     if style.ax is not None:
         panels = style.axes(n)
-        return Panels(panels[0].figure, panels, list(panels), list(panels), 1)
+        return Panels(panels[0].figure, panels, list(panels), list(panels))
     margin = margin if style.legend else 0.0
     most = max(1, int(((style.width or PAGE) - margin) / least))
     wanted = style.n_columns or min(columns or _columns(n), most)
@@ -84,7 +90,7 @@ def small_multiples(
     for ax in panels[n:]:
         ax.set_visible(False)
     left = [row[0] for row in axes]
-    return Panels(figure, panels[:n], left, _lowest(axes), cols)
+    return Panels(figure, panels[:n], left, _lowest(axes))
 
 
 def _columns(n: int) -> int:
@@ -112,13 +118,10 @@ def map_panels(
     cols = min(style.n_columns or columns or _columns(n), n, max(1, int(room / least)))
     if style.width is not None or (style.n_columns is None and width * cols > room):
         width = max(min(width, room / cols) if style.width is None else room / cols, 1.2)
-    made = small_multiples(
+    return small_multiples(
         n, (width, width * tall + 0.5), style, margin=margin, columns=columns, least=least,
         sharex=True, sharey=True,
     )  # fmt: skip
-    if isinstance(made.figure, Figure) and style.ax is None:
-        made.figure.set_layout_engine("compressed")  # panels keep the terrain's proportions
-    return made
 
 
 def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
@@ -141,25 +144,52 @@ def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: An
     if not style.legend:
         return
     axes = list(options.pop("axes", made.panels))
-    rows = -(-len(axes) // made.columns)
-    shape = {"aspect": 14 * min(rows, 3), "shrink": 0.95, "pad": 0.02}
+    heights = _heights(axes)
+    shape = {"aspect": 14 * min(len(heights), 3), "shrink": 0.95, "pad": 0.02}
     bar = made.figure.colorbar(image, ax=axes, **shape | options)
-    if "location" not in options:
-        shares = [ax.get_position().height for ax in axes[:: made.columns]]
-        letters = int(_LETTERS * sum(shares) * _inches(made.figure))
-        label = textwrap.fill(label, max(18, letters))
-    else:
+    if "location" in options:
         bar.ax.locator_params(axis="x", nbins=4)
+    else:
+        label = textwrap.fill(label, max(18, int(_LETTERS * sum(heights))))
+        if bar.norm.__class__ is Normalize:
+            bar.ax.locator_params(axis="y", nbins=5)
     bar.set_label(label, fontsize=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
 
 
-def _width(figure: Figure | SubFigure) -> float:
-    return float(figure.get_figure(root=True).get_figwidth())  # pyright: ignore[reportOptionalMemberAccess]
+def _heights(axes: Sequence[Axes]) -> list[float]:
+    """Height of each row of Axes, inches, wherever in the figure they are."""
+    rows: dict[float, float] = {}
+    for ax in axes:
+        box = ax.get_position(original=True)
+        row = round(box.y0 + box.y1, 2)
+        rows[row] = max(rows.get(row, 0.0), box.height)
+    return [height * _whole(axes[0]).get_figheight() for height in rows.values()]
 
 
-def _inches(figure: Figure | SubFigure) -> float:
-    return float(figure.get_figure(root=True).get_figheight())  # pyright: ignore[reportOptionalMemberAccess]
+def _whole(ax: Axes) -> Figure:
+    """Figure of Axes, with all its parts."""
+    figure = ax.get_figure(root=True)
+    assert isinstance(figure, Figure)  # noqa: S101
+    return figure
+
+
+def fit_height(made: Panels, style: Style) -> None:
+    """Give a new figure of maps the height that they take at its width.
+
+    It depends on the proportions of the maps beside the width of bars and numbers; any other height
+    would leave a gap above, or at the sides.
+    """
+    if style.ax is not None:
+        return
+    figure = _whole(made.panels[0])
+    engine = ConstrainedLayoutEngine(compress=True)  # panels keep the terrain's proportions
+    figure.set_layout_engine(engine)
+    figure.set_figheight(1.5 * figure.get_figheight())  # for the width alone to limit the maps
+    engine.execute(figure)
+    panels = Bbox.union([ax.get_tightbbox() for ax in figure.axes if ax.get_visible()])
+    title = figure.get_suptitle() and (MEDIUM + 4.0) / 72.0
+    figure.set_figheight(panels.height / figure.dpi + 2.0 * _PAD + (title or 0.0))
 
 
 def legend(made: Panels, handles: Sequence[Any], style: Style, **options: Any) -> None:
@@ -168,13 +198,20 @@ def legend(made: Panels, handles: Sequence[Any], style: Style, **options: Any) -
         return
     shape: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handles": list(handles)}
     shape |= {"handlelength": 1.6, "columnspacing": 1.2}
+    first = made.panels[0]
+    whole = _whole(first)
+    width = whole.get_figwidth()
     if style.ax is not None:
-        made.panels[0].legend(**shape, loc="best")
+        letters = int((first.get_position().width * width - _KEY) / _LETTER)
+        lines = [textwrap.fill(str(handle.get_label()), max(letters, 8)) for handle in handles]
+        first.legend(**shape | {"labels": lines, "frameon": True, "framealpha": 0.85}, loc="best")
         return
     longest = max((len(str(handle.get_label())) for handle in handles), default=1)
-    room = int(_width(made.figure) / (_KEY + _LETTER * longest))
+    room = int(width / (_KEY + _LETTER * longest))
     options["ncols"] = max(1, min(options.get("ncols", 3), room))
     made.figure.legend(**shape | {"loc": "outside lower center"} | options)
+    lines = -(-len(handles) // options["ncols"]) + ("title" in options)
+    whole.set_figheight(whole.get_figheight() + _LINE * lines)
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:

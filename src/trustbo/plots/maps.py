@@ -15,17 +15,18 @@ from matplotlib.image import AxesImage
 from scipy.ndimage import gaussian_filter
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.plots.layout import (
     Panels,
     colour_bar,
     extent_of,
+    fit_height,
     grid_lines,
     label_maps,
     map_panels,
     set_titles,
 )
-from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Grid, Workspace
 from trustbo.workspace.grid import over_cells
@@ -78,7 +79,7 @@ def trust_maps(
     Raises:
         TrustboError: There is no such mission.
     """
-    require_kind("trust_maps", history, xr.Dataset, "a history, such as Result.history")
+    require_kind("plots.trust_maps", history, xr.Dataset, "give a history, such as Result.history")
     look, number = Style.of(style), history["iteration"].values.tolist()
     chosen = _chosen(missions, number)
     maps = [history["trust_map"].sel(iteration=i) for i in chosen]
@@ -151,8 +152,8 @@ def robot_maps(
     Returns:
         Axes, shape (robot,).
     """
-    such = "maps (robot, row, col), such as planner.cost_map(params, per_robot=True)"
-    require_kind("robot_maps", maps, xr.DataArray, such)
+    such = "give maps (robot, row, col), such as planner.cost_map(params, per_robot=True)"
+    require_kind("plots.robot_maps", maps, xr.DataArray, such)
     look, maps = Style.of(style), maps.transpose("robot", "row", "col")
     values = np.where(workspace.passable.values, maps.values, np.nan)
     if path is not None:
@@ -187,8 +188,8 @@ def path_posterior(
     Returns:
         Axes of the map.
     """
-    such = "probabilities (row, col), such as planner.path_posterior(posterior)"
-    require_kind("path_posterior", share, xr.DataArray, such)
+    such = "give probabilities (row, col), such as planner.path_posterior(posterior)"
+    require_kind("plots.path_posterior", share, xr.DataArray, such)
     return _one_map(
         share, workspace, path, "P(cell on the best path)", Normalize(0.0, 1.0), Style.of(style)
     )
@@ -385,11 +386,12 @@ def draw_scale_of(ax: Axes, width: float, corner: tuple[int, int] = (1, 0)) -> N
     length = max(f * magnitude for f in (1, 2, 5) if f * magnitude <= 0.4 * width * (1 + 1e-9))
     share = length / width  # of the axes
     x, y = (0.96 - share if corner[0] else 0.04), (0.87 if corner[1] else 0.045)
-    (bar,) = ax.plot([x, x + length / width], [y, y], color="black", transform=ax.transAxes)
+    (bar,) = ax.plot([x, x + share], [y, y], color="black", transform=ax.transAxes)
     bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=outlined(4.0))
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    text = ax.text(x, y + 0.02, label, fontsize=SMALL, color="black", transform=ax.transAxes)
-    text.set_path_effects(outlined(2.5))
+    edge = ("left", x) if corner[0] == 0 else ("right", x + share)  # for a long text to stay inside
+    text = ax.text(edge[1], y + 0.02, label, ha=edge[0], fontsize=SMALL, transform=ax.transAxes)
+    text.set(color="black", path_effects=outlined(2.5))
 
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
@@ -430,3 +432,4 @@ def _finish(
         label = f"{label[:-1]}; " if label.endswith(")") else f"{label} ("
         label += "grey: impassable)"
     colour_bar(made, mappable, label, look, **options)
+    fit_height(made, look)

@@ -7,10 +7,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import ShapeError, TrustboError, require_kind
 from trustbo.planning import QUANTILES, Plan
 from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
-from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 _SIZE = 2.5, 1.9
 
@@ -34,7 +34,9 @@ def mission_trust(
     Raises:
         TrustboError: There is no such mission.
     """
-    require_kind("mission_trust", posterior, xr.DataTree, "a posterior, such as Result.posterior")
+    require_kind(
+        "plots.mission_trust", posterior, xr.DataTree, "give a posterior, such as Result.posterior"
+    )
     look, latent = Style.of(style), posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
     if not isinstance(mission, int | np.integer) or not -n_missions <= mission < n_missions:
@@ -72,7 +74,9 @@ def plan_trust(
     Raises:
         ShapeError: The number of robots or bounds differs from that of the plan.
     """
-    require_kind("plan_trust", plan, Plan, "a Plan, such as Result.plan or campaign.ask()")
+    require_kind(
+        "plots.plan_trust", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()"
+    )
     look, (n_bounds, n_robots) = Style.of(style), plan.trust.shape
     if len(robots) != n_robots:
         raise ShapeError(f"the plan has {n_robots} robots; got the names {tuple(robots)}.")
@@ -120,5 +124,5 @@ def _panels(
     label_lower(made, "bound")
     for ax in made.left:
         ax.set_ylabel("trust, contact rate", fontsize=SMALL)
-    legend(made, made.panels[0].get_legend_handles_labels()[0], look, ncols=2)
+    legend(made, made.panels[0].get_legend_handles_labels()[0], look, ncols=4)
     return made.panels

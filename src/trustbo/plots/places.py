@@ -9,11 +9,18 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 
-from trustbo.errors import ShapeError
+from trustbo.errors import ShapeError, require_kind
 from trustbo.inference import place_maps
-from trustbo.plots.layout import colour_bar, extent_of, label_maps, map_panels, set_titles
+from trustbo.plots.layout import (
+    colour_bar,
+    extent_of,
+    fit_height,
+    label_maps,
+    map_panels,
+    set_titles,
+)
 from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined, robust_limits
-from trustbo.plots.style import Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import Style, StyleOptions, theme
 from trustbo.workspace import Grid, Workspace
 from trustbo.workspace.moves import MOVES
 
@@ -51,9 +58,9 @@ def place_map(
         TrustboError: The model has no effects of places.
         ShapeError: The workspace has fewer cells than the posterior's grid.
     """
-    such = "a posterior with places, such as Result.posterior, and a Workspace"
-    require_kind("place_map", posterior, xr.DataTree, such)
-    require_kind("place_map", workspace, Workspace, such)
+    such = "give a posterior with places, such as Result.posterior, and a Workspace"
+    require_kind("plots.place_map", posterior, xr.DataTree, such)
+    require_kind("plots.place_map", workspace, Workspace, such)
     look, maps = Style.of(style), place_maps(posterior)
     have, grid = (maps.sizes["row"], maps.sizes["col"]), workspace.grid
     if have[0] > grid.shape[0] or have[1] > grid.shape[1]:
@@ -92,6 +99,7 @@ def place_map(
         }
         under = {"location": "bottom", "aspect": 24, "pad": 0.02}
         colour_bar(made, ScalarMappable(*colours[kind]), labels[kind], look, **of_kind, **under)
+    fit_height(made, look)
     return made.panels
 
 

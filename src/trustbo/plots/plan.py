@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.planning import Plan
 from trustbo.plots.layout import (
     MARKERS,
@@ -19,7 +19,7 @@ from trustbo.plots.layout import (
     small_multiples,
 )
 from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
-from trustbo.plots.style import Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import Style, StyleOptions, theme
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours of Okabe and Ito (2008), by robot; in grey, markers tell robots apart."""
@@ -48,7 +48,7 @@ def plan_map(
     Raises:
         TrustboError: The workspace has no terrain in memory, or there is no such bound.
     """
-    require_kind("plan_map", plan, Plan, "a Plan, such as Result.plan or campaign.ask()")
+    require_kind("plots.plan_map", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()")
     look = Style.of(style)
     if plan.waypoints is None:
         raise TrustboError(

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.plots.layout import (
     DASHES,
     MARKERS,
@@ -56,13 +56,10 @@ def regret_curves(
         TrustboError: This is no dataset; a coordinate is unknown; or no regret is, as no simulator
             of the study knows the truth.
     """
+    such = "give a study's dataset, from study.load_study"
+    require_kind("plots.regret_curves", dataset, xr.Dataset, such)
     require_choice("variable", variable, _MEANING)
     look = Style.of(style)
-    if not isinstance(dataset, xr.Dataset):
-        raise TrustboError(
-            "regret_curves takes a study's dataset, from study.load_study; got a "
-            f"{type(dataset).__name__}."
-        )
     for name in (by, panels or by):
         require_choice(
             "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]

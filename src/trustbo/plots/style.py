@@ -1,6 +1,5 @@
 """Appearance that all figures share: colours on light and dark paper, and the options of a user."""
 
-import difflib
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Self, TypedDict
 
@@ -10,7 +9,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, to_hex, to_rgb
 
-from trustbo.errors import TrustboError, require_positive, require_whole
+from trustbo.errors import TrustboError, require_positive, require_whole, unknown
 
 SMALL, MEDIUM = 8.0, 9.0
 """Sizes of text, points: of numbers and keys, and of labels and titles."""
@@ -133,9 +132,7 @@ class Style:
         known = [f.name for f in fields(cls)]
         for name in options:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"did you mean {near[0]}=?" if near else f"choose of {', '.join(known)}."
-                raise TrustboError(f"unknown option {name}=; {hint}")
+                raise unknown("option", name, known)
         return cls(**options)
 
     def colours(self, default: str | Colormap) -> Colormap:
@@ -161,11 +158,5 @@ class Style:
 
 def curve_colours(n: int, style: Style) -> np.ndarray:
     """Colours of n curves that can be told from the paper, also in grey; shape (n, 4)."""
-    dark = theme().paper != LIGHT.paper and luminance(theme().paper) < 0.5
-    return style.colours("viridis")(np.linspace(*((0.35, 1.0) if dark else (0.0, 0.8)), max(n, 1)))
-
-
-def require_kind(function: str, value: object, kinds: type | tuple[type, ...], such: str) -> None:
-    """Refuse another kind of object than a figure draws; `such` names one, for the TrustboError."""
-    if not isinstance(value, kinds):
-        raise TrustboError(f"plots.{function} takes {such}; got a {type(value).__name__}.")
+    ends = (0.35, 1.0) if luminance(theme().paper) < 0.5 else (0.0, 0.8)
+    return style.colours("viridis")(np.linspace(*ends, max(n, 1)))

@@ -8,11 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.plots.layout import (
     as_text,
     colour_bar,
     extent_of,
+    fit_height,
     grid_lines,
     label_maps,
     map_panels,
@@ -21,7 +22,7 @@ from trustbo.plots.layout import (
     small_multiples,
 )
 from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined
-from trustbo.plots.style import SMALL, Style, StyleOptions, require_kind, theme
+from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace import Workspace
 
@@ -45,7 +46,7 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
     Raises:
         TrustboError: The workspace has no terrain, or one that is read lazily.
     """
-    require_kind("terrain_maps", workspace, Workspace, "a Workspace")
+    require_kind("plots.terrain_maps", workspace, Workspace, "give a Workspace")
     look, terrain, pixels = Style.of(style), workspace.terrain, workspace.pixels
     if terrain is None or pixels is None:
         raise TrustboError(
@@ -75,19 +76,27 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
     label_maps(made)
     label = "index (0 worst, 1 best; grey: too steep)"
     colour_bar(made, ScalarMappable(Normalize(0, 1), colours), label, look)
-    # Inside, so that the panels keep one size.
     if look.legend:
-        inset = surface.inset_axes((0.04, 0.05, 0.35, 0.05))
-        bar = made.figure.colorbar(
-            ScalarMappable(heights, "cividis"), cax=inset, orientation="horizontal"
-        )
-        ends = float(np.nanmin(dsm)), float(np.nanmax(dsm))
-        bar.set_ticks(ends, labels=[f"{ends[0]:.0f}", f"{ends[1]:.0f} m"])
-        inset.xaxis.set_ticks_position("top")
-        inset.tick_params(labelsize=SMALL, length=0, pad=1)
-        for text in inset.get_xticklabels():
-            text.set(path_effects=outlined(2.0), color="black")
+        _draw_heights(surface, heights)
+    fit_height(made, look)
     return made.panels
+
+
+def _draw_heights(ax: Axes, heights: Normalize) -> None:
+    """Draw the bar of heights at the top of the surface: inside, for panels to keep one size."""
+    inset = ax.inset_axes((0.05, 0.91, 0.9, 0.04))
+    bar = ax.figure.colorbar(
+        ScalarMappable(heights, "cividis"), cax=inset, orientation="horizontal"
+    )
+    bar.set_ticks([])
+    span, low = heights.vmax - heights.vmin, heights.vmin
+    digits = 0 if span >= 5.0 else 1
+    for x, side, text in (
+        (0.0, "left", f"{low:.{digits}f}"),
+        (1.0, "right", f"{heights.vmax:.{digits}f} m"),
+    ):
+        drawn = inset.text(x, -0.4, text, ha=side, va="top", transform=inset.transAxes)
+        drawn.set(fontsize=SMALL, path_effects=outlined(2.0), color="black")
 
 
 def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOptions]) -> np.ndarray:
@@ -103,7 +112,9 @@ def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOpti
     Raises:
         TrustboError: There are no composites.
     """
-    require_kind("loadings", composites, Mapping, "composites by name, `Workspace.composites`")
+    require_kind(
+        "plots.loadings", composites, Mapping, "give composites by name, `Workspace.composites`"
+    )
     look = Style.of(style)
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")
@@ -121,7 +132,7 @@ def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOpti
     shares = [float(index.explained_variance_ratio_[0]) for index in composites.values()]
     set_titles(
         made,
-        [f"{n}: {share:.0%} of the variance" for n, share in zip(composites, shares, strict=True)],
+        [f"{n}:\n{share:.0%} of the variance" for n, share in zip(composites, shares, strict=True)],
         look,
     )
     return made.panels
