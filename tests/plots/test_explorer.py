@@ -1,16 +1,21 @@
 """The interactive page: its numbers are the result's, it is whole, and it works in a browser."""
 
 import html
+import io
 import json
 import re
 import time
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from PIL import Image
+from scipy.spatial import cKDTree
 
 import trustbo as tb
 from trustbo.campaign.exploring import scene_of
-from trustbo.plots.explorer import Layer, Scene, scene
+from trustbo.plots import DARK, LIGHT
+from trustbo.plots.explorer import Layer, Scene, Step, draw_explorer, scene
 
 WIDTHS = {"wide": (1300, 900, False), "phone": (390, 844, True)}
 
@@ -284,6 +289,53 @@ def test_it_follows_the_colours_of_the_system(scheme, chromium, files):
     assert (ground > 128) == (scheme == "light")
     assert abs(ground - ink) > 150
     assert (int(axis[1:3], 16) > 128) == (scheme == "dark")
+
+
+def map_pixels(chromium):
+    """RGB of the map as the browser shows it, (pixel, 3)."""
+    corners = chromium.execute_script(
+        """
+        const plot = Bokeh.documents.map((d) => d.get_model_by_name("map")).find((found) => found)
+        const view = Bokeh.index.get_by_id(plot.id)
+        const box = view.el.getBoundingClientRect()
+        const {x_scale: x, y_scale: y} = view.frame
+        return [box.left + x.compute(plot.x_range.start), box.top + y.compute(plot.y_range.end),
+                box.left + x.compute(plot.x_range.end), box.top + y.compute(plot.y_range.start)]
+        """
+    )
+    with Image.open(io.BytesIO(chromium.get_screenshot_as_png())) as shot:
+        return np.asarray(shot.convert("RGB").crop([round(at) for at in corners])).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("relief", [True, False])
+def test_the_map_has_the_colours_of_its_bar(scheme, relief, chromium, files, record):
+    """Of all pixels, path and posts included, 85 % are within 30 RGB units of the bar's."""
+    seen = opened(chromium, files["explore"], scheme=scheme)
+    box = seen.find_element("id", "relief")
+    if box.is_selected() != relief:
+        box.click()
+    time.sleep(0.3)
+    bar = 255.0 * np.array([to_rgb(colour) for colour in record["palettes"]["viridis"]])
+    pixels = map_pixels(seen)
+    assert len(pixels) > 50_000
+    assert np.mean(cKDTree(bar).query(pixels)[0] <= 30.0) >= 0.85
+
+
+@pytest.mark.parametrize(("scheme", "colours"), [("light", LIGHT), ("dark", DARK)])
+def test_impassable_cells_have_the_grey_of_the_theme_and_a_key(scheme, colours, chromium, tmp_path):
+    shape, passable = (2, 2), np.array([[True, True], [True, False]])
+    workspace = tb.Workspace.from_awareness(np.full((1, *shape, 2), 0.5), passable)
+    layer = Layer("trust_mean", "trust", "Trust", np.full(shape, 0.5), (0.0, 1.0))
+    half = np.full((5, 1), 0.5)
+    step = Step("m", "", "", [(0, 0), (0, 1)], np.full((2, 2), 0.5), None, half[:1], half)
+    draw_explorer(Scene("t", workspace, [layer], [step])).save(tmp_path / "page.html")
+    seen = opened(chromium, (tmp_path / "page.html").as_uri(), scheme=scheme)
+    assert "impassable" in seen.find_element("css selector", ".key").text
+    time.sleep(0.3)
+    closed = 255.0 * np.array(to_rgb(colours.closed))
+    near = (np.abs(map_pixels(seen) - closed) <= 1.0).all(1)
+    assert 0.15 < near.mean() < 0.3  # one cell of four
 
 
 def test_a_notebook_s_frame_is_as_high_as_the_page(chromium, files):

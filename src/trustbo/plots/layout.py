@@ -187,7 +187,8 @@ def fit_height(made: Panels, style: Style) -> None:
     figure.set_layout_engine(engine)
     figure.set_figheight(1.5 * figure.get_figheight())  # for the width alone to limit the maps
     engine.execute(figure)
-    panels = Bbox.union([ax.get_tightbbox() for ax in figure.axes if ax.get_visible()])
+    boxes = [ax.get_tightbbox() for ax in figure.axes if ax.get_visible()]
+    panels = Bbox.union([box for box in boxes if box is not None])
     title = figure.get_suptitle() and (MEDIUM + 4.0) / 72.0
     figure.set_figheight(panels.height / figure.dpi + 2.0 * _PAD + (title or 0.0))
 

@@ -77,23 +77,22 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
     label = "index (0 worst, 1 best; grey: too steep)"
     colour_bar(made, ScalarMappable(Normalize(0, 1), colours), label, look)
     if look.legend:
-        _draw_heights(surface, heights)
+        _draw_heights(surface, heights, float(np.nanmin(dsm)), float(np.nanmax(dsm)))
     fit_height(made, look)
     return made.panels
 
 
-def _draw_heights(ax: Axes, heights: Normalize) -> None:
+def _draw_heights(ax: Axes, heights: Normalize, low: float, high: float) -> None:
     """Draw the bar of heights at the top of the surface: inside, for panels to keep one size."""
     inset = ax.inset_axes((0.05, 0.91, 0.9, 0.04))
     bar = ax.figure.colorbar(
         ScalarMappable(heights, "cividis"), cax=inset, orientation="horizontal"
     )
     bar.set_ticks([])
-    span, low = heights.vmax - heights.vmin, heights.vmin
-    digits = 0 if span >= 5.0 else 1
+    digits = 0 if high - low >= 5.0 else 1
     for x, side, text in (
         (0.0, "left", f"{low:.{digits}f}"),
-        (1.0, "right", f"{heights.vmax:.{digits}f} m"),
+        (1.0, "right", f"{high:.{digits}f} m"),
     ):
         drawn = inset.text(x, -0.4, text, ha=side, va="top", transform=inset.transAxes)
         drawn.set(fontsize=SMALL, path_effects=outlined(2.0), color="black")

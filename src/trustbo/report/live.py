@@ -97,7 +97,10 @@ def _sections(result: Result) -> list[Section]:
     rates = curve_picture(
         result.history["contact_rate"].values, label="contact rate", x_label="missions"
     )
-    path = "Expected trust now, and the path recommended now, from circle to star."
+    path = (
+        "Expected trust now, and the path recommended now, from circle to star. Grey cells are "
+        "impassable, or the start, whose trust is assumed."
+    )
     contact = "Mean contact rate that each mission measured."
     table = tables.history_table(result)
     return [

@@ -198,7 +198,9 @@ async function start() {
   function paint() {
     document.documentElement.toggleAttribute("data-dark", isDark())
     const style = getComputedStyle(document.documentElement)
-    const [ink, line, median] = ["--ink", "--line", "--median"].map((name) => style.getPropertyValue(name).trim())
+    const names = ["--ink", "--line", "--median", "--closed"]
+    const [ink, line, median, closed] = names.map((name) => style.getPropertyValue(name).trim())
+    part("colours").nan_color = closed
     for (const plot of [map, chart]) {
       for (const axis of [...plot.below, ...plot.left]) {
         const names = ["axis_label_text_color", "major_label_text_color", "axis_line_color", "major_tick_line_color"]
