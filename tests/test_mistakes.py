@@ -9,7 +9,18 @@ import xarray as xr
 
 import trustbo as tb
 from trustbo.export import write_csv, write_path
-from trustbo.inference import TrustFilter, fit, loo, params_of, prior_predictive, sample_prior
+from trustbo.inference import (
+    TrustFilter,
+    by_rate,
+    diagnostics,
+    fit,
+    loo,
+    params_of,
+    place_maps,
+    prior_from,
+    prior_predictive,
+    sample_prior,
+)
 from trustbo.models import PlaceEffect, PooledTrust, Priors, TrustParams
 from trustbo.planning import Planner, roll_trust
 from trustbo.plots import regret_curves
@@ -72,7 +83,10 @@ def posterior(case):
 MISTAKES = {
     # missions
     "row and col swapped": (lambda c: c.tell([(b, a) for a, b in c.path]), "were row and col swap"),
-    "rates in percent": (lambda c: c.tell(y=100 * c.y), "percent. divide by 100"),
+    "ratings of 1 to 7": (
+        lambda c: c.tell(y=np.full_like(c.y, 7.0)), r"= 7 is .*rating .* .rating - 1. / .n - 1..\.$"
+    ),
+    "rates in percent": (lambda c: c.tell(y=100 * c.y), r"percent. divide by 100.\.$"),
     "other robots": (lambda c: c.tell(z=c.z[:, :2], y=c.y[:, :2]), "has robots .* not .'r1'"),
     "another grid": (
         lambda c: c.tell([(r + 20, k) for r, k in c.path]), "outside the grid of 6 rows"
@@ -86,6 +100,31 @@ MISTAKES = {
     "a result, no missions": (lambda c: fit(c.result), "got a Result. Give its .missions"),
     "a number, no missions": (lambda c: fit(3), "must be a list of missions; got a int"),
     "missions as text": (lambda c: fit(["a"]), "mission 0 is no Mission; got 'a'"),
+    "arrays, no missions": (
+        lambda c: fit([c.z]), r"mission 0 is no Mission; got array.\[\[\[.{10,60}\.$"
+    ),
+    "missions for a posterior": (
+        lambda c: Planner(c.workspace, *ENDS).plan_expected([c.mission]), "posterior: got list .Mis"
+    ),
+    "draws of missions": (
+        lambda c: Planner(c.workspace, *ENDS).path_posterior([c.mission]), "got list .*; give one"
+    ),
+    "diagnostics of missions": (
+        lambda c: diagnostics([c.mission]), "diagnostics takes a posterior from fit; got a list"
+    ),
+    "rates of missions": (
+        lambda c: by_rate([c.mission]), "by_rate takes a posterior from fit; got a list"
+    ),
+    "places of missions": (
+        lambda c: place_maps([c.mission]), "place_maps takes a posterior from fit; got a list"
+    ),
+    "a prior from missions": (
+        lambda c: prior_from([c.mission]), "prior_from takes a posterior from fit; got a Mission"
+    ),
+    "a prior from one posterior": (
+        lambda c: prior_from(c.result.posterior), "a list of posteriors; got one. Write .posterior"
+    ),
+    "a filter over a model": (lambda c: TrustFilter(PooledTrust()), "got PooledTrust rates gauss"),
     # places
     "start off the grid": (lambda c: c.iterate((6, 0), (0, 5)), "rows are 0..5 from the top"),
     "start of floats": (lambda c: c.iterate((5.0, 0.5), (0, 5)), "two whole numbers .row, col."),

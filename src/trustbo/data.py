@@ -25,6 +25,7 @@ FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
 """Name of the predicted contact rate; `line_of_sight_1`, `_2`, ... where several are assumed."""
+_RATING = 10.0  # largest value that may be an answer on a scale from 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -457,5 +458,8 @@ def require_unit_interval(what: str, values: np.ndarray) -> None:
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
         index = ", ".join(str(i) for i in np.argwhere(bad)[0])
-        percent = " (percent? divide by 100)" if (values[~np.isnan(values)] >= 0.0).all() else ""
-        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{percent}.")
+        rating = (
+            "; rating from 1 to n? (rating - 1) / (n - 1)" if np.nanmax(values) <= _RATING else ""
+        )
+        hint = f" (percent? divide by 100{rating})" if np.nanmin(values) >= 0.0 else ""
+        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")

@@ -88,9 +88,13 @@ def require_positive(what: str, value: object) -> float:
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
     """Return `value` if it is of a class, or one of a union; TrustboError with a remedy if not."""
     if not isinstance(value, kind):
-        shown = " ".join(repr(value).split())
-        raise TrustboError(f"{what}: got {type(value).__name__} {shown:.60}; {remedy}.")
+        raise TrustboError(f"{what}: got {type(value).__name__} {one_line(value)}; {remedy}.")
     return value
+
+
+def one_line(value: object) -> str:
+    """Show a value in a message, which has one line: the first 60 characters of its repr."""
+    return f"{' '.join(repr(value).split()):.60}"
 
 
 def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:

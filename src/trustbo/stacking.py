@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from trustbo.data import Mission
-from trustbo.errors import ShapeError, TrustboError
+from trustbo.errors import ShapeError, TrustboError, one_line
 
 
 class MissionBatch(NamedTuple):
@@ -67,7 +67,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
     first = missions[0]
     for j, mission in enumerate(missions):
         if not isinstance(mission, Mission):
-            raise ShapeError(f"mission {j} is no Mission; got {mission!r}.")
+            raise ShapeError(f"mission {j} is no Mission; got {one_line(mission)}.")
         if (mission.robots, mission.features) != (first.robots, first.features):
             raise ShapeError(
                 f"mission {j} has robots {mission.robots} and features {mission.features}, mission "

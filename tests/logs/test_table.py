@@ -199,6 +199,10 @@ def test_bounds_that_were_planned_but_not_run_are_part_of_the_path():
     ("columns", "message"),
     [
         ({"row": None}, r"the table lacks row; it has mission, bound, robot, col"),
+        (
+            {"contact_rate": [None, 5.0, 6.0]},
+            r"= 5 is outside .* ratings from 1 to n into .rating - 1",
+        ),
         ({"contact_rate": None}, r"lacks contact_rate \(or contact_time and duration\)"),
         ({"bound": [0, 1, 3]}, r"mission 1 has bounds \[0, 1, 3\], but no bound 2"),
         ({"bound": [0, 1, 1]}, r"bound 1, robot 'r1' is there twice, in rows 2 and 3"),
@@ -293,7 +297,10 @@ def test_files_that_are_no_table_are_named(tmp_path):
     file = tmp_path / "bad.csv"
     for text, message in (
         ("", "the table lacks mission, bound, robot, row, col, contact_rate"),
-        ("mission;bound\n1;2\n", "the table lacks robot, row, col"),
+        (
+            "mission;bound\n1;2\n",
+            r"lacks robot, row, col, .* has mission, bound\. A log without places: row = 0",
+        ),
         ("mission,bound\n1,2,3\n", "row 1 has 3 values, the header 2"),
         ("mission,mission\n1,2\n", "two columns of one name: mission, mission"),
         ("mission,bound,robot,row,col,contact_rate,visibility\n", "the table has no rows"),

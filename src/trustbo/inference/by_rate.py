@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of
 from trustbo.inference.evidence import kalman_numpy
 from trustbo.inference.posterior_groups import Law, complete, is_weighted
-from trustbo.inference.posterior_tree import missions_of
+from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.models.place import bounds_of
 from trustbo.stacking import stack_missions
 
@@ -37,9 +37,9 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
 
     Raises:
         TrustboError: Trust does not integrate out under its observations, or robots influence each
-            other; or see `complete`.
+            other; no posterior of `fit`; or see `complete`.
     """
-    law = Law.of(posterior)
+    law = Law.of(require_posterior("by_rate", posterior))
     if not (law.by_numpy and law.family.integrates_out):
         raise TrustboError(
             "rates are predicted one by one for Gaussian observations of robots that do not "

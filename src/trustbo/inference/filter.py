@@ -11,6 +11,7 @@ from trustbo.data import Cell, as_array, require_shares, require_unit_interval
 from trustbo.errors import (
     ShapeError,
     TrustboError,
+    one_line,
     require_choice,
     require_kind,
     require_pair,
@@ -110,8 +111,9 @@ class TrustFilter:
             posterior = params_of(posterior)
         elif not isinstance(posterior, Params):
             raise TrustboError(
-                f"a filter follows a posterior of fit, or draws of parameters; got {posterior!r}. "
-                "Before its first mission a campaign has no posterior: take its `belief`."
+                "a filter follows a posterior of fit, or draws of parameters; got "
+                f"{one_line(posterior)}. Before its first mission a campaign has no posterior: "
+                "take its `belief`."
             )
         n_robots = posterior.n_robots if n_robots is None else n_robots
         if n_robots is None:

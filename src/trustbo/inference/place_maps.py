@@ -20,6 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.errors import TrustboError
 from trustbo.inference.evidence.place_prior import correlation, matern
+from trustbo.inference.posterior_tree import require_posterior
 from trustbo.models.place import N_MOVES, Visited
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
@@ -223,8 +224,9 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
         "n" towards row 0; NaN where a move would come from outside the grid.
 
     Raises:
-        TrustboError: The model has no effects of places.
+        TrustboError: No posterior of `fit`, or its model has no effects of places.
     """
+    require_posterior("place_maps", posterior)
     if "places" not in posterior.children:
         raise TrustboError(
             f"a posterior of {posterior.attrs.get('model', 'a model')} without effects of places "

@@ -9,6 +9,7 @@ import xarray as xr
 
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import sites_of
+from trustbo.inference.posterior_tree import require_posterior
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect
@@ -71,6 +72,10 @@ def prior_from(posteriors: Sequence[xr.DataTree], model: TrustModel | None = Non
 
 def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
     """Names of the features of the posteriors."""
+    if isinstance(posteriors, xr.DataTree):
+        raise TrustboError("prior_from takes a list of posteriors; got one. Write [posterior].")
+    for each in posteriors:
+        require_posterior("prior_from", each)
     if not posteriors:
         raise TrustboError("there are no posteriors to learn priors from; give one at least.")
     names = [

@@ -69,9 +69,9 @@ def read_columns(table: Any, ignore: Sequence[str] = ()) -> dict[str, list[str]]
     if "contact_rate" not in columns and not {"contact_time", "duration"} <= columns.keys():
         missing.append("contact_rate (or contact_time and duration)")
     if missing:
-        raise TrustboError(
-            f"the table lacks {', '.join(missing)}; it has {', '.join(names) or 'no columns'}."
-        )
+        shown = ", ".join(names) or "no columns"
+        nowhere = " A log without places: row = 0, col = bound." if "row" in missing else ""
+        raise TrustboError(f"the table lacks {', '.join(missing)}; it has {shown}.{nowhere}")
     if not columns["mission"]:
         raise TrustboError("the table has no rows.")
     return columns

@@ -146,7 +146,8 @@ def _cells(label: str, rows: dict[int, dict[str, Row]], start: Cell | None) -> t
     """Path of a mission from its rows."""
     if 0 not in rows and start is None:
         raise TrustboError(
-            f"mission {label} has no row of bound 0, its start cell; add one, or give start."
+            f"mission {label} has no row of bound 0, its start cell; add one, or give "
+            "start=(row, col)."
         )
     for row in rows.get(0, {}).values():
         if not (math.isnan(row.numbers["contact_rate"]) and math.isnan(row.numbers["duration"])):
@@ -187,7 +188,10 @@ def _rate(row: Row) -> float:
     if time > total:
         raise TrustboError(f"contact_time = {time:g} s exceeds duration = {total:g} s.")
     if rate > 1.0:
-        raise TrustboError(f"contact_rate = {rate:g} is outside [0, 1]; divide percentages by 100.")
+        raise TrustboError(
+            f"contact_rate = {rate:g} is outside [0, 1]; divide percentages by 100, and "
+            "turn ratings from 1 to n into (rating - 1) / (n - 1)."
+        )
     if math.isnan(rate):
         return time / total if total else math.nan  # Bound refuses a duration of 0
     if abs(rate * total - time) > 1e-6 * total:

@@ -10,9 +10,9 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_choice
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
 from trustbo.inference.draws import params_of
-from trustbo.models.params import Params
+from trustbo.models.params import Params, params_of
 from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
 from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
 from trustbo.planning.paths import AdmissiblePaths
@@ -226,5 +226,10 @@ def _any_move(cells: np.ndarray) -> np.ndarray:
 
 
 def draws_of(posterior: Params | xr.DataTree) -> Params:
-    """Parameters as they are, or the draws of a posterior: leading axis (draw,)."""
-    return params_of(posterior) if isinstance(posterior, xr.DataTree) else posterior
+    """Parameters as they are, or the draws of a posterior: leading axis (draw,).
+
+    TrustboError: neither.
+    """
+    if isinstance(posterior, xr.DataTree):
+        return params_of(posterior)
+    return require_kind("posterior", posterior, Params, "give one of fit, or draws of parameters")

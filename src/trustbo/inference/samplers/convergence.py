@@ -4,6 +4,8 @@ import numpy as np
 import xarray as xr
 from arviz_stats import sampling_diagnostics
 
+from trustbo.inference.posterior_tree import require_posterior
+
 MAX_RHAT, MIN_ESS = 1.01, 400.0
 """Largest rank-normalised R-hat, and least bulk effective sample size, of NUTS."""
 GOOD_KHAT, MAX_KHAT = 0.5, 0.7
@@ -17,7 +19,11 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
         `r_hat` and `ess_bulk`, the worst over all parameters, and `divergences` for NUTS. `k_hat`
         (good below 0.5) and `kish`, the effective number of points, for the exact sampler, whose
         draws are nearly independent.
+
+    Raises:
+        TrustboError: No posterior of `fit`.
     """
+    require_posterior("diagnostics", posterior)
     if posterior.attrs["sampler"] == "exact":
         return {name: posterior.attrs[name] for name in ("k_hat", "kish")}
     by_site = convergence(posterior["posterior"].to_dataset())
