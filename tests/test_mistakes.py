@@ -116,7 +116,7 @@ MISTAKES = {
         lambda c: by_rate([c.mission]), "by_rate takes a posterior from fit; got a list"
     ),
     "places of missions": (
-        lambda c: place_maps([c.mission]), "place_maps takes a posterior from fit; got a list"
+        lambda c: place_maps([c.mission]), "posterior: got list .Mission.*; give one of trust"
     ),
     "a prior from missions": (
         lambda c: prior_from([c.mission]), "prior_from takes a posterior from fit; got a Mission"

@@ -18,9 +18,8 @@ import xarray as xr
 from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_kind
 from trustbo.inference.evidence.place_prior import correlation, matern
-from trustbo.inference.posterior_tree import require_posterior
 from trustbo.models.place import N_MOVES, Visited
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
@@ -226,7 +225,7 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     Raises:
         TrustboError: No posterior of `fit`, or its model has no effects of places.
     """
-    require_posterior("place_maps", posterior)
+    require_kind("posterior", posterior, xr.DataTree, "give one of trustbo.fit")
     if "places" not in posterior.children:
         raise TrustboError(
             f"a posterior of {posterior.attrs.get('model', 'a model')} without effects of places "
