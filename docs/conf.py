@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "extensions"))
 
-FIGURE = re.compile(r"!\[([^]]*)\]\(((?:\.\./)?figures/)(\w+\.png)\)")
+FIGURE = re.compile(r"!\[([^]]*)\]\(((?:\.\./)?figures/)(\w+\.(?:png|svg))\)")
 
 project = "trustbo"
 author = "The trustbo developers"

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import threading
+import tomllib
 import zlib
 from contextlib import redirect_stdout
 from decimal import Decimal
@@ -19,9 +20,12 @@ from types import ModuleType
 import matplotlib.pyplot as plt
 import pytest
 import typer
+from numpyro.distributions import Normal
 
 import trustbo
 from trustbo.cli import app
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.models import CoupledTrust, DriftTrust, HierarchicalTrust, PlaceEffect, PooledTrust
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -214,6 +218,72 @@ def test_the_table_of_equations_names_what_there_is():
         assert tested, f"{paper}: no test"
         for source, test in tested:
             assert f"def {test}(" in (ROOT / "tests" / source).read_text(), test
+
+
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
+CODE = [
+    *(ROOT / name for name in ("pyproject.toml", "Makefile", "README.md", "CONTRIBUTING.md")),
+    *(
+        file
+        for folder in ("src", "tests", "scripts", "benchmarks", "docs")
+        for pattern in ("*.py", "*.md")
+        for file in sorted((ROOT / folder).rglob(pattern))
+    ),
+]
+OUTSIDE = re.compile(r"\b(?:DES[I]GN|ST[Y]LE)\b")
+"""Design and style papers that are not in the repository; docs/architecture.md has what holds."""
+
+
+def test_code_cites_only_documents_of_the_repository():
+    for file in CODE:
+        text = file.read_text(encoding="utf-8")
+        assert not (found := OUTSIDE.search(text)), f"{name_of(file)} cites {found[0]}"
+        for page in re.findall(r"(?<![\w/])docs/[\w/-]+\.md", text):
+            assert (ROOT / page).is_file(), f"{name_of(file)} cites {page}"
+
+
+def test_the_architecture_names_every_room_in_the_order_of_imports():
+    table = ARCHITECTURE.split("| room | content |")[1].split("\n\n")[0]
+    rows = [re.findall(r"`(\w+)(?:/|\.py)`", row.split("|")[1]) for row in table.splitlines()[2:]]
+    config = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    layers = [layer.split(" | ") for layer in config["contracts"][0]["layers"]]
+    assert [sorted(row) for row in rows] == [sorted(names) for names in layers[1:]]  # __main__
+
+
+def test_the_architecture_names_files_that_there_are_and_no_walk_opens_one_twice():
+    files = [f"/{f.relative_to(ROOT)}" for f in CODE]
+    for name in re.findall(r"`([\w/]+\.(?:py|md))`", ARCHITECTURE):
+        assert any(file.endswith(f"/{name}") for file in files), name
+    table = ARCHITECTURE.split("| argument | files, each opened once |")[1].split("\n\n")[0]
+    walks = [re.findall(r"`([\w/]+\.py)`", row) for row in table.splitlines()[2:]]
+    assert len(walks) == 4
+    for walk in walks:
+        assert len(walk) == len(set(walk)) > 5
+
+
+def test_the_architecture_says_which_sampler_auto_takes():
+    place = PlaceEffect()
+    drift = (lambda z, a: a * z[:, 0]), {"a": Normal(0.0, 1.0)}
+    models = {
+        "`PooledTrust`": partial(PooledTrust),
+        "`PooledTrust`, places": partial(PooledTrust, place=place),
+        "`HierarchicalTrust`": partial(HierarchicalTrust),
+        "`HierarchicalTrust`, places": partial(HierarchicalTrust, place=place),
+        "`CoupledTrust`, none": partial(CoupledTrust, inter_robot="none"),
+        "`CoupledTrust`, none, places": partial(CoupledTrust, inter_robot="none", place=place),
+        "`CoupledTrust`, ordered": partial(CoupledTrust, inter_robot="ordered"),
+        "`CoupledTrust`": partial(CoupledTrust),
+        "`DriftTrust`": partial(DriftTrust, *drift),
+        "`DriftTrust`, places": partial(DriftTrust, *drift, place=place),
+    }
+    table = ARCHITECTURE.split("| model | gaussian |")[1].split("\n\n")[0].splitlines()
+    families = ["gaussian", *(name.strip() for name in table[0].strip("|").split("|"))]
+    for row in table[2:]:
+        name, *said = (cell.strip() for cell in row.strip("|").split("|"))
+        model = models.pop(name)
+        found = [resolve_sampler(model(observation=family), "auto")[0] for family in families]
+        assert said == found, name
+    assert models == {}
 
 
 def test_every_benchmark_is_described():

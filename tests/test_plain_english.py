@@ -1,4 +1,4 @@
-"""Docstrings, arguments and help texts begin with a noun or a verb (STYLE 4.4)."""
+"""Docstrings, arguments and help texts begin with a noun or a verb (docs/architecture.md)."""
 
 import ast
 import re

@@ -8,7 +8,7 @@ follows from how difficult the way is, and how steep, t_e degrees beyond the ass
 
 where the margin, by which the true limit is below the assumed one, is not known: a bound that was
 never tried is judged by others like it, and one that was tried mostly by what happened there, the
-less strength s, the more. DESIGN 5.12; docs/failures.md.
+less strength s, the more. Derivation: docs/failures.md.
 """
 
 import time

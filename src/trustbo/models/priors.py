@@ -27,9 +27,9 @@ _SCALES = ("delta_w", "delta_v", "tau")
 class Priors(Displayed):
     """Prior of each parameter, any scalar numpyro distribution, and of trust before bound 1.
 
-    `Priors()` is the default of DESIGN: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5),
-    delta_w and delta_v ~ HalfNormal(0.2), the second argument being a standard deviation, and
-    x_0 ~ N(0.5, 0.5^2), which the paper leaves open. A model ignores parameters it does not have.
+    `Priors()` has the defaults: beta0 ~ Beta(2, 2), beta_m ~ N(0, 1), b ~ N(0, 0.5), delta_w and
+    delta_v ~ HalfNormal(0.2), the second argument being a standard deviation, and x_0 ~
+    N(0.5, 0.5^2), which the paper leaves open. A model ignores parameters it does not have.
 
     Attributes:
         beta0: Autoregression; the diagonal of B0 in the coupled model.

@@ -1,9 +1,9 @@
 """Line of sight of bounds: the share of its time in which robot and lead should see each other.
 
-A bound a -> c has two phases (DESIGN 5.9). T2 stands at its posts in a and watches the lead drive
-to its waypoint in c; then the lead stands and watches T2 close up to posts in c, from which each
-of the admissible next cells can be watched. Both phases are sampled at times spread evenly over
-them, and weighted by their durations:
+A bound a -> c has two phases (docs/concepts.md, "Why bounds"). T2 stands at its posts in a and
+watches the lead drive to its waypoint in c; then the lead stands and watches T2 close up to posts
+in c, from which each of the admissible next cells can be watched. Both phases are sampled at times
+spread evenly over them, and weighted by their durations:
 
     line_of_sight_i = (T_1 mean_k p(post_i -> lead at t_k) + T_2 mean_k p(lead -> robot i at t_k))
                       / (T_1 + T_2),
