@@ -131,7 +131,7 @@ def reliability() -> Figure:
 
 ROOMS = {
     "terrain": ((1.75, 3.0), "features\nof pixels"),
-    "workspace": ((3.9, 3.0), "awareness, posts,\nand ways"),
+    "workspace": ((3.9, 3.0), "awareness,\nposts, ways"),
     "planning": ((6.35, 3.0), "best path under\nthe belief"),
     "simulation": ((8.5, 3.0), "simulators;\nor your robots"),
     "data": ((10.65, 3.0), "mission: path,\nrates, status"),

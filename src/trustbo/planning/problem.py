@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
 from trustbo.inference.draws import params_of
-from trustbo.models.params import Params, params_of
+from trustbo.models.params import Params
 from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
 from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
 from trustbo.planning.paths import AdmissiblePaths
