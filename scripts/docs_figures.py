@@ -178,8 +178,8 @@ def box(
     colours = {"facecolor": theme().band, "edgecolor": COLOURS[0]}
     ax.add_patch(FancyBboxPatch(corner, width, height, boxstyle=style, **colours))
     middle = {"ha": "center", "va": "center"}
-    ax.text(x + width / 2, y + 0.65 * height, text, fontsize=10.5, **middle)
-    ax.text(x + width / 2, y + 0.16 * height, name, fontsize=9.5, family="monospace", **middle)
+    ax.text(x + width / 2, y + 0.653 * height, text, fontsize=10.5, **middle)
+    ax.text(x + width / 2, y + 0.158 * height, name, fontsize=9.5, family="monospace", **middle)
 
 
 def arrow(ax: Axes, tail: tuple[float, float], head: tuple[float, float]) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from docs_figures import draw
+from docs_figures import arrow, box, draw
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
+from matplotlib.patches import Rectangle
 
 import trustbo as tb
 from trustbo.plots.layout import MARKERS
@@ -103,22 +103,10 @@ WIDTH, HEIGHT = 2.7, 0.95
 def loop() -> Figure:
     """The iteration of Fig. 2, with our names."""
     figure, ax = plt.subplots(figsize=(8.4, 2.9), layout="constrained")
-    for (x, y), text, name in BOXES.values():
-        box = FancyBboxPatch(
-            (x, y), WIDTH, HEIGHT, boxstyle="round,pad=0.02,rounding_size=0.08",
-            facecolor=theme().band, edgecolor=COLOURS[0],
-        )  # fmt: skip
-        ax.add_patch(box)
-        ax.text(x + WIDTH / 2, y + 0.62, text, **WIDE)
-        ax.text(x + WIDTH / 2, y + 0.15, name, **{**WIDE, "fontsize": 9.5}, family="monospace")
+    for corner, text, name in BOXES.values():
+        box(ax, corner, (WIDTH, HEIGHT), text, name)
     for start, end in ARROWS:
-        tail, head = _sides(start, end)
-        ax.add_patch(
-            FancyArrowPatch(
-                tail, head, arrowstyle="-|>", mutation_scale=13, color=theme().ink,
-                shrinkA=3, shrinkB=3,
-            )
-        )  # fmt: skip
+        arrow(ax, *_sides(start, end))
     ax.set(xlim=(-0.1, 9.6), ylim=(-0.1, 2.55), aspect="equal")
     ax.axis("off")
     return figure
