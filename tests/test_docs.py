@@ -337,25 +337,24 @@ def built(folder, projects, page):
 
 
 def test_signatures_link_to_other_projects_where_these_can_be_reached(tmp_path):
+    """One has its inventory, one has none, and one is behind no network: no warning of any."""
     pytest.importorskip("sphinx", reason="needs the extra docs")
     (tmp_path / "objects.inv").write_bytes(inventory("xarray.DataTree"))
-    page = "Title\n=====\n\n.. autofunction:: trustbo.inference.complete\n"
+    page = (
+        "Title\n=====\n\n.. autofunction:: trustbo.inference.complete\n\n"
+        ".. automethod:: trustbo.Result.table\n"
+    )
     files = partial(SimpleHTTPRequestHandler, directory=tmp_path)
     with ThreadingHTTPServer(("127.0.0.1", 0), files) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         here = f"http://127.0.0.1:{server.server_port}/"
-        html = built(tmp_path, {"xarray": here, "none": f"{here}none/"}, page)
+        projects = {"xarray": here, "none": f"{here}none/", "pandas": "http://127.0.0.1:9/"}
+        html = built(tmp_path, projects, page)
         server.shutdown()
     # The annotation's name is xarray.core.datatree.DataTree.
     assert f'href="{here}api.html#xarray.DataTree"' in html
-
-
-def test_without_a_network_signatures_have_no_links_and_the_build_no_warning(tmp_path):
-    pytest.importorskip("sphinx", reason="needs the extra docs")
-    page = "Title\n=====\n\n.. autofunction:: trustbo.inference.complete\n"
-    html = built(tmp_path, {"xarray": "http://127.0.0.1:9/"}, page)
-    assert "DataTree" in html
-    assert "127.0.0.1" not in html
+    assert "DataFrame" in html
+    assert "127.0.0.1:9/" not in html
 
 
 @pytest.mark.parametrize("namespace", NAMESPACES)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -55,11 +56,15 @@ def test_every_kernel_keeps_within_its_arrays(tmp_path):
     assert found["never compiled"] == []
 
 
-def test_random_plans_are_the_best_of_all_paths():
+# Some problems have rates without noise.
+@pytest.mark.filterwarnings("ignore:(divide by zero|invalid value):RuntimeWarning")
+def test_random_plans_are_the_best_of_all_paths(monkeypatch):
     """Problem by problem against enumeration; `benchmarks/fuzz_plans.py` says how."""
-    ended = run(["benchmarks/fuzz_plans.py", "100"])
-    assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
-    assert ended.stdout.splitlines()[-1] == "100 problems, 0 wrong, 0 crashes"
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    examine = runpy.run_path(str(ROOT / "benchmarks" / "fuzz_plans.py"))["examine"]
+    examined = [examine(0, index) for index in range(100)]
+    assert [wrong for _, wrong in examined if wrong] == []
+    assert sum(outcome["plans"] for outcome, _ in examined) == 100
 
 
 @pytest.mark.slow

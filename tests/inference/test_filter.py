@@ -9,9 +9,14 @@ from worlds import random_cells
 
 import trustbo as tb
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.inference import TrustFilter, params_of
+from trustbo.inference import TrustFilter, fit, params_of
 from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
 from trustbo.workspace import AwarenessBelief
+
+
+@pytest.fixture(scope="module")
+def posterior(missions):
+    return fit(missions, sampler="exact", seed=1)
 
 
 def mixture(n_draws=4, seed=0):

@@ -172,6 +172,7 @@ def test_settings_have_the_names_of_before_too_and_those_of_nuts_are_for_nuts(mi
         fit(missions, sampler="nuts", max_tree_depth=0)
 
 
+@pytest.mark.slow  # NUTS compiles for this alone
 def test_trajectories_keep_to_their_limit(missions):
     few = {"draws": 30, "warmup": 30, "n_chains": 1, "check": False, "whole": False}
     short = fit(missions, sampler="nuts", max_tree_depth=2, **few)["sample_stats"]
