@@ -1,13 +1,11 @@
 """Calls of ArviZ on exact, NUTS and weighted posteriors, and a view by rate: which fail, and how.
 
-python benchmarks/arviz_calls.py [quick]
+python benchmarks/arviz_calls.py [--quick]
 
 Nearly every public function of ArviZ that takes a posterior is called, some on several groups.
-`dt` is a posterior, `other` one of another model, `half` one of half of the missions. `quick`
-leaves out NUTS.
+`dt` is a posterior, `other` one of another model, `half` one of half of the missions.
 """
 
-import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -17,6 +15,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
+from common import arguments, parsed
 
 import trustbo as tb
 
@@ -178,7 +177,8 @@ def failure(call: str, names: dict) -> str:
 
 def main() -> None:
     """Print a row for each call that fails."""
-    found, others = subjects("quick" in sys.argv)
+    given = parsed(arguments(__doc__, quick="without NUTS"))
+    found, others = subjects(given.quick)
     calls = CALLS.split("\n")[1:-1]
     failures = 0
     for subject, dt in found.items():

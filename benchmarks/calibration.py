@@ -1,16 +1,14 @@
 """Simulation-based calibration of every model, family and sampler; prints the table of the docs.
 
-Run: python benchmarks/calibration.py [folder, default out/calibration] [share of data sets, 1]
-     [samplers, all by default]
+Run: python benchmarks/calibration.py [exact] [nuts] [joint] [--share 1] [--out out/calibration]
 
 Ranks are kept in the folder after each data set: a run that was stopped goes on where it was.
 """
 
 import sys
-import time
-from pathlib import Path
 
 import jax.numpy as jnp
+from common import Table, arguments, parsed, timed
 from numpyro.distributions import HalfNormal, LogNormal, Normal
 
 from trustbo.inference import sbc
@@ -53,34 +51,39 @@ def cases():
     yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
 
 
-def main(folder="out/calibration", share="1", *samplers):
-    print("| model | observation | sampler | data sets | parameters | smallest p | limit | "
-          "50 % interval | 90 % interval | uniform |")  # fmt: skip
-    print("|---|---|---|---|---|---|---|---|---|---|")
+def main():
+    parser = arguments(
+        __doc__, names=("exact", "nuts", "joint"), out="out/calibration", quick="2 data sets each"
+    )
+    parser.add_argument("--share", type=float, default=1.0, help="share of the data sets")
+    given = parsed(parser)
+    table = Table(
+        "model", "observation", "sampler", "data sets", "parameters", "smallest p", "limit",
+        "50 % interval", "90 % interval", "uniform",
+    )  # fmt: skip
     for model, sampler, n, shape in cases():
-        if samplers and sampler not in samplers:
+        if sampler not in given.names:
             continue
-        n = max(2, round(n * float(share)))
+        n = 2 if given.quick else max(2, round(n * given.share))
         name = type(model).__name__
         detail = getattr(model, "inter_robot", model.response)
         detail = "saturating" if isinstance(model, DriftTrust) else detail
         detail = "places" if model.place is not None else detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
-        file = Path(folder) / f"{name}-{detail}-{model.observation}-{sampler}.json"
-        started = time.perf_counter()
-        result = sbc(
-            model, sampler, n_datasets=n, shape=shape, checkpoint=file, n_ranked=396, progress=False
+        file = given.out / f"{name}-{detail}-{model.observation}-{sampler}.json"
+        options = {"n_datasets": n, "shape": shape, "checkpoint": file, "progress": False}
+        seconds, result = timed(
+            lambda model=model, sampler=sampler, given=options: sbc(model, sampler, **given)
         )
         p, limit = float(result["p_value"].min()), 0.01 / result.sizes["parameter"]
         half, most = result["coverage"].mean("parameter").values
-        print(
-            f"| {label} | {model.observation} | `{sampler}` | {n} | {result.sizes['parameter']} | "
-            f"{p:.4f} | {limit:.5f} | {half:.1%} | {most:.1%} | "
-            f"{'not rejected' if p > limit else 'REJECTED'} |",
-            flush=True,
-        )
-        print(f"{label}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+        table.row(
+            label, model.observation, f"`{sampler}`", n, result.sizes["parameter"], f"{p:.4f}",
+            f"{limit:.5f}", f"{half:.1%}", f"{most:.1%}",
+            "not rejected" if p > limit else "REJECTED",
+        )  # fmt: skip
+        print(f"{label}: {seconds:.0f} s", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -1,6 +1,6 @@
 """Random campaigns on bad days: killed, disk full, files damaged, logs with errors, flags changed.
 
-Run: python benchmarks/chaos.py [number of campaigns] [--out FILE]
+Run: python benchmarks/chaos.py [-n 300] [--quick] [--out FILE]
 
 Each campaign is drawn from its seed: terrain or awareness alone, shape, robots, model, sampler,
 policy, objective, options, threats, odd data. It is run once undisturbed and once with mishaps, and
@@ -13,10 +13,8 @@ FILE (out/chaos.jsonl), a line each; run again, it goes on.
 
 import errno
 import hashlib
-import json
 import os
 import shutil
-import sys
 import tempfile
 import traceback
 import warnings
@@ -27,6 +25,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from common import Table, add_record, arguments, parsed, read_records
 
 import trustbo as tb
 import trustbo.files
@@ -34,8 +33,6 @@ from trustbo.campaign.replacing import current, own_files
 from trustbo.models import CoupledTrust, PooledTrust, TrustParams
 from trustbo.simulation import Degradation, KinematicSimulator, ModelSimulator, Threat
 
-N = next((int(word) for word in sys.argv[1:] if word.isdigit()), 300)
-OUT = Path(sys.argv[sys.argv.index("--out") + 1] if "--out" in sys.argv else "out/chaos.jsonl")
 MISHAPS = ("kill", "full disk", "flags", "damage", "errors in logs", "interrupt")
 FOREIGN = (
     "notes.txt", "old.csv", ".bashrc.1", ".notes.2024.csv", "posteriors/mine.nc", "ticks/raw.12",
@@ -371,22 +368,20 @@ def outcome(seed):
 
 def main():
     warnings.simplefilter("ignore")
-    OUT.parent.mkdir(parents=True, exist_ok=True)
-    done = {}
-    if OUT.exists():
-        done = {r["seed"]: r for r in map(json.loads, OUT.read_text().splitlines())}
-    for seed in range(N):
+    given = parsed(arguments(__doc__, n=300, out="out/chaos.jsonl", quick="5 campaigns"))
+    n = 5 if given.quick else given.n
+    done = {record["seed"]: record for record in read_records(given.out)}
+    for seed in range(n):
         if seed not in done:
             done[seed] = outcome(seed)
-            with OUT.open("a") as stream:
-                stream.write(json.dumps(done[seed]) + "\n")
-    records = [done[seed] for seed in range(N)]
-    print("| mishap | campaigns | same | refused at once | other |\n|---|---:|---:|---:|---:|")
+            add_record(given.out, done[seed])
+    records = [done[seed] for seed in range(n)]
+    table = Table("mishap", "campaigns", "same", "refused at once", "other")
     for mishap in MISHAPS:
         mine = [r["outcome"] for r in records if r["mishap"] == mishap]
         same_, refused = mine.count("same"), mine.count("refused")
-        print(f"| {mishap} | {len(mine)} | {same_} | {refused} | {len(mine) - same_ - refused} |")
-    print(f"\n{N} campaigns: {dict(Counter(r['outcome'] for r in records))}")
+        table.row(mishap, len(mine), same_, refused, len(mine) - same_ - refused)
+    print(f"\n{n} campaigns: {dict(Counter(r['outcome'] for r in records))}")
     for name in ("data", "model", "sampler", "policy", "objective"):
         print(f"by {name}: {dict(Counter(r[name] for r in records))}")
     planted, gone = (sum(n) for n in zip(*(

@@ -1,13 +1,13 @@
-"""Time of plans within a risk, beside plans without: python benchmarks/constrained.py.
+"""Time of plans within a risk, and of plans without: python benchmarks/constrained.py [--quick].
 
 Random awareness and chances to fail of every bound, on 10 x 10 and 50 x 50 cells; medians over
 maps of the time of one plan, with the compiled engine, and of the ratio to the plan without risk.
 """
 
 import statistics
-import time
 
 import numpy as np
+from common import Table, arguments, median_seconds, parsed
 
 from trustbo.models import TrustParams
 from trustbo.planning import Planner
@@ -24,13 +24,7 @@ MAX_FAILURE = 0.1
 
 
 def seconds(planner):
-    planner.plan(PARAMS)
-    took = []
-    for _ in range(3):
-        started = time.perf_counter()
-        plan = planner.plan(PARAMS)
-        took.append(time.perf_counter() - started)
-    return statistics.median(took), plan
+    return median_seconds(lambda: planner.plan(PARAMS), 3), planner.plan(PARAMS)
 
 
 def case(n, objective, observation, seed):
@@ -47,18 +41,21 @@ def case(n, objective, observation, seed):
     return free, within, plan.exact
 
 
-if __name__ == "__main__":
-    print("| cells | objective | without risk | within .1 | ratio | exact |")
-    print("|---|---|---:|---:|---:|---:|")
-    for n in (10, 50):
+def main():
+    given = parsed(arguments(__doc__, quick="10 x 10 cells alone"))
+    table = Table("cells", "objective", "without risk", "within .1", "ratio", "exact")
+    for n in (10,) if given.quick else (10, 50):
         for objective, observation in CASES:
             found = [case(n, objective, observation, seed) for seed in range(N_MAPS)]
             free, within = (1e3 * statistics.median(row[i] for row in found) for i in (0, 1))
             ratio = statistics.median(row[1] / row[0] for row in found)
             exact = sum(row[2] for row in found)
             name = objective if observation == "gaussian" else f"{objective}, {observation}"
-            print(
-                f"| {n} x {n} | {name} | {free:.2f} ms | {within:.2f} ms | {ratio:.1f} | "
-                f"{exact}/{N_MAPS} |",
-                flush=True,
-            )
+            table.row(
+                f"{n} x {n}", name, f"{free:.2f} ms", f"{within:.2f} ms", f"{ratio:.1f}",
+                f"{exact}/{N_MAPS}",
+            )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

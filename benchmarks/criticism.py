@@ -1,8 +1,8 @@
 """Size and power of criticise: is a planted fault named after 15 missions?
 
-Run: python benchmarks/criticism.py [data sets of each fault, default 100] [file] [--quick]
+Run: python benchmarks/criticism.py [-n 100] [--quick] [--out FILE]
 
-It goes on where the file, criticism.csv by default, ends; --quick is 5 data sets.
+-n data sets of each fault; it goes on where the file, out/criticism.jsonl by default, ends.
 
 Each data set is a synthetic workspace of 10 x 10 cells, 3 robots with awareness of their own, 15
 missions of 11 bounds between two corners, and rates drawn from a pooled truth with one fault, or
@@ -11,12 +11,10 @@ which anything is found at level .05; in which the planted fault is the one that
 seconds of criticise; and all names. Rates are clipped to [0, 1], which is rare.
 """
 
-import sys
-import time
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
+from common import Table, add_record, arguments, parsed, read_records, timed
 from scipy import ndimage
 
 from trustbo import Mission
@@ -101,33 +99,28 @@ def draw_missions(fault, rng):
     return missions
 
 
-def main(n, kept):
+def main():
     """Run what is not in the file yet, data set by data set of all faults, and print shares."""
-    done = {}
-    if kept.exists():
-        rows = (line.split(",") for line in kept.read_text().splitlines())
-        done = {(fault, int(seed)): (name, float(s)) for fault, seed, name, s in rows}
+    given = parsed(arguments(__doc__, n=100, out="out/criticism.jsonl", quick="5 data sets each"))
+    n = 5 if given.quick else given.n
+    done = {(fault, seed): rest for fault, seed, *rest in read_records(given.out)}
     for seed in range(n):
         for fault in FAULTS:
             if (fault, seed) in done:
                 continue
             rng = np.random.default_rng([sorted(FAULTS).index(fault), seed])
             posterior = fit(draw_missions(fault, rng), PooledTrust(), "exact", whole=False)
-            started = time.perf_counter()
-            found = criticise(posterior, compare=False).fault, time.perf_counter() - started
-            done[fault, seed] = found
-            with kept.open("a") as file:
-                file.write(f"{fault},{seed},{found[0]},{found[1]:.3f}\n")
-    print(f"{n} data sets of each fault, level .05; kept in {kept}\n")
-    print(f"{'fault':20s}{'found':>7s}{'named':>7s}{'seconds':>9s}   names")
+            seconds, found = timed(lambda dt=posterior: criticise(dt, compare=False))
+            done[fault, seed] = found.fault, seconds
+            add_record(given.out, (fault, seed, found.fault, seconds))
+    print(f"{n} data sets of each fault, level .05; kept in {given.out}\n")
+    table = Table("fault", "found", "named", "seconds", "names", first=18)
     for fault, right in FAULTS.items():
         names = Counter(done[fault, seed][0] for seed in range(n))
         seconds = np.median([done[fault, seed][1] for seed in range(n)])
-        shares = f"{1.0 - names['none'] / n:7.2f}{names[right] / n:7.2f}{seconds:9.2f}"
-        print(f"{fault:20s}{shares}   {dict(names.most_common())}")
+        shares = (f"{share:.2f}" for share in (1.0 - names["none"] / n, names[right] / n))
+        table.row(fault, *shares, f"{seconds:.2f}", dict(names.most_common()))
 
 
 if __name__ == "__main__":
-    given = [each for each in sys.argv[1:] if each != "--quick"]
-    size = int(given[0]) if given else 5 if "--quick" in sys.argv else 100
-    main(size, Path(given[1] if len(given) > 1 else "criticism.csv"))
+    main()

@@ -1,6 +1,6 @@
 """Campaigns killed by SIGKILL while the posterior's and the report's files are being written.
 
-Run: python benchmarks/endurance.py [number of moments]
+Run: python benchmarks/endurance.py [-n 20] [--quick]
 
 Each process begins a campaign of three missions and writes its report, and kills itself at one
 moment: when half of a file is written under its temporary name, or when the file has just got its
@@ -11,20 +11,19 @@ What a mission of a long campaign costs, in seconds, memory and disk: benchmarks
 
 import os
 import signal
-import sys
 import tempfile
 import traceback
 import warnings
 from pathlib import Path
 
 import numpy as np
+from common import arguments, parsed
 
 import trustbo as tb
 import trustbo.files
 from trustbo.logs.netcdf import read_tree
 from trustbo.models import TrustParams
 
-N = int(sys.argv[1]) if len(sys.argv) > 1 else 20
 ENDS, MISSIONS = ((2, 0), (0, 2)), 3
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)
 FILES = (
@@ -118,17 +117,19 @@ def check(folder, told, undisturbed):
 
 
 def main():
+    given = parsed(arguments(__doc__, n=20, quick="2 moments"))
+    moments = MOMENTS[: 2 if given.quick else given.n]
     with tempfile.TemporaryDirectory() as parent:
         undisturbed = Path(parent) / "undisturbed"
         assert in_a_process(finish, undisturbed, Path(parent) / "all") == 0
         good, died = 0, 0
-        for j, (name, whole) in enumerate(MOMENTS[:N]):
+        for j, (name, whole) in enumerate(moments):
             folder, told = Path(parent) / str(j), Path(parent) / f"told{j}"
             died += in_a_process(killed, folder, told, name, whole) == -signal.SIGKILL
             ok = in_a_process(check, folder, told, undisturbed) == 0
             good += ok
             print(f"{name}, {'whole' if whole else 'half'}: {'as it was' if ok else 'LOST'}")
-        n = len(MOMENTS[:N])
+        n = len(moments)
         print(f"{n} moments, {died} killed by SIGKILL, {good} opened and came to the same end")
 
 

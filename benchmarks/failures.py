@@ -1,6 +1,6 @@
 """Failures: the table of docs/failures.md, in Markdown.
 
-    python benchmarks/failures.py --data ../shared/data --out out/failures
+    python benchmarks/failures.py [part ...] --data DIR --out out/failures
 
 Worlds with tight slope limits, named ground:limit:excess. The assumed limit is the true one plus
 the excess, in degrees: 0, geometry knows all that it can; above, ways lead over ground that stops
@@ -13,16 +13,15 @@ The part `reliability` compares the chance to arrive that a campaign's plan has 
 --out, it measures that version; `product` is of 1 - p_fail, all that 0.2 knew.
 """
 
-import argparse
 import json
 import multiprocessing
-import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from common import Table, arguments, parsed, timed
 from scipy import sparse
 
 import trustbo as tb
@@ -236,9 +235,8 @@ def measure(name, given):
         simulate = MujocoSimulator if given.simulator == "mujoco" else KinematicSimulator
         world, simulator = world_of(name, given.data, simulate)
         for part in missing:
-            started = time.perf_counter()
-            known[part] = PARTS[part](world, simulator, given)
-            print(f"{name} {part}: {time.perf_counter() - started:.0f} s", flush=True)
+            seconds, known[part] = timed(lambda p=part: PARTS[p](world, simulator, given))
+            print(f"{name} {part}: {seconds:.0f} s", flush=True)
             file.write_text(json.dumps(known) + "\n")
     return known
 
@@ -248,8 +246,10 @@ def shown(values):
 
 
 def print_campaigns(results):
-    print("\n| world | safe path | first 3 | all 15 | last 5 | entered again | slowest fit, s |")
-    print("|---|---:|---:|---:|---:|---:|---:|")
+    print()
+    table = Table(
+        "world", "safe path", "first 3", "all 15", "last 5", "entered again", "slowest fit, s"
+    )
     whole = []
     for name, found in results.items():
         safe = found.get("safe", {course: (1.0, 1.0) for course in found["campaigns"]})
@@ -260,21 +260,20 @@ def print_campaigns(results):
         again = [entered for run in runs for entered in run["again"]]
         whole += [(ok, again)] if kept else []
         longer = f" (+{far})" if far else ""
-        parts = " | ".join(shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:]))
+        parts = [shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:])]
         slowest = max(run["seconds"] for run in found["campaigns"].values())
-        print(
-            f"| {name} | {len(kept)} of {len(safe)}{longer} | {parts} | {shown(again)} | "
-            f"{slowest:.2f} |"
-        )
+        safe_of = f"{len(kept)} of {len(safe)}{longer}"
+        table.row(name, safe_of, *parts, shown(again), f"{slowest:.2f}")
     ok = np.concatenate([ok for ok, _ in whole])
     again = [entered for _, part in whole for entered in part]
-    parts = " | ".join(shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:]))
-    print(f"| all | {len(ok)} | {parts} | {shown(again)} | |")
+    parts = [shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:])]
+    table.row("all", len(ok), *parts, shown(again), "")
 
 
 def print_learning(results, csv):
-    print("\n| world | missions fail | skill after 15 | after 60 | error after 15 | after 60 |")
-    print("|---|---:|---:|---:|---:|---:|")
+    print()
+    head = "world", "missions fail", "skill after 15", "after 60", "error after 15", "after 60"
+    table = Table(*head)
     lines, total = ["world,missions,bin,n,predicted,arrived"], {}
     for name, found in results.items():
         learnt = found["learn"]
@@ -289,10 +288,10 @@ def print_learning(results, csv):
                 if count > 0.0:
                     shares = f"{predicted / count:.4f},{arrived / count:.4f}"
                     lines.append(f"{name},{n},{b},{count:.0f},{shares}")
-        print(f"| {name} | {np.mean(learnt['failed']):.2f} | {' | '.join(cells)} |")
+        table.row(name, f"{np.mean(learnt['failed']):.2f}", *cells)
     for i, what in enumerate(("mean over draws", "at the posterior mean")):
         errors = [f"{error_of(bins[i]):.2f}" for bins in total.values()]
-        print(f"| all, {what} | | | | {' | '.join(errors)} |")
+        table.row(f"all, {what}", "", "", "", *errors)
     if csv is not None:
         Path(csv).write_text("\n".join(lines) + "\n")
 
@@ -304,21 +303,20 @@ def error_of(bins):
 
 
 def print_limits(results):
-    print("\n| max_failure | plans within it | predicted failures | realised | others: realised |")
-    print("|---:|---:|---:|---:|---:|")
+    print()
+    head = "max_failure", "plans within it", "predicted failures", "realised", "others: realised"
+    table = Table(*head)
     for most in LIMITS:
         runs = [run for r in results.values() for run in r["limits"][str(most)].values()]
         held = [run for run in runs if 1.0 - run["p_arrive"] <= most + 1e-9]
         other = [run["failed"] for run in runs if run not in held]
         cells = shown([1.0 - r["p_arrive"] for r in held]), shown([r["failed"] for r in held])
-        print(f"| {most} | {len(held)} of {len(runs)} | {' | '.join(cells)} | {shown(other)} |")
+        table.row(most, f"{len(held)} of {len(runs)}", *cells, shown(other))
 
 
 def print_reliability(found):
     """Means by mission and excess; intervals, 95 %, are bootstraps over courses of worlds."""
-    print("\n| excess | mission | predicted | product | arrived | predicted - arrived | Brier |")
-    print("|---:|---:|---:|---:|---:|---:|---:|")
-    rng, table = np.random.default_rng(0), []
+    rng, judged = np.random.default_rng(0), []
     for (name, _), campaigns in found.items():
         rows = np.array(
             [
@@ -329,9 +327,12 @@ def print_reliability(found):
         p, product, arrived = np.moveaxis(rows, -1, 0)  # each (seed, mission)
         brier = (p - arrived) ** 2 + arrived * (1.0 - arrived)
         means = np.stack([p, product, arrived, p - arrived, brier]).mean(1)
-        table.append((name.split(":")[2], means))
+        judged.append((name.split(":")[2], means))
+    print()
+    head = "excess", "mission", "predicted", "product", "arrived", "predicted - arrived", "Brier"
+    table = Table(*head)
     for excess in ("0", "4", "both"):
-        own = np.array([means for which, means in table if excess in (which, "both")])
+        own = np.array([means for which, means in judged if excess in (which, "both")])
         if not len(own):
             continue
         again = own[rng.integers(len(own), size=(2000, len(own)))].mean(1)
@@ -340,7 +341,7 @@ def print_reliability(found):
             cells = [
                 f"{own.mean(0)[i, k]:.3f} ({low[i, k]:.3f} to {high[i, k]:.3f})" for i in range(5)
             ]
-            print(f"| {excess} | {mission} | {' | '.join(cells)} |")
+            table.row(excess, mission, *cells)
     rows = [row for seeds in found.values() for one in seeds.values() for row in one]
     k_hat, seconds = (max(row[name] for row in rows) for name in ("k_hat", "seconds"))
     refused = np.mean([row["k_hat"] > 0.7 for row in rows])
@@ -348,34 +349,30 @@ def print_reliability(found):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("quick", nargs="?", choices=["quick"])
-    parser.add_argument("--data")
-    parser.add_argument("--out", default="out/failures")
-    parser.add_argument("--csv")
+    parser = arguments(
+        __doc__, names=[*PARTS, "reliability"], data=True, seeds=3, out="out/failures",
+        quick="one course and few missions of each world",
+    )  # fmt: skip
+    parser.add_argument("--csv", help="file of the bins of reliability")
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
-    parser.add_argument(
-        "--parts", nargs="*", default=[*PARTS, "reliability"], choices=[*PARTS, "reliability"]
-    )
     parser.add_argument("--courses", nargs="*", default=COURSES, choices=COURSES)
     parser.add_argument("--simulator", default="kinematic", choices=["kinematic", "mujoco"])
     parser.add_argument("--unseen", type=int, default=5000)
     parser.add_argument("--missions", type=int, default=15)
     parser.add_argument("--after", type=int, default=200)
     parser.add_argument("--policy")
-    parser.add_argument("--seeds", type=int, default=3, help="campaigns of a course, reliability")
     parser.add_argument("--runs", type=int, default=50, help="runs of a plan, reliability")
     parser.add_argument("--jobs", type=int, default=1, help="processes, reliability")
-    given = parser.parse_args()
+    given = parsed(parser)
     warnings.simplefilter("ignore")
     if given.quick:
         given.out, given.unseen, given.courses = f"{given.out}-quick", 300, given.courses[:1]
         given.seeds, given.runs = 1, 10
     Path(given.out).mkdir(parents=True, exist_ok=True)
     names = [n for n in given.worlds if given.data or n.startswith("synthetic")]
-    if "reliability" in given.parts:
+    if "reliability" in given.names:
         print_reliability(reliability([n for n in names if n.split(":")[2] in ("0", "4")], given))
-    given.parts = [part for part in given.parts if part in PARTS]
+    given.parts = [part for part in given.names if part in PARTS]
     results = {name: measure(name, given) for name in names}
     if "campaigns" in given.parts:
         print_campaigns(results)

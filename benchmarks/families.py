@@ -1,7 +1,7 @@
 """Regret and leave-one-out density by family of observations, over the worlds.
 
-    python benchmarks/families.py regret --data ../shared/data --out out/families
-    python benchmarks/families.py loo --data ../shared/data
+    python benchmarks/families.py regret --data DIR --out out/families
+    python benchmarks/families.py loo --data DIR
 
 `regret`: campaigns of 15 missions with effects of places under each family, and the seconds of
 their fits; `auto` looks at the rates of each fit. `loo`: every family on the missions of one
@@ -9,10 +9,10 @@ campaign of each terrain, along random paths; the log density of a mission left 
 counts of ticks, less that of the best family. Both go on where they stopped.
 """
 
-import argparse
 import warnings
 
 import numpy as np
+from common import Table, arguments, parsed
 
 import trustbo as tb
 from trustbo.inference import fit
@@ -29,16 +29,18 @@ HARDER = ("wellington", "tahoe-aged", "synthetic-0-aged", "bcts-low", "tahoe-wal
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("regret", "loo"))
-    parser.add_argument("--data")
-    parser.add_argument("--out", default="out/families")
+    parser = arguments(
+        __doc__, names=("regret", "loo"), data=True, out="out/families", quick="one synthetic world"
+    )
     parser.add_argument("--families", nargs="*")
     parser.add_argument("--worlds", nargs="*")
     parser.add_argument("--courses", nargs="*", default=["sw-ne", "n-s"])
     parser.add_argument("--executor", default="loky")
-    given = parser.parse_args()
-    (regret if given.what == "regret" else loo)(given)
+    given = parsed(parser)
+    if given.quick:
+        given.worlds, given.courses = ["synthetic-0"], ["sw-ne"]
+    for name in given.names:
+        {"regret": regret, "loo": loo}[name](given)
 
 
 def regret(given):
@@ -59,7 +61,7 @@ def regret(given):
 def loo(given):
     families = given.families or LOO
     total = dict.fromkeys(families, 0.0)
-    print("| world | 0 or 1 | " + " | ".join(families) + " |\n|---|" + "---|" * (len(families) + 1))
+    table = Table("world", "0 or 1", *families)
     for name in given.worlds or TERRAINS:
         missions = driven(worlds(given.data)[name])
         rates = np.concatenate([m.contact_rate.ravel() for m in missions])
@@ -67,9 +69,8 @@ def loo(given):
         found = {family: density(missions, family) for family in families}
         best = max(found.values())
         total = {family: total[family] + found[family] - best for family in families}
-        row = " | ".join(f"{found[family] - best:.0f}" for family in families)
-        print(f"| {name} | {piled:.0%} | {row} |", flush=True)
-    print("| all | | " + " | ".join(f"{total[family]:.0f}" for family in families) + " |")
+        table.row(name, f"{piled:.0%}", *(f"{found[family] - best:.0f}" for family in families))
+    table.row("all", "", *(f"{total[family]:.0f}" for family in families))
 
 
 def driven(world, n=15):

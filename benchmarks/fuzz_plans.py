@@ -1,6 +1,7 @@
 """Random planning problems against every path, written out or in a table over all states.
 
-Run: python benchmarks/fuzz_plans.py [N] [--first I] [--seed S] [--jobs J] [--checked] [--out FILE]
+Run: python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--jobs J] [--checked]
+     [--out FILE]
 
 Draws grids, strips and closed bounds, awareness of cells or bounds, effects of places, all models,
 objectives and families, length weights, limits on bounds from "shortest" to "shortest+300", walks
@@ -25,6 +26,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from common import add_record, arguments, parsed, read_records
 from peers.every_path import (
     STEPS,
     TooManyError,
@@ -410,21 +412,21 @@ def environment_of(checked):
 
 
 def main():
-    words = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    words.add_argument("n", nargs="?", type=int, default=1000)
+    words = arguments(__doc__, n=1000, quick="100 problems")
     for name in ("--first", "--seed"):
         words.add_argument(name, type=int, default=0)
     words.add_argument("--jobs", type=int, default=1)
     words.add_argument("--checked", action="store_true")
     words.add_argument("--out", type=Path)
     words.add_argument("--work", nargs=3, type=int, help=argparse.SUPPRESS)
-    given = words.parse_args()
+    given = parsed(words)
+    if given.quick:
+        given.n = 100
     if given.work:
         work(*given.work)
         return 0
-    known = {}
-    if given.out and given.out.exists():
-        known = {tuple(json.loads(line)["chunk"]): json.loads(line) for line in given.out.open()}
+    kept = read_records(given.out) if given.out else []
+    known = {tuple(record["chunk"]): record for record in kept}
     environment, end = environment_of(given.checked), given.first + given.n
     chunks = [(given.seed, i, min(i + _CHUNK, end)) for i in range(given.first, end, _CHUNK)]
     total, wrong = Counter(), []
@@ -436,9 +438,7 @@ def main():
     with ThreadPoolExecutor(given.jobs) as pool:
         for i, (key, found) in enumerate(pool.map(run, chunks)):
             if given.out and key not in known:
-                given.out.parent.mkdir(parents=True, exist_ok=True)
-                with given.out.open("a") as file:
-                    file.write(json.dumps({"chunk": key, **found}) + "\n")
+                add_record(given.out, {"chunk": key, **found})
             total.update(found["outcome"])
             wrong += found["wrong"]
             for line in found["wrong"]:

@@ -1,9 +1,9 @@
 """Speed of our inference beside other tools on the same posteriors, and how it grows with data.
 
 Run: python benchmarks/inference.py [pooled] [families] [large] [coupled] [scaling] [latency]
-[quick]
+[--quick]
 
-All sections by default; `quick` cuts the numbers of draws by ten, to see that everything runs.
+All sections by default; `--quick` cuts the numbers of draws by ten, to see that everything runs.
 Cold is the first call in this process, compilation included (PyTensor's disk cache is empty); warm
 the median of later ones with other seeds, which compile only what a tool compiles each time, as
 numpyro's MCMC does to find its starts. "off" is the largest distance of a parameter's mean from the
@@ -17,7 +17,6 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Any, NamedTuple
 import arviz as az
 import jax
 import numpy as np
+from common import Table, arguments, median_seconds, parsed, timed, verdict
 from jax import lax
 from threadpoolctl import threadpool_limits
 
@@ -149,16 +149,6 @@ def peer(module, *needs):
 # --- measuring ---
 
 
-def seconds_of(function):
-    started = time.perf_counter()
-    result = function()
-    return time.perf_counter() - started, result
-
-
-def median_seconds(function, n):
-    return float(np.median([seconds_of(function)[0] for _ in range(n)]))
-
-
 def unknowns(sites):
     """Every unknown once, as one array (chain, draw, unknown)."""
     columns = []
@@ -170,11 +160,11 @@ def unknowns(sites):
     return np.concatenate(columns, axis=-1)
 
 
-def measure(name, sampler, reference=None, *, n_warm=N_WARM, compile_seconds=0.0):
-    """Time a sampler, print its row, and return it."""
-    cold, draws = seconds_of(lambda: sampler(1))
+def measure(table, name, sampler, reference=None, *, n_warm=N_WARM, compile_seconds=0.0):
+    """Time a sampler, print its row of the table, and return it."""
+    cold, draws = timed(lambda: sampler(1))
     cold += compile_seconds
-    runs = [seconds_of(partial(sampler, 2 + i)) for i in range(n_warm)]
+    runs = [timed(partial(sampler, 2 + i)) for i in range(n_warm)]
     warm = float(np.median([seconds for seconds, _ in runs])) if runs else cold
     draws = runs[-1][1] if runs else draws
     if isinstance(draws, Exact):
@@ -189,18 +179,12 @@ def measure(name, sampler, reference=None, *, n_warm=N_WARM, compile_seconds=0.0
         off = np.abs((x.mean((0, 1)) - reference.mean((0, 1))) / reference.std((0, 1))).max()
     row = Row(name, cold, warm, ess, worst, float(off))
     cells = (f"{cold:.2f}", f"{warm:.3f}", f"{ess:.0f}", f"{ess / warm:.1f}", worst, f"{off:.3f}")
-    print_row((name, *cells))
+    table.row(name, *cells)
     return row
 
 
-def print_row(cells, first=54):
-    print("| " + " | ".join([f"{cells[0]:{first}s}", *(f"{c:>11s}" for c in cells[1:])]) + " |",
-          flush=True)  # fmt: skip
-
-
-def print_header(cells):
-    print_row(cells)
-    print_row(("---", *["---:"] * (len(cells) - 1)))
+def aligned(*columns):
+    return Table(*columns, first=54, others=11)
 
 
 def print_ratios(ratios):
@@ -211,17 +195,16 @@ def print_ratios(ratios):
     Cold targets are judged by the less favourable of the two.
     """
     print()
-    print_header(("effective draws per second, ratio", "warm", "cold", "cold, 1000", "target",
-                  "reached"))  # fmt: skip
+    head = "effective draws per second, ratio", "warm", "cold", "cold, 1000", "target", "reached"
+    table = aligned(*head)
     for what, ours, theirs, target, when in ratios:
         speeds = [row.speeds for row in theirs]
         if not speeds:
             continue
         found = np.array(ours.speeds) / np.max(speeds, axis=0)
         judged = found[0] if when == "warm" else found[1:].min()
-        reached = "yes" if judged >= target else "NO"
         cells = (f"{ratio:.1f} x" for ratio in found)
-        print_row((what, *cells, f"{target} x", f"{reached} ({when})"))
+        table.row(what, *cells, f"{target} x", f"{verdict(judged >= target)} ({when})")
     print()
 
 
@@ -238,22 +221,22 @@ def pooled(quick):
     arrays = (data.awareness, data.rates)
     print(f"\n## pooled: {data.rates.size} observations, 6 unknowns\n")
     reference = unknowns(trustbo_exact(data.missions)(1000).sites)
-    print_header(HEADER)
-    exact = measure("trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
+    table = aligned(*HEADER)
+    exact = measure(table, "trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
     settings = NutsSettings(draws=100 if quick else 1000)
     sampler = trustbo_nuts(PooledTrust(), data.missions, settings)
-    nuts = measure("trustbo NUTS, 4 x (300 + 1000)", sampler, reference)
-    mcmc = numpyro_pooled(arrays, reference, quick)
+    nuts = measure(table, "trustbo NUTS, 4 x (300 + 1000)", sampler, reference)
+    mcmc = numpyro_pooled(table, arrays, reference, quick)
     if dynamax := peer("dynamax_blackjax", "dynamax", "blackjax"):
         sampler = dynamax.pooled(*arrays, **settings_of(500, 1000, 4, quick))
-        measure("dynamax + blackjax NUTS, 4 x (500 + 1000)", sampler, reference, n_warm=1)
+        measure(table, "dynamax + blackjax NUTS, 4 x (500 + 1000)", sampler, reference, n_warm=1)
     draws = 100 if quick else 1000
-    rows = nutpie_rows("pooled_marginal", data, reference, {"draws": draws, "chains": 4})
+    rows = nutpie_rows(table, "pooled_marginal", data, reference, {"draws": draws, "chains": 4})
     if rows:
-        nutpie_joint(arrays, reference, draws)
+        nutpie_joint(table, arrays, reference, draws)
     gibbs = peer("gibbs")
     sampler = gibbs.pooled(*arrays, 500 if quick else 5000)
-    measure("Gibbs (NumPy), 4 x (500 + 5000)", sampler, reference, n_warm=1)
+    measure(table, "Gibbs (NumPy), 4 x (500 + 5000)", sampler, reference, n_warm=1)
     low_rank = [row for kind, row in rows.items() if kind.startswith("low rank")]
     print_ratios([
         ("trustbo exact / best PyMC + nutpie", exact, rows.values(), 20, "warm"),
@@ -263,30 +246,32 @@ def pooled(quick):
     ])  # fmt: skip
 
 
-def nutpie_joint(arrays, reference, draws):
+def nutpie_joint(table, arrays, reference, draws):
     pymc = peer("pymc_nutpie", "pymc", "nutpie")
-    seconds, compiled = seconds_of(lambda: pymc.compile_model(pymc.pooled_joint(*arrays)))
+    seconds, compiled = timed(lambda: pymc.compile_model(pymc.pooled_joint(*arrays)))
     sampler = pymc.sampler_of(compiled, PooledTrust().dims, draws=draws, chains=4)
     name = f"PyMC + nutpie joint, non-centred, 4 x (default + {draws})"
-    measure(name, sampler, reference, n_warm=1, compile_seconds=seconds)
+    measure(table, name, sampler, reference, n_warm=1, compile_seconds=seconds)
 
 
-def numpyro_pooled(arrays, reference, quick):
+def numpyro_pooled(table, arrays, reference, quick):
     """Rows of numpyro's MCMC on the marginal likelihood; the joint ones are only printed."""
     mcmc, rows = peer("numpyro_mcmc"), []
     for warmup in (1000, 300):
         options = settings_of(warmup, 1000, 4, quick)
         name = f"numpyro MCMC, dense, 4 x ({warmup} + 1000)"
-        rows.append(measure(name, mcmc.marginal(PooledTrust(), *arrays, **options), reference))
+        rows.append(
+            measure(table, name, mcmc.marginal(PooledTrust(), *arrays, **options), reference)
+        )
     for centred in (True, False):
         options = settings_of(500, 1000, 4, quick)
         name = f"numpyro joint, {'' if centred else 'non-'}centred, 4 x (500 + 1000)"
         sampler = mcmc.joint(*arrays, centred=centred, **options)
-        measure(name, sampler, reference, n_warm=1)
+        measure(table, name, sampler, reference, n_warm=1)
     return rows
 
 
-def nutpie_rows(build, data, reference, lengths, finish=None, n_warm=N_WARM):
+def nutpie_rows(table, build, data, reference, lengths, finish=None, n_warm=N_WARM):
     """Rows of PyMC + nutpie by kind; none where a tool is missing."""
     pymc, rows = peer("pymc_nutpie", "pymc", "nutpie"), {}
     if pymc is None:
@@ -297,10 +282,10 @@ def nutpie_rows(build, data, reference, lengths, finish=None, n_warm=N_WARM):
     length = f"{lengths['chains']} x ({tune} + {lengths['draws']})"
     for kind, with_jax in (("low rank", False), ("diagonal", False), ("low rank, JAX", True)):
         if kind != "diagonal":  # which shares its compiled code with the one before
-            seconds, compiled = seconds_of(partial(pymc.compile_model, model, with_jax=with_jax))
+            seconds, compiled = timed(partial(pymc.compile_model, model, with_jax=with_jax))
         low_rank = kind != "diagonal"
         sampler = pymc.sampler_of(compiled, **lengths, low_rank=low_rank, finish=finish)
-        rows[kind] = measure(f"PyMC + nutpie {kind}, {length}", sampler, reference,
+        rows[kind] = measure(table, f"PyMC + nutpie {kind}, {length}", sampler, reference,
                              n_warm=n_warm, compile_seconds=seconds)  # fmt: skip
     return rows
 
@@ -357,13 +342,14 @@ def cold_seconds(name, sampler, settings):
 
 def print_cold(name, sampler, settings):
     counted(name)
-    print(seconds_of(partial(draws_of, name, sampler, NutsSettings(*settings), 0))[0])
+    print(timed(partial(draws_of, name, sampler, NutsSettings(*settings), 0))[0])
 
 
 def families(quick):
     print("\n## families: 20 missions x 8 bounds x 3 robots; exact beside NUTS of 4 x (300 + 1000)")
     print("Distances from long NUTS, target acceptance .98, the largest of all unknowns.\n")
-    print_header(("", "cold s", "target", "warm s", "target", "mean, sd", "sd, %", "5-95 %, sd"))
+    head = "", "cold s", "target", "warm s", "target", "mean, sd", "sd, %", "5-95 %, sd"
+    table = aligned(*head)
     settings = NutsSettings(30, 50) if quick else NutsSettings()
     length = settings if quick else NutsSettings(300, 1500, 4, 0.98)
     for name, (*_, cold, warm) in COUNTED.items():
@@ -371,7 +357,7 @@ def families(quick):
         for sampler, n in (("exact", 5), ("nuts", 1)):
             first = cold_seconds(name, sampler, settings)
             draws_of(name, sampler, settings, 0)
-            runs = [seconds_of(partial(draws_of, name, sampler, settings, i)) for i in range(n)]
+            runs = [timed(partial(draws_of, name, sampler, settings, i)) for i in range(n)]
             ours = np.mean([moments(draws) for _, draws in runs], axis=0)
             off = np.abs((ours - [mean, sd, low, high]) / sd).max(1)
             again = float(np.median([seconds for seconds, _ in runs]))
@@ -379,17 +365,17 @@ def families(quick):
             cells = (f"{first:.2f}", f"{cold or ''}" * exact, f"{again:.3f}",
                      f"{warm or ''}" * exact, f"{off[0]:.3f}", f"{100 * off[1]:.1f}",
                      f"{off[2:].max():.3f}")  # fmt: skip
-            print_row((f"{name}, {sampler}", *cells))
+            table.row(f"{name}, {sampler}", *cells)
 
 
 def large(quick):
     data = pooled_data(640)
     print(f"\n## large: {data.rates.size} observations, 6 unknowns\n")
     reference = unknowns(trustbo_exact(data.missions)(1000).sites)
-    print_header(HEADER)
-    exact = measure("trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
+    table = aligned(*HEADER)
+    exact = measure(table, "trustbo exact, 4000 draws", trustbo_exact(data.missions), reference)
     lengths = {"draws": 30 if quick else 300, "tune": 300, "chains": 2}
-    rows = nutpie_rows("pooled_marginal", data, reference, lengths, n_warm=1)
+    rows = nutpie_rows(table, "pooled_marginal", data, reference, lengths, n_warm=1)
     print_ratios([("trustbo exact / best PyMC + nutpie", exact, rows.values(), 50, "warm")])
 
 
@@ -405,13 +391,15 @@ def coupled(quick):
         kept[seed] = sampler(seed)
         return kept[seed]
 
-    print_header(HEADER)
-    nuts = measure("trustbo NUTS, 4 x (300 + 1000)", remembered, n_warm=1 if quick else 2)
+    table = aligned(*HEADER)
+    nuts = measure(table, "trustbo NUTS, 4 x (300 + 1000)", remembered, n_warm=1 if quick else 2)
     reference = np.concatenate([unknowns(sites) for sites in kept.values()])
     mcmc = peer("numpyro_mcmc").marginal(model, *arrays, **settings_of(500, 500, 2, quick))
-    rival = measure("numpyro MCMC, dense, 2 x (500 + 500)", mcmc, reference, n_warm=1)
+    rival = measure(table, "numpyro MCMC, dense, 2 x (500 + 500)", mcmc, reference, n_warm=1)
     lengths = {"draws": 30 if quick else 300, "tune": 300, "chains": 2}
-    rows = nutpie_rows("coupled_marginal", data, reference, lengths, "coupled_matrices", n_warm=1)
+    rows = nutpie_rows(
+        table, "coupled_marginal", data, reference, lengths, "coupled_matrices", n_warm=1
+    )
     print_ratios([
         ("trustbo NUTS / best PyMC + nutpie", nuts, rows.values(), 20, "cold"),
         ("trustbo NUTS / numpyro MCMC", nuts, [rival], 4, "cold"),
@@ -420,24 +408,24 @@ def coupled(quick):
 
 def scaling(quick):
     print("\n## scaling: one exact log density at 4096 points; gathering its statistics\n")
-    print_header(("observations", "density ms", "gather ms", "with stacking"))
+    table = aligned("observations", "density ms", "gather ms", "with stacking")
     costs = []
     for n_missions in (40, 160, 640, 2560):
         data = pooled_data(n_missions)
         costs.append(exact_cost(data))
         cells = (f"{1000 * seconds:.1f}" for seconds in costs[-1])
-        print_row((f"{data.rates.size}", *cells))
+        table.row(data.rates.size, *cells)
     growth = costs[-1][0] / costs[0][0]
     print(f"\ngrowth of the density over 64 x the data: {growth:.2f} x (target <= 2 x)")
     print("\n## scaling: one potential and gradient of NUTS, padded as `fit` pads\n")
-    print_header(("", "observations", "padded", "us", "ns per rate"))
+    table = aligned("", "observations", "padded", "us", "ns per rate")
     for n_missions in (20, 200, 1000, 3334):
-        gradient_row(PooledTrust(), pooled_data(n_missions), quick)
+        gradient_row(table, PooledTrust(), pooled_data(n_missions), quick)
     for n_robots in (1, 3, 10, 30):
-        gradient_row(PooledTrust(), pooled_data(20, n_robots), quick)
+        gradient_row(table, PooledTrust(), pooled_data(20, n_robots), quick)
     for n_robots in (1, 3, 6, 10):
         model = CoupledTrust()
-        gradient_row(model, simulate(model, coupled_truth, 20, n_robots), quick)
+        gradient_row(table, model, simulate(model, coupled_truth, 20, n_robots), quick)
 
 
 def exact_cost(data):
@@ -455,7 +443,7 @@ def exact_cost(data):
     )
 
 
-def gradient_row(model, data, quick):
+def gradient_row(table, model, data, quick):
     batch = stack_missions(data.missions)
     missions = nuts_data(model, batch, np.ones(len(batch.contact_rate)))
     n = 20 if quick or batch.contact_rate.size > 20_000 else 200
@@ -477,7 +465,7 @@ def gradient_row(model, data, quick):
         seconds = median_seconds(lambda: jax.block_until_ready(run(missions)), 5) / n
     name = f"{type(model).__name__}, {len(data.missions)} missions, {data.rates.shape[2]} robots"
     cells = (data.rates.size, batch.contact_rate.size, f"{1e6 * seconds:.0f}")
-    print_row((name, *map(str, cells), f"{1e9 * seconds / data.rates.size:.0f}"))
+    table.row(name, *cells, f"{1e9 * seconds / data.rates.size:.0f}")
 
 
 FRESH = """
@@ -502,26 +490,28 @@ print(time.perf_counter() - started)
 
 def latency(quick):
     print("\n## latency\n")
-    print_header(("", "median ms", "target ms", "reached"))
+    table = aligned("", "median ms", "target ms", "reached")
     n, model, missions = 5 if quick else 20, PooledTrust(), pooled_data(21).missions
     statistics = update_statistics(model, None, missions[:-1])
 
     def refit():
         return sample_statistics(model, update_statistics(model, statistics, missions[-1:]))
 
-    latency_row("refit after one more mission, 20 before", median_seconds(refit, n), 50)
+    latency_row(table, "refit after one more mission, 20 before", median_seconds(refit, n), 50)
     whole = median_seconds(lambda: fit(missions, sampler="exact"), n)
-    latency_row("the whole fit(..., sampler='exact'), all groups", whole)
+    latency_row(table, "the whole fit(..., sampler='exact'), all groups", whole)
     for one in (model, CoupledTrust()):
         params = sample_prior(one, N_FEATURES, 1000, 0, n_robots=N_ROBOTS)
-        latency_row(f"TrustFilter.update, {type(params).__name__}, 1000 draws",
+        latency_row(table, f"TrustFilter.update, {type(params).__name__}, 1000 draws",
                     filter_seconds(params, missions), 1)  # fmt: skip
     runs = [
         float(subprocess.run([sys.executable, "-W", "ignore", "-c", FRESH], check=True, text=True,
                              capture_output=True).stdout)
         for _ in range(1 if quick else 3)
     ]  # fmt: skip
-    latency_row("first fit(..., sampler='exact') of a fresh process", float(np.median(runs)), 500)
+    latency_row(
+        table, "first fit(..., sampler='exact') of a fresh process", float(np.median(runs)), 500
+    )
 
 
 def filter_seconds(params, missions):
@@ -530,14 +520,14 @@ def filter_seconds(params, missions):
     for mission in missions:
         following.reset()
         for z, y in zip(mission.awareness, mission.contact_rate, strict=True):
-            seconds.append(seconds_of(partial(following.update, z, y))[0])
+            seconds.append(timed(partial(following.update, z, y))[0])
     return float(np.median(seconds))
 
 
-def latency_row(name, seconds, target=None):
+def latency_row(table, name, seconds, target=None):
     ms = 1000.0 * seconds
-    reached = "" if target is None else "yes" if ms <= target else "NO"
-    print_row((name, f"{ms:.2f}", "" if target is None else str(target), reached))
+    reached = "" if target is None else verdict(ms <= target)
+    table.row(name, f"{ms:.2f}", "" if target is None else target, reached)
 
 
 def print_machine():
@@ -565,15 +555,12 @@ SECTIONS: dict[str, Any] = {
 }
 
 
-def main(*words):
-    unknown = set(words) - {*SECTIONS, "quick"}
-    if unknown:
-        sys.exit(f"unknown section {', '.join(sorted(unknown))}; choose from {', '.join(SECTIONS)}")
+def main():
+    given = parsed(arguments(__doc__, names=SECTIONS, quick="a tenth of the draws"))
     print_machine()
-    chosen = [name for name in SECTIONS if name in words] or list(SECTIONS)
-    for name in chosen:
-        SECTIONS[name](quick="quick" in words)
+    for name in given.names:
+        SECTIONS[name](given.quick)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -5,16 +5,15 @@ contact of 200 bounds, simulated with the chances of detection instead of detect
 next cells; and R2 of the team's contact. Then seconds for all bounds of a terrain of 500 x 500
 pixels, beside `from_terrain(bounds=False)` in the same run.
 
-    python benchmarks/line_of_sight.py [mode ...]
+    python benchmarks/line_of_sight.py [mode ...] [--data DIR] [--quick]
 """
 
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from common import Table, arguments, median_seconds, parsed
 
 from trustbo import Team, Workspace
 from trustbo.simulation import KinematicSimulator
@@ -22,18 +21,19 @@ from trustbo.simulation.sensing import detections
 from trustbo.terrain import read_terrain, synthetic_terrain
 from trustbo.workspace.moves import MOVES, existing_bounds
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 N_BOUNDS, N_NEXT = 200, 4
 
 
-def terrains() -> Iterator[tuple[str, xr.Dataset]]:
-    """Made terrains, and real ones where they are."""
-    for seed in range(3):
+def terrains(data: Path | None, n: int) -> Iterator[tuple[str, xr.Dataset]]:
+    """Made terrains, and those that the folder holds."""
+    for seed in range(n):
         yield f"synthetic {seed}", synthetic_terrain((500.0, 500.0), seed=seed)
     for name in ("wellington", "tahoe", "bcts", "topography"):
-        files = [DATA / name / f"{kind}.tif" for kind in ("dem", "dsm")]
+        if data is None:
+            continue
+        files = [data / name / f"{kind}.tif" for kind in ("dem", "dsm")]
         if not files[0].is_file():
-            print(f"{name:12s} skipped: there is no {files[0]}")
+            print(f"{name} skipped: there is no {files[0]}")
             continue
         terrain = read_terrain(*files)
         if name == "bcts":  # the fullest 250 m of a strip
@@ -71,38 +71,30 @@ def compared(workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
     return np.array(expected), np.array(simulated)
 
 
-def seconds(make: Callable[[], object], n: int = 3) -> float:
-    """Median of some runs, after one to compile."""
-    make()
-    times = []
-    for _ in range(n):
-        started = time.perf_counter()
-        make()
-        times.append(time.perf_counter() - started)
-    return float(np.median(times))
-
-
 def main() -> None:
     """Print both tables."""
-    print("terrain       sight            r      bias    rmse   R2 of the team's contact")
-    for name, terrain in terrains():
-        for mode in sys.argv[1:] or ["transmittance", "wall", "bare"]:
+    modes = ("transmittance", "wall", "bare")
+    given = parsed(arguments(__doc__, names=modes, data=True, quick="one synthetic terrain"))
+    table = Table("terrain", "sight", "r", "bias", "rmse", "R2 of the team's contact")
+    made = 1 if given.quick else 3
+    for name, terrain in terrains(None if given.quick else given.data, made):
+        for mode in given.names:
             workspace = Workspace.from_terrain(terrain, (10, 10), sight=mode)
             los, rate = compared(workspace)
             r = np.corrcoef(los.ravel(), rate.ravel())[0, 1]
             team = np.corrcoef(los.mean(1), rate.mean(1))[0, 1] ** 2
             off = los - rate
-            print(
-                f"{name:13s} {mode:14s} {r:6.3f}  {off.mean():+.3f}   "
-                f"{np.sqrt((off**2).mean()):.3f}   {team:.3f}"
-            )
+            rmse = np.sqrt((off**2).mean())
+            table.row(name, mode, f"{r:.3f}", f"{off.mean():+.3f}", f"{rmse:.3f}", f"{team:.3f}")
     terrain, team = synthetic_terrain((500.0, 500.0), seed=0), Team(n_robots=4)
-    for shape in ((10, 10), (50, 50)):
-        plain = seconds(lambda s=shape: Workspace.from_terrain(terrain, s, team, bounds=False))
-        whole = seconds(lambda s=shape: Workspace.from_terrain(terrain, s, team))
-        print(
-            f"{shape[0]} x {shape[1]} cells, 4 robots: {whole:.2f} s, {plain:.2f} s without bounds"
+    for side in (10, 50):
+        plain, whole = (
+            median_seconds(
+                lambda s=side, b=bounds: Workspace.from_terrain(terrain, (s, s), team, bounds=b), 3
+            )
+            for bounds in (False, True)
         )
+        print(f"{side} x {side} cells, 4 robots: {whole:.2f} s, {plain:.2f} s without bounds")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Posteriors with two modes: the share of each that a sampler finds, and the true one.
 
-Run: python benchmarks/modes.py [number of posteriors, default 24] [exact | nuts]
+Run: python benchmarks/modes.py [exact] [nuts] [-n 24] [--quick]
 
 The truth is a quadrature of its own: given beta0, the covariance of a mission's trust without its
 noises is diagonalised once, so a grid of (beta0, delta_w, delta_v) costs little; beta and b
@@ -8,12 +8,12 @@ integrate out. Data sets are drawn until enough have two modes in beta0: perfect
 constant rates but once, and few rates under `Priors.zheng2023`.
 """
 
-import sys
 import warnings
 from typing import NamedTuple
 
 import numpy as np
 import numpyro.distributions as dist
+from common import arguments, parsed
 from scipy import stats
 
 from trustbo.data import Mission
@@ -117,7 +117,7 @@ def odd_missions(kind: str, rng: np.random.Generator) -> list[Mission]:
     return [Mission.from_arrays(path, rng.uniform(size=(K, I, 2)), y) for y in rates]
 
 
-def main(n_wanted: int = 24, sampler: str = "exact", n_tried: int = 3000) -> None:
+def share_of_modes(n_wanted: int, sampler: str, n_tried: int = 3000) -> None:
     """Print the share of beta0 below the valley, by quadrature and by the sampler."""
     warnings.simplefilter("ignore")
     done, worst, refused = 0, 0.0, 0
@@ -155,6 +155,8 @@ def main(n_wanted: int = 24, sampler: str = "exact", n_tried: int = 3000) -> Non
 
 
 if __name__ == "__main__":
-    words = sys.argv[1:]
-    names = [word for word in words if not word.isdigit()]
-    main(next((int(word) for word in words if word.isdigit()), 24), *names)
+    parser = arguments(__doc__, names=("exact", "nuts"), n=24, quick="2 posteriors")
+    parser.set_defaults(names=["exact"])
+    chosen = parsed(parser)
+    for sampler in chosen.names:
+        share_of_modes(2 if chosen.quick else chosen.n, sampler)

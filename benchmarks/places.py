@@ -1,6 +1,6 @@
 """Effects of places: what they cost, what they cost where there are none, and learned priors.
 
-Run: python benchmarks/places.py times|nuts|absent|terrains|sights|stopping [--data ../shared/data]
+Run: python benchmarks/places.py [times|nuts|absent|terrains|sights|stopping ...] [--data DIR]
 
 - times: refits and draws, median of five, one core, beside NUTS on the same marginal (the peer).
 - nuts: means and sds of twelve seeds together, beside long NUTS (the peer); fifteen minutes.
@@ -10,15 +10,14 @@ Run: python benchmarks/places.py times|nuts|absent|terrains|sights|stopping [--d
 - stopping: campaigns that `RegretBound(eps=.05)` stopped, and how many of them were wrong.
 """
 
-import argparse
 import os
-import time
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import arviz as az
 import numpy as np
+from common import Table, arguments, median_seconds, parsed, timed
 from scipy.stats import binomtest
 
 import trustbo as tb
@@ -32,16 +31,6 @@ from trustbo.workspace.sight import Sight
 
 PLACES = PooledTrust(place=PlaceEffect())
 TARGETS = {"objective": "mean", "max_bounds": "shortest+2"}
-
-
-def median_time(function, n=5):
-    function()
-    taken = []
-    for _ in range(n):
-        started = time.perf_counter()
-        function()
-        taken.append(time.perf_counter() - started)
-    return float(np.median(taken))
 
 
 def walk(rng, shape, ends):
@@ -97,39 +86,41 @@ def campaign(world, workspace, course, n, seed, **options):
     return result, np.array(found)
 
 
-def times(_):
-    print("seconds\n\n| missions | visited bounds | cold | warm, one more | 1000 draws of all |")
-    print("|---|---:|---:|---:|---:|")
+def times(given):
+    print("seconds\n")
+    table = Table("missions", "visited bounds", "cold", "warm, one more", "1000 draws of all")
     for name, side, n, random_ends, missing in (
         ("10 x 10, 15", 10, 15, False, 0.0),
         ("10 x 10, 15, 15 % of rates missing", 10, 15, False, 0.15),
         ("10 x 10, 60", 10, 60, False, 0.0),
         ("10 x 10, 60, random ends", 10, 60, True, 0.0),
         ("30 x 30, 40, corner to corner", 30, 40, False, 0.0),
-    ):
+    )[: 1 if given.quick else None]:
         workspace, missions = driven(side, n, random_ends, missing)
-        given = {"workspace": workspace, "sampler": "exact", "whole": False}
-        earlier = tb.fit(missions[:-1], PLACES, **given)
-        cold = median_time(lambda m=missions, g=given: tb.fit(m, PLACES, **g), 3)
-        warm = median_time(
-            lambda m=missions, g=given, e=earlier: tb.fit(m, PLACES, earlier=e, **g), 3
+        fitted = {"workspace": workspace, "sampler": "exact", "whole": False}
+        earlier = tb.fit(missions[:-1], PLACES, **fitted)
+        cold = median_seconds(lambda m=missions, g=fitted: tb.fit(m, PLACES, **g), 3)
+        warm = median_seconds(
+            lambda m=missions, g=fitted, e=earlier: tb.fit(m, PLACES, earlier=e, **g), 3
         )
-        posterior = tb.fit(missions, PLACES, earlier=earlier, **given)
-        drawn = median_time(lambda p=posterior: params_of(p), 3)
+        posterior = tb.fit(missions, PLACES, earlier=earlier, **fitted)
+        drawn = median_seconds(lambda p=posterior: params_of(p), 3)
         n_bounds = posterior["places"].sizes["bound"]
-        print(f"| {name} | {n_bounds} | {cold:.3f} | {warm:.3f} | {drawn:.3f} |", flush=True)
+        table.row(name, n_bounds, *(f"{seconds:.3f}" for seconds in (cold, warm, drawn)))
+    if given.quick:
+        return
     workspace, missions = driven(10, 8, False)
-    started = time.perf_counter()
-    tb.fit(missions, PLACES, workspace=workspace, sampler="nuts", check=False)
-    taken = time.perf_counter() - started
+    options = {"workspace": workspace, "sampler": "nuts", "check": False}
+    taken, _ = timed(lambda: tb.fit(missions, PLACES, **options))
     print(f"\nNUTS on the same marginal, 10 x 10, 8 missions: {taken:.0f} s")
 
 
-def absent(_):
+def absent(given):
     """Campaigns on truths that have no effects of places."""
+    n = 2 if given.quick else 24
     kinds = {"places": PLACES, "none": PooledTrust()}
     found = {name: {"lost": [], "learning": [], "tau": []} for name in kinds}
-    for seed in range(24):
+    for seed in range(n):
         ground = synthetic_terrain((500.0, 500.0), seed=seed % 6, relief=30.0)
         workspace = tb.Workspace.from_terrain(ground, (10, 10))
         rng = np.random.default_rng(seed)
@@ -153,7 +144,7 @@ def absent(_):
                     [float(sites[t].quantile(0.5)) for t in ("tau_s", "tau_e")]
                 )
     lost = {name: np.array(each["lost"]) for name, each in found.items()}
-    print("24 campaigns of 15 missions; contact lost in bounds, expected on the path recommended")
+    print(f"{n} campaigns of 15 missions; contact lost in bounds, expected on the path recommended")
     for name in kinds:
         learning = np.mean(found[name]["learning"])
         print(f"  {name:7s} lost {lost[name].mean():.3f}, lost while learning {learning:.3f}")
@@ -162,17 +153,17 @@ def absent(_):
           f"(prior {PlaceEffect().tau_s * 0.674:.3f})")  # fmt: skip
 
 
-def terrains(data):
+def terrains(given):
     """Priors of the other terrains, on worlds of an old survey."""
-    grounds = ("synthetic-0", "synthetic-1", *REAL)
-    chosen = [worlds(data)[f"{ground}-aged"] for ground in grounds]
+    grounds = ("synthetic-0", "synthetic-1", *(REAL if given.data else ()))
+    chosen = [worlds(given.data)[f"{ground}-aged"] for ground in grounds]
 
     def run(world, course, model, n):
         return campaign(world, world.workspace(), course, n, seed=1, model=model)
 
     posteriors = [run(world, "nw-se", PLACES, 15)[0].posterior for world in chosen]
-    print("| world | course | regret after 1, default | learned prior | after 3 | learned |")
-    print("|---|---|---:|---:|---:|---:|")
+    head = "world", "course", "regret after 1, default", "learned prior", "after 3", "learned"
+    table = Table(*head)
     rows = []
     for i, world in enumerate(chosen):
         learned = prior_from([p for j, p in enumerate(posteriors) if j != i])
@@ -181,19 +172,18 @@ def terrains(data):
             for model in (PLACES, learned):
                 row += [*run(world, course, model, 3)[1][[0, 2]]]
             rows.append(row)
-            print(f"| {world.name} | {course} | {row[0]:.2f} | {row[2]:.2f} | {row[1]:.2f} "
-                  f"| {row[3]:.2f} |", flush=True)  # fmt: skip
+            table.row(world.name, course, *(f"{row[i]:.2f}" for i in (0, 2, 1, 3)))
     after = np.array(rows)
     print(f"\nmedians {np.median(after, axis=0).round(2)}, means {after.mean(0).round(2)} "
           "(default after 1, 3; learned after 1, 3)")  # fmt: skip
 
 
-def sights(data):
+def sights(given):
     """Wrong canopy: one assumption of sight, and three that bracket the truth."""
     three = [Sight(extinction=0.3), Sight(extinction=0.1 / 3.0), Sight(crown_base=0.0)]
     found = {}
-    for world in worlds(data).values():
-        if world.kind != "canopy" or (data is None and not world.is_made):
+    for world in of_synthetic_or_given(given.data):
+        if world.kind != "canopy":
             continue
         for name, sight in (("one, wrong", world.assumed), ("three", three)):
             workspace = tb.Workspace.from_terrain(
@@ -209,12 +199,15 @@ def sights(data):
         print(f"{name}: regret after 1, 3, 8, 15 missions, medians of {n}: {middle}")
 
 
-def stopping(data):
+def of_synthetic_or_given(data):
+    """Worlds that have their files: synthetic ones, and all where there is a folder."""
+    return [world for world in worlds(data).values() if data is not None or world.is_made]
+
+
+def stopping(given):
     """Stops of `RegretBound` on the worlds."""
     stopped, wrong, missions, n = 0, 0, [], 0
-    for world in worlds(data).values():
-        if data is None and not world.is_made:
-            continue
+    for world in of_synthetic_or_given(given.data):
         for course in COURSES:
             rule = tb.RegretBound(eps=0.05)
             result, regret = campaign(world, world.workspace(), course, 15, seed=0, stop=rule)
@@ -228,7 +221,7 @@ def stopping(data):
     print(f"{n} campaigns; missions {np.median(missions):g} ({np.quantile(missions, 0.9):g})")
 
 
-def nuts(_):
+def nuts(given):
     workspace, missions = driven(6, 8, random_ends=False)
     seeds = [
         moments(tb.fit(missions, PLACES, "exact", workspace=workspace, seed=seed))
@@ -261,14 +254,13 @@ def moments(posterior):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
     parts = {f.__name__: f for f in (times, nuts, absent, terrains, sights, stopping)}
-    parser.add_argument("part", nargs="*", choices=[*parts, []], default=["times", "absent"])
-    parser.add_argument("--data")
-    given = parser.parse_args()
-    for part in given.part:
+    parser = arguments(__doc__, names=parts, data=True, quick="one row, two campaigns")
+    parser.set_defaults(names=["times", "absent"])
+    given = parsed(parser)
+    for part in given.names:
         print(f"\n{part}\n")
-        parts[part](given.data)
+        parts[part](given)
 
 
 if __name__ == "__main__":

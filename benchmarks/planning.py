@@ -1,18 +1,15 @@
 """Speed of planning beside networkx and scipy.
 
-Run: python benchmarks/planning.py [quick]
+Run: python benchmarks/planning.py [--quick]
 
 Peers get what they are good at: networkx a graph that is built once and whose weights are set
 anew for each draw; scipy a CSR matrix likewise. All find the same costs (checked to 1e-9). Medians
 of 5 (networkx: of 1, on fewer draws, scaled); uses all cores that the process may.
 """
 
-import statistics
-import sys
-import time
-
 import networkx as nx
 import numpy as np
+from common import Table, arguments, faster, median_seconds, parsed, timed, verdict
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
@@ -24,24 +21,6 @@ from trustbo.planning.engines.buckets import best_stationary
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.values import entry_cost
 from trustbo.workspace import Workspace
-
-QUICK = "quick" in sys.argv
-
-
-def seconds(work, repeats=5):
-    work()
-    took = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - started)
-    return statistics.median(took)
-
-
-def once(work):
-    started = time.perf_counter()
-    result = work()
-    return time.perf_counter() - started, result
 
 
 def workspace_of(n, kind="open", seed=0):
@@ -68,27 +47,33 @@ def csr_of(admissible):
     return csr_matrix((np.ones(len(cols)), (rows, cols)), shape=(n, n))
 
 
-def line(label, took, ours=None, note=""):
-    ratio = "" if ours is None else f"{took / ours:8.1f} x"
-    print(f"| {label:<52} | {1e3 * took:12.3f} ms | {ratio:>10} | {note}", flush=True)
+class Times(Table):
+    """Milliseconds of each way, and their ratio to ours."""
+
+    def __init__(self, what):
+        super().__init__("", what, "of ours", "note", first=52, others=10)
+
+    def line(self, label, took, ours=None, note=""):
+        """Print a way."""
+        self.row(label, f"{1e3 * took:.3f} ms", "" if ours is None else faster(took, ours), note)
 
 
 def many_draws(n, n_networkx):
     """1000 draws of the posterior on n x n cells."""
     print(f"\n## 1000 draws, {n} x {n} cells, each draw's best path\n")
-    print(f"| {'':<52} | {'all 1000':>15} | {'of ours':>10} |\n|---|---:|---:|---|")
+    table = Times("all 1000")
     workspace = workspace_of(n)
     ends = (workspace, (n - 1, 0), (0, n - 1))
     draws = sample_prior(PooledTrust(), 2, 1000, seed=0)
     planner = Planner(*ends, "stationary")
-    ours = seconds(lambda: planner.plan_draws(draws))
+    ours = median_seconds(lambda: planner.plan_draws(draws))
     drawn = planner.plan_draws(draws)
-    line("trustbo, stationary (a history-free cost)", ours)
+    table.line("trustbo, stationary (a history-free cost)", ours)
 
     dynamics = planner.dynamics(draws)
     steady_state, length_cost = dynamics.steady_state(), np.zeros(8)
     start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
-    search = seconds(
+    search = median_seconds(
         lambda: best_stationary(
             steady_state.__getitem__,
             1000,
@@ -99,7 +84,7 @@ def many_draws(n, n_networkx):
             goal,
         )
     )
-    line("the same without computing u from the draws", search)
+    table.line("the same without computing u from the draws", search)
     costs = entry_cost(planner.paths.passable, dynamics)[:, 0]
     matrix = csr_of(planner.paths)
 
@@ -110,9 +95,9 @@ def many_draws(n, n_networkx):
             totals[d] = dijkstra(matrix, indices=start)[goal]
         return totals
 
-    took, totals = once(scipy_loop)
+    took, totals = timed(scipy_loop)
     np.testing.assert_allclose(np.exp(-totals), drawn.values, rtol=1e-9)
-    line("scipy.sparse.csgraph.dijkstra, reused matrix", took, ours, target(took / ours, 5))
+    table.line("scipy.sparse.csgraph.dijkstra, reused matrix", took, ours, target(took / ours, 5))
     print(f"(scipy is given the costs: {took / search:.1f} x our search alone)")
 
     graph = planner.graph
@@ -127,46 +112,45 @@ def many_draws(n, n_networkx):
             totals.append(nx.dijkstra_path_length(graph, planner.start, planner.goal))
         return totals
 
-    took, totals = once(networkx_loop)
+    took, totals = timed(networkx_loop)
     np.testing.assert_allclose(np.exp(-np.array(totals)), drawn.values[list(some)], rtol=1e-9)
     took *= 1000 / len(some)
-    line("networkx, reused graph", took, ours, target(took / ours, 50 if n == 10 else 150))
+    table.line("networkx, reused graph", took, ours, target(took / ours, 50 if n == 10 else 150))
     if n == 10:
-        print(f"\n5 ms for 1000 draws: {'yes' if ours <= 5e-3 else 'NO'} ({1e3 * ours:.1f} ms)")
+        print(f"\n5 ms for 1000 draws: {verdict(ours <= 5e-3)} ({1e3 * ours:.1f} ms)")
 
     planner = Planner(*ends, "terminal")
     planner.plan_draws(draws)
-    ours = seconds(lambda: planner.plan_draws(draws))
-    print()
-    line("trustbo, terminal, shortest + 2 bounds", ours)
-    contact_lost(ends, n)
+    ours = median_seconds(lambda: planner.plan_draws(draws))
+    table.line("trustbo, terminal, shortest + 2 bounds", ours)
+    contact_lost(table, ends, n)
     if n > 10:
         return
     by_networkx, few = Planner(*ends, "terminal", engine="networkx"), 20
-    took, drawn = once(lambda: by_networkx.plan_draws(draws, n_draws=few))
+    took, drawn = timed(lambda: by_networkx.plan_draws(draws, n_draws=few))
     compiled = planner.plan_draws(draws, n_draws=few)
     np.testing.assert_allclose(compiled.values, drawn.values, rtol=1e-9)
-    line("our reference on networkx (layered graph)", took * 1000 / few, ours)
+    table.line("our reference on networkx (layered graph)", took * 1000 / few, ours)
 
 
-def contact_lost(ends, n):
+def contact_lost(table, ends, n):
     """1000 draws by lost_contact, for rates that are linear in trust, and for counts."""
     for family, most in (("gaussian", 5), ("beta_binomial", 50)):
         planner = Planner(*ends, observation=family)
         draws = sample_prior(PooledTrust(observation=family), 2, 1000, seed=0)
-        took = seconds(lambda p=planner, d=draws: p.plan_draws(d))
-        note = "" if n > 10 else f"target {most} ms: {'yes' if took <= most * 1e-3 else 'NO'}"
-        line(f"trustbo, lost_contact, {family}", took, None, note)
+        took = median_seconds(lambda p=planner, d=draws: p.plan_draws(d))
+        note = "" if n > 10 else f"target {most} ms: {verdict(took <= most * 1e-3)}"
+        table.line(f"trustbo, lost_contact, {family}", took, None, note)
 
 
 def target(ratio, least):
-    return f"target {least} x: {'yes' if ratio >= least else 'NO'}"
+    return f"target {least} x: {verdict(ratio >= least)}"
 
 
-def large(n, kind):
+def large(n, kind, peers):
     """One plan on n x n cells, from an array to a path."""
     print(f"\n## one plan, {n} x {n} cells, {kind}, from an array\n")
-    print(f"| {'':<52} | {'seconds':>15} | {'of ours':>10} |\n|---|---:|---:|---|")
+    table = Times("one plan")
     workspace = workspace_of(n, kind)
     params = TrustParams(0.6, np.array([0.8, 0.6]), -0.2, 0.1, 0.1)
     ends = (workspace, (0, 0), (n - 1, n - 1))
@@ -174,8 +158,8 @@ def large(n, kind):
     def trustbo_plan():
         return Planner(*ends, "stationary", engine="numba").plan(params)
 
-    ours, plan = seconds(trustbo_plan), trustbo_plan()
-    line("trustbo, stationary, Planner and plan", ours, None, f"{len(plan.path)} cells")
+    ours, plan = median_seconds(trustbo_plan), trustbo_plan()
+    table.line("trustbo, stationary, Planner and plan", ours, None, f"{len(plan.path)} cells")
     planner = Planner(*ends, "stationary")
     cost = entry_cost(planner.paths.passable, planner.dynamics(params))[0]
     start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
@@ -187,24 +171,25 @@ def large(n, kind):
         total, before = dijkstra(matrix, indices=start, return_predecessors=True)
         return total[goal], path_of(before, start, goal, n)
 
-    took, (total, _) = once(scipy_plan)
+    took, (total, _) = timed(scipy_plan)
     np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-7)
     asked = kind == "open"  # the targets for terrain; for a maze, the heap's is the target
     note = target(took / ours, 5) if asked else ""
-    line("scipy.sparse.csgraph.dijkstra, matrix built", took, ours, note)
+    table.line("scipy.sparse.csgraph.dijkstra, matrix built", took, ours, note)
 
     def heap_plan():
         total, before = heap(cost, start, goal)
         return total, path_of(before, start, goal, n)
 
-    took, (total, _) = seconds(heap_plan), heap_plan()
+    took, (total, _) = median_seconds(heap_plan), heap_plan()
     np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-7)
-    line("a binary heap, compiled", took, ours, f"target, not over 2 x it: "
-         f"{'yes' if ours <= 2 * took else 'NO'}")  # fmt: skip
-    if not QUICK:
-        took, total = once(lambda: networkx_plan(cost, (0, 0), (n - 1, n - 1)))
+    table.line(
+        "a binary heap, compiled", took, ours, f"target, not over 2 x: {verdict(ours <= 2 * took)}"
+    )
+    if peers:
+        took, total = timed(lambda: networkx_plan(cost, (0, 0), (n - 1, n - 1)))
         np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-7)
-        line("networkx, graph built", took, ours, target(took / ours, 500) if asked else "")
+        table.line("networkx, graph built", took, ours, target(took / ours, 500) if asked else "")
 
 
 def networkx_plan(cost, start, goal):
@@ -262,10 +247,11 @@ heap = _make_heap()
 
 
 def main():
+    given = parsed(arguments(__doc__, quick="a smaller map, without networkx on it"))
     many_draws(10, 200)
     many_draws(100, 5)
     for kind in ("open", "maze"):
-        large(300 if QUICK else 1000, kind)
+        large(300 if given.quick else 1000, kind, peers=not given.quick)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How soon do policies find the best path, and do they get stuck? Prints the tables of the docs.
 
-Run: python benchmarks/policies.py [quick] [--seeds 100] [--workers cores] [--out FILE.csv]
+Run: python benchmarks/policies.py [--quick] [--seeds 100] [--workers cores] [--out FILE.csv]
          [--objective terminal] [--policies NAME ...] [--scenarios NAME ...]
 
 Each run is 15 missions of 3 robots on 10 x 10 cells, with a fit by the exact sampler after each.
@@ -18,18 +18,16 @@ which only missions measure, where they pass. `map` trusts the map all the same;
 Rows are appended to the CSV (default out/policies.csv) as runs end; those there are not run again.
 """
 
-import argparse
 import csv
 import os
-import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from common import Table, arguments, parsed, timed
 from scipy.spatial.distance import cdist
 from scipy.stats import binomtest, rankdata
 
@@ -168,13 +166,15 @@ def study(options):
         if (name, policy, seed) not in done
     ]
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
-    with options.out.open("a", newline="") as file:
-        for task, regret in results(todo, options.workers):
-            csv.writer(file).writerow([*task, *(f"{r:.6g}" for r in regret)])
-            file.flush()
+
+    def run_all():
+        with options.out.open("a", newline="") as file:
+            for task, regret in results(todo, options.workers):
+                csv.writer(file).writerow([*task, *(f"{r:.6g}" for r in regret)])
+                file.flush()
+
     if todo:
-        seconds = time.perf_counter() - started
+        seconds, _ = timed(run_all)
         print(f"{len(todo)} runs of {N_MISSIONS} missions in {seconds:.0f} s\n")
 
 
@@ -191,13 +191,9 @@ def table(regrets, options):
     found = {}
     for name in options.scenarios:
         print(f"{name}, objective {options.objective}: regret, median / 90 % quantile\n")
-        print(
-            "| policy | runs | "
-            + " | ".join(f"after {k}" for k in SHOWN)
-            + " | within 5 % after 1 | "
-            f"after 10 | stuck after {N_MISSIONS} |"
-        )
-        print("|---" * (len(SHOWN) + 5) + "|")
+        shown = [f"after {k}" for k in SHOWN]
+        stuck = f"stuck after {N_MISSIONS}"
+        lines = Table("policy", "runs", *shown, "within 5 % after 1", "after 10", stuck)
         for policy in options.policies:
             rows = [regrets.get((name, policy, seed)) for seed in range(options.seeds)]
             r = np.array([row for row in rows if row is not None])
@@ -208,7 +204,7 @@ def table(regrets, options):
                 f"{np.median(r[:, k - 1]):.1%} / {np.quantile(r[:, k - 1], 0.9):.1%}" for k in SHOWN
             ]
             cells += [share(r[:, k - 1] <= FOUND) for k in (1, 10)] + [share(r[:, -1] > FOUND)]
-            print(f"| `{policy}` | {len(r)} | " + " | ".join(cells) + " |")
+            lines.row(f"`{policy}`", len(r), *cells)
         print()
     return found
 
@@ -227,8 +223,7 @@ SUMMARY = (
 def summary(found, options):
     """One table of all scenarios."""
     columns = [column for column in SUMMARY if column[0] in options.scenarios]
-    print("| policy | " + " | ".join(f"{s}: {what} after {k}" for s, k, what in columns) + " |")
-    print("|---" * (len(columns) + 1) + "|")
+    lines = Table("policy", *(f"{s}: {what} after {k}" for s, k, what in columns))
     for policy in options.policies:
         cells = []
         for name, k, what in columns:
@@ -238,7 +233,7 @@ def summary(found, options):
                 continue
             hits = regret[:, k - 1] <= FOUND
             cells.append(f"{share(hits if what == 'found' else ~hits)} of {len(hits)}")
-        print(f"| `{policy}` | " + " | ".join(cells) + " |")
+        lines.row(f"`{policy}`", *cells)
     print()
 
 
@@ -268,15 +263,12 @@ def targets(found):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("quick", nargs="?", choices=["quick"], help="3 seeds")
-    parser.add_argument("--seeds", type=int, default=100)
+    parser = arguments(__doc__, seeds=100, out="out/policies.csv", quick="3 seeds")
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
-    parser.add_argument("--out", type=Path, default=Path("out/policies.csv"))
     parser.add_argument("--objective", default="terminal")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
     parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=list(SCENARIOS))
-    options = parser.parse_args()
+    options = parsed(parser)
     if options.quick:
         options.seeds = min(options.seeds, 3)
     study(options)

@@ -1,16 +1,15 @@
 """Does NUTS recover known parameters? Coverage of 95 % intervals over simulated campaigns.
 
-Run: python benchmarks/recovery.py [number of campaigns, default 20]
+Run: python benchmarks/recovery.py [-n 20] [--quick]
 
 Truths are drawn at random, each campaign is 8 missions of 11 bounds with 3 robots. Trust before
 the first bound is N(0.5, 0.1^2), so that contact rates stay in [0, 1] without being cut there,
 which the Gaussian model does not know of; a draw with a rate outside is drawn again.
 """
 
-import sys
-
 import jax
 import numpy as np
+from common import Table, arguments, parsed
 
 from trustbo import Mission
 from trustbo.inference import diagnostics, fit, params_of
@@ -36,7 +35,9 @@ def simulate_campaign(rng, model):
             return truth, [Mission.from_arrays(path, *pair) for pair in zip(z, rates, strict=True)]
 
 
-def main(n_campaigns=20):
+def main():
+    given = parsed(arguments(__doc__, n=20, quick="2 campaigns"))
+    n_campaigns = 2 if given.quick else given.n
     rng = np.random.default_rng(0)
     model = PooledTrust(Priors(x0_sd=0.1))
     inside = {name: [] for name in ("beta0", "beta[0]", "beta[1]", "b", "delta_w", "delta_v")}
@@ -60,11 +61,12 @@ def main(n_campaigns=20):
             low, high = np.percentile(values, [2.5, 97.5])
             inside[name].append(low <= true <= high)
     print(f"{n_campaigns} simulated campaigns; truth inside the 95 % interval:")
+    table = Table("parameter", "inside", "share", first=8)
     for name, hits in inside.items():
-        print(f"  {name:8s} {sum(hits):3d} of {n_campaigns} ({np.mean(hits):.0%})")
-    print(f"  all      {np.mean(list(inside.values())):.1%}")
+        table.row(name, f"{sum(hits)} of {n_campaigns}", f"{np.mean(hits):.0%}")
+    table.row("all", "", f"{np.mean(list(inside.values())):.1%}")
     print(f"worst R-hat {worst['r_hat']:.4f}, smallest bulk ESS {worst['ess_bulk']:.0f} of 4000")
 
 
 if __name__ == "__main__":
-    main(*(int(a) for a in sys.argv[1:]))
+    main()

@@ -1,26 +1,24 @@
 """Speed of sight and of missions beside other ray casters.
 
-Run: python benchmarks/simulation.py
+Run: python benchmarks/simulation.py [--data DIR] [--quick]
 
 Rays: pairs of points up to 100 m apart, sensor and target 1 m above ground, on 1000 x 1000 pixels
 of 1 m; the same pairs for all. `embree` (embreex, a triangle mesh of the ground) and MuJoCo (a
 heightfield) know opaque ground only, as does our mode "bare"; "wall" blocks at the surface;
 "transmittance" also measures the metres inside the canopy. Agreement is with "bare". The
-real scene is steep New Zealand bush at 1 m (../shared/data/wellington), mirrored until it is as
-large. All on one core; seconds are medians of 5 (the NumPy loop: of 1, on 2000 pairs). Missing
-tools are left out.
+real scene is steep New Zealand bush at 1 m (DIR/wellington), mirrored until it is as large.
+All on one core; seconds are medians of 5 (the NumPy loop: of 1, on 2000 pairs). Missing tools are
+left out.
 """
 
 import importlib.util
 import os
-import statistics
 import sys
-import time
 import warnings
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from common import Table, arguments, faster, median_seconds, parsed, verdict
 
 import trustbo as tb
 from trustbo.workspace.sight import Sight, detection_probability
@@ -29,12 +27,9 @@ N_PAIRS, N_SIDE, REACH, EYE = 100_000, 1000, 100.0, 1.0
 OPTICS = np.array([EYE, EYE, np.inf, 1.0])
 
 
-REAL = Path(__file__).parents[2] / "shared" / "data" / "wellington"
-
-
-def real_terrain():
+def real_terrain(folder):
     """The real terrain, mirrored at its edges to N_SIDE pixels a side."""
-    terrain = tb.terrain.read_terrain(REAL / "dem.tif", REAL / "dsm.tif")
+    terrain = tb.terrain.read_terrain(folder / "dem.tif", folder / "dsm.tif")
     rows, cols = terrain["dem"].shape
     size = ((0, N_SIDE - rows), (0, N_SIDE - cols))
     coords = {"y": 5e6 - np.arange(N_SIDE) - 0.5, "x": 5e5 + np.arange(N_SIDE) + 0.5}
@@ -61,16 +56,6 @@ def scene(terrain):
     angle, far = rng.uniform(0, 2 * np.pi, N_PAIRS), REACH * np.sqrt(rng.uniform(size=N_PAIRS))
     b = a + np.stack([far * np.cos(angle), far * np.sin(angle)], axis=1)
     return workspace, surface, a, b
-
-
-def seconds(work, repeats=5):
-    work()
-    took = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - started)
-    return statistics.median(took)
 
 
 def ours(surface, a, b, mode):
@@ -158,33 +143,36 @@ def mujoco_rays(surface, a, b, n=2000):
     return cast
 
 
-def row(label, n, took, seen, reference=None):
-    agrees = "" if reference is None else f"{np.mean((seen > 0.5) == reference[: len(seen)]):.2%}"
-    print(
-        f"| {label:<44} | {n / took / 1e6:8.3f} | {np.mean(seen):8.1%} | {agrees:>8} |", flush=True
-    )
+class Rays(Table):
+    """Speed of each caster, and its agreement with the reference."""
+
+    def line(self, label, n, took, seen, reference=None):
+        """Print a caster."""
+        same = None if reference is None else np.mean((seen > 0.5) == reference[: len(seen)])
+        agrees = "" if same is None else f"{same:.2%}"
+        self.row(label, f"{n / took / 1e6:.3f}", f"{np.mean(seen):.1%}", agrees)
 
 
 def rays(name, terrain):
     _, surface, a, b = scene(terrain)
     print(f"\n## rays, {name} (standard deviation {surface.ground.std():.1f} m)\n")
-    print(f"| {'':<44} | {'M rays/s':>8} | {'clear':>8} | {'agrees':>8} |\n|---|---:|---:|---:|")
+    table = Rays("", "M rays/s", "clear", "agrees", first=44, others=8)
     bare = None
     for mode in ("bare", "wall", "transmittance"):
-        took = seconds(lambda mode=mode: ours(surface, a, b, mode))
+        took = median_seconds(lambda mode=mode: ours(surface, a, b, mode))
         seen = ours(surface, a, b, mode)
         bare = seen > 0.5 if bare is None else bare
-        row(f"trustbo, {mode}", N_PAIRS, took, seen, bare if mode == "bare" else None)
+        table.line(f"trustbo, {mode}", N_PAIRS, took, seen, bare if mode == "bare" else None)
     if importlib.util.find_spec("embreex"):
         cast = embree(surface, a, b)
-        row("embree, opaque ground", N_PAIRS, seconds(cast), cast(), bare)
+        table.line("embree, opaque ground", N_PAIRS, median_seconds(cast), cast(), bare)
     if importlib.util.find_spec("mujoco"):
         cast = mujoco_rays(surface, a, b)
-        row("MuJoCo, heightfield, one by one", 2000, seconds(cast, 3), cast(), bare)
-    row(
+        table.line("MuJoCo, heightfield, one by one", 2000, median_seconds(cast, 3), cast(), bare)
+    table.line(
         "NumPy loop",
         2000,
-        seconds(lambda: numpy_loop(surface, a, b), 1),
+        median_seconds(lambda: numpy_loop(surface, a, b), 1),
         numpy_loop(surface, a, b),
         bare,
     )
@@ -196,26 +184,31 @@ def missions():
     simulator = tb.simulation.KinematicSimulator(workspace)
     n_bounds = len(simulator.run(path, seed=0).bounds)
     seeds = iter(range(1, 10_000))
-    alone = seconds(lambda: simulator.run(path, seed=next(seeds)), 20)
-    batch = seconds(lambda: simulator.run_batch(path, [next(seeds) for _ in range(256)]), 3) / 256
+    alone = median_seconds(lambda: simulator.run(path, seed=next(seeds)), 20)
+    batch = (
+        median_seconds(lambda: simulator.run_batch(path, [next(seeds) for _ in range(256)]), 3)
+        / 256
+    )
     print(
         f"\n## missions of {n_bounds} bounds, the lead and 3 robots, 1000 x 1000 pixels, one core\n"
     )
-    print(f"one at a time: {1e3 * alone:.1f} ms (target 50: {'yes' if alone < 0.05 else 'NO'})")
-    print(f"256 together: {1e3 * batch:.1f} ms each, {alone / batch:.1f} x as fast (target 5 x: "
-          f"{'yes' if alone / batch >= 5 else 'NO'})")  # fmt: skip
+    print(f"one at a time: {1e3 * alone:.1f} ms (target 50: {verdict(alone < 0.05)})")
+    print(f"256 together: {1e3 * batch:.1f} ms each, faster by {faster(alone, batch, 5)}")
 
 
 def main():
+    given = parsed(arguments(__doc__, data=True, quick="rays of one scene"))
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     print(f"Python {sys.version.split()[0]}, one core; target: 5 M rays/s with canopy")
-    for relief in (20.0, 100.0):
+    for relief in (20.0,) if given.quick else (20.0, 100.0):
         rays(f"relief {relief:g} m", synthetic(relief))
-    if REAL.exists():
-        rays("wellington", real_terrain())
+    if given.quick:
+        return
+    if given.data is not None and (given.data / "wellington").is_dir():
+        rays("wellington", real_terrain(given.data / "wellington"))
     else:
-        print(f"\nskipped: the real scene, for there is no {REAL}")
+        print("\nskipped: the real scene, wellington/dem.tif and dsm.tif, which --data names")
     missions()
 
 

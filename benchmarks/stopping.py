@@ -1,6 +1,6 @@
 """How often `RegretBound` stops too soon, and how many missions it saves.
 
-Run: python benchmarks/stopping.py [quick]
+Run: python benchmarks/stopping.py [-n 100] [--quick]
 
 Simulated campaigns on 10 x 10 cells with 3 robots, low noise (sd 0.05 and 0.05; the target) and
 high (0.2 and 0.2; rates are then cut at 0 and 1 now and then): the truth is drawn from the priors,
@@ -9,9 +9,8 @@ under which trust would leave [0, 1] are drawn again, so that hardly any rate is
 failed if, where the rule stopped it, the recommended path's true regret is above eps.
 """
 
-import sys
-
 import numpy as np
+from common import Table, arguments, parsed, verdict
 from scipy.ndimage import gaussian_filter
 from scipy.stats import binomtest, rankdata
 
@@ -21,7 +20,6 @@ from trustbo.models import PooledTrust
 from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator
 
-N = 20 if "quick" in sys.argv else 100
 SHAPE, ENDS, MOST = (10, 10), ((9, 0), (0, 9)), 15
 CASES = (
     (0.05, 0.05, 0.1),
@@ -53,12 +51,14 @@ def regret(workspace, truth, path):
 
 
 def main():
-    print(f"{N} campaigns of at most {MOST} missions, sampler exact, policy greedy\n")
-    print("| noise | eps | delta | stopped | failures | 95 % interval | target | missions (90 %) |")
-    print("|---:|---:|---:|---:|---:|---:|---|---:|")
-    for noise, eps, delta in CASES:
+    given = parsed(arguments(__doc__, n=100, quick="5 campaigns of the first row"))
+    n = 5 if given.quick else given.n
+    print(f"{n} campaigns of at most {MOST} missions, sampler exact, policy greedy\n")
+    head = "noise", "eps", "delta", "stopped", "failures", "95 % interval", "target"
+    table = Table(*head, "missions (90 %)")
+    for noise, eps, delta in CASES[: 1 if given.quick else None]:
         failed, stopped, missions = 0, 0, []
-        for seed in range(N):
+        for seed in range(n):
             workspace, truth = world(seed, noise)
             result = tb.iterate(
                 workspace, *ENDS, n_iterations=MOST, simulator=ModelSimulator(workspace, truth),
@@ -71,14 +71,11 @@ def main():
                 failed += regret(workspace, truth, result.path) > eps
         low, high = binomtest(failed, max(1, stopped)).proportion_ci()
         rate = failed / max(1, stopped)
-        met = "yes" if rate <= delta + 0.03 else "NO"
-        print(
-            f"| {noise:g} | {eps:g} | {delta:g} | {stopped} | {rate:.1%} "
-            f"| {low:.1%} to {high:.1%} | "
-            f"<= {delta + 0.03:.0%}: {met} | {np.median(missions):g} "
-            f"({np.quantile(missions, 0.9):g}) |",
-            flush=True,
-        )
+        target = f"<= {delta + 0.03:.0%}: {verdict(rate <= delta + 0.03)}"
+        most = f"{np.median(missions):g} ({np.quantile(missions, 0.9):g})" if missions else ""
+        interval = f"{low:.1%} to {high:.1%}"
+        row = f"{noise:g}", f"{eps:g}", f"{delta:g}", stopped, f"{rate:.1%}", interval
+        table.row(*row, target, most)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How much sooner is a study done on two cores, and does it survive a worker's death?
 
-Run: python benchmarks/study.py [quick] [--nuts]
+Run: python benchmarks/study.py [--quick] [--nuts]
 
 4 policies x 20 seeds x 8 missions on 10 x 10 cells, contact rates from the trust model itself, the
 posterior by the exact sampler: fitting is quick then, so that what the workers do beside it counts.
@@ -9,7 +9,6 @@ a cluster, of which a worker is killed (SIGKILL) once a quarter of the runs have
 more, with nothing left to do. `--nuts` adds a smaller study by NUTS, whose workers have to compile.
 """
 
-import argparse
 import os
 import signal
 import tempfile
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from common import arguments, parsed, timed
 from distributed import Client, LocalCluster
 
 from trustbo import study
@@ -38,10 +38,8 @@ def settings(n_seeds, sampler):
     )
 
 
-def timed(config, folder, executor):
-    started = time.perf_counter()
-    dataset = study.run_study(config, folder, executor, progress=False)
-    return dataset, time.perf_counter() - started
+def run(config, folder, executor):
+    return timed(lambda: study.run_study(config, folder, executor, progress=False))
 
 
 def same(a, b):
@@ -57,9 +55,9 @@ def same(a, b):
 
 def compare(config, folder):
     """Serial against two workers; the serial results."""
-    alone, t_serial = timed(config, folder / "serial", "serial")
+    t_serial, alone = run(config, folder / "serial", "serial")
     load = os.getloadavg()[0]
-    shared, t_dask = timed(config, folder / "dask", "dask")
+    t_dask, shared = run(config, folder / "dask", "dask")
     cpu = [float(dataset["seconds_cpu"].sum()) for dataset in (alone, shared)]
     n = int(np.isfinite(alone["value"]).sum())
     ratio = t_serial / t_dask
@@ -94,21 +92,20 @@ def survive(config, folder, expected):
     ):
         killer = threading.Thread(target=kill_one, args=(client, folder, n_before))
         killer.start()
-        dataset, seconds = timed(config, folder, client)
+        seconds, dataset = run(config, folder, client)
         killer.join()
     met = same(expected, dataset) and dataset.attrs["n_failed"] == 0
     print(
         f"{'met   ' if met else 'MISSED'} a worker killed midway: the same numbers, {seconds:.1f} s"
     )
-    _, seconds = timed(config, folder, "dask")
+    seconds, _ = run(config, folder, "dask")
     print(f"{'met   ' if seconds < 5 else 'MISSED'} called again, nothing to do: {seconds:.2f} s")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("quick", nargs="?", choices=["quick"], help="3 seeds")
+    parser = arguments(__doc__, quick="3 seeds")
     parser.add_argument("--nuts", action="store_true", help="a study of 4 x 3 runs by NUTS too")
-    options = parser.parse_args()
+    options = parsed(parser)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         config = settings(3 if options.quick else 20, "exact")

@@ -1,9 +1,9 @@
 """Speed and memory of the terrain's features beside GDAL and xarray-spatial.
 
-Run: python benchmarks/terrain.py [attributes] [awareness] [visibility] [huge] [quick]
+Run: python benchmarks/terrain.py [attributes] [awareness] [visibility] [huge] [--quick]
 
-All sections by default; `quick` leaves out the largest rasters. `gdaldem` is Debian's gdal-bin: it
-is installed with apt-get where that is possible, else its rows are left out. Every figure comes
+All sections by default; `--quick` leaves out the largest rasters. `gdaldem` is Debian's gdal-bin:
+it is installed with apt-get where that is possible, else its rows are left out. Every figure comes
 from a fresh process, is the median of 3 (of 1 from 10 000 x 10 000 pixels on), and leaves out what
 importing and a first call on 50 x 50 pixels take. Peak is the process'
 largest resident memory.
@@ -16,11 +16,11 @@ import statistics
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import numpy as np
 import rasterio
+from common import Table, arguments, faster, parsed, timed
 from rasterio.transform import from_origin
 from rasterio.windows import Window
 
@@ -56,7 +56,7 @@ def write_pair(folder, n):
     return files
 
 
-# --- workers, each in a process of its own: print seconds and peak ---
+# --- workers, each in a process of its own: they prepare, and return the work to time ---
 
 
 def trustbo_files(dem, out):
@@ -65,17 +65,18 @@ def trustbo_files(dem, out):
 
     from trustbo.terrain import features
 
+    def run():
+        with rioxarray.open_rasterio(dem) as opened:
+            ground = opened.isel(band=0, drop=True).load().to_dataset(name="dem")
+        with rasterio.open(dem) as source:
+            profile = source.profile | {"tiled": False}
+        for name in ATTRIBUTES:
+            values = getattr(features, name)(ground)
+            with rasterio.open(Path(out) / f"trustbo_{name}.tif", "w", **profile) as sink:
+                sink.write(values.values, 1)
+
     warm_up(dem)
-    started = time.perf_counter()
-    with rioxarray.open_rasterio(dem) as opened:
-        ground = opened.isel(band=0, drop=True).load().to_dataset(name="dem")
-    with rasterio.open(dem) as source:
-        profile = source.profile | {"tiled": False}
-    for name in ATTRIBUTES:
-        values = getattr(features, name)(ground)
-        with rasterio.open(Path(out) / f"trustbo_{name}.tif", "w", **profile) as sink:
-            sink.write(values.values, 1)
-    return time.perf_counter() - started
+    return run
 
 
 def trustbo_memory(dem, out):
@@ -84,10 +85,7 @@ def trustbo_memory(dem, out):
 
     warm_up(dem)
     ground = in_memory(dem)
-    started = time.perf_counter()
-    for name in ATTRIBUTES:
-        getattr(features, name)(ground)
-    return time.perf_counter() - started
+    return lambda: [getattr(features, name)(ground) for name in ATTRIBUTES]
 
 
 def warm_up(dem):
@@ -107,10 +105,7 @@ def xrspatial_memory(dem, out):
     ground = in_memory(dem)["dem"]
     for name in ATTRIBUTES:  # compiles
         getattr(xrspatial, name)(ground[:50, :50])
-    started = time.perf_counter()
-    for name in ATTRIBUTES:
-        getattr(xrspatial, name)(ground)
-    return time.perf_counter() - started
+    return lambda: [getattr(xrspatial, name)(ground) for name in ATTRIBUTES]
 
 
 def in_memory(dem):
@@ -130,11 +125,7 @@ def trustbo_cells(dem, out):
     warm_up(dem)
     ground = in_memory(dem)
     ground["dsm"] = ground["dem"]
-    before = peak()
-    started = time.perf_counter()
-    features = {"traversability": ATTRIBUTES[:3]}
-    cells_of(ground, features)
-    return time.perf_counter() - started, peak() - before
+    return lambda: cells_of(ground, {"traversability": ATTRIBUTES[:3]})
 
 
 def cells_of(ground, features):
@@ -152,34 +143,31 @@ def xrspatial_cells(dem, out):
     ground = in_memory(dem)["dem"]
     for name in ATTRIBUTES:
         getattr(xrspatial, name)(ground[:50, :50])
-    before = peak()
-    started = time.perf_counter()
-    for name in ATTRIBUTES[:3]:
-        values = getattr(xrspatial, name)(ground).values
-        np.nanmean(values.reshape(10, len(values) // 10, 10, -1), axis=(1, 3))
-    return time.perf_counter() - started, peak() - before
+
+    def run():
+        for name in ATTRIBUTES[:3]:
+            values = getattr(xrspatial, name)(ground).values
+            np.nanmean(values.reshape(10, len(values) // 10, 10, -1), axis=(1, 3))
+
+    return run
 
 
-def trustbo_lazy(dem, out):
+def trustbo_lazy(dem, out, **how):
     """Everything that a workspace needs, from files that are never whole in memory."""
     import trustbo as tb
 
-    before = peak()
-    started = time.perf_counter()
-    terrain = tb.terrain.read_terrain(dem, str(dem).replace("dem", "dsm"), lazy=True)
-    tb.Workspace.from_terrain(terrain, (10, 10), bounds=False)
-    return time.perf_counter() - started, peak() - before
+    def run():
+        terrain = tb.terrain.read_terrain(
+            dem, str(dem).replace("dem", "dsm"), **how or {"lazy": True}
+        )
+        tb.Workspace.from_terrain(terrain, (10, 10), bounds=False)
+
+    return run
 
 
 def trustbo_averaged(dem, out):
     """DEM and DSM averaged while they are read, as the command line does, and the workspace."""
-    import trustbo as tb
-
-    before = peak()
-    started = time.perf_counter()
-    terrain = tb.terrain.read_terrain(dem, str(dem).replace("dem", "dsm"), max_pixels=9e6)
-    tb.Workspace.from_terrain(terrain, (10, 10), bounds=False)
-    return time.perf_counter() - started, peak() - before
+    return trustbo_lazy(dem, out, max_pixels=9e6)
 
 
 def visibility(dem, out):
@@ -192,9 +180,7 @@ def visibility(dem, out):
     trees = np.maximum(0.0, 12 * np.sin(x / 23) * np.sin(x[:, None] / 17) - 4)
     terrain = assemble_terrain(ground, ground + trees)
     openness(terrain, 40.0, n_rays=24)
-    started = time.perf_counter()
-    openness(terrain, 40.0, n_rays=24)
-    return time.perf_counter() - started
+    return lambda: openness(terrain, 40.0, n_rays=24)
 
 
 def peak():
@@ -204,9 +190,10 @@ def peak():
 
 
 def work(name, dem, out):
-    took = globals()[name](dem, out)
-    seconds, extra = took if isinstance(took, tuple) else (took, None)
-    print(json.dumps([seconds, peak(), extra]))
+    run = globals()[name](dem, out)
+    before = peak()
+    seconds, _ = timed(run)
+    print(json.dumps([seconds, peak(), peak() - before]))
 
 
 # --- the tables ---
@@ -229,51 +216,49 @@ def gdaldem(dem, out, repeats):
     """Median seconds of the four commands, and the largest peak."""
     if not shutil.which("gdaldem"):
         return None
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
+
+    def run():
         for name, words in GDALDEM.items():
             target = str(out / f"gdal_{name}.tif")
             subprocess.run(["gdaldem", words[0], str(dem), target, *words[1:], "-q"], check=True)
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds), float("nan"), None
+
+    return statistics.median(timed(run)[0] for _ in range(repeats)), float("nan"), None
 
 
-def row(label, result, base=None, target=None):
-    if result is None:
-        return
-    seconds, most, _ = result
-    ratio = "" if base is None else f"{base / seconds:.1f} x"
-    reached = (
-        ""
-        if target is None or base is None
-        else f"(target {target:g} x: {'yes' if base / seconds >= target else 'NO'})"
-    )
-    print(f"| {label:<52} | {seconds:9.3f} | {most:8.0f} | {ratio:>9} | {reached}", flush=True)
+class Costs(Table):
+    """Seconds and memory of each way, and its speed relative to the first."""
 
+    def __init__(self, title):
+        print(f"\n## {title}\n")
+        super().__init__("", "seconds", "peak MB", "faster", first=52, others=9)
 
-def head(title):
-    print(f"\n## {title}\n\n| {'':<52} | {'seconds':>9} | {'peak MB':>8} | {'faster':>9} |")
-    print("|---|---:|---:|---:|")
+    def line(self, label, result, base=None, target=None):
+        """Print a way, if it ran."""
+        if result is not None:
+            seconds, most, _ = result
+            ratio = "" if base is None else faster(base, seconds, target)
+            self.row(label, f"{seconds:.3f}", f"{most:.0f}", ratio)
 
 
 def attributes(folder, sizes):
     for n in sizes:
         dem, _ = write_pair(folder, n)
         repeats = 3 if n < 10000 else 1
-        head(f"slope, roughness, TRI, TPI of {n} x {n} pixels")
+        table = Costs(f"slope, roughness, TRI, TPI of {n} x {n} pixels")
         reference = gdaldem(dem, folder, repeats)
         base = None if reference is None else reference[0]
-        row("gdaldem, file to file, 4 runs", reference)
-        row(
+        table.line("gdaldem, file to file, 4 runs", reference)
+        table.line(
             "trustbo, file to file",
             measure("trustbo_files", dem, folder, repeats),
             base,
             GDALDEM_TARGET[n],
         )
         ours = measure("trustbo_memory", dem, folder, repeats)
-        row("trustbo, in memory", ours, base, GDALDEM_TARGET[n])
-        row("xarray-spatial, in memory", measure("xrspatial_memory", dem, folder, repeats), base)
+        table.line("trustbo, in memory", ours, base, GDALDEM_TARGET[n])
+        table.line(
+            "xarray-spatial, in memory", measure("xrspatial_memory", dem, folder, repeats), base
+        )
         if shutil.which("gdaldem"):
             compare(folder)
 
@@ -295,12 +280,14 @@ def awareness(folder, sizes):
     for n in sizes:
         dem, _ = write_pair(folder, n)
         repeats = 3 if n < 10000 else 1
-        head(f"DEM of {n} x {n} pixels in memory to traversability of 10 x 10 cells")
+        table = Costs(f"DEM of {n} x {n} pixels in memory to traversability of 10 x 10 cells")
         full = measure("xrspatial_cells", dem, folder, repeats)
         base = None if full is None else full[0]
-        row("xarray-spatial: 3 whole maps, averaged", full)
+        table.line("xarray-spatial: 3 whole maps, averaged", full)
         ours = measure("trustbo_cells", dem, folder, repeats)
-        row("trustbo: sampled fit, strips, index per cell", ours, base, 10.0 if n == 4000 else None)
+        table.line(
+            "trustbo: sampled fit, strips, index per cell", ours, base, 10.0 if n == 4000 else None
+        )
         for label, result in (("xarray-spatial", full), ("trustbo", ours)):
             if result is not None:
                 print(f"{label}: {result[2]:.0f} MB beyond the input")
@@ -308,19 +295,17 @@ def awareness(folder, sizes):
 
 def huge(folder, n):
     dem, _ = write_pair(folder, n)
-    head(f"workspace of {n} x {n} pixels, DEM and DSM on disk, openness included")
-    row("trustbo, averaged to 9e6 pixels at most", measure("trustbo_averaged", dem, folder, 1))
-    row("trustbo, lazy", measure("trustbo_lazy", dem, folder, 1))
+    table = Costs(f"workspace of {n} x {n} pixels, DEM and DSM on disk, openness included")
+    table.line(
+        "trustbo, averaged to 9e6 pixels at most", measure("trustbo_averaged", dem, folder, 1)
+    )
+    table.line("trustbo, lazy", measure("trustbo_lazy", dem, folder, 1))
 
 
-def main(*words):
-    sections = {w for w in words if w != "quick"} or {
-        "attributes",
-        "awareness",
-        "visibility",
-        "huge",
-    }
-    quick = "quick" in words
+def main():
+    names = ("attributes", "awareness", "visibility", "huge")
+    given = parsed(arguments(__doc__, names=names, quick="without the largest rasters"))
+    sections, quick = given.names, given.quick
     if not shutil.which("gdaldem"):
         subprocess.run(["apt-get", "install", "-y", "-qq", "gdal-bin"], capture_output=True)
     with tempfile.TemporaryDirectory() as name:
@@ -330,8 +315,8 @@ def main(*words):
         if "awareness" in sections:
             awareness(folder, (4000,) if quick else (4000, 10000))
         if "visibility" in sections:
-            head("visibility index of 500 x 500 pixels, 24 rays of 40 m, with canopy")
-            row("trustbo", measure("visibility", write_pair(folder, 500)[0], folder, 3))
+            table = Costs("visibility index of 500 x 500 pixels, 24 rays of 40 m, with canopy")
+            table.line("trustbo", measure("visibility", write_pair(folder, 500)[0], folder, 3))
         if "huge" in sections:
             huge(folder, 4000 if quick else 20000)
 
@@ -340,4 +325,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["work"]:
         work(*sys.argv[2:])
     else:
-        main(*sys.argv[1:])
+        main()

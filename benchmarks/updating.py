@@ -1,13 +1,13 @@
 """Twenty missions, one after the other: refitting, and passing on moments, against long NUTS.
 
-Run: python benchmarks/updating.py [missions, default 20]
+Run: python benchmarks/updating.py [-n 20] [--quick]
 """
 
-import sys
 from dataclasses import replace
 
 import jax
 import numpy as np
+from common import Table, arguments, parsed
 
 from trustbo.data import Mission
 from trustbo.inference import fit, moment_matched, params_of, sample_statistics
@@ -32,11 +32,13 @@ def columns(params):
     return np.column_stack([p.beta0, p.beta, p.b, p.delta_w, p.delta_v])
 
 
-def main(n_missions=20):
+def main():
+    given = parsed(arguments(__doc__, n=20, quick="2 missions"))
+    n_missions = 2 if given.quick else given.n
     model, statistics, priors = PooledTrust(), None, PooledTrust().priors
     missions = simulate(n_missions, seed=0)
     print("mean error in posterior sd (worst parameter), and sd ratio (least, greatest)")
-    print("missions | refit, exact sampler    | moments passed on")
+    table = Table("missions", "refit, exact sampler", "moments passed on")
     worst = {"refit": [0.0, 1.0, 1.0], "moments": [0.0, 1.0, 1.0]}
     for j, mission in enumerate(missions, start=1):
         statistics = update_statistics(model, statistics, [mission])
@@ -47,22 +49,22 @@ def main(n_missions=20):
             continue
         long = fit(missions[:j], model, "nuts", seed=j, n_draws=10_000)
         reference = columns(params_of(long))
-        line = f"{j:8d}"
+        cells = []
         for name, draws in (("refit", refit), ("moments", columns(params_of(passed_on)))):
             error = np.abs(draws.mean(0) - reference.mean(0)) / reference.std(0)
             ratio = draws.std(0) / reference.std(0)
-            line += f" | {error.max():6.3f} ({ratio.min():.3f}, {ratio.max():.3f})  "
+            cells.append(f"{error.max():.3f} ({ratio.min():.3f}, {ratio.max():.3f})")
             kept = worst[name]
             worst[name] = [
                 max(kept[0], error.max()),
                 min(kept[1], ratio.min()),
                 max(kept[2], ratio.max()),
             ]
-        print(line, flush=True)
+        table.row(j, *cells)
     for name, (error, least, greatest) in worst.items():
         print(f"{name}: worst mean error {error:.3f} sd, sd ratio {least:.3f} to {greatest:.3f}")
     print("target for refit: mean error <= 0.06 sd, sd ratio 0.95 to 1.05")
 
 
 if __name__ == "__main__":
-    main(*(int(a) for a in sys.argv[1:]))
+    main()

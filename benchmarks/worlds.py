@@ -1,14 +1,13 @@
 """The open benchmark: the tables of docs/worlds.md, in Markdown.
 
-    python benchmarks/worlds.py --data ../shared/data --out out/worlds
+    python benchmarks/worlds.py --data DIR --out out/worlds
 
 All worlds x 4 courses x contenders, 15 missions each; called again, it goes on where it stopped.
 `--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
 """
 
-import argparse
-
 import numpy as np
+from common import arguments, parsed
 
 from trustbo.study import run_worlds, worlds_table
 from trustbo.study.benchmark import as_text
@@ -17,17 +16,15 @@ RIGHT, WRONG = ("right", "bare", "slopes"), ("aged", "canopy")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data")
-    parser.add_argument("--out", default="out/worlds")
+    parser = arguments(
+        __doc__, data=True, seeds=1, out="out/worlds", quick="three small worlds, 3 missions"
+    )
     parser.add_argument("--objective", default="lost_contact")
     parser.add_argument("--max-bounds", default="shortest+4")
     parser.add_argument("--policy", nargs="*", default=["optimistic"])
     parser.add_argument("--model", nargs="*", default=["places"])
-    parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--targets", action="store_true")
-    parser.add_argument("--quick", action="store_true")
-    given = parser.parse_args()
+    given = parsed(parser)
     objective, max_bounds = given.objective, given.max_bounds
     if given.targets:
         objective, max_bounds = "mean", "shortest+2"

@@ -2,8 +2,9 @@
 
 They are those of docs/gallery.md by its own code, and a few more. A diagram is an SVG.
 
-The figures of long campaigns and of reliability are of the tables that `benchmarks/campaigns.py
---csv` and `benchmarks/failures.py --csv` wrote. Run: python scripts/docs_figures.py [name ...]
+The figures of long campaigns and of reliability are of the tables in docs/figures/tables, which
+`benchmarks/campaigns.py --out` and `benchmarks/failures.py learn --csv` wrote.
+Run: python scripts/docs_figures.py [name ...]
 """
 
 import io
@@ -27,7 +28,7 @@ from trustbo.plots.style import theme
 
 mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
-RESULTS = FIGURES.parents[1] / "benchmarks" / "results"
+TABLES = FIGURES / "tables"
 STEP = re.compile(r"^```python\n(.*?)^```|^!\[[^]]*\]\(figures/(\w+)\.png\)", flags=re.S | re.M)
 PAPERS = {"": plots.LIGHT._replace(paper="#ffffff"), "dark": plots.DARK._replace(paper="#131416")}
 """Themes by folder; their papers are those of the pages of the documentation."""
@@ -86,7 +87,7 @@ def long_campaigns() -> Figure:
     figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.6), layout="constrained")
     styles = {"0.1": ("#D55E00", "--", "version 0.1"), "0.2": ("#0072B2", "-", "now")}
     for version, (color, line, label) in styles.items():
-        table = np.genfromtxt(RESULTS / f"campaigns_{version}.csv", delimiter=",", names=True)
+        table = np.genfromtxt(TABLES / f"campaigns_{version}.csv", delimiter=",", names=True)
         memory = (table["memory_mb"] - table["memory_mb"][0]) / 1e3
         for ax, values in zip(
             axes, (table["seconds"], memory, table["disk_mb"] / 1e3), strict=True
@@ -102,7 +103,7 @@ def long_campaigns() -> Figure:
 def reliability() -> Figure:
     """Draw the share of missions that arrived by the chance predicted, after 15 and 60 missions."""
     table = np.genfromtxt(
-        RESULTS / "failures_reliability.csv", delimiter=",", names=True, dtype=None, encoding=None
+        TABLES / "failures_reliability.csv", delimiter=",", names=True, dtype=None, encoding=None
     )
     figure, axes = plt.subplots(1, 2, figsize=(7, 3.3), layout="constrained", sharey=True)
     styles = {

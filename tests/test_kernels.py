@@ -70,7 +70,7 @@ def test_random_plans_are_the_best_of_all_paths(monkeypatch):
 @pytest.mark.slow
 def test_two_thousand_random_plans_keep_within_their_arrays(tmp_path):
     """Other problems than the hundred above, with kernels that check their indices."""
-    words = ["benchmarks/fuzz_plans.py", "2000", "--first", "100"]
+    words = ["benchmarks/fuzz_plans.py", "-n", "2000", "--first", "100"]
     ended = run(words, **checked(tmp_path))
     assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
     assert ended.stdout.splitlines()[-1] == "2000 problems, 0 wrong, 0 crashes"
