@@ -18,7 +18,7 @@ import trustbo as tb
 from trustbo.inference import fit
 from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.study import run_worlds, worlds, worlds_table
-from trustbo.study.benchmark import as_text
+from trustbo.study.table import as_text
 
 REGRET = ("gaussian", "auto", "censored")
 LOO = ("gaussian", "censored", "beta_binomial", "student_t")
@@ -52,9 +52,9 @@ def regret(given):
         models=models, baselines=(), sampler="auto", executor=given.executor,
     )  # fmt: skip
     print(as_text(worlds_table(results)))
-    seconds = results["seconds_fit"].groupby("contender").median(...)
+    seconds = results["seconds_fit"].groupby("method").median(...)
     print("\nmedian seconds of a fit\n")
-    for name, value in zip(seconds["contender"].values, seconds.values, strict=True):
+    for name, value in zip(seconds["method"].values, seconds.values, strict=True):
         print(f"{name}: {value:.2f}")
 
 

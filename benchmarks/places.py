@@ -24,8 +24,8 @@ import trustbo as tb
 from trustbo.inference import params_of, prior_from
 from trustbo.models import PlaceEffect, PooledTrust, TrustParams
 from trustbo.simulation import ModelSimulator, Truth
+from trustbo.study import worlds
 from trustbo.study.world import COURSES, REAL
-from trustbo.study.world_set import worlds
 from trustbo.terrain import synthetic_terrain
 from trustbo.workspace.sight import Sight
 

@@ -44,7 +44,7 @@ def main():
     worst = {"r_hat": 0.0, "ess_bulk": np.inf}
     for campaign in range(n_campaigns):
         truth, missions = simulate_campaign(rng, model)
-        posterior = fit(missions, model, seed=campaign)
+        posterior = fit(missions, model, "nuts", seed=campaign)
         found = diagnostics(posterior)
         worst["r_hat"] = max(worst["r_hat"], found["r_hat"])
         worst["ess_bulk"] = min(worst["ess_bulk"], found["ess_bulk"])

@@ -29,8 +29,10 @@ TRUTH = {"beta0": 0.6, "beta": [0.3, 0.2], "b": 0.05, "delta_w": 0.05, "delta_v"
 
 def settings(n_seeds, sampler):
     return study.Study(
-        terrains={"cells": {"kind": "random", "shape": (10, 10), "seed": "run"}},
-        simulators={"truth": {"kind": "model", **TRUTH}},
+        terrains={"cells": {"kind": "random_workspace", "shape": (10, 10), "seed": "run"}},
+        simulators={
+            "truth": {"kind": "ModelSimulator", "params": {"kind": "TrustParams", **TRUTH}}
+        },
         policies=["greedy", "thompson", "optimistic", "random"],
         samplers=[sampler],
         seeds=n_seeds,

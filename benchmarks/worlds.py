@@ -2,15 +2,19 @@
 
     python benchmarks/worlds.py --data DIR --out out/worlds
 
-All worlds x 4 courses x contenders, 15 missions each; called again, it goes on where it stopped.
+All worlds x 4 courses x methods, 15 missions each; called again, it goes on where it stopped.
+BoTorch is left out where it is not installed.
 `--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
 """
 
+from importlib.util import find_spec
+
 import numpy as np
+from baselines.botorch import PathBandit
 from common import arguments, parsed
 
 from trustbo.study import run_worlds, worlds_table
-from trustbo.study.benchmark import as_text
+from trustbo.study.table import as_text
 
 RIGHT, WRONG = ("right", "bare", "slopes"), ("aged", "canopy")
 
@@ -28,8 +32,10 @@ def main():
     objective, max_bounds = given.objective, given.max_bounds
     if given.targets:
         objective, max_bounds = "mean", "shortest+2"
+    methods = {"BoTorch": PathBandit} if find_spec("botorch") else {}
     results = run_worlds(
-        given.out, data=given.data, policies=given.policy, models=given.model, seeds=given.seeds,
+        given.out, data=given.data, methods=methods, policies=given.policy, models=given.model,
+        seeds=given.seeds,
         objective=objective, max_bounds=max_bounds, quick=given.quick, executor="loky",
     )  # fmt: skip
     kinds = results["kind"].values
@@ -43,8 +49,8 @@ def main():
             n = len(np.unique(results["world"].values[chosen]))
             print(f"\n{title} ({n} worlds), {objective}, {max_bounds}\n")
             print(as_text(worlds_table(results.isel(run=chosen))))
-    print("\nby kind and contender\n")
-    print(as_text(worlds_table(results, ["kind", "contender"])))
+    print("\nby kind and method\n")
+    print(as_text(worlds_table(results, ["kind", "method"])))
 
 
 if __name__ == "__main__":

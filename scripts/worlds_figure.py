@@ -1,9 +1,9 @@
-"""Draws docs/figures/worlds.png: regret of what contenders recommend, by kind of world.
+"""Draws docs/figures/worlds.png: regret of what methods recommend, by kind of world.
 
     python scripts/worlds_figure.py FILE.png default=FOLDER:optimistic paper=FOLDER:paper ...
 
 Each curve is named, default, without, botorch, paper or shortest, with the folder of
-`benchmarks/worlds.py` or `trustbo worlds` and the contender in it that it is of. With `--together`
+`benchmarks/worlds.py` or `trustbo worlds` and the method in it that it is of. With `--together`
 before the file, all kinds of worlds are in one panel, as in docs/figures/worlds_outsider.png.
 """
 
@@ -42,9 +42,9 @@ def main() -> None:
     results = {}
     for one in given:
         name, _, source = one.partition("=")
-        folder, _, contender = source.rpartition(":")
+        folder, _, method = source.rpartition(":")
         runs = load_study(folder)
-        results[name] = runs.isel(run=runs["contender"].values == contender)
+        results[name] = runs.isel(run=runs["method"].values == method)
     kinds = (
         {(kind,): title for kind, title in KINDS.items()} if whole else {tuple(KINDS): "all worlds"}
     )

@@ -16,7 +16,7 @@ from trustbo.export import FORMATS
 from trustbo.inference.samplers.choice import SAMPLERS
 from trustbo.models.families import AUTO, FAMILIES
 from trustbo.planning import OBJECTIVES, POLICIES
-from trustbo.study.parts import NAMED_MODELS
+from trustbo.study.methods import MODELS
 from trustbo.workspace import SIGHT_MODES
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
@@ -225,7 +225,7 @@ def test_shells_complete_commands_flags_and_names():
     ("option", "names"),
     [
         ("policy", POLICIES), ("objective", OBJECTIVES), ("sampler", SAMPLERS),
-        ("model", [model.kind for model in NAMED_MODELS]), ("observation", [AUTO, *FAMILIES]),
+        ("model", MODELS), ("observation", [AUTO, *FAMILIES]),
         ("sight", SIGHT_MODES),
     ],
 )  # fmt: skip

@@ -9,6 +9,8 @@ import threading
 import time
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
+from shutil import copy
 
 import jax
 import matplotlib.pyplot as plt
@@ -22,12 +24,13 @@ from typer.testing import CliRunner
 import trustbo as tb
 from trustbo import study
 from trustbo.cli import app
-from trustbo.study import executors, workers
+from trustbo.study import executors, experiment
 
+DATA = Path(__file__).parents[1] / "data"
 TRUTH = {"beta0": 0.6, "beta": [0.3, 0.2], "b": 0.05, "delta_w": 0.05, "delta_v": 0.05}
 CONFIG = {
-    "terrains": {"cells": {"kind": "random", "shape": [5, 5], "seed": "run"}},
-    "simulators": {"truth": {"kind": "model", **TRUTH}},
+    "terrains": {"cells": {"kind": "random_workspace", "shape": [5, 5], "seed": "run"}},
+    "simulators": {"truth": {"kind": "ModelSimulator", "params": {"kind": "TrustParams", **TRUTH}}},
     "policies": ["greedy", "random"],
     "samplers": ["exact"],
     "seeds": 3,
@@ -40,7 +43,11 @@ def run(folder, executor="serial", **changes):
 
 
 def keys(**changes):
-    return [one.key for one in study.Study.of(CONFIG | changes).runs()]
+    return [one.key for one in runs_of(CONFIG | changes)]
+
+
+def runs_of(settings):
+    return study.Study.of(settings).experiment().runs()
 
 
 def assert_same(a, b):
@@ -71,13 +78,13 @@ def client(tmp_path_factory):
 @pytest.fixture
 def counted(monkeypatch):
     """The runs that were run here, serially."""
-    seen, execute = [], executors.execute
+    seen, execute = [], experiment.execute
 
     def count(one, caller):
         seen.append(str(one))
         return execute(one, caller)
 
-    monkeypatch.setattr(executors, "execute", count)
+    monkeypatch.setattr(experiment, "execute", count)
     return seen
 
 
@@ -86,7 +93,7 @@ def counted(monkeypatch):
 
 @pytest.mark.slow  # processes start for long
 def test_a_key_is_the_same_in_another_process(client):
-    table = f"__import__('trustbo').study.Study.of({CONFIG!r}).runs()"
+    table = f"__import__('trustbo').study.Study.of({CONFIG!r}).experiment().runs()"
     assert client.submit(eval, f"[run.key for run in {table}]").result() == keys()
     assert len(set(keys())) == 6
 
@@ -94,8 +101,8 @@ def test_a_key_is_the_same_in_another_process(client):
 def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
     cells, truth = CONFIG["terrains"]["cells"], CONFIG["simulators"]["truth"]
     same = {
-        "terrains": {"renamed": cells | {"shape": (5, 5), "start": [4, 0], "n_robots": 3}},
-        "simulators": {"renamed": truth | {"x0_mean": 0.5, "n_ticks": None}},
+        "terrains": {"renamed": cells | {"shape": (5, 5), "n_robots": 3, "start": None}},
+        "simulators": {"renamed": truth | {"n_ticks": None}},
         "objectives": "lost_contact",
         "seeds": [0, 1, 2],
     }
@@ -103,8 +110,8 @@ def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
     assert keys(seeds=4)[:6] == keys()
     for change in (
         {"terrains": {"cells": cells | {"n_robots": 2}}},
-        {"simulators": {"truth": truth | {"b": 0.06}}},
-        {"models": {"pooled": {"response": "change"}}},
+        {"simulators": {"truth": truth | {"params": truth["params"] | {"b": 0.06}}}},
+        {"models": {"PooledTrust": {"response": "change"}}},
         {"objectives": ["mean"]},
         {"options": {"connectivity": 4}},
         {"n_iterations": 3},
@@ -113,7 +120,7 @@ def test_a_key_depends_on_what_decides_the_numbers_and_on_nothing_else():
 
 
 def test_every_option_is_crossed_with_every_other():
-    table = study.Study.of(
+    table = runs_of(
         CONFIG
         | {
             "objectives": ["terminal", "mean"],
@@ -121,7 +128,7 @@ def test_every_option_is_crossed_with_every_other():
             "samplers": "nuts",
             "options": {"forgetting": [1.0, 0.8], "connectivity": 4},
         }
-    ).runs()
+    )
     assert len(table) == 3 * 2 * 2 * 2 * 2
     assert len({one.key for one in table}) == len(table)
     assert {one.labels["forgetting"] for one in table[:16]} == {1.0, 0.8}
@@ -134,15 +141,44 @@ def test_a_file_s_content_decides_and_not_its_name(tmp_path):
         for name in ("dem", "dsm"):
             terrain[name].rio.to_raster(tmp_path / place / f"{name}.tif")
     table = [
-        "terrains:\n  hill: {kind: files, dem: dem.tif, dsm: dsm.tif, shape: [2, 2]}\n",
-        "terrains:\n  hill: {kind: files, dem: dem.tif, dsm: dem.tif, shape: [2, 2]}\n",
+        "terrains:\n  hill: {kind: read_terrain, dem: dem.tif, dsm: dsm.tif, shape: [2, 2]}\n",
+        "terrains:\n  hill: {kind: read_terrain, dem: dem.tif, dsm: dem.tif, shape: [2, 2]}\n",
     ]
     found = []
     for i, (place, text) in enumerate((("a", table[0]), ("b", table[0]), ("b", table[1]))):
         file = tmp_path / place / f"{i}.yaml"
         file.write_text(text)
-        found.append(study.read_study(file).runs()[0].key)
+        found.append(study.read_study(file).experiment().runs()[0].key)
     assert found[0] == found[1] != found[2]
+
+
+def test_a_file_of_version_0_2_means_the_same_study(tmp_path):
+    terrain = tb.terrain.synthetic_terrain((40.0, 40.0), seed=1)
+    for name in ("dem", "dsm"):
+        terrain[name].rio.to_raster(tmp_path / f"{name}.tif")
+    old, new = (
+        study.read_study(copy(DATA / f"study_{version}.yaml", tmp_path))
+        for version in ("0.2", "0.3")
+    )
+    assert old.settings() != new.settings()  # defaults, which the old one has written out
+    table = [one.key for one in new.experiment().runs()]
+    assert [one.key for one in old.experiment().runs()] == table
+    assert len(set(table)) == 3 * 2 * 5 * 2
+    again = study.Study.of(json.loads(json.dumps(new.settings())))
+    assert [one.key for one in again.experiment().runs()] == table
+
+
+def test_a_constructor_of_the_user_is_named_with_its_module(serial, tmp_path, monkeypatch):
+    (tmp_path / "my_grids.py").write_text(
+        "from trustbo.study import random_workspace\n"
+        "def grid(side, seed=0):\n    return random_workspace((side, side), seed=seed)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    mine = {"kind": "my_grids:grid", "side": 5, "seed": "run"}
+    assert_same(run(tmp_path / "out", terrains={"cells": mine}).drop_vars("key"),
+                serial.drop_vars("key"))  # fmt: skip
+    with pytest.raises(tb.TrustboError, match=r"'cells' \(my_grids:grid\) 'sid' \(did you mean 's"):
+        run(tmp_path / "out", terrains={"cells": {"kind": "my_grids:grid", "sid": 5}})
 
 
 # --- where they run ---
@@ -208,7 +244,7 @@ def no_cache():
 def test_workers_keep_compiled_code_in_the_user_s_cache_unless_told_where(monkeypatch, tmp_path):
     for own in ("a", "b"):  # the second finds what the first set
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / own))
-        workers.keep_compiled_code()
+        executors.keep_compiled_code()
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "a" / "trustbo" / "jax")
 
 
@@ -263,17 +299,17 @@ def test_a_study_goes_on_where_it_stopped(serial, tmp_path, counted, monkeypatch
     class StoppedError(Exception):
         pass
 
-    counting = executors.execute
+    counting = experiment.execute
 
     def stop_after_two(one, caller):
         if len(counted) == 2:
             raise StoppedError
         return counting(one, caller)
 
-    monkeypatch.setattr(executors, "execute", stop_after_two)
+    monkeypatch.setattr(experiment, "execute", stop_after_two)
     with pytest.raises(StoppedError):
         run(tmp_path)
-    monkeypatch.setattr(executors, "execute", counting)
+    monkeypatch.setattr(experiment, "execute", counting)
     assert len(counted) == 2
     partial = study.load_study(tmp_path)
     assert partial.sizes["run"] == 2
@@ -299,7 +335,7 @@ def test_a_run_that_fails_does_not_stop_the_others_and_is_tried_again(
         return drive(self, path, seed=seed)
 
     monkeypatch.setattr(tb.simulation.ModelSimulator, "run", lose_radio)
-    flat = CONFIG["simulators"]["truth"] | {"b": 0.25}
+    flat = {"kind": "ModelSimulator", "params": {"kind": "TrustParams", **TRUTH, "b": 0.25}}
     simulators = {"flat": flat, "good": CONFIG["simulators"]["truth"]}
     changes = {"simulators": simulators, "policies": "greedy", "seeds": 1}
     with pytest.warns(UserWarning, match="1 of 2 runs failed.*simulator=flat.*radio lost"):
@@ -322,7 +358,7 @@ def test_a_worker_of_another_version_is_an_error(tmp_path, monkeypatch):
     def execute(one, caller):
         return {"missions": [], "versions": {"trustbo": "0.0.7"}}
 
-    monkeypatch.setattr(executors, "execute", execute)
+    monkeypatch.setattr(experiment, "execute", execute)
     with pytest.raises(tb.TrustboError, match=r"the worker has trustbo 0\.0\.7, and the study"):
         run(tmp_path)
 
@@ -353,15 +389,19 @@ def test_regret_is_held_against_the_best_path_under_the_truth(serial):
 
 def test_kinematic_runs_know_their_regret_if_asked_to(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    hill = {"kind": "synthetic", "size": [90, 90], "relief": 6, "shape": [3, 3], "seed": 5}
+    hill = {"kind": "synthetic_terrain", "size": [90, 90], "relief": 6, "shape": [3, 3], "seed": 5}
     result = run(
-        tmp_path, terrains={"hill": hill}, simulators="kinematic", seeds=1, policies="greedy"
+        tmp_path,
+        terrains={"hill": hill},
+        simulators="KinematicSimulator",
+        seeds=1,
+        policies="greedy",
     )
     assert result["regret"].isnull().all()
-    assert result["simulator"].item() == "kinematic"
+    assert result["simulator"].item() == "KinematicSimulator"
     with pytest.raises(tb.TrustboError, match="no regret is known"):
         tb.plots.regret_curves(result)
-    known = {"kind": "kinematic", "known_truth": True}
+    known = {"kind": "KinematicSimulator", "known_truth": True}
     changes = {"terrains": {"hill": hill}, "simulators": {"known": known}, "seeds": 1}
     result = run(tmp_path / "known", policies="greedy", **changes)
     assert (result["regret"] >= 0.0).all()
@@ -387,7 +427,7 @@ def test_a_study_is_kept_in_files_that_netcdf_and_json_read(serial, folder, tmp_
     assert one["identity"]["trustbo"] == tb.__version__
     assert len(one["missions"]) == 2
     kept = json.loads((folder / "study.json").read_text())
-    assert [r.key for r in study.Study.of(kept["study"]).runs()] == keys()
+    assert [r.key for r in runs_of(kept["study"])] == keys()
     with pytest.raises(tb.TrustboError, match="holds no study"):
         study.load_study(tmp_path)
 
@@ -425,7 +465,10 @@ def test_regret_curves_show_each_policy_s_median(serial):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"policy": "greedy"}, "unknown setting of a study 'policy'; choose one of terrains, pol"),
+        (
+            {"policy": "greedy"},
+            r"setting of a study 'policy' \(did you mean 'policies'\?\); choose one of terrains, p",
+        ),
         ({"policies": ["gredy"]}, "unknown policy 'gredy'; choose one of greedy"),
         ({"policies": ["greedy", "greedy"]}, "policies must be at least one, and distinct"),
         ({"policies": []}, "policies must be at least one"),
@@ -437,13 +480,34 @@ def test_regret_curves_show_each_policy_s_median(serial):
             {"terrains": {"a": {"shape": [5, 5]}}},
             "unknown kind of terrain 'a'; choose one of synth",
         ),
+        (
+            {"terrains": {"a": {"kind": "SynteticTerrain"}}},
+            r"unknown kind of terrain 'SynteticTerrain' \(did you mean 'synthetic_terrain'\?\)",
+        ),
+        (
+            {"terrains": {"a": {"kind": "example", "shap": [5, 5]}}},
+            r"of terrain 'a' \(example\) 'shap' \(did you mean 'shape'\?\); choose one of name",
+        ),
+        (
+            {"models": {"a": {"kind": "PooledTrust", "place": {"kind": "PlaceEfect"}}}},
+            r"model 'a': unknown kind 'PlaceEfect' \(did you mean 'PlaceEffect'\?\); give the name",
+        ),
+        (
+            {"models": {"a": {"kind": "PooledTrust", "place": {"kind": "PlaceEffect", "cell": 1}}}},
+            r"setting of model 'a', place \(PlaceEffect\) 'cell' \(did you mean 'cells'\?\)",
+        ),
+        ({"simulators": {"a": {"kind": "nowhere:Simulator"}}}, "'nowhere:Simulator' cannot be imp"),
+        (
+            {"simulators": {"KinematicSimulator": {"known_truth": 1}}},
+            "simulator 'KinematicSimulator': known_truth must be true or false; got 1",
+        ),
         ({"terrains": {}}, "a study needs at least one terrain"),
         ({"terrains": 5}, "terrains must be distinct names of kinds"),
         ({"terrains": {"random": 5}}, "terrain 'random' must be a mapping of settings; got 5"),
         ({"terrains": {"random": {"size": 3}}}, "unknown setting of terrain 'random' .*'size'; ch"),
         ({"terrains": {"random": {"shape": 5}}}, r"terrain 'random': shape must be two whole num"),
-        ({"terrains": {"random": {"seed": "each"}}}, "seed .* must be a whole number .*'each'"),
-        ({"terrains": {"files": {"dem": "x.tif"}}}, "terrain 'files' .*: needs dsm; got"),
+        ({"terrains": {"random": {"seed": "each"}}}, "seed .* must be a whole number; got 'each'"),
+        ({"terrains": {"read_terrain": {}}}, r"terrain 'read_terrain' \(read_terrain\) needs dem"),
         ({"terrains": {"files": {"dem": "x", "dsm": "y"}}}, "dem: there is no file '.*x'"),
         ({"terrains": {"random": {"shape": [5, 5], "goal": [0, 9]}}}, r"goal \(0, 9\) is outside"),
         ({"simulators": {"model": {"beta0": 0.5}}}, "needs beta, b, delta_w, delta_v; got"),
@@ -452,7 +516,7 @@ def test_regret_curves_show_each_policy_s_median(serial):
         ({"models": {"pooled": {"observation": "odd"}}}, "model 'pooled': unknown observation"),
         (
             {"models": {"pooled": {"priors": "mine"}}},
-            "unknown priors 'mine'; choose one of default",
+            "model 'pooled': .*priors .*'mine'",
         ),
         (
             {"models": {"coupled": {"observation": "censored"}}},
@@ -489,9 +553,11 @@ def test_yaml_that_cannot_be_is_refused(tmp_path):
 
 YAML = """
 terrains:
-  cells: {kind: random, shape: [5, 5], seed: run}
+  cells: {kind: random_workspace, shape: [5, 5], seed: run}
 simulators:
-  truth: {kind: model, beta0: 0.6, beta: [0.3, 0.2], b: 0.05, delta_w: 0.05, delta_v: 0.05}
+  truth:
+    kind: ModelSimulator
+    params: {kind: TrustParams, beta0: 0.6, beta: [0.3, 0.2], b: 0.05, delta_w: 0.05, delta_v: 0.05}
 policies: [greedy, random]
 samplers: [exact]
 seeds: 3

@@ -4,6 +4,8 @@ import dataclasses
 import sys
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,8 +18,9 @@ from trustbo.errors import TrustboError
 from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.planning.policies import ucb
 from trustbo.simulation import KinematicSimulator, Truth
-from trustbo.study import World, run_worlds, worlds, worlds_table
-from trustbo.study.contenders import contenders_of, identity_of
+from trustbo.study import World, load_study, run_worlds, worlds, worlds_table
+from trustbo.study.calls import identity_of
+from trustbo.study.methods import cases_of
 from trustbo.study.world import COURSES, REAL, aged
 from trustbo.workspace.sight import Sight
 
@@ -49,6 +52,10 @@ def tiny(monkeypatch, tmp_path_factory):
     cache = tmp_path_factory.getbasetemp() / "cache"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     monkeypatch.setattr("trustbo.study.benchmark.worlds", lambda data=None: {"tiny": TINY})
+
+
+def cases(models, policies, baselines=(), methods=None):
+    return cases_of(models, policies, baselines, methods or {}, "mean", 9, "exact")
 
 
 def run(folder, **changes):
@@ -101,30 +108,30 @@ def test_the_true_world_differs_from_the_assumed_one_as_it_says():
         assert max(abs(start[0] - goal[0]), abs(start[1] - goal[1])) == 2
 
 
-def test_contenders_run_on_worlds_and_their_recommendations_are_judged(tiny, tmp_path):
+def test_methods_run_on_worlds_and_their_recommendations_are_judged(tiny, tmp_path):
     results = run(tmp_path)
-    assert results["contender"].values.tolist() == list(ROWS)
+    assert results["method"].values.tolist() == list(ROWS)
     assert set(results["status"].values.ravel()) <= {"ok", "stuck"}
     truth = Truth.of(TINY.simulator(TINY.workspace()))
     best = truth.value(truth.best((2, 0), (0, 2))).lost
     np.testing.assert_allclose(results["oracle"], best)
     side = ((2, 0), (1, 0), (0, 0), (0, 1), (0, 2))
-    own = results.sel(run=results["contender"] == "corner")
+    own = results.sel(run=results["method"] == "corner")
     np.testing.assert_allclose(own["regret_followed"], truth.regret(side))
     # The baselines recommend what they do next; the paper's, what it has learned.
     for name in ROWS[1:3]:
-        row = results.sel(run=results["contender"] == name)
+        row = results.sel(run=results["method"] == name)
         assert row["recommended"].values[0, 0].tolist() == row["path"].values[0, 1].tolist()
-    short = results.sel(run=results["contender"] == "shortest path")["path"].values
+    short = results.sel(run=results["method"] == "shortest path")["path"].values
     assert (short[0, :, 3:] == -1).all()
     table = worlds_table(results)
     assert table.index.tolist() == list(ROWS)
     assert (table["arrive", "value"] <= 1.0).all()
     assert (table["regret after 0", "low"] <= table["regret after 0", "high"]).all()
-    kept = results.sel(run=results["contender"] == "paper")
+    kept = results.sel(run=results["method"] == "paper")
     assert table.loc["paper", ("regret after 1", "value")] == kept["regret"].values[0, 0]
     assert table.loc["paper", ("lost after 0", "value")] == kept["lost_before"].values[0] - best
-    by_kind = worlds_table(results, ["kind", "contender"])
+    by_kind = worlds_table(results, ["kind", "method"])
     assert ("aged", "paper") in by_kind.index
     before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()}
     run(tmp_path)
@@ -137,7 +144,7 @@ def test_a_user_s_policy_model_and_simulator_enter_by_one_argument(tiny, tmp_pat
         tmp_path / "own", models=tb.models.PooledTrust(), simulator=blind,
         policies=["greedy", corner], **changes,
     )  # fmt: skip
-    assert own["contender"].values.tolist() == ["greedy", "corner"]
+    assert own["method"].values.tolist() == ["greedy", "corner"]
     plain = run(tmp_path / "plain", **changes)
     assert float(own["oracle"][1]) > float(plain["oracle"][0]) + 0.5  # half is lost
     assert len({*own["key"].values.tolist(), *plain["key"].values.tolist()}) == 3
@@ -147,15 +154,15 @@ def test_a_policy_may_be_named(tmp_path, monkeypatch):
     (tmp_path / "my_policies.py").write_text("def best(key, posterior, planner): ...")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", list(sys.path))
-    (one,) = contenders_of("pooled", "my_policies:best", (), "mean", 9)
-    assert (one.name, one.policy) == ("best", "my_policies:best")
+    ((name, case),) = cases("pooled", "my_policies:best").items()
+    assert (name, case.policy) == ("best", "my_policies:best")
 
 
 def test_every_model_and_policy_has_a_row_and_a_key_of_its_own():
     """Of three models of one class, two would have been left out without a word."""
     models = [PooledTrust(place=PlaceEffect()), PooledTrust(observation="censored"), PooledTrust()]
     policies = [partial(ucb, kappa=1.0), partial(ucb, kappa=2.0)]
-    names = [one.name for one in contenders_of(models, policies, (), "mean", 9)]
+    names = list(cases(models, policies))
     assert names[:3] == [
         "PooledTrust(places) ucb(kappa=1.0)",
         "PooledTrust(places) ucb(kappa=2.0)",
@@ -165,7 +172,7 @@ def test_every_model_and_policy_has_a_row_and_a_key_of_its_own():
     assert identity_of(policies[0]) != identity_of(policies[1])
     assert identity_of(Lucky(1)) == identity_of(Lucky(1)) != identity_of(Lucky(2))
     with pytest.raises(TrustboError, match="two policies have the name 'Lucky'"):
-        contenders_of("pooled", [Lucky(1), Lucky(2)], (), "mean", 9)
+        cases("pooled", [Lucky(1), Lucky(2)])
 
 
 class Lucky:
@@ -182,7 +189,7 @@ def test_the_command_prints_the_table(tiny, tmp_path):
     words += ["--iterations", 1, "--executor", "serial", "--objective", "mean"]
     done = CliRunner().invoke(app, ["worlds", *map(str, words)])
     assert done.exit_code == 0, done.output
-    assert "| contender | regret after 0 (%) | regret after 1 (%) |" in done.output
+    assert "| method | regret after 0 (%) | regret after 1 (%) |" in done.output
     assert "| shortest path | " in done.output
     table = pd.read_csv(tmp_path / "out" / "worlds.csv", header=[0, 1], index_col=0, skiprows=[2])
     assert table.index.tolist() == ["greedy", "shortest path"]
@@ -207,7 +214,7 @@ def test_absent_files_are_named_with_where_to_put_them(tmp_path):
         ({"policies": 3}, "policy must be a name or a callable; got 3"),
         ({"models": "pool"}, "unknown model 'pool'; choose one of"),
         ({"models": "math:pi"}, "model must be a trust model, .* got 3.14"),
-        ({"baselines": ["best"]}, "unknown baseline 'best'; choose one of random"),
+        ({"baselines": ["best"]}, "unknown baseline .* 'best'; choose one of random"),
         (
             {"simulator": "math:tau"},
             "simulator 'math:tau' must be a function that makes",
@@ -219,19 +226,50 @@ def test_impossible_comparisons_are_refused(tiny, tmp_path, changes, message):
         run(tmp_path, **changes)
 
 
+class Counting:
+    """Policy that learns by itself: it counts missions, and recommends by their number."""
+
+    def __init__(self):
+        self.n_missions = 0
+
+    def __call__(self, key, posterior, planner):
+        return corner(key, posterior, planner)
+
+    def learn(self, campaign, mission):
+        self.n_missions += 1
+
+    def recommend(self, campaign):
+        paths = ((2, 0), (1, 1), (0, 2)), ((2, 0), (1, 0), (0, 1), (0, 2))
+        return paths[min(self.n_missions, 1)]
+
+
+def test_a_factory_of_methods_makes_a_new_one_for_each_campaign(tiny, tmp_path):
+    changes = {"baselines": [], "methods": {"counting": Counting}, "courses": ["sw-ne", "w-e"]}
+    results = run(tmp_path, n_iterations=1, **changes)
+    assert results["method"].values.tolist() == ["corner", "counting"] * 2
+    own = results.sel(run=(results["method"] == "counting") & (results["course"] == "sw-ne"))
+    truth = Truth.of(TINY.simulator(TINY.workspace()))
+    before, after = (Counting.recommend(SimpleNamespace(n_missions=n), None) for n in (0, 1))
+    np.testing.assert_allclose(own["regret_before"], truth.regret(before, max_bounds="shortest+4"))
+    np.testing.assert_allclose(own["regret"][:, 0], truth.regret(after, max_bounds="shortest+4"))
+
+
 if find_spec("botorch"):  # a peer, which only `make bench` installs
 
-    def test_the_outsider_learns_and_recommends(tiny, tmp_path):
-        results = run(tmp_path, policies="greedy", baselines=["botorch"], n_iterations=3)
-        row = results.sel(run=results["contender"] == "BoTorch")
+    def test_botorch_learns_and_recommends(tiny, tmp_path, monkeypatch):
+        monkeypatch.chdir(Path(__file__).parents[2])
+        monkeypatch.setattr("sys.path", list(sys.path))
+        baselines = ["benchmarks.baselines.botorch:PathBandit"]
+        results = run(tmp_path, policies="greedy", baselines=baselines, n_iterations=3)
+        row = results.sel(run=results["method"] == "PathBandit")
         assert np.isfinite(row["regret"]).all()
 
 
-def test_without_botorch_its_baseline_is_left_out(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr("trustbo.study.benchmark.find_spec", lambda name: None)
-    with pytest.warns(UserWarning, match="the baseline botorch is left out: BoTorch is not inst"):
-        results = run(tmp_path, baselines=["botorch"], n_iterations=1)
-    assert results["contender"].values.tolist() == ["corner"]
+def test_results_of_version_0_2_are_read_under_the_new_name_of_their_rows(tiny, tmp_path):
+    results = run(tmp_path, baselines=[], n_iterations=1)
+    file = tmp_path / "study.json"
+    file.write_text(file.read_text().replace('"method"', '"contender"'))
+    assert load_study(tmp_path)["method"].values.tolist() == results["method"].values.tolist()
 
 
 def survey(folder, missing):

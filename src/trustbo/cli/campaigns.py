@@ -65,7 +65,7 @@ def run(
         cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
         chosen = CampaignOptions(**options)
         require_outputs(out, overwrite=overwrite)
-        trust_model = _models()[model](observation=observation).model()
+        trust_model = _model(model, observation)
         _require_sampling(chosen, trust_model, sampler)
         from trustbo import simulation
         from trustbo.campaign.loop import iterate
@@ -226,9 +226,17 @@ def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: st
 
 
 def _models() -> dict[str, Any]:
-    from trustbo.study.parts import NAMED_MODELS
+    from trustbo.study.methods import MODELS
 
-    return {model.kind: model for model in NAMED_MODELS}
+    return MODELS
+
+
+def _model(name: str, observation: str) -> "TrustModel":
+    from trustbo.study.calls import Call
+    from trustbo.study.methods import model_of
+
+    call = _models()[name]
+    return model_of(Call(call.kind, (*call.keywords, ("observation", observation))))
 
 
 def _require_same(file: Path, example: Path) -> None:

@@ -54,10 +54,10 @@ Benchmark
   worlds.model NAME: Model, given once for each: places (the default), pooled, hierarchical,
     coupled, or module:name.
   simulator NAME: Your own simulator of a world, module:name.
-  baseline NAME: Baseline, given once for each: random, shortest, paper, botorch, none; by default
-    all of them.
+  baseline NAME: Baseline, given once for each: random, shortest, paper, none, or module:name; by
+    default the first three.
   max_bounds NAME: Admissible paths: shortest, shortest+4, or the most bounds allowed.
-  by NAME: Rows of the table: contender, kind, world or course.
+  by NAME: Rows of the table: method, kind, world or course.
   quick: Run three small worlds, one course and three missions only.
   seeds N: Number of campaigns for each course.
 Missions

@@ -20,7 +20,7 @@ def worlds(
     max_bounds: str = "shortest+4",
     iterations: int = 15,
     seeds: int = 1,
-    by: str = "contender",
+    by: str = "method",
     quick: bool = False,
     out: Path = Path("out/worlds"),
     executor: str | None = None,
@@ -33,14 +33,15 @@ def worlds(
     Example: trustbo worlds --data terrain/ --policy optimistic --policy mine:policy
 
     The folder gets a file for each campaign, and worlds.csv. The same command again runs
-    the rest. Your own policy, model or simulator is named module:name.
+    the rest. A policy, model, baseline or simulator of the user is named module:name.
     """
     with one_line_errors(debug):
         from trustbo.files import write_text
         from trustbo.spreadsheet import frame_as_csv
-        from trustbo.study.benchmark import as_text, run_worlds, worlds_table
-        from trustbo.study.contenders import BASELINES
+        from trustbo.study.benchmark import run_worlds
+        from trustbo.study.methods import BASELINES
         from trustbo.study.store import Store
+        from trustbo.study.table import as_text, worlds_table
 
         Store(out).require_free("worlds.csv")
         if executor is None:

@@ -1,42 +1,166 @@
-"""Settings of a study, checked before any work starts, and its table of runs."""
+"""Settings of a study, checked before any work starts, and the experiment that they mean."""
 
+import inspect
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+from os import PathLike
 from pathlib import Path
 from typing import Any, Self
 
+import xarray as xr
+
+from trustbo.campaign.loop import path_class
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
 from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
-from trustbo.planning import OBJECTIVES, POLICIES
-from trustbo.study.parts import MODELS, SIMULATORS, parts_of
-from trustbo.study.run import Run
+from trustbo.models.model import TrustModel
+from trustbo.planning import OBJECTIVES, POLICIES, Planner
+from trustbo.simulation import ModelSimulator, Simulator, Truth
+from trustbo.study.calls import FILES, Call, call_of, require_known, takes
+from trustbo.study.experiment import Experiment
+from trustbo.study.methods import Case, model_call, model_of
+from trustbo.study.parts import SIMULATORS
 from trustbo.study.terrains import TERRAINS
+from trustbo.team import Team
+from trustbo.workspace import Location, Workspace, survey
+from trustbo.workspace.location import CELL, named
 
 OPTIONS = (
     *(option.name for option in fields(CampaignOptions) if option.name != "callbacks"),
     "stop",
 )
 """Names in `Study.options`."""
+TERRAINS = ("synthetic_terrain", "read_terrain", "read_lidar", "example", "random_workspace")
+SIMULATORS = ("KinematicSimulator", "ModelSimulator", "MujocoSimulator")
+MODEL_KINDS = ("PooledTrust", "HierarchicalTrust", "CoupledTrust")
+_GRID = tuple(inspect.signature(Workspace.from_terrain).parameters)[1:]
+"""Keywords of the planning grid, which a terrain has in addition to those of its constructor."""
+_ENDS = ("start", "goal")
+type _Ends = tuple[Location | None, Location | None]
+_NOTHING = Call("", ())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Terrain and simulator of a study, as a scene of an experiment.
+
+    Attributes:
+        labels: Names of the terrain and the simulator.
+        terrain: Call that makes a terrain or a workspace.
+        grid: Keywords of `Workspace.from_terrain`.
+        start: Start; by default bottom left.
+        goal: Goal; by default top right.
+        simulating: Call that makes the simulator.
+        known_truth: Whether the truth is found, for regret; that of a model costs nothing.
+    """
+
+    labels: Mapping[str, Any] = field(default_factory=dict, compare=False)
+    terrain: Call
+    grid: Call = _NOTHING
+    start: Location | None = None
+    goal: Location | None = None
+    simulating: Call = _NOTHING
+    known_truth: bool = False
+
+    def __post_init__(self) -> None:
+        for part in (self.terrain, self.grid):
+            if (shape := part.get("shape")) is not None:
+                require_pair("shape", shape)
+        for name in _ENDS:
+            if (given := getattr(self, name)) is not None:
+                end = named(name, given)
+                # As JSON and hashes can hold it.
+                object.__setattr__(self, name, end.values if end.names == CELL else end.text)
+
+    @property
+    def ends(self) -> tuple[Location, Location]:
+        """Start and goal."""
+        return _ends((self.start, self.goal), self.workspace().passable.shape)
+
+    def at(self, seed: int) -> "Place":
+        """Place of the run with this seed."""
+        calls = {name: getattr(self, name).at(seed) for name in ("terrain", "grid", "simulating")}
+        return replace(self, **calls)
+
+    def identity(self) -> dict[str, Any]:
+        """Settings that the numbers depend on."""
+        return {
+            "terrain": self.terrain.identity(),
+            "grid": self.grid.identity(),
+            "ends": (self.start, self.goal),
+            "simulator": self.simulating.identity(),
+            "known_truth": self.known_truth,
+        }
+
+    def settings(self) -> dict[str, Any]:
+        """Settings of the terrain, as JSON can hold them."""
+        ends = {n: getattr(self, n) for n in _ENDS if getattr(self, n) is not None}
+        return self.terrain.settings() | self.grid.settings() | ends
+
+    def workspace(self, *, bounds: bool = True) -> Workspace:
+        """Workspace, which is made once per process, for a few terrains."""
+        return _workspace(self.terrain, self.grid, (self.start, self.goal))
+
+    def simulator(self, workspace: Workspace) -> Simulator:
+        """Make the simulator."""
+        return self.simulating.make(workspace=workspace)
+
+    def truth(self) -> Truth | None:
+        """Truth of the simulator; None where it is not asked for."""
+        asked = self.known_truth or self.simulating.kind == ModelSimulator.__name__
+        return Truth.of(self.simulator(self.workspace())) if asked else None
+
+    def judged_by(self, planner: Planner) -> dict[str, Any]:
+        """Paths that regret is held against, see `path_class`."""
+        return path_class(planner)
+
+
+def _ends(given: _Ends, shape: tuple[int, ...]) -> tuple[Location, Location]:
+    """Start and goal that were given, or the corners at the bottom left and the top right."""
+    start, goal = given
+    return (shape[0] - 1, 0) if start is None else start, (
+        0,
+        shape[1] - 1,
+    ) if goal is None else goal
+
+
+@lru_cache(maxsize=4)
+def _workspace(terrain: Call, grid: Call, ends: _Ends) -> Workspace:
+    made, keywords = terrain.make(), grid.make()
+    if isinstance(made, Workspace):
+        if keywords:
+            raise TrustboError(
+                f"{terrain.kind} makes a workspace, which takes no {', '.join(keywords)}."
+            )
+        return made
+    if not isinstance(made, xr.Dataset):
+        raise TrustboError(f"{terrain.kind} must make a terrain or a Workspace; got {made!r}.")
+    team = keywords.get("team") or Team()
+    cells = survey(made, keywords.get("shape", (10, 10)), team)
+    for name, end in zip(_ENDS, _ends(ends, cells.grid.shape), strict=True):
+        cells.require_cell(name, end)  # before awareness is computed
+    return Workspace.from_terrain(made, **keywords)
 
 
 @dataclass(frozen=True)
 class Study:
     """Every policy with every objective, model, sampler, simulator, terrain, option and seed.
 
-    Terrains, simulators and models are given as a mapping of your own names to settings, the `kind`
-    among them; or as a list of kinds, with their defaults. See docs/studies.md.
+    Terrains, simulators and models are mappings of names to settings: the `kind` is a public
+    constructor, such as `KinematicSimulator`, or `"module:name"`, and the rest its keywords, which
+    may have a `kind` too; or lists of kinds, with their defaults. See docs/studies.md.
 
     Attributes:
-        terrains: Terrains of the kinds `synthetic`, `files`, `random`.
+        terrains: Terrains, with keywords of `Workspace.from_terrain`, `start` and `goal`.
         policies: Names in `planning.POLICIES`.
         objectives: Names in `planning.OBJECTIVES`.
-        models: Models of the kinds `pooled`, `places`, `hierarchical`, `coupled`, `own`.
+        models: Models, or the names `pooled`, `places`, `hierarchical`, `coupled`.
         samplers: `"auto"`, `"exact"`, `"nuts"`, `"joint"`.
-        simulators: Simulators of the kinds `kinematic`, `model`.
+        simulators: Simulators, with `known_truth` where regret is asked for.
         seeds: Seeds, or their number: 0, 1, ...
         n_iterations: Missions of a run.
         options: Fields of `CampaignOptions` but callbacks, and `stop`, the settings of a
@@ -51,15 +175,15 @@ class Study:
     objectives: Any = (OBJECTIVE,)
     models: Any = ("pooled",)
     samplers: Any = (SAMPLER,)
-    simulators: Any = ("kinematic",)
+    simulators: Any = ("KinematicSimulator",)
     seeds: Any = 1
     n_iterations: int = 8
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         keep = object.__setattr__
-        for name, kinds in (("terrain", TERRAINS), ("simulator", SIMULATORS), ("model", MODELS)):
-            keep(self, f"{name}s", parts_of(name, getattr(self, f"{name}s"), kinds))
+        for what, make in (("terrain", _place), ("simulator", _simulating), ("model", _model)):
+            keep(self, f"{what}s", _by_name(what, getattr(self, f"{what}s"), make))
         for what, plural, choices in (
             ("policy", "policies", POLICIES),
             ("objective", "objectives", OBJECTIVES),
@@ -77,7 +201,7 @@ class Study:
         for name, model in self.models.items():
             for sampler in self.samplers:
                 try:
-                    resolve_sampler(model.model(), sampler)
+                    resolve_sampler(model_of(model), sampler)
                 except TrustboError as error:
                     raise TrustboError(f"model {name!r}: {error}") from None
 
@@ -92,54 +216,89 @@ class Study:
             return configuration
         if not isinstance(configuration, Mapping):
             raise TrustboError(f"a study is a Study or a mapping; got {configuration!r}.")
-        known = [f.name for f in fields(cls)]
         for name in configuration:
-            require_choice("setting of a study", name, known)
+            require_known("setting of a study", name, [f.name for f in fields(cls)])
         if "terrains" not in configuration:
-            raise TrustboError("a study needs terrains, e.g. terrains: [random].")
+            raise TrustboError("a study needs terrains, e.g. terrains: [random_workspace].")
         return cls(**configuration)
 
-    def runs(self) -> list[Run]:
-        """List the runs, seed by seed, so that the first to end are of every kind."""
+    def experiment(self) -> Experiment:
+        """Every case of a model and a policy on every terrain, with every simulator and seed."""
+        scenes = {
+            f"{terrain}, {simulator}": replace(
+                place, labels={"terrain": terrain, "simulator": simulator}, **simulating
+            )
+            for terrain, place in self.terrains.items()
+            for simulator, simulating in self.simulators.items()
+        }
         axes: dict[str, Any] = {
-            "seed": self.seeds,
-            "terrain": self.terrains,
-            "simulator": self.simulators,
             "model": self.models,
             "sampler": self.samplers,
             "objective": self.objectives,
             **self.options,
             "policy": self.policies,
         }
-        return [
-            self._run(dict(zip(axes, values, strict=True)))
-            for values in itertools.product(*axes.values())
-        ]
-
-    def _run(self, labels: dict[str, Any]) -> Run:
-        return Run(
-            labels,
-            self.terrains[labels["terrain"]].at(labels["seed"]),
-            self.simulators[labels["simulator"]],
-            self.models[labels["model"]],
-            labels["policy"],
-            labels["objective"],
-            labels["sampler"],
-            labels["seed"],
-            self.n_iterations,
-            {name: labels[name] for name in self.options},
-        )
+        cases = {}
+        for values in itertools.product(*axes.values()):
+            labels = dict(zip(axes, values, strict=True))
+            cases[repr(values)] = Case(
+                labels, self.models[labels["model"]], labels["policy"], labels["objective"],
+                labels["sampler"], {name: labels[name] for name in self.options},
+            )  # fmt: skip
+        return Experiment(cases, scenes, self.seeds, self.n_iterations, self.settings())
 
     def settings(self) -> dict[str, Any]:
         """Settings as JSON can hold them; `Study.of` reads them."""
-        own: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name in ("terrains", "simulators", "models"):
-            own[name] = {label: part.settings() for label, part in own[name].items()}
-        return own
+        settings = {f.name: getattr(self, f.name) for f in fields(self)}
+        settings["terrains"] = {name: place.settings() for name, place in self.terrains.items()}
+        settings["simulators"] = {
+            name: one["simulating"].settings() | {"known_truth": one["known_truth"]}
+            for name, one in self.simulators.items()
+        }
+        settings["models"] = {
+            name: model.settings() if isinstance(model, Call) else repr(model)
+            for name, model in self.models.items()
+        }
+        return settings
+
+
+def run_study(
+    study: Study | Mapping[str, Any] | FilePath,
+    directory: FilePath,
+    executor: Any = None,
+    *,
+    n_workers: int | None = None,
+    progress: bool = True,
+) -> xr.Dataset:
+    """Run the runs of a study that have not ended yet.
+
+    Args:
+        study: Study, a mapping of its settings, or a YAML file of them.
+        directory: Folder of the results, a file for each run. Called again, a study goes on where
+            it stopped, and repeats runs that failed.
+        executor: `None` or `"serial"`: this process, one run after the other. `"loky"` or `"dask"`:
+            a process for each core, of a local cluster in the case of Dask. The address of a Dask
+            scheduler (`"tcp://..."`), a `distributed.Client`, or any `concurrent.futures.Executor`
+            that does not fork.
+        n_workers: Number of processes that `"loky"` and `"dask"` start; by default one for each
+            core.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Results as `load_study` returns them. A warning names runs that failed; `failures` lists
+        them.
+
+    Raises:
+        TrustboError: An impossible study or executor, before any work starts; or every run failed.
+    """
+    if isinstance(study, str | PathLike):
+        study = read_study(study)
+    experiment = Study.of(study).experiment()
+    return experiment.run(directory, executor, n_workers=n_workers, progress=progress)
 
 
 def read_study(path: FilePath) -> Study:
-    """Read a study from a YAML file; paths of rasters are relative to its folder.
+    """Read a study from a YAML file, of this version or 0.2; files are relative to its folder.
 
     Raises:
         TrustboError: No such file, no YAML, or settings that `Study` refuses.
@@ -148,25 +307,140 @@ def read_study(path: FilePath) -> Study:
     configuration = read_yaml(file)
     try:
         if isinstance(configuration, Mapping):
-            configuration = _with_paths_from(file.parent, dict(configuration))
+            configuration = _with_paths_from(file.parent, configuration)
         return Study.of(configuration)
     except TrustboError as error:
         raise TrustboError(f"{file}: {error}") from None
 
 
-def _with_paths_from(folder: Path, configuration: dict[str, Any]) -> dict[str, Any]:
-    terrains = configuration.get("terrains")
+def migrate(what: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a terrain, simulator or model of version 0.2 as those of this one.
+
+    Settings of this version are returned unchanged.
+    """
+    new = dict(settings)
+    kind = new.pop("kind", None)
+    if kind == "own" and what == "model":
+        return {"kind": new.get("source")}
+    if kind not in _KINDS.get(what, {}):
+        return dict(settings)
+    if what == "terrain" and kind != "random" and "n_robots" in new:
+        n_robots = new.pop("n_robots")
+        new |= {} if n_robots == 3 else {"team": {"kind": "Team", "n_robots": n_robots}}
+    if what == "model":
+        if new.get("priors") in ("default", "zheng2023"):
+            new |= (
+                {"priors": {"kind": "Priors.zheng2023"}} if new.pop("priors") != "default" else {}
+            )
+        if kind == "places":
+            names = [name for name in ("cells", "bounds") if name in new]
+            new["place"] = {"kind": "PlaceEffect", **{name: new.pop(name) for name in names}}
+    if kind == "model":
+        observation = new.pop("observation", "gaussian")
+        n_ticks = {"n_ticks": new.pop("n_ticks")} if "n_ticks" in new else {}
+        new = {"params": {"kind": "TrustParams", **new}, **n_ticks}
+        if observation != "gaussian":
+            new["model"] = {"kind": "PooledTrust", "observation": observation}
+    return {"kind": _KINDS[what][kind], **new}
+
+
+_KINDS = {
+    "terrain": {
+        "synthetic": "synthetic_terrain", "files": "read_terrain", "random": "random_workspace",
+    },
+    "simulator": {"kinematic": "KinematicSimulator", "model": "ModelSimulator"},
+    "model": {
+        "pooled": "PooledTrust", "places": "PooledTrust", "hierarchical": "HierarchicalTrust",
+        "coupled": "CoupledTrust",
+    },
+}  # fmt: skip
+"""Kinds of version 0.2 and the constructors that they meant."""
+
+
+def _by_name(what: str, given: object, make: Any) -> dict[str, Any]:
+    """Parts of a study by their names.
+
+    Given are names of kinds, or a mapping of names to settings, whose `kind` may be left out where
+    the name is that of a kind. TrustboError: another type, or an unknown kind or setting.
+    """
+    if isinstance(given, str):
+        given = (given,)
+    if not isinstance(given, Mapping):
+        names = given if isinstance(given, list | tuple) else ()
+        given = {name: {} for name in names if isinstance(name, str)}
+        if not given or len(given) != len(names):
+            raise TrustboError(
+                f"{what}s must be distinct names of kinds, or a mapping of names to settings; "
+                f"got {names or given!r}."
+            )
+    if not given:
+        raise TrustboError(f"a study needs at least one {what}; got none.")
+    parts = {}
+    for name, settings in given.items():
+        noun = f"{what} {str(name)!r}"
+        if isinstance(settings, Mapping | None):
+            settings = migrate(what, {"kind": str(name), **(settings or {})})
+        elif not (what == "model" and isinstance(settings, TrustModel)):
+            raise TrustboError(f"{noun} must be a mapping of settings; got {settings!r}.")
+        try:
+            parts[str(name)] = make(noun, settings)
+        except TrustboError as error:
+            message = str(error)
+            prefix = "" if repr(str(name)) in message else f"{noun}: "
+            raise TrustboError(prefix + message) from None
+    return parts
+
+
+def _place(noun: str, settings: dict[str, Any]) -> Place:
+    settings = dict(settings)
+    ends = {name: settings.pop(name) for name in _ENDS if name in settings}
+    whole = settings.get("kind") == "random_workspace"  # a workspace takes no keywords of a grid
+    more = () if whole else _GRID
+    call = call_of(noun, settings, TERRAINS, more=(*more, *_ENDS))
+    mine = [takes(call.kind, name) for name, _ in call.keywords]
+    terrain, grid = (
+        tuple(pair for pair, own in zip(call.keywords, mine, strict=True) if own is of_terrain)
+        for of_terrain in (True, False)
+    )
+    return Place(terrain=Call(call.kind, terrain), grid=Call("", grid), **ends)
+
+
+def _simulating(noun: str, settings: dict[str, Any]) -> dict[str, Any]:
+    settings = dict(settings)
+    known = settings.pop("known_truth", False)
+    if not isinstance(known, bool):
+        raise TrustboError(f"known_truth must be true or false; got {known!r}.")
+    given = ("workspace",)
+    call = call_of(noun, settings, SIMULATORS, given=given, more=("known_truth",))
+    return {"simulating": call, "known_truth": known}
+
+
+def _model(noun: str, settings: dict[str, Any] | TrustModel) -> Call | TrustModel:
+    if isinstance(settings, TrustModel):
+        return settings
+    kind, more = settings["kind"], len(settings) > 1
+    if isinstance(kind, TrustModel):
+        return kind
+    if isinstance(kind, str) and ":" in kind and not more:
+        return model_call(noun, kind)
+    call = call_of(noun, settings, MODEL_KINDS)
+    model_of(call)
+    return call
+
+
+def _with_paths_from(folder: Path, configuration: Mapping[str, Any]) -> dict[str, Any]:
+    changed, terrains = dict(configuration), configuration.get("terrains")
     if isinstance(terrains, Mapping):
-        configuration["terrains"] = {
+        changed["terrains"] = {
             name: {
-                key: str(folder / value) if key in ("dem", "dsm") else value
+                key: str(folder / value) if key in FILES and isinstance(value, str) else value
                 for key, value in settings.items()
             }
             if isinstance(settings, Mapping)
             else settings
             for name, settings in terrains.items()
         }
-    return configuration
+    return changed
 
 
 def _listed(what: str, values: object) -> Sequence[Any]:

@@ -1,66 +1,72 @@
-"""Executors of runs: this process, processes of this machine, or a Dask cluster."""
+"""Executors of runs: this process, processes of this machine, or a Dask cluster; their set-up."""
 
+import ctypes
 import importlib.util
+import os
+import socket
+import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
+import jax
+
 from trustbo.errors import TrustboError, pip_install, require_choice
+from trustbo.files import cache_folder
 from trustbo.parallel import n_cores
-from trustbo.study import workers
-from trustbo.study.run import Run, execute
 
 EXECUTORS = ("serial", "loky", "dask")
 _N_POOLS = 3
 """Pools in a row in which no run ends, before a study gives up."""
+_LOST = {"error": "lost: the workers of its pool died"}
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+_ready = False
+
+type Work[R] = Callable[[R, tuple[str, int]], dict[str, Any]]
+"""Record of a run; the second argument is the host and process of the caller."""
 
 
-def completed(
-    runs: Sequence[Run], executor: object = None, *, n_workers: int | None = None
-) -> Iterator[tuple[Run, dict[str, Any]]]:
-    """Execute runs; yield each with its record, as they end.
+def completed[R](
+    runs: Sequence[R], work: Work[R], executor: object = None, *, n_workers: int | None = None
+) -> Iterator[tuple[R, dict[str, Any]]]:
+    """Work on runs; yield each with its record, as they end.
 
-    A run whose worker dies is repeated: by Dask on another worker, else in a new pool. "loky" and
-    "dask" start `n_workers` processes, by default as many as there are cores. TrustboError: an
+    A run whose worker dies is repeated: by Dask on another worker, by "loky" in a new pool. "loky"
+    and "dask" start `n_workers` processes, by default as many as there are cores. TrustboError: an
     unknown executor (see `run_study`), one that forks, or whose package is not installed.
     """
-    if not runs:
-        return
-    caller = workers.this_process()
+    caller = this_process()
     if executor is None or executor == "serial":
-        for run in runs:
-            yield run, execute(run, caller)
+        yield from ((run, work(run, caller)) for run in runs)
         return
-    pending, tries = list(runs), _N_POOLS
+    pending, tries = list(runs), _N_POOLS if executor == "loky" else 1
     while pending and tries:
-        lost: list[Run] = []
+        lost: list[R] = []
         with _pool(executor, min(n_workers or n_cores(), len(pending))) as pool:
-            for run, record in _through(pool, pending, caller):
+            for run, record in _through(pool, pending, work, caller):
                 if record is None:
                     lost.append(run)
                 else:
                     yield run, record
-        if executor == "loky":  # a pool ends with a worker; another one may help
-            tries = tries - 1 if len(lost) == len(pending) else _N_POOLS
-        else:
-            tries = 0
+        # A pool of loky ends with a worker; another one may help.
+        tries = _N_POOLS if executor == "loky" and len(lost) < len(pending) else tries - 1
         pending = lost
-    for run in pending:
-        yield run, {"error": "lost: the workers of its pool died"}
+    yield from ((run, dict(_LOST)) for run in pending)
 
 
-def _through(
-    pool: Executor, runs: Sequence[Run], caller: tuple[str, int]
-) -> Iterator[tuple[Run, dict[str, Any] | None]]:
+def _through[R](
+    pool: Executor, runs: Sequence[R], work: Work[R], caller: tuple[str, int]
+) -> Iterator[tuple[R, dict[str, Any] | None]]:
     """Each run with its record; None if the pool broke before."""
-    futures: dict[Future[dict[str, Any]], Run] = {}
-    broken: list[Run] = []
+    futures: dict[Future[dict[str, Any]], R] = {}
+    broken: list[R] = []
     try:
         for run in runs:
             try:
-                futures[pool.submit(execute, run, caller)] = run
+                futures[pool.submit(work, run, caller)] = run
             except BrokenExecutor:
                 broken.append(run)
         for future in as_completed(list(futures)):
@@ -82,13 +88,13 @@ def _through(
 
 def require_executor(executor: object) -> None:
     """Refuse an executor that cannot run a study: unknown, not installed, or one that forks."""
-    if executor is None or hasattr(executor, "get_executor"):
+    if executor is None or executor == "serial" or hasattr(executor, "get_executor"):
         return
     if isinstance(executor, str):
         if "://" not in executor:
             require_choice('executor (or give an address, "tcp://...")', executor, EXECUTORS)
-        package = executor if executor in ("serial", "loky") else "distributed"
-        if package != "serial" and importlib.util.find_spec(package) is None:
+        package = "loky" if executor == "loky" else "distributed"
+        if importlib.util.find_spec(package) is None:
             raise TrustboError(
                 f'executor {executor!r} needs {package}: {pip_install(package)}; or take "serial".'
             )
@@ -111,47 +117,33 @@ def require_executor(executor: object) -> None:
 def _pool(executor: Any, n_workers: int) -> Iterator[Executor]:
     """Open the executor; one that is made here ends here."""
     if executor == "loky":
-        yield from _loky(n_workers)
+        from loky import ProcessPoolExecutor as LokyExecutor
+
+        pool = LokyExecutor(n_workers)
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=True, kill_workers=True)
+            raise
+        pool.shutdown(wait=True)
     elif isinstance(executor, str):
-        yield from _dask(executor, n_workers)
-    elif hasattr(executor, "get_executor"):  # a distributed.Client
-        yield _of_client(executor)
+        from distributed import Client
+
+        with ExitStack() as stack:
+            address = _cluster(stack, n_workers) if executor == "dask" else executor
+            yield _of_client(stack.enter_context(Client(address)))
     else:
-        yield executor
+        yield _of_client(executor) if hasattr(executor, "get_executor") else executor
 
 
-def _loky(n_workers: int) -> Iterator[Executor]:
-    from loky import ProcessPoolExecutor as LokyExecutor
-
-    pool = LokyExecutor(n_workers)
-    try:
-        yield pool
-    except BaseException:
-        pool.shutdown(wait=True, kill_workers=True)
-        raise
-    pool.shutdown(wait=True)
-
-
-def _dask(address: str, n_workers: int) -> Iterator[Executor]:
+def _cluster(stack: ExitStack, n_workers: int) -> Any:
+    """Local Dask cluster of processes of one thread each."""
     from dask.config import set as configured
-    from distributed import Client, LocalCluster
+    from distributed import LocalCluster
 
-    if address != "dask":
-        with Client(address) as client:
-            yield _of_client(client)
-        return
-    with (
-        configured({"distributed.worker.profile.enabled": False}),  # it takes 5 %
-        LocalCluster(
-            n_workers=n_workers,
-            threads_per_worker=1,
-            processes=True,
-            memory_limit=0,
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield _of_client(client)
+    stack.enter_context(configured({"distributed.worker.profile.enabled": False}))  # it takes 5 %
+    options: dict[str, Any] = {"processes": True, "memory_limit": 0, "dashboard_address": None}
+    return stack.enter_context(LocalCluster(n_workers=n_workers, threads_per_worker=1, **options))
 
 
 def _of_client(client: Any) -> Executor:
@@ -163,3 +155,76 @@ def _of_client(client: Any) -> Executor:
             stacklevel=2,
         )
     return client.get_executor(pure=False)
+
+
+# --- set-up of a worker process: one core, freed memory kept, compiled code shared ---
+
+
+def this_process() -> tuple[str, int]:
+    """Host and process number."""
+    return socket.gethostname(), os.getpid()
+
+
+def prepare(caller: tuple[str, int]) -> None:
+    """Set this process up as a worker, once, before JAX starts; unless it is the caller itself."""
+    global _ready
+    if _ready or this_process() == caller:
+        return
+    _ready = True
+    pin_to_core()
+    keep_freed_memory()
+    keep_compiled_code()
+
+
+def pin_to_core() -> int | None:
+    """Pin this process to a core that no other worker on this machine has taken, and return it.
+
+    XLA's pool has as many threads as the process may use cores when it starts, whatever the usual
+    flags say; two workers of two threads each slow each other down. The core is taken by a lock on
+    a file that stays open, which the system releases when the process ends, however it ends. None
+    if all are taken, or where there is no affinity: nothing is pinned then.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return None
+    import fcntl  # where there is affinity, there is this
+
+    for core in sorted(os.sched_getaffinity(0)):
+        name = f"trustbo-{os.getuid()}-core-{core}.lock"
+        try:
+            file = os.open(Path(tempfile.gettempdir()) / name, os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError:
+            continue
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(file)
+            continue
+        # Each thread has its own affinity, and new threads inherit it.
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setaffinity(int(thread), {core})
+        return core
+    return None
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep freed memory, instead of asking the system for it again and again.
+
+    Dask's nanny sets MALLOC_TRIM_THRESHOLD_ to 64 KiB for its workers, with which a fit takes a
+    third longer.
+    """
+    with suppress(OSError, AttributeError):  # without glibc
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, 32 << 20)
+        mallopt(_M_TRIM_THRESHOLD, 256 << 20)
+
+
+def keep_compiled_code() -> None:
+    """Share compiled code with the workers before and beside this one, on disk.
+
+    The folder is in the user's cache, `$XDG_CACHE_HOME/trustbo/jax`, and not in the study's folder:
+    anyone who can write to it can run code here. A folder that the user has set, e.g. by
+    `JAX_COMPILATION_CACHE_DIR`, is used instead.
+    """
+    if jax.config.jax_compilation_cache_dir is None:  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder("jax")))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -8,7 +8,6 @@ from typing import Any
 
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import FilePath, not_ours, read_record, require_file, require_folder, write_text
-from trustbo.study.run import Run
 
 
 class Store:
@@ -29,11 +28,10 @@ class Store:
             if file.exists() and not (self.folder / "study.json").is_file():
                 raise not_ours(file)
 
-    def write_study(self, settings: dict[str, Any], runs: list[Run]) -> None:
-        """Write `study.json`: the settings, and the table of runs by key."""
+    def write_study(self, settings: dict[str, Any], table: dict[str, dict[str, Any]]) -> None:
+        """Write `study.json`: the settings, and the labels of each run by key."""
         if os.path.lexists(self.folder / "study.json"):
             self.table()  # refuses a file of another program
-        table = {run.key: run.labels for run in runs}
         self._write("study.json", {"study": settings, "runs": table})
 
     def table(self) -> dict[str, dict[str, Any]]:
@@ -46,19 +44,18 @@ class Store:
         runs = _read(file).get("runs")
         if not isinstance(runs, dict) or not all(isinstance(one, dict) for one in runs.values()):
             raise DamagedFileError(f"{str(file)!r} is damaged, or of no study: it has no runs.")
-        return runs
+        return {key: _now_named(labels) for key, labels in runs.items()}
 
     def has(self, key: str) -> bool:
         """Whether the run has ended."""
         return self._run(key).is_file()
 
-    def write(self, run: Run, record: dict[str, Any]) -> None:
+    def write(self, key: str, record: dict[str, Any]) -> None:
         """Write the record of a run: to `runs/`, or to `failed/` if it holds an error."""
         failed = "error" in record
-        own = {"key": run.key, "labels": run.labels, "identity": run.identity, **record}
-        self._write(f"{'failed' if failed else 'runs'}/{run.key}.json", own)
+        self._write(f"{'failed' if failed else 'runs'}/{key}.json", {"key": key, **record})
         if not failed:
-            self._failure(run.key).unlink(missing_ok=True)
+            self._failure(key).unlink(missing_ok=True)
 
     def read(self, key: str) -> dict[str, Any]:
         """Read the record of a run that has ended."""
@@ -78,6 +75,11 @@ class Store:
     def _write(self, name: str, record: dict[str, Any]) -> None:
         text = json.dumps(_plain(record), indent=1, allow_nan=False, default=str)
         write_text(self.folder / name, text)
+
+
+def _now_named(labels: dict[str, Any]) -> dict[str, Any]:
+    """Labels of version 0.2 under the names of this one."""
+    return {"method" if name == "contender" else name: label for name, label in labels.items()}
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Results of runs as one Dataset, and a summary of it."""
+"""Results of runs as one Dataset, and tables of it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,6 +14,10 @@ _PATHS = ("path", "recommended")
 BEFORE = ("regret_before", "lost_before", "p_arrive_before")
 """Variables of the path recommended before the first mission."""
 _NOT_AXES = ("key", "seed")
+SHOWN = (0, 1, 3, 8, 15)
+"""Numbers of missions after which regret is shown."""
+FAR = 5.0
+"""Regret in % beyond which a campaign is still far off."""
 
 
 def to_dataset(
@@ -104,3 +108,89 @@ def _labels(values: list[Any]) -> np.ndarray:
     """Array of numbers; anything else, or a mixture, becomes text."""
     numbers = all(isinstance(value, int | float) for value in values)
     return np.array(values if numbers else [str(value) for value in values])
+
+
+def worlds_table(dataset: xr.Dataset, by: str | Sequence[str] = "method") -> pd.DataFrame:
+    """Summarise the results of `run_worlds`, with 95 % intervals.
+
+    Intervals are those of a bootstrap over pairs of world and course, which campaigns of the same
+    pair enter together.
+
+    Args:
+        dataset: Results of `run_worlds`, or `load_study`.
+        by: Coordinates of the rows: `method`, `kind`, `world`, `course`.
+
+    Returns:
+        Table with columns of two levels, the quantity and `value`, `low` and `high`: the median
+        `regret after n` missions in %, the median `lost after n` in bounds more than on the best
+        path, `lost while learning` (the mean of that over the missions driven), the share of
+        missions that `arrive`, and of campaigns still `far` off, by more than 5 %, in the end.
+    """
+    by = [by] if isinstance(by, str) else list(by)
+    known = {str(n) for n, c in dataset.coords.items() if c.dims == ("run",)}
+    for name in by:
+        require_choice("coordinate", name, sorted(known))
+    numbers = _numbers(dataset)
+    pairs = dataset["world"].values + "/" + dataset["course"].values
+    keys = list(zip(*(dataset[name].values for name in by), strict=True))
+    rows = {}
+    for key in dict.fromkeys(keys):
+        mine = np.array([k == key for k in keys])
+        rows[key if len(by) > 1 else key[0]] = _summary(
+            {name: values[mine] for name, values in numbers.items()}, pairs[mine]
+        )
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    table.columns = pd.MultiIndex.from_tuples(table.columns)
+    table.index.name = " and ".join(by)
+    return table
+
+
+def _numbers(dataset: xr.Dataset) -> dict[str, np.ndarray]:
+    """Numbers of each run, shape (run,)."""
+    n_missions = dataset.sizes["mission"]
+    best = dataset["oracle"].values
+    regret = np.concatenate([dataset["regret_before"].values[:, None], dataset["regret"]], axis=1)
+    lost = np.concatenate([dataset["lost_before"].values[:, None], dataset["lost"]], axis=1)
+    after = [n for n in SHOWN if n <= n_missions]
+    numbers = {f"regret after {n}": regret[:, n] for n in after}
+    numbers |= {f"lost after {n}": lost[:, n] - best for n in after}
+    driven = dataset["lost_followed"].values - best[:, None]
+    numbers["lost while learning"] = np.nanmean(driven, axis=1)
+    ran = dataset["status"].values != ""
+    arrived = (dataset["status"].values == "ok").sum(1) / ran.sum(1)
+    return numbers | {"arrive": arrived, "far": np.where(regret[:, -1] > FAR, 1.0, 0.0)}
+
+
+def _summary(numbers: Mapping[str, np.ndarray], pairs: np.ndarray) -> dict[tuple[str, str], float]:
+    """Value and interval of each quantity."""
+    rng, (names, index) = np.random.default_rng(0), np.unique(pairs, return_inverse=True)
+    members = [np.flatnonzero(index == i) for i in range(len(names))]
+    drawn = [
+        np.concatenate([members[i] for i in rng.integers(len(names), size=len(names))])
+        for _ in range(1000)
+    ]
+    row = {}
+    for name, values in numbers.items():
+        shares = name in ("arrive", "far", "lost while learning")
+        middle = np.nanmean if shares else np.nanmedian
+        low, high = np.quantile([middle(values[chosen]) for chosen in drawn], [0.025, 0.975])
+        row |= {(name, "value"): float(middle(values)), (name, "low"): low, (name, "high"): high}
+    return row
+
+
+def as_text(table: pd.DataFrame) -> str:
+    """Table of `worlds_table` in Markdown, each value with its interval."""
+    names = list(dict.fromkeys(name for name, _ in table.columns))
+    head = [str(table.index.name), *(f"{name} (%)" if "regret" in name else name for name in names)]
+    lines = [" | ".join(head), " | ".join("---" for _ in head)]
+    for key, row in table.iterrows():
+        label = ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
+        cells = []
+        for name in names:
+            places = 1 if "regret" in name else 2
+            value, low, high = (
+                f"{row[name, what]:.{places}f}" for what in ("value", "low", "high")
+            )
+            cells.append(f"{value} [{low}, {high}]")
+        lines.append(" | ".join([label, *cells]))
+    return "\n".join(f"| {line} |" for line in lines)

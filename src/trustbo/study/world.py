@@ -1,11 +1,10 @@
 """A world: a true terrain, sight and team, what is assumed of them, and courses through it."""
 
-import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import xarray as xr
@@ -14,7 +13,9 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
+from trustbo.planning import Planner
 from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.study.calls import digest, identity_of, imported
 from trustbo.team import Robot, Team
 from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.workspace import Workspace
@@ -28,7 +29,7 @@ _STRIP = 250
 """Rows of a real terrain that are used, those with most data: all but bcts have not many more."""
 
 Simulate = Callable[..., Simulator]
-"""Function `simulator(workspace, *, terrain, sight, team)` of a true world, the user's own."""
+"""Function `simulator(workspace, *, terrain, sight, team)` of a true world."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,9 @@ class World:
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides its numbers; real terrains by their contents."""
-        own = asdict(self)
-        del own["data"]
-        return own if self.is_made else own | {"files": [_digest(f) for f in self.files()]}
+        settings = asdict(self)
+        del settings["data"]
+        return settings | ({} if self.is_made else {"files": [digest(f) for f in self.files()]})
 
     def files(self) -> list[str]:
         """Files of a real terrain.
@@ -141,6 +142,77 @@ class World:
         return (int(a), int(b)), (int(c), int(d))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Course:
+    """Course through a world as a scene of an experiment.
+
+    Attributes:
+        world: World.
+        course: Name in `COURSES`.
+        judged: Objective and admissible paths that regret is held against.
+        simulate: Function of the user that makes the simulator, or `"module:name"` of one.
+    """
+
+    world: World
+    course: str
+    judged: tuple[str, int | str] = ("lost_contact", "shortest+4")
+    simulate: Simulate | str | None = None
+
+    @property
+    def labels(self) -> Mapping[str, Any]:
+        """World, its kind and course."""
+        return {"world": self.world.name, "kind": self.world.kind, "course": self.course}
+
+    @property
+    def ends(self) -> tuple[Cell, Cell]:
+        """Start and goal."""
+        return self.world.ends(self.course)
+
+    def at(self, seed: int) -> "Course":
+        """Scene of any run: a world has no seed."""
+        return self
+
+    def identity(self) -> dict[str, Any]:
+        """Settings that the numbers depend on."""
+        return {
+            "world": self.world.identity(),
+            "course": self.course,
+            "judged": self.judged,
+            "simulator": identity_of(self.simulate),
+        }
+
+    def workspace(self, *, bounds: bool = True) -> Workspace:
+        """Workspace of the world, which all its courses share."""
+        return self.world.workspace(bounds=bounds)
+
+    def simulator(self, workspace: Workspace) -> Simulator:
+        """Make the simulator of the world."""
+        simulate: Any = self.simulate
+        if isinstance(simulate, str):
+            simulate = imported("simulator", simulate)
+        usable = simulate is None or callable(simulate)
+        made: Any = self.world.simulator(workspace, cast(Any, simulate)) if usable else None
+        if not callable(getattr(made, "run", None)):
+            raise TrustboError(
+                f"simulator {self.simulate!r} must be a function that makes a simulator from a "
+                "workspace and the true terrain, sight and team."
+            )
+        return made
+
+    def truth(self, *, progress: bool = False) -> Truth:
+        """Truth of the world, for any awareness in the workspace."""
+        return Truth.of(self.simulator(self.workspace()), progress=progress)
+
+    def judged_by(self, planner: Planner) -> dict[str, Any]:
+        """Paths that regret is held against, the same for all methods."""
+        objective, max_bounds = self.judged
+        return {
+            "objective": "mean" if objective == "mean" else "lost_contact",
+            "max_bounds": max_bounds,
+            "connectivity": planner.connectivity,
+        }
+
+
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
     """Terrain as an old survey has it: canopy lower, with clearings, ground off by some 0.3 m.
 
@@ -185,8 +257,3 @@ def _read(dem: str, dsm: str) -> xr.Dataset:
     known = np.isfinite(whole["dem"].values).sum(1)
     first = int(np.convolve(known, np.ones(n_rows), "valid").argmax())
     return whole.isel(y=slice(first, first + n_rows))
-
-
-@lru_cache(maxsize=64)
-def _digest(path: str) -> str:
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Outsider of the benchmark: BoTorch on paths, which knows nothing of bounds or trust.
+"""BoTorch on paths, without bounds or trust.
 
 A Gaussian process over path-averaged features predicts the contact lost on a path; the next path
 has the largest log expected improvement among 500 candidates, as many as are good and diverse.
@@ -12,7 +12,6 @@ from jax import Array
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError, pip_install
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
@@ -25,18 +24,14 @@ enough."""
 
 
 class PathBandit:
-    """Policy by BoTorch; it learns from the missions itself, and recommends by its own mean."""
+    """Policy by BoTorch; it learns from the missions, and recommends by the mean of its process."""
 
-    __name__ = "botorch"
+    __name__ = "BoTorch"
 
     def __init__(self) -> None:
-        """Know nothing; TrustboError: BoTorch is not installed."""
-        try:
-            import botorch  # noqa: F401  # pyright: ignore[reportMissingImports]
-        except ImportError:
-            raise TrustboError(
-                f"the baseline botorch needs BoTorch: {pip_install('botorch')}; or leave it out."
-            ) from None
+        """Begin without missions; ImportError: BoTorch is not installed."""
+        import botorch  # noqa: F401
+
         self._paths: list[tuple[Cell, ...]] = []
         self._features = np.empty((0, 0))
         self._inputs: list[np.ndarray] = []
@@ -65,7 +60,7 @@ class PathBandit:
         sampler, rng = path_sampler(planner.paths), np.random.default_rng(0)
         drawn = list(dict.fromkeys(sampler.draw(rng) for _ in range(_N_DRAWN)))
         features = np.stack([_features(planner, path) for path in drawn])
-        # Before it knows better: fewer bounds, and more of every feature.
+        # Before any mission: fewer bounds, and more of every feature.
         order = np.argsort(-features.sum(1), kind="stable")
         bounds = [_bounds(path) for path in drawn]
         chosen: list[int] = []
@@ -80,12 +75,12 @@ class PathBandit:
     def _best(self, *, improve: bool) -> int:
         if len(self._values) < 2:
             return 0 if not self._values or not improve else len(self._paths) // 2
-        import torch  # pyright: ignore
-        from botorch.acquisition import LogExpectedImprovement  # pyright: ignore
-        from botorch.fit import fit_gpytorch_mll  # pyright: ignore
-        from botorch.models import SingleTaskGP  # pyright: ignore
-        from botorch.models.transforms import Normalize, Standardize  # pyright: ignore
-        from gpytorch.mlls import ExactMarginalLogLikelihood  # pyright: ignore
+        import torch
+        from botorch.acquisition import LogExpectedImprovement
+        from botorch.fit import fit_gpytorch_mll
+        from botorch.models import SingleTaskGP
+        from botorch.models.transforms import Normalize, Standardize
+        from gpytorch.mlls import ExactMarginalLogLikelihood
 
         x = torch.tensor(np.stack(self._inputs), dtype=torch.float64)
         y = torch.tensor(self._values, dtype=torch.float64)[:, None]

@@ -1,0 +1,1 @@
+"""Baselines of the benchmark by other packages, one file each."""

@@ -1,0 +1,360 @@
+"""Experiments: cases on scenes with seeds, each a run with a record; one loop for all of them."""
+
+import hashlib
+import json
+import math
+import os
+import socket
+import time
+import traceback
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from typing import Any, Protocol, Self
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.loop import missions
+from trustbo.campaign.result import Result
+from trustbo.campaign.stopping import RegretBound
+from trustbo.data import Cell, Mission
+from trustbo.errors import TrustboError
+from trustbo.files import FilePath, interpreting
+from trustbo.models.backend import VERSIONS
+from trustbo.planning import Planner
+from trustbo.simulation import Simulator, Truth
+from trustbo.study import executors
+from trustbo.study.methods import Case
+from trustbo.study.store import Store
+from trustbo.study.table import to_dataset
+from trustbo.workspace import Location, Workspace
+
+
+class Scene(Protocol):
+    """Workspace with start and goal, and a simulator: where cases are run."""
+
+    @property
+    def labels(self) -> Mapping[str, Any]:
+        """Name of the scene along each axis of the experiment."""
+        ...
+
+    def at(self, seed: int) -> Self:
+        """Scene of the run with this seed."""
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """Settings that the numbers depend on."""
+        ...
+
+    def workspace(self, *, bounds: bool = True) -> Workspace:
+        """Workspace of the campaign; without awareness of bounds for a case that has none."""
+        ...
+
+    @property
+    def ends(self) -> tuple[Location, Location]:
+        """Start and goal."""
+        ...
+
+    def simulator(self, workspace: Workspace) -> Simulator:
+        """Make the simulator that runs paths of the workspace."""
+        ...
+
+    def truth(self) -> Truth | None:
+        """Truth of the simulator; None where it is not asked for."""
+        ...
+
+    def judged_by(self, planner: Planner) -> dict[str, Any]:
+        """Paths that regret is held against, see `path_class`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """One campaign of an experiment."""
+
+    case: Case
+    scene: Scene
+    seed: int
+    n_iterations: int
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        """Name of the run along each axis of the experiment."""
+        return {"seed": self.seed, **self.scene.labels, **self.case.labels}
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Everything that its numbers depend on; names that the user gives to parts are not."""
+        return {
+            "case": self.case.identity(),
+            "scene": self.scene.identity(),
+            "seed": self.seed,
+            "n_iterations": self.n_iterations,
+            "trustbo": version("trustbo"),
+        }
+
+    @property
+    def key(self) -> str:
+        """Hash of the identity: the same run has the same key on any machine."""
+        text = json.dumps(_canonical(self.identity), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+    def begin(self, *callbacks: Any) -> tuple[Campaign, Iterator[object]]:
+        """Set up the campaign, and its missions, of which none has been run yet.
+
+        TrustboError: impossible settings.
+        """
+        workspace = self.scene.workspace(bounds=self.case.bounds)
+        campaign = self.case.campaign(workspace, self.scene.ends, self.seed, callbacks)
+        stop = self.case.options.get("stop")
+        rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
+        simulator = self.scene.simulator(workspace)
+        return campaign, missions(campaign, simulator, n_iterations=self.n_iterations, stop=rule)
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name}={value}" for name, value in self.labels.items())
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Every case on every scene with every seed.
+
+    Attributes:
+        cases: Factories of campaigns by name.
+        scenes: Scenes by name.
+        seeds: Seeds of the campaigns.
+        n_iterations: Missions of a campaign.
+        settings: Settings, as JSON can hold them, that are kept with the results.
+    """
+
+    cases: Mapping[str, Case]
+    scenes: Mapping[str, Scene]
+    seeds: Sequence[int]
+    n_iterations: int
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def runs(self) -> list[Run]:
+        """List the runs, seed by seed, so that the first to end are of every kind."""
+        return [
+            Run(case, scene, seed, self.n_iterations)
+            for seed in self.seeds
+            for scene in (scene.at(seed) for scene in self.scenes.values())
+            for case in self.cases.values()
+        ]
+
+    def run(
+        self,
+        directory: FilePath,
+        executor: Any = None,
+        *,
+        n_workers: int | None = None,
+        progress: bool = True,
+    ) -> xr.Dataset:
+        """Run the runs that have not ended yet, see `run_study`."""
+        executors.require_executor(executor)
+        store, runs = Store(directory), self.runs()
+        keys = {run.key: run for run in runs}
+        pending = [run for key, run in keys.items() if not store.has(key)]
+        _rehearse(pending)
+        store.write_study(dict(self.settings), {key: run.labels for key, run in keys.items()})
+        total, failed = len(keys), []
+        done = total - len(pending)
+        with tqdm(total=total, initial=done, desc="runs", disable=not progress) as bar:
+            ended = executors.completed(pending, execute, executor, n_workers=n_workers)
+            for run, record in ended:
+                _require_version(record)
+                store.write(run.key, {"labels": run.labels, "identity": run.identity, **record})
+                if "error" in record:
+                    failed.append(f"{run}: {record['error']}")
+                    bar.set_postfix_str(f"{len(failed)} failed")
+                bar.update()
+        if failed:
+            message = (
+                f"{len(failed)} of {total} runs failed, and are run again at the next call: "
+                f"{'; '.join(failed[:3])}{'; ...' if len(failed) > 3 else ''} "
+                f"(tracebacks: {store.folder / 'failed'})"
+            )
+            if len(failed) == total:
+                raise TrustboError(message)
+            warnings.warn(message, stacklevel=3)
+        return load_study(directory)
+
+
+def load_study(directory: FilePath) -> xr.Dataset:
+    """Read the results of a study so far.
+
+    Runs in the folder that are of another study, or another version of trustbo, are left out.
+
+    Returns:
+        Dataset with dims run and mission (1, 2, ...). For each mission: `value` (expected objective
+        of its plan), `path` and `recommended` (row and col of each step, -1 after the goal),
+        `regret` (true regret of the path recommended after it, in % of the contact that the best
+        path keeps, see `Truth.regret`), `lost` (contact that it loses, in bounds), `p_arrive` (its
+        probability to arrive), the same with `_followed` for the path it followed, `contact_rate`
+        (mean), `status`, diagnostics of the posterior (see `models.diagnostics`), and seconds. For
+        each run: `oracle` (contact lost on the best path), the three numbers with `_before` for the
+        path recommended before the first mission, `seconds` and `seconds_cpu` (of its process). NaN
+        where the truth is unknown, or where there is no such mission. Coordinates of run: its key,
+        and its label along each axis of the study. Attributes: the study's number of runs,
+        `n_runs`, and of failed ones, `n_failed`.
+
+    Raises:
+        TrustboError: The folder holds no study, or no run of it has ended.
+    """
+    store = Store(directory)
+    table = store.table()
+    records = {key: store.read(key) for key in table if store.has(key)}
+    if not records:
+        raise TrustboError(f"no run of the study in {str(store.folder)!r} has ended yet.")
+    with interpreting(store.folder):
+        dataset = to_dataset(records, table)
+    n_failed = sum(store.failure(key) is not None for key in table)
+    return dataset.assign_attrs(n_runs=len(table), n_failed=n_failed)
+
+
+def failures(directory: FilePath) -> pd.DataFrame:
+    """List the runs of a study that failed: labels, error and traceback, by key.
+
+    Raises:
+        TrustboError: The folder holds no study.
+    """
+    store = Store(directory)
+    rows = {key: store.failure(key) for key in store.table()}
+    return pd.DataFrame.from_dict(
+        {
+            key: row["labels"] | {"error": row["error"], "traceback": row.get("traceback", "")}
+            for key, row in rows.items()
+            if row is not None
+        },
+        orient="index",
+    )
+
+
+def execute(run: Run, caller: tuple[str, int]) -> dict[str, Any]:
+    """Execute a run in this process; `caller` is the host and process of the experiment.
+
+    Returns the record of the run and of each mission; or the `error` it failed with.
+    """
+    executors.prepare(caller)
+    started, cpu = time.perf_counter(), time.process_time()
+    with warnings.catch_warnings(record=True) as caught, threadpool_limits(1):
+        warnings.simplefilter("always")
+        try:
+            record = _record(run)
+        except Exception as error:
+            record = {
+                "error": f"{type(error).__name__}: {error}",
+                "traceback": traceback.format_exc(),
+            }
+    return record | {
+        "seconds": time.perf_counter() - started,
+        "seconds_cpu": time.process_time() - cpu,
+        "warnings": sorted({str(warning.message) for warning in caught}),
+        "host": socket.gethostname(),
+        "process": os.getpid(),
+        "versions": {name: version(name) for name in ("trustbo", "jax", "numpyro", "numpy")},
+    }
+
+
+@dataclass
+class _Referee:
+    """Compares the path recommended after each mission, and its path, with the best one."""
+
+    scene: Scene
+    truth: Truth | None
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def __call__(self, campaign: Campaign, mission: Mission) -> None:
+        followed = self.judge(campaign, mission.path)
+        row = self.recommended(campaign)
+        self.rows.append(row | {f"{name}_followed": value for name, value in followed.items()})
+
+    def recommended(self, campaign: Campaign) -> dict[str, Any]:
+        """Path that the model recommends or, where it has its choice, the policy; and its value."""
+        choose = getattr(campaign.policy, "recommend", None)
+        path = campaign.recommend().path if choose is None else choose(campaign)
+        return {"recommended": [list(cell) for cell in path], **self.judge(campaign, path)}
+
+    def judge(self, campaign: Campaign, path: tuple[Cell, ...]) -> dict[str, float]:
+        """Regret in % and contact lost in bounds; NaN if it does not lead from start to goal."""
+        ends = campaign.planner.start, campaign.planner.goal
+        if self.truth is None or (path[0], path[-1]) != ends:
+            return {"regret": math.nan, "lost": math.nan, "p_arrive": math.nan}
+        value = self.truth.value(path)
+        regret = self.truth.regret(path, **self.scene.judged_by(campaign.planner))
+        return {"regret": regret, "lost": value.lost, "p_arrive": value.p_arrive}
+
+    def oracle(self, campaign: Campaign) -> float:
+        """Contact lost on the best path, in bounds; NaN where the truth is not known."""
+        if self.truth is None:
+            return math.nan
+        judged_by = self.scene.judged_by(campaign.planner)
+        return self.truth.value(self.truth.best(*self.scene.ends, **judged_by)).lost
+
+
+def _record(run: Run) -> dict[str, Any]:
+    referee = _Referee(run.scene, run.scene.truth())
+    campaign, steps = run.begin(referee)
+    before = referee.recommended(campaign)
+    for _ in steps:
+        pass
+    result = campaign.result()
+    return {
+        "missions": _rows(result, referee.rows),
+        "oracle": referee.oracle(campaign),
+        **{f"{name}_before": before[name] for name in ("regret", "lost", "p_arrive")},
+        "stop_reason": result.stop_reason,
+    }
+
+
+def _rows(result: Result, refereed: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Numbers of each mission, from the history and the referee."""
+    history = result.history
+    scalars = [n for n, values in history.data_vars.items() if values.dims == ("iteration",)]
+    rows = []
+    for i, mission in enumerate(result.missions):
+        row: dict[str, Any] = {"path": [list(cell) for cell in mission.path]}
+        row |= {str(name): history[name].values[i].item() for name in scalars}
+        row["value"] = row.pop("objective")
+        rows.append(row | refereed[i])
+    return rows
+
+
+def _canonical(value: Any) -> Any:
+    """Value with one form for each number, 1 for 1.0, and lists for tuples."""
+    if isinstance(value, dict):
+        return {str(name): _canonical(v) for name, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_canonical(v) for v in value]
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
+def _require_version(record: dict[str, Any]) -> None:
+    """Make a record by another version of trustbo an error: the key has ours."""
+    ours, theirs = VERSIONS["trustbo"], record.get("versions", {}).get("trustbo")
+    if theirs not in (None, ours):
+        record["error"] = f"the worker has trustbo {theirs}, and the study {ours}"
+
+
+def _rehearse(runs: Sequence[Run]) -> None:
+    """Set up a campaign of each kind, so that impossible ones are refused now, not in an hour."""
+    seen = set()
+    for run in runs:
+        kind = repr({name: label for name, label in run.labels.items() if name != "seed"})
+        if kind in seen:
+            continue
+        seen.add(kind)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                run.begin()
+        except (TypeError, ValueError) as error:
+            raise TrustboError(f"the run {run}: {error}") from error

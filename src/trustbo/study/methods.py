@@ -1,0 +1,262 @@
+"""Methods that are compared: a model and a policy, or a baseline; the user's own among them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jax import Array
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.options import SAMPLER
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_choice
+from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.models.model import TrustModel, require_model
+from trustbo.models.params import Params
+from trustbo.models.record import model_to_record
+from trustbo.planning import POLICIES, Plan, Planner
+from trustbo.planning.path_sampling import path_sampler
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.policies import random, seed_of
+from trustbo.study.calls import Call, identity_of, imported
+from trustbo.workspace import Location, Workspace
+
+MODELS = {
+    "pooled": Call("PooledTrust", ()),
+    "places": Call("PooledTrust", (("place", Call("PlaceEffect", ())),)),
+    "hierarchical": Call("HierarchicalTrust", ()),
+    "coupled": Call("CoupledTrust", ()),
+}
+"""Models by short names."""
+POOLED = MODELS["pooled"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Factory of campaigns: a model, a policy and options, on any workspace and with any seed.
+
+    Attributes:
+        labels: Name of the case along each axis of the experiment.
+        model: Trust model, or the call that makes it.
+        policy: Name of a policy, a policy, or `"module:name"` of one.
+        objective: Objective of the policy.
+        sampler: Sampler of the posterior.
+        options: Options of the campaign, and `stop`.
+        bounds: False for awareness of cells alone, as in the paper.
+        factory: Whether `policy` makes the policy of each campaign, which learns by itself.
+    """
+
+    labels: Mapping[str, Any]
+    model: Call | TrustModel
+    policy: Any
+    objective: str
+    sampler: str = SAMPLER
+    options: Mapping[str, Any] = field(default_factory=dict)
+    bounds: bool = True
+    factory: bool = False
+
+    def campaign(
+        self,
+        workspace: Workspace,
+        ends: tuple[Location, Location],
+        seed: int,
+        callbacks: Sequence[Any] = (),
+    ) -> Campaign:
+        """Begin a campaign.
+
+        Raises:
+            TrustboError: Impossible settings.
+        """
+        policy = resolved("policy", self.policy, POLICIES)
+        policy = policy() if self.factory else policy
+        learn = getattr(policy, "learn", None)  # of one that learns by itself
+        options = {name: value for name, value in self.options.items() if name != "stop"}
+        return Campaign(
+            workspace,
+            *ends,
+            model=model_of(self.model),
+            policy=self.policy if self.policy in POLICIES else policy,
+            objective=self.objective,
+            sampler=self.sampler,
+            seed=seed,
+            callbacks=callbacks if learn is None else (learn, *callbacks),
+            **options,
+        )
+
+    def identity(self) -> dict[str, Any]:
+        """Settings that the numbers depend on."""
+        return {
+            "model": model_to_record(model_of(self.model)),
+            "policy": identity_of(self.policy),
+            "objective": self.objective,
+            "sampler": self.sampler,
+            "options": dict(self.options),
+            "bounds": self.bounds,
+        }
+
+
+class Unlearned:
+    """Policy that recommends what it would do next, and ignores what a model has learned."""
+
+    def __init__(self, name: str, choose: Callable[[Array, Params, Planner], Plan]) -> None:
+        """Wrap a policy."""
+        self.__name__, self._choose = name, choose
+
+    def __call__(self, key: Array, posterior: Params, planner: Planner) -> Plan:
+        """Choose a path."""
+        return self._choose(key, posterior, planner)
+
+    def recommend(self, campaign: Campaign) -> tuple[Cell, ...]:
+        """Path of the next mission."""
+        return campaign.ask().path
+
+
+def random_path() -> Unlearned:
+    """Policy that draws any admissible path."""
+    return Unlearned("random", random)
+
+
+def shortest_path() -> Unlearned:
+    """Policy that draws any of the paths with the fewest bounds."""
+    return Unlearned("shortest", _random_shortest)
+
+
+def _random_shortest(key: Array, posterior: Params, planner: Planner) -> Plan:
+    ends = planner.start, planner.goal
+    paths = AdmissiblePaths(planner.workspace, *ends, planner.connectivity, "shortest", True)
+    path = path_sampler(paths).draw(np.random.default_rng(seed_of(key)))
+    return planner.evaluate(path, posterior.mean())
+
+
+BASELINES = ("random", "shortest", "paper")
+"""Baselines: a random path, a random one of the shortest, and the paper's method."""
+
+
+def cases_of(
+    models: Any,
+    policies: Any,
+    baselines: Sequence[str],
+    methods: Mapping[str, Callable[[], Any]],
+    objective: str,
+    max_bounds: int | str,
+    sampler: str,
+) -> dict[str, Case]:
+    """Every model with every policy, baselines, and methods of one's own, by name.
+
+    Raises:
+        TrustboError: An unknown name, or two methods of one name.
+    """
+    kinds, named = _models_of(models), _by_name("policies", _listed(policies))
+    for policy in named.values():
+        if not callable(resolved("policy", policy, POLICIES)):
+            raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
+    options = {"max_bounds": max_bounds}
+    rows: dict[str, dict[str, Any]] = {
+        name if len(kinds) == 1 else f"{label} {name}": {"model": model, "policy": policy}
+        for label, model in kinds.items()
+        for name, policy in named.items()
+    }
+    paper = {"objective": "terminal", "bounds": False}
+    paper["options"] = {"initial": "prior_draw", "max_bounds": "shortest+2"}
+    ours = {
+        "random": {"random path": {"policy": random_path, "factory": True}},
+        "shortest": {"shortest path": {"policy": shortest_path, "factory": True}},
+        "paper": {"paper": {"policy": "greedy", **paper}},
+    }
+    for name in baselines:
+        if ":" in name:
+            row = {_name(name): {"policy": name, "factory": True}}
+        else:
+            row = ours[require_choice('baseline (or give "module:name")', name, BASELINES)]
+        rows |= row
+    rows |= {name: {"policy": make, "factory": True} for name, make in methods.items()}
+    cases = {}
+    for name, row in rows.items():
+        settings = {"model": POOLED, "objective": objective, "options": options, **row}
+        labels = {"method": name, "policy": name}
+        able = _able(model_of(settings["model"]), sampler)
+        cases[name] = Case(labels, **settings, sampler=able)
+    return cases
+
+
+def model_of(given: Call | TrustModel) -> TrustModel:
+    """Make a trust model; TrustboError: it is none."""
+    made = given.make() if isinstance(given, Call) else given
+    require_model(made)
+    return made
+
+
+def model_call(name: str, source: str) -> Call | TrustModel:
+    """Model of a `"module:name"`: that object, or the one that it makes when called."""
+    found = imported("model", source)
+    if callable(found) and not isinstance(found, TrustModel):
+        found = Call(source, ())
+    model_of(found)
+    return found
+
+
+def resolved(what: str, given: Any, known: Mapping[str, Any]) -> Any:
+    """Object itself, one of some that are known by name, or that of a `"module:name"`.
+
+    TrustboError: there is no such module or name.
+    """
+    if not isinstance(given, str):
+        return given
+    if ":" not in given:
+        return known[require_choice(f'{what} (or give "module:name")', given, known)]
+    return imported(what, given)
+
+
+def _able(model: TrustModel, sampler: str) -> str:
+    """Sampler, or the default one where the model does not take it."""
+    try:
+        resolve_sampler(model, sampler)
+    except TrustboError:
+        return SAMPLER
+    return sampler
+
+
+def _models_of(models: Any) -> dict[str, Call | TrustModel]:
+    """Models by name."""
+    found: dict[str, Call | TrustModel] = {}
+    for name, given in _by_name("models", _listed(models)).items():
+        if not isinstance(given, str):
+            found[name] = given if isinstance(given, TrustModel) else model_of(given())
+        elif ":" in given:
+            found[name] = model_call(name, given)
+        else:
+            found[name] = MODELS[require_choice("model", given, MODELS)]
+    return found
+
+
+def _listed(given: Any) -> list[Any]:
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
+def _by_name(what: str, given: Sequence[Any]) -> dict[str, Any]:
+    """Objects by the names of their rows; TrustboError: two have the same."""
+    names = [_name(one) for one in given]
+    for name in names:
+        if names.count(name) > 1:
+            raise TrustboError(
+                f"two {what} have the name {name!r}, and each row of the table needs another: "
+                'give functions of other names, or "module:name" of each.'
+            )
+    return dict(zip(names, given, strict=True))
+
+
+def _name(given: Any) -> str:
+    if isinstance(given, str):
+        return given.rpartition(":")[2]
+    if isinstance(given, partial):
+        return f"{_name(given.func)}({', '.join(f'{k}={v}' for k, v in given.keywords.items())})"
+    name = getattr(given, "__name__", type(given).__name__)
+    if not isinstance(given, TrustModel):
+        return name
+    usual = {f.name: f.default for f in fields(given)}
+    options = given.options().items()
+    chosen = [v for option, v in options if isinstance(v, str) and v != usual[option]]
+    chosen += [] if given.place is None else ["places"]
+    return f"{name}({', '.join(chosen)})" if chosen else name
