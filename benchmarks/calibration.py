@@ -10,6 +10,7 @@ import sys
 import jax.numpy as jnp
 from common import Table, arguments, parsed, timed
 from numpyro.distributions import HalfNormal, LogNormal, Normal
+from sbc_places import Walks
 
 from trustbo.inference import sbc
 from trustbo.models import CoupledTrust, DriftTrust, HierarchicalTrust, PlaceEffect, PooledTrust
@@ -71,7 +72,14 @@ def main():
         detail = "places" if model.place is not None else detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
         file = given.out / f"{name}-{detail}-{model.observation}-{sampler}.json"
-        options = {"n_datasets": n, "shape": shape, "checkpoint": file, "progress": False}
+        design = None if model.place is None else Walks.random(shape[:2], seed=0)
+        options = {
+            "design": design,
+            "n_datasets": n,
+            "shape": shape,
+            "checkpoint": file,
+            "progress": False,
+        }
         seconds, result = timed(
             lambda model=model, sampler=sampler, given=options: sbc(model, sampler, **given)
         )

@@ -1,6 +1,7 @@
 """Calibration of the samplers, and of the test itself."""
 
 from importlib import import_module
+from pathlib import Path
 
 import arviz as az
 import matplotlib.pyplot as plt
@@ -44,9 +45,16 @@ def test_a_posterior_of_another_prior_is_found_out(monkeypatch):
     assert float(ranks["p_value"].sel(parameter="delta_v")) < 1e-6
 
 
-def test_effects_of_places_are_ranked_as_parameters_are():
+def test_effects_of_places_are_ranked_as_parameters_are(monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    walks = import_module("sbc_places").Walks.random((2, 5), seed=0)
     model = PooledTrust(place=PlaceEffect())
     options = {"shape": (2, 5, 2, 1), "n_datasets": 12, "n_ranked": 40, "progress": False}
+    with pytest.raises(TrustboError, match=r"design=None and place=PlaceEffect.*needs a design"):
+        sbc(model, "exact", **options)
+    options["design"] = walks
+    with pytest.raises(TrustboError, match=r"and place=None: .* one without takes none"):
+        sbc(PooledTrust(), "exact", **options)
     ranks = sbc(model, "exact", **options)
     names = ["beta0", "beta[0]", "b", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e"]
     effects = ["place[first]", "place[last]", "place_bound[first]", "place_bound[second]"]

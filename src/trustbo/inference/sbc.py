@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import xarray as xr
@@ -13,16 +14,34 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, read_record, write_text
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.choice import resolve_sampler
-from trustbo.inference.samplers.run import draw_posterior
+from trustbo.inference.samplers.run import Draws, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.inference.sbc_places import Walks
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
+from trustbo.models.place import Visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.stacking import MissionBatch
 
 _CHAINS = 4
 _INTERVALS = (0.5, 0.9)
+
+
+class Design(Protocol):
+    """Missions that visit places, and the effects that are ranked."""
+
+    def places(self, model: TrustModel) -> Visited:
+        """Places that the missions visit."""
+        ...
+
+    def simulate(
+        self, model: TrustModel, awareness: np.ndarray, ticks: np.ndarray, seed: int
+    ) -> dict[str, np.ndarray]:
+        """Parameters, ranked effects and contact rates drawn from the prior, by name."""
+        ...
+
+    def effects(self, model: TrustModel, draws: Draws, seed: int) -> dict[str, np.ndarray]:
+        """Draws of the ranked effects, (chain, draw)."""
+        ...
 
 
 def sbc(
@@ -35,15 +54,14 @@ def sbc(
     n_draws: int = 1000,
     n_ranked: int = 396,
     seed: int = 0,
+    design: Design | None = None,
     checkpoint: FilePath | None = None,
     progress: bool = True,
 ) -> xr.Dataset:
     """Rank each true parameter among posterior draws, over data sets simulated from the prior.
 
     If prior, likelihood and sampler fit together, ranks are uniform. Awareness is uniform in
-    [0, 1]; contact rates are the model's, for Gaussian observations not cut to [0, 1]. Where places
-    have effects, missions walk at random over a grid of 4 x 4 cells, and the effects of the first
-    two bounds, of the mission's first cell and of the last cell of the grid are ranked too.
+    [0, 1]; contact rates are the model's, for Gaussian observations not cut to [0, 1].
 
     Args:
         model: Trust model; by default `PooledTrust()`.
@@ -55,6 +73,8 @@ def sbc(
         n_draws: Draws of each of the 4 chains of NUTS.
         n_ranked: Draws each truth is ranked among, a multiple of 4; NUTS is thinned to these.
         seed: Seed; the same seed gives the same ranks.
+        design: Missions that visit places, for a model with effects of places, which are ranked
+            too; `benchmarks/sbc_places.py` has random walks.
         checkpoint: A file that keeps the ranks after each data set; with it, a call goes on where
             one with the same arguments stopped.
         progress: Whether to show a progress bar.
@@ -65,12 +85,18 @@ def sbc(
         bins; and `coverage` (interval, parameter), the share of truths in the central interval.
 
     Raises:
-        TrustboError: The sampler is unknown or does not suit the model, there are no data sets, or
-            the checkpoint is of other arguments.
+        TrustboError: The sampler is unknown or does not suit the model, there are no data sets, a
+            model with effects of places has no design, or the checkpoint is of other arguments.
     """
     model = PooledTrust() if model is None else model
     sampler, _ = resolve_sampler(model, sampler)
     require_whole("n_datasets", n_datasets, 1)
+    if (model.place is None) != (design is None):
+        raise TrustboError(
+            f"design={design!r} and place={model.place!r}: a model with effects of places needs a "
+            "design, missions that visit places, and one without takes none; see "
+            "benchmarks/sbc_places.py."
+        )
     kept = require_whole("n_ranked", n_ranked, _CHAINS) // _CHAINS
     settings = NutsSettings(draws=kept if sampler == "exact" else n_draws, n_chains=_CHAINS)
     thinned = np.linspace(0, settings.draws - 1, kept).astype(int)
@@ -79,25 +105,24 @@ def sbc(
     asked = f"{model.describe()}, {model.priors.describe()}, {sampler}, {shape}, {n_ticks}, "
     asked += f"{settings!r}, {n_ranked}, {seed}"
     ranks = _read(checkpoint, asked)
-    walks = None if model.place is None else Walks.random(shape[:2], seed)
     model = model.at_resolution({float(n_ticks): 1.0})
     for j in tqdm(range(n_datasets), desc="data sets", disable=not progress):
         if j < len(ranks):
             continue
         # Not seed + j, whose random numbers the sampler draws.
         own = int(np.random.SeedSequence([seed, j]).generate_state(1)[0])
-        if walks is None:
+        if design is None:
             simulated = _simulate(model, awareness, ticks, own)
         else:
-            simulated = walks.simulate(model, awareness, ticks, own)
+            simulated = design.simulate(model, awareness, ticks, own)
         batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
-        places = None if walks is None else walks.places(model)
+        places = None if design is None else design.places(model)
         draws, _ = draw_posterior(
             model, sampler, settings, seed + j, batch, places=places, check=False
         )
         found = draws.params
-        if walks is not None:
-            found = found | walks.effects(model, draws, seed + j)
+        if design is not None:
+            found = found | design.effects(model, draws, seed + j)
         rank = {}
         for name in found:
             below = (found[name][:, thinned] < simulated[name]).sum((0, 1))

@@ -23,8 +23,6 @@ from trustbo.simulation import ModelSimulator, Simulator, Truth
 from trustbo.study.calls import FILES, Call, call_of, require_known, takes
 from trustbo.study.experiment import Experiment
 from trustbo.study.methods import Case, model_call, model_of
-from trustbo.study.parts import SIMULATORS
-from trustbo.study.terrains import TERRAINS
 from trustbo.team import Team
 from trustbo.workspace import Location, Workspace, survey
 from trustbo.workspace.location import CELL, named
