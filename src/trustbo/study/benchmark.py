@@ -9,11 +9,9 @@ import xarray as xr
 from trustbo.campaign.options import OBJECTIVE, POLICY
 from trustbo.errors import require_choice, require_whole
 from trustbo.files import FilePath
-from trustbo.study.contenders import BASELINES
 from trustbo.study.experiment import Experiment
 from trustbo.study.methods import BASELINES, cases_of
 from trustbo.study.world import COURSES, REAL, Course, Simulate, World
-from trustbo.study.world_set import worlds
 from trustbo.workspace.sight import Sight
 
 _WALL, _BARE = Sight("wall"), Sight("bare")

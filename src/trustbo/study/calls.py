@@ -101,14 +101,14 @@ def constructor(kind: str) -> Callable[..., Any]:
         return imported("kind", kind)
     name, _, method = kind.partition(".")
     public = _public()
-    found = getattr(public[name], name) if name in public else None
-    found = getattr(found, method, None) if method else found
-    if not callable(found):
+    made = getattr(public[name], name) if name in public else None
+    made = getattr(made, method, None) if method else made
+    if not callable(made):
         raise TrustboError(
             f"unknown kind {kind!r}{_meant(kind, public)}; give the name of a public "
             'constructor, such as Team, or "module:name" of your own.'
         )
-    return found
+    return made
 
 
 def call_of(
@@ -159,12 +159,12 @@ def takes(kind: str, name: str) -> bool:
     return name in _parameters(kind)
 
 
-def require_known(what: str, name: object, known: Iterable[str]) -> None:
-    """Refuse an unknown name (TrustboError), with the known one that it resembles."""
-    known = tuple(known)
-    if name not in known:
-        meant = _meant(str(name), known)
-        raise TrustboError(f"unknown {what} {name!r}{meant}; choose one of {', '.join(known)}.")
+def require_known(what: str, name: object, choices: Iterable[str]) -> None:
+    """Refuse an unknown name (TrustboError), with the choice that it resembles."""
+    choices = tuple(choices)
+    if name not in choices:
+        meant = _meant(str(name), choices)
+        raise TrustboError(f"unknown {what} {name!r}{meant}; choose one of {', '.join(choices)}.")
 
 
 def imported(what: str, source: str) -> Any:
@@ -204,8 +204,8 @@ def _parameters(kind: str) -> Mapping[str, inspect.Parameter]:
     return inspect.signature(constructor(kind)).parameters
 
 
-def _meant(name: str, known: Iterable[str]) -> str:
-    by_lower = {one.lower(): one for one in known}
+def _meant(name: str, choices: Iterable[str]) -> str:
+    by_lower = {one.lower(): one for one in choices}
     close = get_close_matches(name.lower(), by_lower, 1)
     return f" (did you mean {by_lower[close[0]]!r}?)" if close else ""
 

@@ -395,9 +395,8 @@ def _place(noun: str, settings: dict[str, Any]) -> Place:
     whole = settings.get("kind") == "random_workspace"  # a workspace takes no keywords of a grid
     more = () if whole else _GRID
     call = call_of(noun, settings, TERRAINS, more=(*more, *_ENDS))
-    mine = [takes(call.kind, name) for name, _ in call.keywords]
     terrain, grid = (
-        tuple(pair for pair, own in zip(call.keywords, mine, strict=True) if own is of_terrain)
+        tuple((n, value) for n, value in call.keywords if takes(call.kind, n) is of_terrain)
         for of_terrain in (True, False)
     )
     return Place(terrain=Call(call.kind, terrain), grid=Call("", grid), **ends)
@@ -405,12 +404,12 @@ def _place(noun: str, settings: dict[str, Any]) -> Place:
 
 def _simulating(noun: str, settings: dict[str, Any]) -> dict[str, Any]:
     settings = dict(settings)
-    known = settings.pop("known_truth", False)
-    if not isinstance(known, bool):
-        raise TrustboError(f"known_truth must be true or false; got {known!r}.")
+    asked = settings.pop("known_truth", False)
+    if not isinstance(asked, bool):
+        raise TrustboError(f"known_truth must be true or false; got {asked!r}.")
     given = ("workspace",)
     call = call_of(noun, settings, SIMULATORS, given=given, more=("known_truth",))
-    return {"simulating": call, "known_truth": known}
+    return {"simulating": call, "known_truth": asked}
 
 
 def _model(noun: str, settings: dict[str, Any] | TrustModel) -> Call | TrustModel:
@@ -431,7 +430,7 @@ def _with_paths_from(folder: Path, configuration: Mapping[str, Any]) -> dict[str
     if isinstance(terrains, Mapping):
         changed["terrains"] = {
             name: {
-                key: str(folder / value) if key in FILES and isinstance(value, str) else value
+                key: _from(folder, value) if key in FILES else value
                 for key, value in settings.items()
             }
             if isinstance(settings, Mapping)
@@ -439,6 +438,13 @@ def _with_paths_from(folder: Path, configuration: Mapping[str, Any]) -> dict[str
             for name, settings in terrains.items()
         }
     return changed
+
+
+def _from(folder: Path, files: Any) -> Any:
+    """File or files, relative to a folder."""
+    if isinstance(files, list):
+        return [_from(folder, file) for file in files]
+    return str(folder / files) if isinstance(files, str) else files
 
 
 def _listed(what: str, values: object) -> Sequence[Any]:

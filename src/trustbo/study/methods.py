@@ -1,4 +1,4 @@
-"""Methods that are compared: a model and a policy, or a baseline; the user's own among them."""
+"""Methods that are compared: a model and a policy, or a baseline, ours or the user's."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -143,7 +143,7 @@ def cases_of(
     max_bounds: int | str,
     sampler: str,
 ) -> dict[str, Case]:
-    """Every model with every policy, baselines, and methods of one's own, by name.
+    """Every model with every policy, baselines, and further methods, by name.
 
     Raises:
         TrustboError: An unknown name, or two methods of one name.
@@ -197,15 +197,15 @@ def model_call(name: str, source: str) -> Call | TrustModel:
     return found
 
 
-def resolved(what: str, given: Any, known: Mapping[str, Any]) -> Any:
-    """Object itself, one of some that are known by name, or that of a `"module:name"`.
+def resolved(what: str, given: Any, named: Mapping[str, Any]) -> Any:
+    """Object itself, one of those with a name, or that of a `"module:name"`.
 
     TrustboError: there is no such module or name.
     """
     if not isinstance(given, str):
         return given
     if ":" not in given:
-        return known[require_choice(f'{what} (or give "module:name")', given, known)]
+        return named[require_choice(f'{what} (or give "module:name")', given, named)]
     return imported(what, given)
 
 
