@@ -254,6 +254,22 @@ def test_a_factory_of_methods_makes_a_new_one_for_each_campaign(tiny, tmp_path):
     np.testing.assert_allclose(own["regret"][:, 0], truth.regret(after, max_bounds="shortest+4"))
 
 
+def test_factories_that_differ_in_a_constant_alone_have_rows_of_their_own(tiny, tmp_path):
+    methods = {"one": lambda: Lucky(1), "two": lambda: Lucky(2)}
+    one, two = cases("pooled", [], [], methods).values()
+    assert one.identity() != two.identity()
+    assert one.identity() == cases("pooled", [], [], methods)["one"].identity()
+
+
+def test_a_method_whose_package_is_absent_is_refused_before_any_work(tiny, tmp_path):
+    def absent():
+        import no_such_package  # noqa: F401
+
+    with pytest.raises(TrustboError, match=r"method=absent, .*No module named 'no_such_package'"):
+        run(tmp_path, methods={"absent": absent})
+    assert not list(tmp_path.iterdir())
+
+
 if find_spec("botorch"):  # a peer, which only `make bench` installs
 
     def test_botorch_learns_and_recommends(tiny, tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache, partial
@@ -184,12 +185,18 @@ def identity_of(given: Any) -> Any:
         return given
     if isinstance(given, partial):
         return [identity_of(given.func), repr(given.args), repr(sorted(given.keywords.items()))]
-    if isinstance(given, type):
-        return f"{given.__module__}:{given.__qualname__} {_hash(inspect.getsource(given).encode())}"
     kind = given if hasattr(given, "__qualname__") else type(given)
-    code = getattr(getattr(given, "__code__", None), "co_code", None)
-    code = repr(sorted(getattr(given, "__dict__", {}).items())).encode() if code is None else code
-    return f"{kind.__module__}:{kind.__qualname__} {_hash(code)}"
+    if isinstance(given, type):
+        with suppress(OSError):  # without a file, the name has to do
+            return f"{kind.__module__}:{kind.__qualname__} {_hash(inspect.getsource(given))}"
+        state: Any = ""
+    elif (code := getattr(given, "__code__", None)) is not None:
+        # Constants that are code or objects have addresses, which differ between processes.
+        plain = [c for c in code.co_consts if isinstance(c, str | int | float | tuple | None)]
+        state = code.co_code, plain, code.co_names, given.__defaults__
+    else:
+        state = sorted(getattr(given, "__dict__", {}).items())
+    return f"{kind.__module__}:{kind.__qualname__} {_hash(repr(state))}"
 
 
 @lru_cache(maxsize=1)
@@ -262,5 +269,5 @@ def digest(path: str) -> str:
         return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _hash(code: bytes) -> str:
-    return hashlib.sha256(code).hexdigest()[:12]
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]

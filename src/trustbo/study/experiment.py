@@ -356,5 +356,5 @@ def _rehearse(runs: Sequence[Run]) -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 run.begin()
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, ImportError) as error:
             raise TrustboError(f"the run {run}: {error}") from error
