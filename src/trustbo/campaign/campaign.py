@@ -34,7 +34,8 @@ from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import resolve_policy
 from trustbo.stacking import fill_awareness
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 _N_MAPS = 500

@@ -23,7 +23,8 @@ from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
 from trustbo.simulation.protocol import require_bounds, require_call, takes
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 
 
 def iterate(

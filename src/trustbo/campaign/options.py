@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from trustbo.hazard import Hazard
     from trustbo.models import TrustModel
     from trustbo.planning import Planner
-    from trustbo.workspace import AwarenessBelief, Location, Workspace
+    from trustbo.workspace import AwarenessBelief, Workspace
+    from trustbo.workspace.location import Location
 
     Callback = Callable[[Campaign, Mission], None]
 

@@ -55,7 +55,7 @@ from trustbo.workspace import netcdf as archive
 from trustbo.workspace.moves import require_on_grid
 
 if TYPE_CHECKING:
-    from trustbo.plots import Explorer
+    from trustbo.plots.explorer import Explorer
 
 _NEW = ("max_failure", "failure_cost")
 """Options of planning that results of version 0.1 lack."""

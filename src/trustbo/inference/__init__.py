@@ -6,7 +6,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 from trustbo.inference.by_rate import by_rate
 from trustbo.inference.compare import compare
 from trustbo.inference.draws import params_of
-from trustbo.inference.filter import TrustFilter, TrustForecast, TrustState
+from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.place_maps import place_maps
@@ -16,17 +16,13 @@ from trustbo.inference.prior_predictive import prior_predictive, sample_prior
 from trustbo.inference.samplers.convergence import diagnostics
 from trustbo.inference.sbc import sbc
 from trustbo.inference.updating import (
-    ExactPosterior,
     moment_matched,
     sample_statistics,
     update_statistics,
 )
 
 __all__ = [
-    "ExactPosterior",
     "TrustFilter",
-    "TrustForecast",
-    "TrustState",
     "by_rate",
     "compare",
     "complete",

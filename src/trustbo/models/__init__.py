@@ -10,18 +10,16 @@ from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
-from trustbo.models.params import CoupledParams, DriftParams, RobotParams, TrustParams
+from trustbo.models.params import CoupledParams, RobotParams, TrustParams
 from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 from trustbo.models.state_space.contact_rate import ContactRate
-from trustbo.models.state_space.generate import TrustSample
 
 __all__ = [
     "ContactRate",
     "CoupledParams",
     "CoupledTrust",
-    "DriftParams",
     "DriftTrust",
     "HierarchicalTrust",
     "PlaceEffect",
@@ -30,7 +28,6 @@ __all__ = [
     "RobotParams",
     "TrustModel",
     "TrustParams",
-    "TrustSample",
 ]
 __dir__ = __all__.copy  # completion lists public names alone
 
@@ -38,7 +35,7 @@ _MOVED = {
     "trustbo.criticism": ("Criticism", "criticise"),
     "trustbo.hazard": ("CAUSES", "BoundRisk", "Hazard", "LostMission", "fit_hazard"),
     "trustbo.inference": (
-        "ExactPosterior", "TrustFilter", "TrustForecast", "TrustState", "by_rate", "complete",
+        "TrustFilter", "by_rate", "complete",
         "diagnostics", "fit", "loo", "moment_matched", "params_of", "place_maps", "prior_from",
         "prior_predictive", "sample_prior", "sample_statistics", "sbc",
     ),

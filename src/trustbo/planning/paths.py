@@ -20,7 +20,8 @@ from trustbo.planning.graph import (
     move_lengths,
     require_way,
 )
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 from trustbo.workspace.moves import (
     MOVES,
     existing_bounds,

@@ -27,7 +27,8 @@ from trustbo.planning.problem import PlanningProblem, draws_of
 from trustbo.planning.risk import FailureRule, Risk
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.planning.values import evaluate
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 
 
 class Planner(Displayed):

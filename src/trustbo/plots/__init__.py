@@ -4,7 +4,6 @@ from trustbo.plots.animation import animate_mission
 from trustbo.plots.calibration import calibration
 from trustbo.plots.campaign import campaign_history, parameter_history
 from trustbo.plots.criticism import criticism
-from trustbo.plots.explorer import Explorer
 from trustbo.plots.maps import (
     cell_map,
     draw_path,
@@ -18,11 +17,11 @@ from trustbo.plots.mission import mission_trust, plan_trust
 from trustbo.plots.places import place_map
 from trustbo.plots.plan import plan_map
 from trustbo.plots.regret import regret_curves
-from trustbo.plots.style import DARK, LIGHT, Style, Theme
+from trustbo.plots.style import DARK, LIGHT, Style
 from trustbo.plots.terrain import loadings, terrain_maps
 
 __all__ = [
-    "DARK", "LIGHT", "Explorer", "Style", "Theme", "animate_mission", "calibration",
+    "DARK", "LIGHT", "Style", "animate_mission", "calibration",
     "campaign_history", "cell_map", "criticism",
     "draw_path", "draw_scale", "hazard_map", "loadings", "mission_trust", "parameter_history",
     "path_posterior", "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps",

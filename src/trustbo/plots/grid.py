@@ -9,8 +9,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.ticker import MultipleLocator
 
 from trustbo.plots.style import SMALL
-from trustbo.workspace import Survey
 from trustbo.workspace.location import crs_name
+from trustbo.workspace.survey import Survey
 
 _WIDTH, _HEIGHT, _LEAST = 7.0, 11.0, 1.5
 """Largest width and height of the map, and the least of either, inches."""

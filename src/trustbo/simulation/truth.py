@@ -31,7 +31,8 @@ from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import takes
 from trustbo.simulation.replicates import KinematicReplicates, PlainReplicates
 from trustbo.terrain.dataset import digest_of
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 
 OBJECTIVES = ("lost_contact", "mean")
 """Objectives that a truth has a best path for."""

@@ -24,8 +24,8 @@ from trustbo.study.calls import FILES, Call, call_of, require_known, takes
 from trustbo.study.experiment import Experiment
 from trustbo.study.methods import Case, model_call, model_of
 from trustbo.team import Team
-from trustbo.workspace import Location, Workspace, survey
-from trustbo.workspace.location import CELL, named
+from trustbo.workspace import Workspace, survey
+from trustbo.workspace.location import CELL, Location, named
 
 OPTIONS = (
     *(option.name for option in fields(CampaignOptions) if option.name != "callbacks"),

@@ -33,7 +33,8 @@ from trustbo.study import executors
 from trustbo.study.methods import Case
 from trustbo.study.store import Store
 from trustbo.study.table import to_dataset
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 
 
 class Scene(Protocol):

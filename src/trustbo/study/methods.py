@@ -21,7 +21,8 @@ from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.policies import random, seed_of
 from trustbo.study.calls import Call, identity_of, imported
-from trustbo.workspace import Location, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.location import Location
 
 MODELS = {
     "pooled": Call("PooledTrust", ()),
