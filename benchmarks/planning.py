@@ -17,8 +17,8 @@ from scipy.sparse.csgraph import dijkstra
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner
-from trustbo.planning.engines.buckets import best_stationary
 from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.search.buckets import best_stationary
 from trustbo.planning.values import entry_cost
 from trustbo.workspace import Workspace
 

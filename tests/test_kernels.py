@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 REACH_EVERY_KERNEL = (
-    "planning/engines",
+    "planning/search",
     "planning/test_closed_bounds.py",
     "planning/test_risk.py",
     "inference/evidence/test_ep.py",

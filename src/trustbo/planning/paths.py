@@ -12,7 +12,6 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_cells, require_kind, require_whole
 from trustbo.parallel import plain
-from trustbo.planning.engines.layers import Layers, build_layers
 from trustbo.planning.graph import (
     NoPathError,
     cell_graph,
@@ -20,6 +19,7 @@ from trustbo.planning.graph import (
     move_lengths,
     require_way,
 )
+from trustbo.planning.search.layers import Layers, build_layers
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import (

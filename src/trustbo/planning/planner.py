@@ -17,7 +17,6 @@ from trustbo.errors import ShapeError, TrustboError, require_choice, require_kin
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
-from trustbo.planning import search
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective
 from trustbo.planning.paths import AdmissiblePaths
@@ -25,6 +24,7 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.posterior import DrawnPaths, choose_draws
 from trustbo.planning.problem import PlanningProblem, draws_of
 from trustbo.planning.risk import FailureRule, Risk
+from trustbo.planning.search import solve
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.planning.values import evaluate
 from trustbo.workspace import Workspace
@@ -115,7 +115,7 @@ class Planner(Displayed):
                 for Gaussian rates and `team="mean"`.
             NoPathError: The goal cannot be reached.
         """
-        self.engine, self._engine = engine, search.Engine(engine, backend)
+        self.engine, self._engine = engine, solve.Engine(engine, backend)
         self.family = FAMILIES[require_choice("observation", observation, FAMILIES)]
         self.lag = float(require_choice("response", response, RESPONSES) == "change")
         self._engine.choose(0, 1)
@@ -256,12 +256,12 @@ class Planner(Displayed):
                 f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
                 "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
             )
-        path, gap, engine = search.find_path(self.problem, self.dynamics(params, x0), self._engine)
+        path, gap, engine = solve.find_path(self.problem, self.dynamics(params, x0), self._engine)
         plan = evaluate(self.problem, path, params, x0)
         return replace(
             plan,
-            exact=gap <= search.EXACT,
-            bound=search.value_bound(self.objective, plan.value, gap),
+            exact=gap <= solve.EXACT,
+            bound=solve.value_bound(self.objective, plan.value, gap),
             engine=engine,
             seconds=time.perf_counter() - started,
         )
@@ -275,7 +275,7 @@ class Planner(Displayed):
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        return search.find_path(self.problem, dynamics, self._engine).path
+        return solve.find_path(self.problem, dynamics, self._engine).path
 
     def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
         """Find the path with the best expectation over draws of terminal, mean or lost contact.
@@ -293,7 +293,7 @@ class Planner(Displayed):
         """
         started = time.perf_counter()
         params = draws_of(posterior)
-        path = search.find_expected(self.problem, self.dynamics(params))
+        path = solve.find_expected(self.problem, self.dynamics(params))
         plan = evaluate(self.problem, path, params, cap=False)
         seconds = time.perf_counter() - started
         return replace(plan, exact=True, bound=plan.value, engine="numba", seconds=seconds)
@@ -314,7 +314,7 @@ class Planner(Displayed):
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
         dynamics = self.dynamics(params, draws=chosen)
         return DrawnPaths(
-            self.problem, dynamics, *search.find_paths(self.problem, dynamics, self._engine), chosen
+            self.problem, dynamics, *solve.find_paths(self.problem, dynamics, self._engine), chosen
         )
 
     def evaluate(

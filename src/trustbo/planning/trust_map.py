@@ -8,11 +8,11 @@ from scipy.special import expit
 from trustbo.data import Cell
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.engines.compiled import plan_compiled
-from trustbo.planning.engines.reachable_trust import best_trust
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
 from trustbo.planning.problem import PlanningProblem
+from trustbo.planning.search.compiled import plan_compiled
+from trustbo.planning.search.reachable_trust import best_trust
 from trustbo.planning.values import team_trust
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.engines.contact_loss import expected_loss, least_slope
-from trustbo.planning.engines.layers import Layers
+from trustbo.planning.search.contact_loss import expected_loss, least_slope
+from trustbo.planning.search.layers import Layers
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)

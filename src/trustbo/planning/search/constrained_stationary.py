@@ -1,7 +1,7 @@
 """Best path within a limit on risk where costs are free of history: the objective `stationary`.
 
 Method: label setting for the resource-constrained shortest path (Martins 1984), best first, with
-the bound of `lagrangian`.
+the bound of `dual`.
 
 State of a label: cell, cost so far, sums of risks, parent. Costs are positive and risks not
 negative, so the best feasible walk is a simple path. Estimate of the cost of its completions: the
@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.engines.lagrangian import PRICES, Best, next_price
-from trustbo.planning.engines.room import with_room
+from trustbo.planning.search.dual import PRICES, Best, next_price
+from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
@@ -79,7 +79,7 @@ def best_within(network: Network, max_labels: int) -> Best:
 
 @_part
 def _dual(network):
-    """Maximise the Lagrangian bound over the price of risk, see `constrained`.
+    """Maximise the Lagrangian bound over the price of risk, see `labels`.
 
     The best path known, least costs to go at price 0 and at the best price, this price, the bound.
     """

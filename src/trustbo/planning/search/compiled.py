@@ -7,22 +7,22 @@ import numpy as np
 from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows, plain
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.engines.buckets import best_stationary
-from trustbo.planning.engines.compiled_risk import (
+from trustbo.planning.objectives import Objective
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.risk import RiskTable
+from trustbo.planning.search.buckets import best_stationary
+from trustbo.planning.search.compiled_risk import (
     LayeredSearch,
     plan_layered,
     plan_stationary,
     require_complete,
 )
-from trustbo.planning.engines.constrained_stationary import least_to_goal
-from trustbo.planning.engines.contact_loss import LAWS, TINY_SD, least_loss
-from trustbo.planning.engines.dominance import build_heuristic, dominance_tests
-from trustbo.planning.engines.labels import TERMINAL, LabelRisk, LabelSearch, mode_of, search
-from trustbo.planning.engines.lagrangian import Best
-from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
-from trustbo.planning.objectives import Objective
-from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.risk import RiskTable
+from trustbo.planning.search.constrained_stationary import least_to_goal
+from trustbo.planning.search.contact_loss import LAWS, TINY_SD, least_loss
+from trustbo.planning.search.dominance import build_heuristic, dominance_tests
+from trustbo.planning.search.dual import Best
+from trustbo.planning.search.labels_vector import TERMINAL, LabelRisk, LabelSearch, mode_of, search
+from trustbo.planning.search.layers import Weights, additive_weights, best_additive
 from trustbo.planning.values import entry_cost
 
 _TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)

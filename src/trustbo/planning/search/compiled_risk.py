@@ -8,11 +8,13 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.engines.constrained import best_within
-from trustbo.planning.engines.constrained_stationary import Network, least_to_goal
-from trustbo.planning.engines.constrained_stationary import best_within as best_free_within
-from trustbo.planning.engines.contact_loss import LAWS, TINY_SD
-from trustbo.planning.engines.costs_to_go import (
+from trustbo.planning.objectives import Objective
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.risk import RiskTable
+from trustbo.planning.search.constrained_stationary import Network, least_to_goal
+from trustbo.planning.search.constrained_stationary import best_within as best_free_within
+from trustbo.planning.search.contact_loss import LAWS, TINY_SD
+from trustbo.planning.search.costs_to_go import (
     LEAST,
     NONE,
     SOFTPLUS,
@@ -20,12 +22,10 @@ from trustbo.planning.engines.costs_to_go import (
     EdgeRisk,
     safest_to_go,
 )
-from trustbo.planning.engines.lagrangian import Best
-from trustbo.planning.engines.layers import Weights, additive_weights, best_additive
-from trustbo.planning.engines.reference import best_stationary
-from trustbo.planning.objectives import Objective
-from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.risk import RiskTable
+from trustbo.planning.search.dual import Best
+from trustbo.planning.search.labels import best_within
+from trustbo.planning.search.layers import Weights, additive_weights, best_additive
+from trustbo.planning.search.reference import best_stationary
 
 _MAX_LABELS = 300_000  # per search
 _MAX_ENTRIES = 20_000_000  # of the risks of labels

@@ -31,10 +31,10 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.engines.contact_loss import CLIPPED, LOGISTIC, expected_loss
-from trustbo.planning.engines.dominance import Heuristic
-from trustbo.planning.engines.room import with_room
 from trustbo.planning.objectives import Objective
+from trustbo.planning.search.contact_loss import CLIPPED, LOGISTIC, expected_loss
+from trustbo.planning.search.dominance import Heuristic
+from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.engines.costs_to_go import (
+from trustbo.planning.search.costs_to_go import (
     LEAST,
     Ahead,
     Bounds,
@@ -30,7 +30,7 @@ from trustbo.planning.engines.costs_to_go import (
     loss_of,
     pass_back,
 )
-from trustbo.planning.engines.layers import Layers
+from trustbo.planning.search.layers import Layers
 
 _part = njit(nogil=True, error_model="numpy", **PART)
 PRICES = 12

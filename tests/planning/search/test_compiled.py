@@ -10,9 +10,9 @@ from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
 from trustbo.planning import Planner
-from trustbo.planning.engines import compiled as engines
-from trustbo.planning.engines.buckets import best_stationary
-from trustbo.planning.search import Engine
+from trustbo.planning.search import compiled as engines
+from trustbo.planning.search.buckets import best_stationary
+from trustbo.planning.search.solve import Engine
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from trustbo.planning.engines.reachable_trust import best_trust
 from trustbo.planning.graph import fewest_bounds
+from trustbo.planning.search.reachable_trust import best_trust
 from trustbo.workspace.moves import MOVES, existing_bounds, move_indices
 
 

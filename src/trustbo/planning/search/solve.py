@@ -9,12 +9,12 @@ from scipy.special import expit, logit
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.engines.compiled import expected_path, plan_compiled
-from trustbo.planning.engines.compiled_risk import safest_path
-from trustbo.planning.engines.reference import plan_networkx
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.risk import FailureRule, InfeasibleError, Risk, RiskTable
+from trustbo.planning.search.compiled import expected_path, plan_compiled
+from trustbo.planning.search.compiled_risk import safest_path
+from trustbo.planning.search.reference import plan_networkx
 
 ENGINES = ("auto", "networkx", "numba")
 LARGEST_FOR_NETWORKX = 2500

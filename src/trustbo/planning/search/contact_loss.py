@@ -33,8 +33,8 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART, over_rows
-from trustbo.planning.engines.layers import Layers
-from trustbo.planning.engines.room import with_room
+from trustbo.planning.search.layers import Layers
+from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)

@@ -10,7 +10,7 @@ bound costs its toll and a loss l(x) that falls in x; `NONE` has no loss and nee
 takes the largest loss instead of the sum. A path is feasible if enough of its r are within their
 limits, and costs a failure cost F times 1 - exp(-r) of the first resource besides.
 
-A label is dropped if its cost with a bound on that of its completions, (a) or (b) of `lagrangian`,
+A label is dropped if its cost with a bound on that of its completions, (a) or (b) of `dual`,
 cannot beat the best path known, or if the safest completion, resource by resource, exceeds the
 limits.
 
@@ -34,7 +34,7 @@ import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.engines.costs_to_go import (
+from trustbo.planning.search.costs_to_go import (
     LEAST,
     NONE,
     Bounds,
@@ -48,9 +48,9 @@ from trustbo.planning.engines.costs_to_go import (
     loss_of,
     with_safest,
 )
-from trustbo.planning.engines.lagrangian import Best, failure, lagrangian
-from trustbo.planning.engines.layers import Layers
-from trustbo.planning.engines.room import with_room
+from trustbo.planning.search.dual import Best, failure, lagrangian
+from trustbo.planning.search.layers import Layers
+from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
