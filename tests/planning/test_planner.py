@@ -40,13 +40,28 @@ def test_the_graph_is_networkx_s_with_positions_and_lengths(workspace):
     assert not Planner(workspace, (4, 0), (0, 5), connectivity=4).graph.has_edge((4, 0), (3, 1))
 
 
+def test_the_graph_of_costs_has_the_stationary_plan_as_its_shortest_path(workspace):
+    p_fail = np.random.default_rng(1).uniform(0.0, 0.2, (8, 5, 6))
+    planner = Planner(workspace, (4, 0), (0, 5), length_weight=1e-3).with_risk(p_fail)
+    graph = planner.graph_of(PARAMS)
+    plan = Planner(workspace, (4, 0), (0, 5), "stationary", length_weight=1e-3).plan(PARAMS)
+    assert tuple(nx.dijkstra_path(graph, (4, 0), (0, 5), weight="cost")) == plan.path
+    total = nx.path_weight(graph, plan.path, "cost")
+    np.testing.assert_allclose(np.exp(-total), plan.value, rtol=1e-12)
+    risk = nx.path_weight(graph, plan.path, "risk")
+    np.testing.assert_allclose(np.exp(-risk), planner.problem.risk.survival(plan.path), rtol=1e-12)
+    assert "cost" not in planner.graph.edges[plan.path[:2]]
+    with pytest.raises(TrustboError, match=r"abs\(beta0\) < 1; got 1"):
+        planner.graph_of(PARAMS._replace(beta0=1.0))
+
+
 def test_a_plan_says_what_it_is(workspace):
     planner = Planner(workspace, (4, 0), (0, 5), "terminal")
     plan = planner.plan(PARAMS)
     assert plan.path[0] == (4, 0)
     assert plan.path[-1] == (0, 5)
     assert plan.trust.shape == (len(plan.path) - 1, 3)
-    assert (plan.exact, plan.engine, plan.revisits) == (True, "networkx", 0)
+    assert (plan.exact, plan.engine, plan.revisits) == (True, "numba", 0)
     assert plan.bound == plan.value == planner.evaluate(plan.path, PARAMS).value
     awareness = workspace.awareness.values[:, *zip(*plan.path[1:], strict=True)]
     np.testing.assert_allclose(plan.trust, roll_trust(PARAMS, awareness.swapaxes(0, 1)))

@@ -356,7 +356,7 @@ def test_a_search_that_is_cut_short_keeps_the_limit_and_its_bound_holds(
         planner = Planner(workspace, (n - 1, 0), (0, n - 1), objective, engine="numba", **options)
         planner = planner.with_risk(p, draws)
         whole = planner.plan(params)
-        monkeypatch.setattr("trustbo.planning.search.compiled_risk._MAX_LABELS", 1)
+        monkeypatch.setattr("trustbo.planning.search.labels.MAX_LABELS", 1)
         try:
             plan = planner.plan(params)
         except TrustboError:  # no feasible path was known by then

@@ -19,7 +19,8 @@ from trustbo.planning.graph import (
     move_lengths,
     require_way,
 )
-from trustbo.planning.search.layers import Layers, build_layers
+from trustbo.planning.search.graph import Graph, grid_graph
+from trustbo.planning.search.layers import build_layers
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import (
@@ -105,31 +106,45 @@ class AdmissiblePaths:
         return fewest_bounds(self.bounds, self.start, self.connectivity)
 
     @cached_property
-    def layers(self) -> Layers:
+    def n_states(self) -> int:
+        """Number of nodes of the layered DAG."""
+        near, far = self.bounds_from_start, self.bounds_to_goal
+        reached = (near >= 0) & (far >= 0)
+        return int(np.maximum(self.longest - near[reached] - far[reached] + 1, 0).sum())
+
+    @property
+    def can_unroll(self) -> bool:
+        """Whether the layered DAG is small enough to be held."""
+        return self.n_states <= _MOST_STATES
+
+    @cached_property
+    def layers(self) -> Graph:
         """Layered DAG: the grid unrolled over the bounds that are left.
 
         TrustboError: it is too large to be held.
         """
-        near, far = plain(self.bounds_from_start), plain(self.bounds_to_goal)
-        reached = (near >= 0) & (far >= 0)
-        n_states = np.maximum(self.longest - near[reached] - far[reached] + 1, 0).sum()
-        if n_states > _MOST_STATES:
+        if not self.can_unroll:
             raise TrustboError(
                 f"max_bounds = {self.max_bounds!r} admits paths of up to {self.longest} bounds, "
-                f"whose search has {n_states:.3g} states, more than {_MOST_STATES:.3g}; give less."
+                f"whose search has {self.n_states:.3g} states, more than {_MOST_STATES:.3g}; give "
+                "less."
             )
-        layers = build_layers(
-            plain(self.bounds_to_goal),
-            plain(self.bounds_from_start),
-            self.steps,
-            self.longest,
-            u_turns=self.u_turns,
-        )
+        ends = plain(self.bounds_to_goal), plain(self.bounds_from_start)
+        layers = build_layers(*ends, self.steps, self.longest, self.u_turns)
         if self.all_alike:
             return layers
-        kept = self.bounds.reshape(len(self.steps), -1)[layers.move, layers.cell[layers.head]]
-        first = np.concatenate([[0], np.cumsum(kept)])[layers.first]
-        return layers._replace(first=first, head=layers.head[kept], move=layers.move[kept])
+        kept = self.bounds.ravel()[layers.bound]
+        return layers._replace(
+            first=np.concatenate([[0], np.cumsum(kept)])[layers.first],
+            head=layers.head[kept],
+            move=layers.move[kept],
+            bound=layers.bound[kept],
+        )
+
+    @cached_property
+    def grid(self) -> Graph:
+        """Graph of the cells from which the goal can be reached, for costs without a history."""
+        return grid_graph(self.neighbours, self.bounds_to_goal.ravel(), self.flat(self.start))
 
     @cached_property
     def all_alike(self) -> bool:

@@ -90,9 +90,7 @@ class Planner(Displayed):
             team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
             length_weight: Cost of a metre of the path, for lost_contact (in bounds), terminal and
                 mean (in units of trust) and stationary (in units of log probability).
-            engine: `"networkx"`, the reference; `"numba"`, compiled; or `"auto"`: networkx for
-                single plans on up to 50 x 50 cells; for success, bottleneck, `team="min"` and
-                lost_contact of other than Gaussian rates up to 10 x 10; never within a risk. All
+            engine: `"numba"`, compiled, which `"auto"` takes; or `"networkx"`, the reference. Both
                 find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
             observation: Family of the contact rates, and
@@ -118,7 +116,7 @@ class Planner(Displayed):
         self.engine, self._engine = engine, solve.Engine(engine, backend)
         self.family = FAMILIES[require_choice("observation", observation, FAMILIES)]
         self.lag = float(require_choice("response", response, RESPONSES) == "change")
-        self._engine.choose(0, 1)
+        require_choice("engine", engine, solve.ENGINES)
         if max_bounds is None:
             max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
         paths = AdmissiblePaths(workspace, start, goal, connectivity, max_bounds, revisit)
@@ -158,6 +156,21 @@ class Planner(Displayed):
     def graph(self) -> nx.DiGraph:
         """Graph of passable cells; nodes with `x`, `y` (CRS metres), edges with `length` (m)."""
         return self.paths.graph
+
+    def graph_of(self, params: Params) -> nx.DiGraph:
+        """Build `graph` with the costs of its bounds, for any algorithm of networkx.
+
+        Attributes of the edges: `length` (m); `drift` of the team's mean trust; `cost`, that of
+        `stationary`: -log sigma of the trust that the bound would lead to if all were like it, and
+        the length cost; and with a risk `risk`, -log(1 - p_fail).
+
+        Args:
+            params: Parameters of any model, without leading axes.
+
+        Raises:
+            TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
+        """
+        return solve.graph_of(self.problem, self.dynamics(params))
 
     @property
     def awareness(self) -> np.ndarray:

@@ -10,9 +10,8 @@ from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
 from trustbo.planning import Planner
-from trustbo.planning.search import compiled as engines
+from trustbo.planning.search import labels_vector
 from trustbo.planning.search.buckets import best_stationary
-from trustbo.planning.search.solve import Engine
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
@@ -74,14 +73,17 @@ def test_all_draws_at_once_are_each_draw_by_itself(objective):
     np.testing.assert_allclose(reference.values, compiled.values, rtol=1e-9)
 
 
-def test_the_engine_is_chosen_by_size_or_named():
-    assert Engine().choose(2500, 1) == "networkx"
-    assert Engine().choose(2501, 1) == "numba"
-    assert Engine().choose(100, 2) == "numba"
-    for objective, team in [("success", "mean"), ("bottleneck", "mean"), ("terminal", "min")]:
-        for n, engine in [(10, "networkx"), (11, "numba")]:
-            planner = Planner(random_workspace(0, n), (n - 1, 0), (0, n - 1), objective, team=team)
-            assert planner.plan(random_params("pooled", 0)).engine == engine
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_plans_are_compiled_unless_networkx_is_asked_for(objective):
+    for n in (5, 11):
+        planner = Planner(random_workspace(0, n), (n - 1, 0), (0, n - 1), objective)
+        assert planner.plan(random_params("pooled", 0)).engine == "numba"
+    ends = random_workspace(0, 5), (4, 0), (0, 4), objective
+    plan = Planner(*ends, engine="networkx").plan(random_params("pooled", 0))
+    assert plan.engine == "networkx"
+
+
+def test_an_unknown_engine_is_refused():
     with pytest.raises(TrustboError, match="unknown engine 'gpu'; choose one of auto, networkx"):
         Planner(random_workspace(0), (8, 0), (0, 8), engine="gpu")
 
@@ -136,11 +138,11 @@ def test_a_plan_that_may_not_be_exact_says_by_how_much(monkeypatch):
     assert exact.exact
     assert exact.bound == exact.value
     # A coarse tolerance drops labels that might have been better.
-    monkeypatch.setattr(engines, "_TOLERANCES", (0.5,))
+    monkeypatch.setattr(labels_vector, "_TOLERANCES", (0.5,))
     rough = Planner(*ends, "terminal", team="min", engine="numba").plan(params)
     assert rough.value <= exact.value + 1e-12 <= rough.bound + 2e-12
     assert rough.exact == (rough.bound <= rough.value + 1e-12)
-    monkeypatch.setattr(engines, "_MAX_LABELS", 10)
+    monkeypatch.setattr(labels_vector, "MAX_LABELS", 10)
     with pytest.raises(TrustboError, match="more than 10 partial paths are worth keeping; lower"):
         Planner(*ends, "terminal", team="min", engine="numba").plan(params)
 
@@ -148,7 +150,7 @@ def test_a_plan_that_may_not_be_exact_says_by_how_much(monkeypatch):
 def test_the_bound_holds_over_many_maps(monkeypatch):
     bounds = {}
     for tolerances in ((0.0,), (0.1,)):
-        monkeypatch.setattr(engines, "_TOLERANCES", tolerances)
+        monkeypatch.setattr(labels_vector, "_TOLERANCES", tolerances)
         for seed in range(12):
             for objective in ("success", "bottleneck", "mean"):
                 workspace = random_workspace(seed, n=6, n_robots=3)

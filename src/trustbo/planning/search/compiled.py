@@ -1,43 +1,57 @@
-"""The compiled engine: dispatch of each objective to its kernel."""
+"""The compiled engine: the search for each kind of problem, in one table.
 
+| kind | value of a path | objectives |
+|---|---|---|
+| `sum` | a sum of weights of its bounds | `terminal`, `mean`, Gaussian `lost_contact` |
+| `history` | losses of one trust along it | `success`, `bottleneck`, other `lost_contact` |
+| `vector` | any of these of several trusts, or without revisits | all but `stationary` |
+| `free` | costs of its bounds, without history | `stationary` |
+"""
+
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows, plain
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import RiskTable
+from trustbo.planning.search import labels, labels_vector
 from trustbo.planning.search.buckets import best_stationary
-from trustbo.planning.search.compiled_risk import (
-    LayeredSearch,
-    plan_layered,
-    plan_stationary,
-    require_complete,
-)
-from trustbo.planning.search.constrained_stationary import least_to_goal
-from trustbo.planning.search.contact_loss import LAWS, TINY_SD, least_loss
-from trustbo.planning.search.dominance import build_heuristic, dominance_tests
-from trustbo.planning.search.dual import Best
-from trustbo.planning.search.labels_vector import TERMINAL, LabelRisk, LabelSearch, mode_of, search
+from trustbo.planning.search.costs_to_go import safest_to_go
+from trustbo.planning.search.graph import Best, Graph, Resources, SearchProblem, no_resources
+from trustbo.planning.search.labels import solve
 from trustbo.planning.search.layers import Weights, additive_weights, best_additive
+from trustbo.planning.search.losses import EXPECTED, LEAST, NONE, SOFTPLUS, TINY_SD
 from trustbo.planning.values import entry_cost
 
-_TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
-_MAX_LABELS = 300_000  # per search
 
+class Case(NamedTuple):
+    """Admissible paths, trust under every draw, objective, and a risk or none."""
 
-class BestPaths(NamedTuple):
-    """Best path of each draw.
+    admissible: AdmissiblePaths
+    dynamics: Dynamics
+    objective: Objective
+    risk: RiskTable | None
 
-    Fields: paths (draw, length), flat indices of cells, filled with -1; gap (draw,), optimality gap
-    in sums of softplus for `success`, in trust elsewhere.
-    """
+    @property
+    def kind(self) -> str:
+        """Kind of the problem; see the head of this file."""
+        if self.objective.name == "stationary":
+            return "free"
+        if not self.objective.has_labels:
+            return "sum" if len(self.dynamics.views) == 1 else "vector"
+        scalar = self.dynamics.is_scalar and self.admissible.revisit
+        return "history" if scalar and self.admissible.can_unroll else "vector"
 
-    paths: np.ndarray
-    gap: np.ndarray
+    @property
+    def length_cost(self) -> np.ndarray:
+        """Cost of the length of each move, (move,)."""
+        return self.objective.length_weight * self.admissible.lengths
 
 
 def plan_compiled(
@@ -45,58 +59,194 @@ def plan_compiled(
     dynamics: Dynamics,
     objective: Objective,
     risk: RiskTable | None = None,
-) -> BestPaths | None:
+) -> Best | None:
     """Find the best path of every draw; `dynamics` with a leading axis (draw,).
 
-    None if no path is feasible under a risk.
+    None if no path is feasible under a risk, which no draw changes.
     """
-    if risk is not None:
-        return _within_risk(admissible, dynamics, objective, risk)
-    length_cost = objective.length_weight * admissible.lengths
-    if objective.name == "lost_contact" and objective.has_labels and dynamics.is_scalar:
-        if admissible.revisit:
-            return _least_loss(admissible, dynamics, objective, length_cost)
-    if objective.has_labels or (objective.name != "stationary" and len(dynamics.views) > 1):
-        return _labelled(admissible, dynamics, objective, length_cost)
-    if objective.name == "stationary":
-        _, paths = best_stationary(
-            lambda part: admissible.masked(dynamics.take(part).steady_state()),
-            len(dynamics.start),
-            admissible.passable,
-            length_cost,
-            admissible.steps,
-            admissible.flat(admissible.start),
-            admissible.flat(admissible.goal),
-        )
-    else:
-        weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
-        drift = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
-        paths = _best_of_lengths(admissible, drift, weights, length_cost)
-    return BestPaths(paths, np.zeros(len(paths)))
+    case = Case(admissible, dynamics, objective, risk)
+    best = SEARCHES[case.kind, risk is not None](case)
+    missing = best.paths[:, 0] < 0
+    if (missing & (best.lower < np.inf)).any():
+        raise _too_many_labels(case)
+    return None if missing.any() else best
 
 
-def _within_risk(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, risk: RiskTable
-) -> BestPaths | None:
-    length_cost = objective.length_weight * admissible.lengths
-    if objective.name == "stationary":
-        cost = entry_cost(admissible.passable, dynamics)
-        return _found(plan_stationary(admissible, cost, length_cost, risk), admissible)
-    scalar = dynamics.is_scalar if objective.has_labels else len(dynamics.views) == 1
-    if not scalar or (objective.has_labels and not admissible.revisit):
-        return _labelled(admissible, dynamics, objective, length_cost, risk)
-    return _found(plan_layered(admissible, dynamics, objective, risk), admissible)
+def _sums(case: Case) -> Best:
+    dynamics, longest = case.dynamics, case.admissible.longest
+    weights = additive_weights(dynamics, dynamics.views[0], case.objective, longest)
+    drift = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
+    return _best_of_lengths(case, drift, weights)
 
 
-def _found(found: list[Best], admissible: AdmissiblePaths) -> BestPaths | None:
-    """Paths and gaps of all draws, None if no path is feasible, which no draw changes."""
-    require_complete(found, admissible.longest)
-    if not all(len(best.path) for best in found):
-        return None
-    paths = np.full((len(found), max(len(best.path) for best in found)), -1, np.int64)
+def _best_of_lengths(case: Case, drift: np.ndarray, weights: Weights) -> Best:
+    layers, length_cost = case.admissible.layers, case.length_cost
+    lengths = np.arange(case.admissible.shortest, case.admissible.longest + 1)
+    if not length_cost.any() or (weights.scale == 1.0).all():
+        scores, paths = best_additive(layers, drift, weights, length_cost, lengths)
+        return Best(paths, -scores, -scores)
+    # A mean divides by the number of bounds, so its length cost is scaled for each of them.
+    tries = [
+        best_additive(layers, drift, weights, n * length_cost, lengths[i : i + 1])
+        for i, n in enumerate(lengths)
+    ]
+    scores = np.stack([scores for scores, _ in tries])
+    chosen = np.argmax(scores, axis=0)
+    paths = np.stack([tries[i][1][d] for d, i in enumerate(chosen)])
+    return Best(paths, -scores.max(0), -scores.max(0))
+
+
+def _sums_within(case: Case) -> Best:
+    dynamics, longest = case.dynamics, case.admissible.longest
+    weights = additive_weights(dynamics, dynamics.views[0], case.objective, longest)
+    u = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
+    return _best_sums(
+        case, [w @ of_draw for w, of_draw in zip(weights.per_bound, u, strict=True)], weights
+    )
+
+
+def _best_sums(case: Case, gains: list[np.ndarray], weights: Weights) -> Best:
+    """Find the paths of the largest (constant + sum of gains) / scale less their length cost.
+
+    Gains (left, bound) or (left, cell) of each draw, by the bounds left after a bound.
+    """
+    layers, scale = case.admissible.layers, weights.scale
+    lengths = np.flatnonzero(layers.starts >= 0)
+    left, bound = layers.rank[layers.head], layers.bound
+    cell, length_cost = layers.cell[layers.head], case.length_cost[layers.move]
+    resources, n_cells = _resources(case, layers), case.admissible.passable.size
+    groups = [lengths] if (scale == 1.0).all() else lengths[:, None]
+    found: list[Best] = [_nothing()] * len(gains)
+
+    def work(first: int, last: int) -> None:
+        for d in range(first, last):
+            of_edges = gains[d][left, bound if gains[d].shape[1] > n_cells else cell]
+            for group in groups:
+                start_cost = np.full((1, len(scale)), np.inf)
+                start_cost[0, group] = -weights.constant[d, group] / scale[group]
+                toll = (length_cost - of_edges / scale[group[0]])[None]
+                found[d] = _better(
+                    solve(_of_sums(layers, toll, start_cost, resources), found[d].cost), found[d]
+                )
+
+    over_rows(work, len(found)) if len(found) > 1 else work(0, 1)
+    return _together(found)
+
+
+def _of_sums(
+    graph: Graph, toll: np.ndarray, start_cost: np.ndarray, resources: Resources
+) -> SearchProblem:
+    """Problem of tolls (draw, edge) alone."""
+    trust = np.repeat([[0.0, 0.0, 1.0]], len(toll), axis=0)
+    return SearchProblem(graph, toll, np.zeros((1, 1)), start_cost, trust, NONE, resources)
+
+
+def _nothing() -> Best:
+    return Best(np.full((1, 1), -1), np.array([np.inf]), np.array([np.inf]))
+
+
+def _better(new: Best, old: Best) -> Best:
+    """The new path of one draw if there is one, else the old one, with the lower of both limits."""
+    paths = new.paths if new.paths[0, 0] >= 0 else old.paths
+    return Best(paths, np.minimum(new.cost, old.cost), np.minimum(new.lower, old.lower))
+
+
+def _together(found: list[Best]) -> Best:
+    """Best paths of several draws, in one table."""
+    paths = np.full((len(found), max(best.paths.shape[1] for best in found)), -1)
     for row, best in zip(paths, found, strict=True):
-        row[: len(best.path)] = best.path
-    return BestPaths(paths, np.array([best.cost - best.bound for best in found]))
+        row[: best.paths.shape[1]] = best.paths[0]
+    return Best(
+        paths,
+        np.concatenate([best.cost for best in found]),
+        np.concatenate([best.lower for best in found]),
+    )
+
+
+def _history(case: Case) -> Best:
+    layers, dynamics = case.admissible.layers, case.dynamics
+    n_draws = len(dynamics.start)
+    start_cost = np.full((1, len(layers.starts)), np.inf)
+    start_cost[0, layers.starts >= 0] = 0.0
+    sd = np.maximum(dynamics.noise_sd, TINY_SD)
+    trust = np.stack([dynamics.transition[:, 0, 0], dynamics.start[:, 0], sd], axis=1)
+    toll = np.zeros((1, len(layers.head)))
+    if case.length_cost.any():
+        toll = case.length_cost[layers.move][None]
+    drift = plain(dynamics.drift[:, 0].reshape(n_draws, -1))
+    return solve(
+        SearchProblem(
+            layers, toll, drift, start_cost, trust, _loss_of(case.objective),
+            _resources(case, layers),
+        )
+    )  # fmt: skip
+
+
+def _loss_of(objective: Objective) -> int:
+    """Loss of a bound for an objective of the whole history."""
+    if objective.name == "lost_contact":
+        return EXPECTED[objective.family.expected_rate]
+    return {"success": SOFTPLUS, "bottleneck": LEAST}[objective.name]
+
+
+def _resources(case: Case, graph: Graph) -> Resources:
+    """Risks of bounds as resources on a graph; none without a risk."""
+    admissible, risk = case.admissible, case.risk
+    if risk is None:
+        return no_resources(graph, len(admissible.steps) * admissible.passable.size)
+    of_bounds = np.ascontiguousarray(risk.of_bounds.reshape(len(risk.limits), -1).T)
+    return Resources(
+        of_bounds,
+        risk.limits,
+        risk.needed,
+        float(risk.failure_cost),
+        *risk.priced(of_bounds),
+        safest_to_go(graph, of_bounds),
+    )
+
+
+def _vector(case: Case) -> Best:
+    grid = case.admissible.grid
+    resources = _resources(case, grid)
+    of_cells = np.full((case.admissible.passable.size, len(resources.limits)), np.inf)
+    of_cells[grid.cell] = resources.safest
+    resources = resources._replace(safest=of_cells)
+    return labels_vector.best_paths(case.admissible, case.dynamics, case.objective, resources)
+
+
+def _free(case: Case) -> Best:
+    admissible, dynamics = case.admissible, case.dynamics
+    totals, paths = best_stationary(
+        lambda part: admissible.masked(dynamics.take(part).steady_state()),
+        len(dynamics.start),
+        admissible.passable,
+        case.length_cost,
+        admissible.steps,
+        admissible.flat(admissible.start),
+        admissible.flat(admissible.goal),
+    )
+    return Best(paths, totals, totals)
+
+
+def _free_within(case: Case) -> Best:
+    grid, cost = case.admissible.grid, entry_cost(case.admissible.passable, case.dynamics)
+    cost = cost.reshape(len(cost), -1)
+    by_bound = cost.shape[1] > case.admissible.passable.size
+    toll = cost[:, grid.bound if by_bound else grid.cell[grid.head]] + case.length_cost[grid.move]
+    return solve(_of_sums(grid, toll, np.zeros((1, 1)), _resources(case, grid)))
+
+
+SEARCHES = {
+    ("sum", False): _sums,
+    ("sum", True): _sums_within,
+    ("history", False): _history,
+    ("history", True): _history,
+    ("vector", False): _vector,
+    ("vector", True): _vector,
+    ("free", False): _free,
+    ("free", True): _free_within,
+}
+"""Search by the kind of a problem, and whether there is a risk."""
 
 
 def expected_path(
@@ -113,169 +263,44 @@ def expected_path(
     Returns:
         Flat indices of cells, filled with -1; None if no path is feasible under a risk.
     """
+    case = Case(admissible, dynamics, objective, risk)
     weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
     u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
     # E[w_j . u] for every number of bounds left j, move and cell: one state for every j.
     gain = np.einsum("djs,dsmc->jmc", weights.per_bound, np.nan_to_num(u)) / len(u)
     pick = np.eye(admissible.longest + 1)[None]
     averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
-    length_cost = objective.length_weight * admissible.lengths
-    if risk is not None:
-        by_left = gain.reshape(len(gain), -1)
-        search = LayeredSearch(admissible, risk, length_cost)
-        best = _found([search.sums(by_left, averaged.constant[0], averaged.scale)], admissible)
-        return None if best is None else best.paths[0]
-    return _best_of_lengths(admissible, gain[None], averaged, length_cost)[0]
-
-
-def _best_of_lengths(
-    admissible: AdmissiblePaths, drift: np.ndarray, weights: Weights, length_cost: np.ndarray
-) -> np.ndarray:
-    lengths = np.arange(admissible.shortest, admissible.longest + 1)
-    if not length_cost.any() or (weights.scale == 1.0).all():
-        return best_additive(admissible.layers, drift, weights, length_cost, lengths)[1]
-    # A mean divides by the number of bounds, so its length cost is scaled for each of them.
-    tries = [
-        best_additive(admissible.layers, drift, weights, n * length_cost, lengths[i : i + 1])
-        for i, n in enumerate(lengths)
-    ]
-    best = np.argmax([scores for scores, _ in tries], axis=0)
-    return np.stack([tries[i][1][d] for d, i in enumerate(best)])
-
-
-def _least_loss(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, length_cost: np.ndarray
-) -> BestPaths:
-    losses, paths = least_loss(
-        admissible.layers,
-        dynamics.drift[:, 0].reshape(len(dynamics.start), dynamics.drift.shape[2], -1),
-        dynamics.transition[:, 0, 0],
-        dynamics.start[:, 0],
-        dynamics.noise_sd,
-        length_cost,
-        LAWS[objective.family.expected_rate],
-        _MAX_LABELS,
-    )
-    if np.isnan(losses).any():
-        raise _too_many_labels(admissible.longest)
-    return BestPaths(paths, np.zeros(len(paths)))
-
-
-def _labelled(
-    admissible: AdmissiblePaths,
-    dynamics: Dynamics,
-    objective: Objective,
-    length_cost: np.ndarray,
-    risk: RiskTable | None = None,
-) -> BestPaths | None:
-    n_draws = len(dynamics.start)
-    found: list[tuple[np.ndarray, float]] = [(np.empty(0), np.nan)] * n_draws
-
-    def work(first: int, last: int) -> None:
-        for d in range(first, last):
-            found[d] = _label_one(admissible, dynamics.take(d), objective, length_cost, label_risk)
-
-    label_risk = _label_risk(admissible, risk)
-    work(0, n_draws) if n_draws == 1 else over_rows(work, n_draws)
-    if not all(len(path) for path, _ in found):
-        return None
-    paths = np.full((n_draws, max(len(path) for path, _ in found)), -1, np.int64)
-    for d, (path, _) in enumerate(found):
-        paths[d, : len(path)] = path
-    return BestPaths(paths, np.array([gap for _, gap in found]))
-
-
-def _label_risk(admissible: AdmissiblePaths, risk: RiskTable | None) -> LabelRisk:
-    """Risks of bounds for the label search; none without a risk."""
-    n_cells = admissible.passable.size
     if risk is None:
-        return LabelRisk(np.empty((0, 0)), np.empty(0), 0, 0.0, np.empty((n_cells, 0)))
-    of_bounds = np.ascontiguousarray(risk.of_bounds.reshape(len(risk.limits), -1).T)
-    safest = least_to_goal(admissible.neighbours, of_bounds, admissible.flat(admissible.goal))
-    return LabelRisk(of_bounds, risk.limits, risk.needed, risk.failure_cost, safest)
+        return _best_of_lengths(case, gain[None], averaged).paths[0]
+    best = _best_sums(case, [gain.reshape(len(gain), -1)], averaged)
+    if best.paths[0, 0] >= 0:
+        return best.paths[0]
+    if best.lower[0] < np.inf:
+        raise _too_many_labels(case)
+    return None
 
 
-def _label_one(
-    admissible: AdmissiblePaths,
-    dynamics: Dynamics,
-    objective: Objective,
-    length_cost: np.ndarray,
-    risk: LabelRisk,
-) -> tuple[np.ndarray, float]:
-    """Find the best path of one draw and its optimality gap."""
-    lengths = [admissible.longest]
-    if not objective.has_labels:
-        lengths = list(range(admissible.shortest, admissible.longest + 1))
-    best, best_score, best_bound = np.empty(0, np.int64), -np.inf, -np.inf
-    for n_bounds in lengths:
-        scale = n_bounds if objective.name == "mean" else 1
-        problem = _label_search(
-            admissible, dynamics, objective, n_bounds, scale * length_cost, risk
-        )
-        path, cost, bound = _search_within_limit(problem)
-        each = n_bounds if objective.name == "lost_contact" and not objective.has_labels else 0
-        if len(path) and -cost / scale - each > best_score:
-            best, best_score = path, -cost / scale - each
-        best_bound = max(best_bound, -bound / scale - each)
-    if not len(best):
-        if best_bound > -np.inf:
-            raise _too_many_labels(admissible.longest)
-        return best, 0.0
-    return best, best_bound - best_score
+def safest_path(
+    admissible: AdmissiblePaths, objective: str, of_bounds: np.ndarray
+) -> tuple[tuple[Cell, ...], float]:
+    """Find the admissible path with the least sum of a risk (move, cell), and this sum."""
+    graph = admissible.grid if objective == "stationary" else admissible.layers
+    start_cost = np.full((1, len(graph.starts)), np.inf)
+    start_cost[0, graph.starts >= 0] = 0.0
+    toll = of_bounds.ravel()[graph.bound][None]
+    best = solve(_of_sums(graph, toll, start_cost, no_resources(graph, of_bounds.size)))
+    path = admissible.cells(best.paths[0])
+    rows, cols = np.array(path[1:]).T
+    moves = [admissible.steps.tolist().index([c[0] - a[0], c[1] - a[1]]) for a, c in pairwise(path)]
+    return path, float(of_bounds[moves, rows * admissible.passable.shape[1] + cols].sum())
 
 
-def _label_search(
-    admissible: AdmissiblePaths,
-    dynamics: Dynamics,
-    objective: Objective,
-    n_bounds: int,
-    length_cost: np.ndarray,
-    risk: LabelRisk,
-) -> LabelSearch:
-    goal = admissible.flat(admissible.goal)
-    at_goal = objective.name == "terminal"
-    return LabelSearch(
-        mode_of(objective),
-        plain(dynamics.transition),
-        plain(dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)),
-        plain(dynamics.start),
-        dynamics.views,
-        dominance_tests(dynamics, n_bounds),
-        build_heuristic(dynamics, n_bounds, admissible.neighbours, goal, at_goal=at_goal),
-        admissible.neighbours,
-        length_cost,
-        admissible.bounds_to_goal.ravel(),
-        admissible.flat(admissible.start),
-        goal,
-        n_bounds,
-        admissible.u_turns,
-        admissible.revisit or not objective.has_labels,
-        max(float(dynamics.noise_sd), TINY_SD),
-        risk,
-    )
-
-
-def _search_within_limit(problem: LabelSearch) -> tuple[np.ndarray, float, float]:
-    """Search exactly, or with the least tolerance that stays within the limit on labels."""
-    if not len(problem.heuristic.powers) and problem.mode >= TERMINAL:
-        raise TrustboError(
-            f"a team's least trust over {problem.max_bounds} bounds on {len(problem.to_goal)} "
-            "cells is too much for sums over paths; use larger cells, or team='mean'."
-        )
-    if not problem.revisit:
-        # If the best walk of all enters no cell twice, it is the best simple path too.
-        free = search(problem._replace(revisit=True), 0.0, _MAX_LABELS)
-        if free.path is not None and len(set(free.path.tolist())) == len(free.path):
-            return free.path, free.cost, free.bound
-    for tolerance in _TOLERANCES:
-        found = search(problem, tolerance, _MAX_LABELS)
-        if found.path is not None:
-            return found.path, found.cost, found.bound
-    raise _too_many_labels(problem.max_bounds)
-
-
-def _too_many_labels(longest: int) -> TrustboError:
+def _too_many_labels(case: Case) -> TrustboError:
+    """Error of a search that reached the limit on labels without a path."""
+    where, instead = "", "team='mean'"
+    if case.risk is not None:
+        where, instead = " under max_failure", "no confidence"
     return TrustboError(
-        f"more than {_MAX_LABELS} partial paths are worth keeping; lower max_bounds = "
-        f"{longest}, use larger cells, or team='mean'."
+        f"more than {labels.MAX_LABELS} partial paths are worth keeping{where}; lower max_bounds = "
+        f"{case.admissible.longest}, use larger cells, or {instead}."
     )

@@ -1,213 +1,192 @@
-"""Costs to go on the layered DAG: least sums of tolls, losses and risks from each node on.
+"""Costs to go: least sums of tolls, losses and resources from each node to the goal.
 
-By dynamic programming from the goal, in the order of the bounds left. A bound costs its toll and a
-loss l(x) that falls in the trust x after it; costs to go hold for the largest trust `hi` with which
-a node can be entered, and with less they grow by at least `slope` for each unit that lacks.
+By passes over the nodes in the order of their rank: one where the graph is layered, else as many as
+change anything (Bellman 1958). A bound costs its toll and a loss l(x) that falls in the trust x
+after it; costs to go hold for the largest trust `hi` with which a node can be entered, and with
+less they grow by at least a slope for each unit that lacks. With beta0 >= 0, let a node be entered
+at x <= hi. Then
+
+    loss of entering it >= W + m (hi - x),  W = l(hi), m the least -l' on [lo, hi],
+    losses after it     >= V + s (hi - x),  s = beta0 min (m' + s') over the heads of its edges,
+
+the latter by induction from the goal, where V = s = 0: an edge at x leads to x' = beta0 x + u,
+which lacks beta0 times as much. Both hold from any x, so U-turns may be allowed or not.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from trustbo.parallel import PART
-from trustbo.planning.search.contact_loss import expected_loss, least_slope
-from trustbo.planning.search.layers import Layers
+from trustbo.planning.search.graph import Costs, Graph, Resources, drift_of, filled
+from trustbo.planning.search.losses import LEAST, NONE, least_slope, loss_of
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
-SOFTPLUS, LEAST, NONE = range(2, 5)
-"""Losses beside those of `contact_loss`: -log sigma(x); the largest -x; and none."""
-
-
-class Bounds(NamedTuple):
-    """Costs of the edges of the DAG, under one draw."""
-
-    toll: np.ndarray  # (edge,)
-    drift: np.ndarray  # (edge,)
-    start_cost: np.ndarray  # (length,), of a path by its number of bounds; inf: not admissible
-    beta0: float
-    x0: float
-    noise_sd: float
-    law: int
-
-
-class EdgeRisk(NamedTuple):
-    """Risk of the edges, and the least to come."""
-
-    of_bounds: np.ndarray  # (bound, resource)
-    bound: np.ndarray  # (edge,), index of its bound
-    priced: np.ndarray  # (bound,), a sum that no feasible path has above
-    priced_limit: float
-    limits: np.ndarray  # (resource,)
-    needed: int
-    failure_cost: float
-    safest: np.ndarray  # (node, resource), least sums from a node to the goal
+_inlined = njit(nogil=True, error_model="numpy", inline="always")  # no counts of references
 
 
 class Ahead(NamedTuple):
     """Trust with which nodes can be entered, and what its lack costs at least."""
 
-    hi: np.ndarray  # (node,)
-    slope: np.ndarray  # (node,), of the losses after the node
-    after: np.ndarray  # (edge,), trust after the edge from `hi`
-    loss: np.ndarray  # (edge,), its loss
+    hi: np.ndarray  # (node,), -inf: on no path
+    loss: np.ndarray  # (node,), W: loss of entering the node at `hi`
+    fall: np.ndarray  # (node,), m: least rise of that loss for each unit of trust that lacks
+    slope: np.ndarray  # (node,), s: the same of the losses after the node
+    of_edge: np.ndarray  # (edge,), loss of an edge from `hi`; (0,) where W and m stand for it
 
 
 class ToGo(NamedTuple):
-    """Least cost from each node to the goal at some price, (node,)."""
+    """Least cost from each node to the goal with some tolls."""
 
-    price: np.ndarray  # (edge,), toll with the price of risk
-    best: np.ndarray
-    second: np.ndarray  # by another first move than that of `best`
-    by: np.ndarray  # first move of `best`, -1 at the goal
+    toll: np.ndarray  # (edge,), with the prices of resources
+    best: np.ndarray  # (node,)
+    second: np.ndarray  # (node,), by another first move than that of `best`
+    by: np.ndarray  # (node,), first move of `best`, -1 at the goal
 
 
 @_compiled
-def safest_to_go(layers: Layers, of_bounds: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """Least sum of each risk (bound, resource) from each node to the goal, (node, resource)."""
-    n_nodes, n_risks = len(layers.cell), of_bounds.shape[1]
-    safest = np.empty((n_nodes, n_risks))
+def safest_to_go(graph: Graph, of_bounds: np.ndarray) -> np.ndarray:
+    """Least sum of each resource (bound, resource) from each node to the goal, (node, resource)."""
+    n_nodes, n_resources = len(graph.rank), of_bounds.shape[1]
+    safest = np.empty((n_nodes, n_resources))
     for node in range(n_nodes):
-        for k in range(n_risks):
-            safest[node, k] = 0.0 if layers.left[node] == 0 else np.inf
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, b = layers.head[e], bound[e]
-            for k in range(n_risks):
-                safest[node, k] = min(safest[node, k], of_bounds[b, k] + safest[h, k])
+        for k in range(n_resources):
+            safest[node, k] = 0.0 if graph.rank[node] == 0 else np.inf
+    changed = n_resources > 0
+    while changed:
+        changed = False
+        for node in range(n_nodes):
+            for e in range(graph.first[node], graph.first[node + 1]):
+                h, b = graph.head[e], graph.bound[e]
+                for k in range(n_resources):
+                    value = of_bounds[b, k] + safest[h, k]
+                    if value < safest[node, k]:
+                        safest[node, k], changed = value, not graph.layered
     return safest
 
 
 @_part
-def any_start(layers: Layers, bounds: Bounds, risk: EdgeRisk) -> bool:
+def any_start(graph: Graph, costs: Costs, resources: Resources) -> bool:
     """Whether the safest path, resource by resource, could be feasible."""
-    nothing = np.zeros(len(risk.limits))
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] < np.inf:
-            if can_be_feasible(risk, nothing, node):
+    nothing = filled(len(resources.limits), 0.0)
+    for length in range(len(graph.starts)):
+        node = graph.starts[length]
+        if node >= 0 and costs.start_cost[length] < np.inf:
+            if can_be_feasible(resources, nothing, node):
                 return True
     return False
 
 
-@_part
-def can_be_feasible(risk: EdgeRisk, so_far: np.ndarray, node: int) -> bool:
-    """Whether enough risks, summed up to a node, can stay within their limits."""
+@_inlined
+def can_be_feasible(resources: Resources, so_far: np.ndarray, node: int) -> bool:
+    """Whether enough sums, up to a node, can stay within their limits."""
     within = 0
-    for k in range(len(risk.limits)):
-        if so_far[k] + risk.safest[node, k] <= risk.limits[k]:
+    for k in range(len(resources.limits)):
+        if so_far[k] + resources.safest[node, k] <= resources.limits[k]:
             within += 1
-    return within >= risk.needed
+    return within >= resources.needed
 
 
 @_part
-def loss_of(law: int, x: float, sd: float) -> float:
-    """Loss of a bound after which trust is x, under noise of that sd."""
-    if law == NONE:
-        return 0.0
-    if law == LEAST:
-        return -x
-    if law == SOFTPLUS:
-        return max(-x, 0.0) + math.log1p(math.exp(-abs(x)))
-    return expected_loss(law, x, sd)
+def look_ahead(graph: Graph, costs: Costs, by_edge: bool) -> Ahead:
+    """Trust at the nodes, from the start on, then what its lack costs, from the goal on.
 
-
-@_part
-def _slope(law, lo, hi, sd):
-    """Least fall of the loss with trust, between lo and hi."""
-    if law == NONE or law == LEAST:
-        return 0.0
-    if law == SOFTPLUS:
-        return 1.0 / (1.0 + math.exp(hi)) if hi < 700.0 else 0.0
-    return least_slope(law, lo, hi, sd)
-
-
-@_part
-def joined(law: int, loss: float, to_come: float) -> float:
-    """Loss so far and to come, together."""
-    return max(loss, to_come) if law == LEAST else loss + to_come
-
-
-@_part
-def look_ahead(layers: Layers, bounds: Bounds) -> Ahead:
-    """Trust at the nodes, from the start on, then what its lack costs, from the goal on."""
-    n_nodes, n_edges, law = len(layers.cell), len(layers.head), bounds.law
-    hi, lo, slope = np.full(n_nodes, -np.inf), np.full(n_nodes, np.inf), np.zeros(n_nodes)
-    after, loss = np.zeros(n_edges), np.zeros(n_edges)
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] < np.inf:
-            hi[node] = lo[node] = bounds.x0
-    for node in range(n_nodes - 1, -1, -1):
-        if hi[node] == -np.inf:  # on no path
+    With `by_edge`, losses are those of edges: closer, and more of them.
+    """
+    n_nodes, loss = len(graph.rank), costs.loss
+    hi, lo = filled(n_nodes, -np.inf), filled(n_nodes, np.inf)
+    own, fall, slope = filled(n_nodes, 0.0), filled(n_nodes, 0.0), filled(n_nodes, 0.0)
+    of_edge = filled(len(graph.head) if by_edge and loss != NONE else 0, 0.0)
+    if loss == NONE and not graph.layered:
+        return Ahead(own, own, fall, slope, of_edge)
+    for length in range(len(graph.starts)):
+        node = graph.starts[length]
+        if node >= 0 and costs.start_cost[length] < np.inf:
+            hi[node] = lo[node] = costs.x0
+    # Arrays of records by names of their own: a loop counts the references of a record's.
+    first, head, cell, bound, drift = graph.first, graph.head, graph.cell, graph.bound, costs.drift
+    beta0, by_bound, sd = costs.beta0, costs.by_bound, costs.noise_sd
+    for node in range(n_nodes - 1, -1, -1):  # from the start: a layered graph's tails come first
+        if hi[node] == -np.inf:
             continue
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h = layers.head[e]
-            after[e] = bounds.beta0 * hi[node] + bounds.drift[e]
-            loss[e] = loss_of(law, after[e], bounds.noise_sd)
-            hi[h] = max(hi[h], after[e])
-            lo[h] = min(lo[h], bounds.beta0 * lo[node] + bounds.drift[e])
-    if law != NONE and law != LEAST:
-        own = np.zeros(n_nodes)
-        for node in range(n_nodes):
+        for e in range(first[node], first[node + 1]):
+            h = head[e]
+            if loss == NONE:
+                hi[h] = 0.0
+                continue
+            u = drift[bound[e]] if by_bound else drift[cell[h]]
+            hi[h] = max(hi[h], beta0 * hi[node] + u)
+            lo[h] = min(lo[h], beta0 * lo[node] + u)
+            if by_edge:
+                of_edge[e] = loss_of(loss, beta0 * hi[node] + u, sd)
+    for node in range(n_nodes if loss != NONE else 0):
+        if hi[node] == -np.inf:
+            continue
+        if not by_edge:
+            own[node] = loss_of(loss, hi[node], sd)
+        fall[node] = least_slope(loss, lo[node], hi[node], sd)
+        if loss == LEAST:  # the largest loss alone counts, and later ones need not be larger
+            continue
+        least = 0.0 if node == 0 else np.inf
+        for e in range(first[node], first[node + 1]):
+            least = min(least, fall[head[e]] + slope[head[e]])
+        slope[node] = beta0 * least if least < np.inf else 0.0
+    return Ahead(hi, own, fall, slope, of_edge)
+
+
+@_part
+def pass_back(graph: Graph, costs: Costs, ahead: Ahead, toll: np.ndarray) -> ToGo:
+    """Compute the least cost to go of every node with some tolls."""
+    n_nodes, loss = len(graph.rank), costs.loss
+    best, second, by = filled(n_nodes, np.inf), filled(n_nodes, np.inf), np.empty(n_nodes, np.int8)
+    for node in range(n_nodes):
+        by[node] = -1
+    best[0] = second[0] = -np.inf if loss == LEAST else 0.0
+    first, head, move = graph.first, graph.head, graph.move
+    cell, bound, drift = graph.cell, graph.bound, costs.drift
+    beta0, by_bound, u_turns, last = costs.beta0, costs.by_bound, graph.u_turns, graph.n_moves - 1
+    hi, own, fall, slope, of_edge = ahead
+    changed, backwards, by_edge = True, False, len(of_edge) > 0
+    while changed:
+        changed = False
+        for i in range(1, n_nodes):
+            node = n_nodes - i if backwards else i
             if hi[node] == -np.inf:
                 continue
-            own[node] = _slope(law, lo[node], hi[node], bounds.noise_sd)
-            least = 0.0 if layers.left[node] == 0 else np.inf
-            for e in range(layers.first[node], layers.first[node + 1]):
-                h = layers.head[e]
-                least = min(least, own[h] + slope[h])
-            slope[node] = bounds.beta0 * least if least < np.inf else 0.0
-    return Ahead(hi, slope, after, loss)
+            least, next_least, chosen = np.inf, np.inf, np.int8(-1)
+            for e in range(first[node], first[node + 1]):
+                h, m = head[e], move[e]
+                total = best[h] if u_turns or by[h] != last - m else second[h]
+                if loss != NONE:
+                    after = beta0 * hi[node] + (drift[bound[e]] if by_bound else drift[cell[h]])
+                    lack = hi[h] - after
+                    enters = of_edge[e] if by_edge else own[h] + fall[h] * lack
+                    total += slope[h] * lack
+                    total = max(enters, total) if loss == LEAST else enters + total
+                total += toll[e]
+                if total < least:
+                    least, next_least, chosen = total, least, m
+                elif total < next_least:
+                    next_least = total
+            changed = changed or (least < best[node] and not graph.layered)
+            best[node], second[node], by[node] = least, next_least, chosen
+        backwards = not backwards
+    return ToGo(toll, best, second, by)
 
 
 @_part
-def pass_back(layers: Layers, law: int, ahead: Ahead, price: np.ndarray) -> ToGo:
-    """Compute the least cost to go of every node at a price, in the order of the bounds left."""
-    n_nodes = len(layers.cell)
-    to_go = ToGo(
-        price, np.full(n_nodes, np.inf), np.full(n_nodes, np.inf), np.full(n_nodes, -1, np.int8)
-    )
-    for node in range(n_nodes):
-        if layers.left[node] == 0:
-            to_go.best[node] = to_go.second[node] = -np.inf if law == LEAST else 0.0
-            continue
-        if ahead.hi[node] == -np.inf:
-            continue
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, m = layers.head[e], layers.move[e]
-            to_come = least_to_come(layers, to_go, h, m) + ahead.slope[h] * (
-                ahead.hi[h] - ahead.after[e]
-            )
-            total = price[e] + joined(law, ahead.loss[e], to_come)
-            if total < to_go.best[node]:
-                to_go.second[node] = to_go.best[node]
-                to_go.best[node], to_go.by[node] = total, m
-            elif total < to_go.second[node]:
-                to_go.second[node] = total
-    return to_go
-
-
-@_part
-def least_to_come(layers: Layers, to_go: ToGo, node: int, move: int) -> float:
-    """Least cost after a node that was entered by a move, from the largest trust."""
-    if layers.u_turns or to_go.by[node] != layers.n_moves - 1 - move:
-        return to_go.best[node]
-    return to_go.second[node]
-
-
-@_part
-def least_trust(layers: Layers, bounds: Bounds, aim: float) -> np.ndarray:
+def least_trust(graph: Graph, costs: Costs, aim: float) -> np.ndarray:
     """Least trust at nodes with which losses -x can stay below an aim, (node,); else infinite."""
-    need = np.full(len(layers.cell), np.inf)
+    need = filled(len(graph.rank), np.inf)
     for node in range(len(need)):
-        if layers.left[node] == 0:
+        if graph.rank[node] == 0:
             need[node] = -aim
-        for e in range(layers.first[node], layers.first[node + 1]):
-            lack = need[layers.head[e]] - bounds.drift[e]
-            if bounds.beta0 > 0.0:
-                need[node] = min(need[node], lack / bounds.beta0)
+        for e in range(graph.first[node], graph.first[node + 1]):
+            lack = need[graph.head[e]] - drift_of(graph, costs, e)
+            if costs.beta0 > 0.0:
+                need[node] = min(need[node], lack / costs.beta0)
             elif lack <= 0.0:
                 need[node] = -np.inf
         need[node] = max(need[node], -aim)
@@ -215,33 +194,32 @@ def least_trust(layers: Layers, bounds: Bounds, aim: float) -> np.ndarray:
 
 
 @_part
-def with_safest(layers: Layers, bounds: Bounds, risk: EdgeRisk, need: np.ndarray) -> EdgeRisk:
+def with_safest(graph: Graph, costs: Costs, resources: Resources, need: np.ndarray) -> Resources:
     """Replace the safest completions by those over edges which leave the trust that nodes need."""
-    n_nodes, n_risks = len(layers.cell), len(risk.limits)
-    hi, safest = np.full(n_nodes, -np.inf), np.full((n_nodes, n_risks), np.inf)
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] < np.inf:
-            hi[node] = bounds.x0
+    n_nodes, n_resources = len(graph.rank), len(resources.limits)
+    hi, safest = filled(n_nodes, -np.inf), np.empty((n_nodes, n_resources))
+    for length in range(len(graph.starts)):
+        node = graph.starts[length]
+        if node >= 0 and costs.start_cost[length] < np.inf:
+            hi[node] = costs.x0
     for node in range(n_nodes - 1, -1, -1):
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, x = layers.head[e], bounds.beta0 * hi[node] + bounds.drift[e]
+        for e in range(graph.first[node], graph.first[node + 1]):
+            h, x = graph.head[e], costs.beta0 * hi[node] + drift_of(graph, costs, e)
             hi[h] = max(hi[h], x) if x >= need[h] else hi[h]
     for node in range(n_nodes):
-        if layers.left[node] == 0:
-            safest[node, :] = 0.0
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, b = layers.head[e], risk.bound[e]
-            if bounds.beta0 * hi[node] + bounds.drift[e] >= need[h]:
-                for k in range(n_risks):
-                    safest[node, k] = min(safest[node, k], risk.of_bounds[b, k] + safest[h, k])
-    return EdgeRisk(
-        risk.of_bounds,
-        risk.bound,
-        risk.priced,
-        risk.priced_limit,
-        risk.limits,
-        risk.needed,
-        risk.failure_cost,
+        for k in range(n_resources):
+            safest[node, k] = 0.0 if graph.rank[node] == 0 else np.inf
+        for e in range(graph.first[node], graph.first[node + 1]):
+            h, b = graph.head[e], graph.bound[e]
+            if costs.beta0 * hi[node] + drift_of(graph, costs, e) >= need[h]:
+                for k in range(n_resources):
+                    safest[node, k] = min(safest[node, k], resources.of_bounds[b, k] + safest[h, k])
+    return Resources(
+        resources.of_bounds,
+        resources.limits,
+        resources.needed,
+        resources.failure_cost,
+        resources.priced,
+        resources.priced_limit,
         safest,
     )

@@ -1,14 +1,28 @@
-"""Lagrangian bounds on paths within a limit on risk, and good paths that they find on the way.
+"""Lagrangian dual of paths within limits on resources, and good paths that it finds on the way.
 
-Bounds on the cost of a path's completions (Handler and Zang 1980; Beasley and Christofides 1989):
-with a price on risk, W(node) is the least sum of tolls, losses and price times risk to come, by
-dynamic programming from the goal, from the largest trust `hi` with which a node can be entered;
-with less trust it grows by at least `slope` (as in `contact_loss`). (a) At price 0, with the
-failure cost of the safest completion. (b) At the price lambda that maximises the bound: a feasible
-completion has lambda (r - limit) <= 0; F (1 - exp(-r)), concave, is replaced by its chord over the
-r that can still be best, which adds its slope to the price.
+Lower limits on the cost of a path's completions (Handler and Zang 1980; Beasley and Christofides
+1989), each by one `pass_back` with prices added to the tolls:
+
+(a) at price 0, with the failure cost of the safest completion;
+(b) at the price lambda that maximises the dual function
+
+        root(lambda) = min over paths [cost + lambda r + chord(r_0)] - lambda limit,
+
+    as a feasible path has lambda (r - limit) <= 0.
+
+| symbol | name | meaning |
+|---|---|---|
+| r, limit | `priced`, `priced_limit` | sum of one resource whose limit every feasible path keeps |
+| lambda | `price` | price of r, >= 0 |
+| r_0 | `first` | sum of the first resource, which has the failure cost F (1 - exp(-r_0)) |
+| F | `failure_cost` | cost of a failure |
+| r_low, r_high | `low`, `high` | least r_0 of any path, and most of any that can still be best |
+| mu, base | `mu`, `base` | chord(r_0) = base + mu r_0 <= F (1 - exp(-r_0)) on [r_low, r_high] |
+| base - lambda limit | `offset` | what (b) adds to the priced cost of a completion |
+| root | `root` | lower limit on the cost of every feasible path |
 
 Each price has a best path; the feasible one of least cost is known before any label is made.
+Without resources, price 0 is the only one, and (a) and (b) are the same.
 """
 
 import math
@@ -19,203 +33,260 @@ from numba import njit
 
 from trustbo.parallel import PART
 from trustbo.planning.search.costs_to_go import (
-    LEAST,
     Ahead,
-    Bounds,
-    EdgeRisk,
     ToGo,
     can_be_feasible,
-    joined,
-    least_to_come,
-    loss_of,
     pass_back,
 )
-from trustbo.planning.search.layers import Layers
+from trustbo.planning.search.graph import Costs, Graph, Resources, filled
+from trustbo.planning.search.losses import LEAST, NONE, joined, loss_of
 
 _part = njit(nogil=True, error_model="numpy", **PART)
-PRICES = 12
-"""Number of prices of risk that are tried."""
+_PRICES = 12
+"""Number of prices that are tried."""
 
 
-class Best(NamedTuple):
-    """Best path: flat indices of cells, none if there is no feasible one; cost and lower bound."""
+class Found(NamedTuple):
+    """Best path known, flat indices of cells; none where there are no cells, and its cost."""
 
     path: np.ndarray
     cost: float
-    bound: float
+
+
+class Dual(NamedTuple):
+    """Lower limits on the costs of completions and of all paths, and the best path seen."""
+
+    known: Found
+    free: ToGo  # (a), price 0
+    priced: ToGo  # (b), best price
+    offset: float  # of (b)
+    root: float
+
+
+class _Tried(NamedTuple):
+    """Path of some costs to go: its cost, first sum, priced sum and whether it is feasible."""
+
+    cost: float
+    first: float
+    used: float
+    feasible: bool
 
 
 @_part
-def _prices(bounds, risk, on_priced, on_first):
-    """Tolls of edges with prices on the priced risk and on that of the first resource."""
-    price = bounds.toll.copy()
-    for e in range(len(price)):
-        b = risk.bound[e]
-        price[e] += on_priced * risk.priced[b] + on_first * risk.of_bounds[b, 0]
-    return price
+def failure(F: float, total: float) -> float:
+    """Failure cost of a path whose first resource sums to `total`."""
+    return -F * math.expm1(-total) if F > 0.0 else 0.0
 
 
 @_part
-def _root(layers, bounds, to_go):
-    """Start node from which the cost to go is least, and that cost."""
-    least, at = np.inf, -1
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] + to_go.best[node] < least:
-            least, at = bounds.start_cost[length] + to_go.best[node], node
-    return least, at
-
-
-@_part
-def _follow(layers, bounds, risk, ahead, to_go, node, cost, path):
-    """Follow the best edges to go; write down the path. Return its cost, risks and priced risk."""
-    law, x, came = bounds.law, bounds.x0, -1
-    total, priced, n = np.zeros(len(risk.limits)), 0.0, layers.left[node]
-    if law == LEAST:
-        cost = -np.inf
-    path[0] = layers.cell[node]
-    for k in range(n):
-        least, chosen, reached = np.inf, -1, 0.0
-        for e in range(layers.first[node], layers.first[node + 1]):
-            h, m = layers.head[e], layers.move[e]
-            if not layers.u_turns and came >= 0 and m == layers.n_moves - 1 - came:
-                continue
-            x_e = bounds.beta0 * x + bounds.drift[e]
-            to_come = least_to_come(layers, to_go, h, m) + ahead.slope[h] * (ahead.hi[h] - x_e)
-            here = joined(law, loss_of(law, x_e, bounds.noise_sd), to_come)
-            here = to_go.price[e] + (max(cost, here) if law == LEAST else here)
-            if here < least:
-                least, chosen, reached = here, e, x_e
-        if chosen < 0:
-            return np.inf, total, priced, 0
-        x, came, node = reached, layers.move[chosen], layers.head[chosen]
-        cost = joined(law, cost, loss_of(law, x, bounds.noise_sd)) + bounds.toll[chosen]
-        for i in range(len(total)):
-            total[i] += risk.of_bounds[risk.bound[chosen], i]
-        priced += risk.priced[risk.bound[chosen]]
-        path[k + 1] = layers.cell[node]
-    return cost, total, priced, n + 1
-
-
-@_part
-def failure(risk: EdgeRisk, total: float) -> float:
-    """Cost of the failures of a path whose bounds' risks of the first kind sum to `total`."""
-    return -risk.failure_cost * math.expm1(-total) if risk.failure_cost > 0.0 else 0.0
-
-
-@_part
-def lagrangian(
-    layers: Layers, bounds: Bounds, risk: EdgeRisk, ahead: Ahead, best: float
-) -> tuple[Best, ToGo, ToGo, float, float]:
-    """Try prices of risk: the best path known, costs to go at price 0 and at the best price.
-
-    Also what (b) adds to the latter, and the bound on all paths.
-    """
-    law, F = bounds.law, risk.failure_cost
-    path = np.empty(len(layers.starts) + 1, np.int64)
-    known = Best(np.empty(0, np.int64), best, best)
-    cheap = pass_back(layers, law, ahead, bounds.toll)
-    least, _ = _root(layers, bounds, cheap)
-    low = np.inf
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] < np.inf:
-            low = min(low, risk.safest[node, 0])
-    high = risk.limits[0]
-    priced, offset, root = cheap, 0.0, least + failure(risk, low)
-    # Local improvement where the price of the first risk is the slope of the failure cost.
-    tangent = F * math.exp(-low)
-    for _ in range(PRICES if F > 0.0 else 0):
-        to_go = pass_back(layers, law, ahead, _prices(bounds, risk, 0.0, tangent))
-        _, start = _root(layers, bounds, to_go)
-        known, _, first, _, _ = _tried(layers, bounds, risk, ahead, to_go, start, known, path)
-        next_tangent = F * math.exp(-first)
-        if abs(next_tangent - tangent) <= 1e-9 * F:
-            break
-        tangent = next_tangent
-    for _ in range(2 if F > 0.0 else 1):
-        # A better path has at most this much of the first risk.
-        if F > 0.0 and known.cost < np.inf:
-            share = (known.cost - least) / F
+def maximise_dual(
+    graph: Graph, costs: Costs, resources: Resources, ahead: Ahead, below: float
+) -> Dual:
+    """Find the price of the best lower limit, and on the way paths that cost less than `below`."""
+    F = resources.failure_cost
+    path = np.empty(_most_cells(graph), np.int64)
+    known = Found(np.empty(0, np.int64), below)
+    free = pass_back(graph, costs, ahead, costs.toll)
+    least, _ = _root(graph, costs, free)
+    low = _safest_of_all(graph, costs, resources) if F > 0.0 else 0.0
+    dual = Dual(known, free, free, 0.0, least + failure(resources.failure_cost, low))  # (a)
+    if len(resources.limits) == 0:  # a good path of every length, as this price is the only one
+        for length in range(len(graph.starts)):
+            start = graph.starts[length]
+            if start >= 0 and costs.start_cost[length] + free.best[start] < known.cost:
+                known, _ = _try(graph, costs, resources, ahead, free, start, known, path)
+        return Dual(known, free, free, 0.0, dual.root)
+    if F == 0.0:
+        return _raise_price(graph, costs, resources, ahead, dual, 0.0, 0.0, path)
+    known = _follow_tangents(graph, costs, resources, ahead, known, low, path)
+    dual = Dual(known, free, free, 0.0, dual.root)
+    high = resources.limits[0]
+    # Two rounds: the paths of the first lower `high`, so that the chord of the second is closer.
+    for _ in range(2):
+        if dual.known.cost < np.inf:
+            # least + F (1 - exp(-r_0)) <= known cost, for any path that is better.
+            share = (dual.known.cost - least) / F
             if share < 1.0:
                 high = min(high, -math.log1p(-max(share, 0.0)))
-        mu, base = 0.0, failure(risk, low)
-        if F > 0.0 and low < high < np.inf:
+        mu, base = 0.0, failure(resources.failure_cost, low)
+        if low < high < np.inf:
             mu = F * (math.exp(-low) - math.exp(-high)) / (high - low)
             base = -F * math.expm1(-low) - mu * low
-        known, priced, offset, root = _dual(
-            layers, bounds, risk, ahead, known, mu, base, priced, offset, root, path
-        )
-        if root >= known.cost:
+        dual = _raise_price(graph, costs, resources, ahead, dual, mu, base, path)
+        if dual.root >= dual.known.cost:
             break
-    return known, cheap, priced, offset, root
+    return dual
 
 
 @_part
-def _tried(layers, bounds, risk, ahead, to_go, start, known, path):
-    """Try the path of some costs to go: the best path known; its cost, risks and if feasible."""
-    cost = 0.0
-    for length in range(len(layers.starts)):
-        if layers.starts[length] == start:
-            cost = bounds.start_cost[length]
-    cost, total, priced, n = _follow(layers, bounds, risk, ahead, to_go, start, cost, path)
-    if n == 0:
-        return known, np.inf, np.inf, np.inf, False
-    feasible = can_be_feasible(risk, total, 0)  # at the goal
-    whole = cost + failure(risk, total[0])
-    if feasible and whole < known.cost:
-        known = Best(path[:n].copy(), whole, whole)
-    return known, cost, total[0], priced, feasible
+def _most_cells(graph):
+    """Largest number of cells of a path that `_follow` may find."""
+    return graph.rank[-1] + 1 if graph.layered else len(graph.rank)
 
 
 @_part
-def _dual(layers, bounds, risk, ahead, known, mu, base, priced, offset, root, path):
-    """Maximise the Lagrangian bound over the price of the limited risk; and see its paths.
+def _safest_of_all(graph, costs, resources):
+    """Least sum of the first resource from the start."""
+    low = np.inf
+    for length in range(len(graph.starts)):
+        node = graph.starts[length]
+        if node >= 0 and costs.start_cost[length] < np.inf:
+            low = min(low, resources.safest[node, 0])
+    return low
 
-    The price is where the lines of the last paths within and beyond the limit meet, or else rises.
+
+@_part
+def _follow_tangents(graph, costs, resources, ahead, known, low, path):
+    """Improve the best path known where the first resource is priced at the failure cost's slope.
+
+    The tangent of the concave cost at the last path's sum, F exp(-r_0), makes it linear; its best
+    path has another sum, and so on until the sum stays: no path then is worse than the last.
     """
-    limit, price = risk.priced_limit, 0.0
-    within_cost, within_used, beyond_cost, beyond_used = np.inf, np.inf, -np.inf, np.inf
-    for _ in range(PRICES if limit < np.inf else 1):
-        to_go = pass_back(layers, bounds.law, ahead, _prices(bounds, risk, price, mu))
-        least, start = _root(layers, bounds, to_go)
+    F = resources.failure_cost
+    tangent = F * math.exp(-low)
+    for _ in range(_PRICES):
+        to_go = pass_back(graph, costs, ahead, _tolls(graph, costs, resources, 0.0, tangent))
+        _, start = _root(graph, costs, to_go)
+        known, tried = _try(graph, costs, resources, ahead, to_go, start, known, path)
+        following = F * math.exp(-tried.first)
+        if abs(following - tangent) <= 1e-9 * F:
+            break
+        tangent = following
+    return known
+
+
+@_part
+def _raise_price(graph, costs, resources, ahead, dual, mu, base, path):
+    """Maximise the dual function over lambda for one chord; see its paths.
+
+    It is concave and made of lines, one for each path: cost + mu r_0 + lambda (r - limit). The next
+    price is where the lines of the last paths within and beyond the limit meet, or a higher one
+    while there is none within. The maximum is reached when a path comes again.
+    """
+    known, free, priced, offset, root = dual
+    limit, price = resources.priced_limit, 0.0
+    within = beyond = np.inf  # cost + mu r_0 of the last paths
+    within_used, beyond_used = np.inf, np.inf
+    for _ in range(_PRICES if limit < np.inf else 1):
+        to_go = free
+        if price > 0.0 or mu > 0.0:
+            to_go = pass_back(graph, costs, ahead, _tolls(graph, costs, resources, price, mu))
+        least, start = _root(graph, costs, to_go)
         added = base - price * limit if price > 0.0 else base
         if least + added > root:
             priced, offset, root = to_go, added, least + added
-        known, cost, first, used, feasible = _tried(
-            layers, bounds, risk, ahead, to_go, start, known, path
-        )
-        if root >= known.cost or (feasible and price == 0.0):
+        known, tried = _try(graph, costs, resources, ahead, to_go, start, known, path)
+        if root >= known.cost or (tried.feasible and price == 0.0):
             break
-        if used <= limit and (len(risk.limits) == 1 or feasible):
-            if cost + mu * first == within_cost and used == within_used:
+        line = tried.cost + mu * tried.first
+        if tried.used <= limit and (len(resources.limits) == 1 or tried.feasible):
+            if line == within and tried.used == within_used:
                 break
-            within_cost, within_used = cost + mu * first, used
+            within, within_used = line, tried.used
         else:
-            if cost + mu * first == beyond_cost and used == beyond_used and within_used < np.inf:
+            if line == beyond and tried.used == beyond_used and within_used < np.inf:
                 break
-            beyond_cost, beyond_used = cost + mu * first, used
-        price = next_price(price, used - limit, within_cost, within_used, beyond_cost, beyond_used)
+            beyond, beyond_used = line, tried.used
+        price = _next_price(price, tried.used - limit, within, within_used, beyond, beyond_used)
         if not price > 0.0:
             break
-    return known, priced, offset, root
+    return Dual(known, free, priced, offset, root)
 
 
 @_part
-def next_price(
-    price: float,
-    excess: float,
-    within_cost: float,
-    within_used: float,
-    beyond_cost: float,
-    beyond_used: float,
-) -> float:
-    """Price at which the last paths within and beyond a limit are worth the same.
+def _next_price(price, excess, within, within_used, beyond, beyond_used):
+    """Price at which the last paths within and beyond the limit cost the same.
 
-    Higher than `price` where there is no path within; `excess` is what the last one has too much.
+    Higher than `price` where there is no path within; `excess` is the use beyond the limit.
     """
     if within_used < beyond_used < np.inf:
-        return (within_cost - beyond_cost) / (beyond_used - within_used)
+        return (within - beyond) / (beyond_used - within_used)
     if price > 0.0:
         return 4.0 * price
     return 1.0 / max(excess, 1e-3) if excess < np.inf else 1.0
+
+
+@_part
+def _tolls(graph, costs, resources, price, mu):
+    """Tolls of edges with prices on the priced resource and on the first one."""
+    tolls = np.empty(len(costs.toll))
+    for e in range(len(tolls)):
+        b = graph.bound[e]
+        tolls[e] = costs.toll[e] + (price * resources.priced[b] + mu * resources.of_bounds[b, 0])
+    return tolls
+
+
+@_part
+def _root(graph, costs, to_go):
+    """Least cost to go from the start, and the start node that has it."""
+    least, chosen = np.inf, -1
+    for length in range(len(graph.starts)):
+        node = graph.starts[length]
+        if node >= 0 and costs.start_cost[length] + to_go.best[node] < least:
+            least, chosen = costs.start_cost[length] + to_go.best[node], node
+    return least, chosen
+
+
+@_part
+def _try(graph, costs, resources, ahead, to_go, start, known, path):
+    """Follow some costs to go from a start node: the best path known, and this one's numbers."""
+    first_cost = 0.0
+    for length in range(len(graph.starts)):
+        if graph.starts[length] == start:
+            first_cost = costs.start_cost[length]
+    total = filled(len(resources.limits), 0.0)
+    cost, used, n = _follow(graph, costs, resources, ahead, to_go, start, first_cost, total, path)
+    if n == 0:
+        return known, _Tried(np.inf, np.inf, np.inf, False)
+    feasible = can_be_feasible(resources, total, 0)  # node 0 is the goal
+    first = total[0] if len(total) > 0 else 0.0
+    whole = cost + failure(resources.failure_cost, first)
+    if feasible and whole < known.cost:
+        copied = np.empty(n, np.int64)
+        for k in range(n):
+            copied[k] = path[k]
+        known = Found(copied, whole)
+    return known, _Tried(cost, first, used, feasible)
+
+
+@_part
+def _follow(graph, costs, resources, ahead, to_go, node, cost, total, path):
+    """Follow the best edges to go; write the path and its sums, return its cost, use and cells.
+
+    No cells where the last move leaves no edge.
+    """
+    loss, x, came, n, used = costs.loss, costs.x0, -1, 1, 0.0
+    first, head, move, cell, bound = graph.first, graph.head, graph.move, graph.cell, graph.bound
+    drift = costs.drift
+    toll, best, second, by = to_go
+    hi, slope, sd = ahead.hi, ahead.slope, costs.noise_sd
+    beta0, by_bound = costs.beta0, costs.by_bound
+    u_turns, last = graph.u_turns, graph.n_moves - 1
+    if loss == LEAST:
+        cost = -np.inf
+    path[0] = cell[node]
+    while node > 0 and n < len(path):
+        least, chosen, reached = np.inf, -1, 0.0
+        for e in range(first[node], first[node + 1]):
+            h, m = head[e], move[e]
+            if not u_turns and came >= 0 and m == last - came:
+                continue
+            here, x_e = best[h] if u_turns or by[h] != last - m else second[h], x
+            if loss != NONE:
+                x_e = beta0 * x + (drift[bound[e]] if by_bound else drift[cell[h]])
+                here = joined(loss, loss_of(loss, x_e, sd), here + slope[h] * (hi[h] - x_e))
+            here = toll[e] + (max(cost, here) if loss == LEAST else here)
+            if here < least:
+                least, chosen, reached = here, e, x_e
+        if chosen < 0:
+            return np.inf, np.inf, 0
+        x, came, node = reached, move[chosen], head[chosen]
+        cost = joined(loss, cost, loss_of(loss, x, sd)) + costs.toll[chosen]
+        b = bound[chosen]
+        for k in range(len(total)):
+            total[k] += resources.of_bounds[b, k]
+        if len(total) > 0:
+            used += resources.priced[b]
+        path[n] = cell[node]
+        n += 1
+    return cost, used, n if node == 0 else 0

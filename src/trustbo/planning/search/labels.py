@@ -1,233 +1,347 @@
-"""Best path within a limit on risk, or with a cost of failure: scalar trust, or sums over bounds.
+"""Best path of a `SearchProblem`: one trust, or none, and any number of resources.
 
-Method: label setting with dominance for the resource-constrained shortest path over the layered DAG
-of `layers` (Martins 1984; Irnich and Desaulniers 2005), pruned by Lagrangian bounds (Handler and
-Zang 1980; Beasley and Christofides 1989).
+Method: label setting with dominance for the resource-constrained shortest path (Martins 1984;
+Irnich and Desaulniers 2005), pruned by the Lagrangian dual of `dual`.
 
-State: node (j, c) as in `layers`; a label there has its cost so far, the trust x of the team, which
-follows x -> beta0 x + u, and the sums r of its bounds' risks -log(1 - p), one for each resource. A
-bound costs its toll and a loss l(x) that falls in x; `NONE` has no loss and needs no trust, `LEAST`
-takes the largest loss instead of the sum. A path is feasible if enough of its r are within their
-limits, and costs a failure cost F times 1 - exp(-r) of the first resource besides.
+State: a label at a node has its cost so far, the trust x of the team, which follows x -> beta0 x +
+u, and the sum r of each resource along its edges. An edge costs its toll and a loss l(x) that falls
+in x; `NONE` has no loss and needs no trust, `LEAST` takes the largest loss instead of the sum. A
+path is feasible if enough of its r are within their limits, and costs a failure cost F times
+1 - exp(-r) of the first resource besides. Without resources every path is feasible.
 
-A label is dropped if its cost with a bound on that of its completions, (a) or (b) of `dual`,
+A label is dropped if its cost with a lower limit on that of its completions, (a) or (b) of `dual`,
 cannot beat the best path known, or if the safest completion, resource by resource, exceeds the
 limits.
 
-Invariant: nodes are processed from the most bounds left to none, so all labels of a node are known.
-A label is dropped if another one at its node costs no more, has no less trust and no more of every
-risk that it could still keep within its limit. Where U-turns are forbidden, the other must have
-come by the same move, or there must be two of these that came by different moves.
-
-With `LEAST` a path is sought whose every loss is below an aim: the cost so far does not matter then
-to what dominates, labels with less trust than every completion needs are dropped, and the safest
-completion is that over edges which the largest trust can take. The lower the aim, the fewer labels:
-it rises from the bound until there is a path, then halves the interval between both.
+Invariant: in a layered graph nodes are processed from the highest rank to the goal, so that all
+labels of a node are known; else labels are, in the order of their lower limit. A label is dropped
+if another one at its node costs no more, has no less trust and no more of every resource that it
+could still keep within its limit. Every completion of it is then one of the other, at no higher
+cost, because trust stays ordered (beta0 >= 0) and l falls. Where U-turns are
+forbidden, the other must have come by the same move, or there must be two of these that came by
+different moves: a completion is forbidden to one of them at most.
 
 Exact because the labels that are left include the best path, unless it is the one known. Beyond
-`max_labels` the best path known is returned, with the Lagrangian bound.
+`max_labels` the best path known is returned, with the lower limit of the dual.
 """
 
+import heapq
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART
+from trustbo.parallel import PART, over_rows
 from trustbo.planning.search.costs_to_go import (
-    LEAST,
-    NONE,
-    Bounds,
-    EdgeRisk,
     any_start,
-    can_be_feasible,
-    joined,
-    least_to_come,
     least_trust,
     look_ahead,
-    loss_of,
     with_safest,
 )
-from trustbo.planning.search.dual import Best, failure, lagrangian
-from trustbo.planning.search.layers import Layers
+from trustbo.planning.search.dual import Found, failure, maximise_dual
+from trustbo.planning.search.graph import Best, SearchProblem, costs_of
+from trustbo.planning.search.losses import LEAST, NONE, joined, loss_of
 from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
+MAX_LABELS = 300_000
+"""Limit on the labels of a draw."""
+_MAX_ENTRIES = 20_000_000  # of the resources of labels
+_MAX_CELLS = 1 << 22  # of the paths of several draws at once
 _AIMS = 100
-"""Number of costs that `LEAST` aims at."""
+"""Number of costs that a bottleneck is sought below."""
+
+
+def solve(problem: SearchProblem, below: np.ndarray | None = None) -> Best:
+    """Find the feasible path of least cost under every draw.
+
+    No cells where there is no path that costs less than `below` (draw,), by default infinite; the
+    cost is then `below`. A lower limit of inf says that no path is feasible.
+    """
+    n_draws = len(problem.trust)
+    below = np.full(n_draws, np.inf) if below is None else below
+    found = np.full(n_draws, np.inf), np.empty(n_draws)  # cost, lower limit
+    graph = problem.graph
+    most = graph.rank[-1] + 1 if graph.layered else len(graph.rank)  # cells of a path
+    parts, step = [], max(1, _MAX_CELLS // most)
+    for begin in range(0, n_draws, step):
+        part = np.full((min(step, n_draws - begin), most), -1, np.int32)
+
+        def work(first: int, last: int, begin: int = begin, part: np.ndarray = part) -> None:
+            draws = begin, begin + first, begin + last
+            _solve(problem, below, _most_labels(problem), *draws, part, *found)
+
+        over_rows(work, len(part)) if len(part) > 1 else work(0, len(part))
+        parts.append(part[:, : max(1, (part >= 0).sum(1).max(initial=0))])
+    longest = max(part.shape[1] for part in parts)
+    parts = [
+        np.pad(part, ((0, 0), (0, longest - part.shape[1])), constant_values=-1) for part in parts
+    ]
+    return Best(np.concatenate(parts), *found)
+
+
+def _most_labels(problem: SearchProblem) -> int:
+    """Limit on the labels of a draw."""
+    return min(MAX_LABELS, _MAX_ENTRIES // max(1, len(problem.resources.limits)))
 
 
 @_compiled
-def best_within(
-    layers: Layers, bounds: Bounds, risk: EdgeRisk, best: float, max_labels: int
-) -> Best:
-    """Find the feasible path of least cost; no path if none costs less than `best`."""
-    none = np.empty(0, np.int64)
-    if not any_start(layers, bounds, risk):
-        return Best(none, np.inf, np.inf)
-    ahead = look_ahead(layers, bounds)
-    known, cheap, priced, offset, root = lagrangian(layers, bounds, risk, ahead, best)
-    if root >= known.cost:
-        return known
-    aim, complete, need = known.cost, True, np.full(len(layers.cell), -np.inf)
-    gap = known.cost - root if known.cost < np.inf else 1.0
-    step = gap / 32.0
-    if bounds.law == LEAST:
-        aim = root + step
-    for _ in range(_AIMS if bounds.law == LEAST else 1):
-        if bounds.law == LEAST:
-            need = least_trust(layers, bounds, aim)
-            risk = with_safest(layers, bounds, risk, need)
-        path, cost, complete = _search(
-            layers, bounds, risk, ahead, need, cheap, priced, offset, aim, max_labels
-        )
-        if len(path) > 0:
-            known = Best(path, cost, root)
-            aim, step = 0.5 * (root + cost), np.inf
-        elif not complete or aim == known.cost:
-            break
-        else:
-            step = 1.1 * step if step < 0.25 * gap else np.inf
-            root, aim = aim, min(aim + step, known.cost)
-    proven = complete and (bounds.law != LEAST or aim == known.cost or root >= known.cost)
-    return Best(known.path, known.cost, known.cost if proven else root)
-
-
-class _Labels(NamedTuple):
-    """Labels: node, move by which it came, parent, next of the node; cost, trust, priced; risks."""
-
-    link: np.ndarray  # (label, 4)
-    state: np.ndarray  # (label, 3)
-    risk: np.ndarray  # (label, resource)
+def _solve(problem, below, max_labels, offset, first, last, paths, cost, lower):
+    """Find the paths of some draws; row 0 of `paths` is that of draw `offset`."""
+    for d in range(first, last):
+        costs = costs_of(problem, d)
+        known, root = _best_of_draw(problem.graph, costs, problem.resources, below[d], max_labels)
+        cost[d], lower[d] = known.cost, root
+        for k in range(len(known.path)):
+            paths[d - offset, k] = known.path[k]
 
 
 @_part
-def _search(layers, bounds, risk, ahead, need, cheap, priced, offset, best, max_labels):
-    """Find a path that costs less than `best`, empty if none; its cost, and if all was seen."""
-    n_risks, law = len(risk.limits), bounds.law
-    labels = _Labels(np.empty((256, 4), np.int64), np.empty((256, 3)), np.zeros((256, n_risks)))
-    heads = np.full(len(layers.cell), -1, np.int64)
-    n, found = np.int64(0), np.int64(-1)  # not literals, for which callees are compiled again
-    for length in range(len(layers.starts)):
-        node = layers.starts[length]
-        if node >= 0 and bounds.start_cost[length] < np.inf:
+def _best_of_draw(graph, costs, resources, below, max_labels):
+    """Find the best path below a cost, and a lower limit on the cost of all paths."""
+    none = Found(np.empty(0, np.int64), np.inf)
+    if not any_start(graph, costs, resources):
+        return none, np.inf
+    ahead = look_ahead(graph, costs, len(resources.limits) > 0)
+    dual = maximise_dual(graph, costs, resources, ahead, below)
+    known, root = dual.known, dual.root
+    if root >= known.cost:
+        return known, known.cost
+    if costs.loss == LEAST:
+        return _best_bottleneck(graph, costs, resources, ahead, dual, max_labels)
+    need = np.empty(0)
+    found, lower = _search(graph, costs, resources, ahead, need, dual, known.cost, max_labels)
+    if len(found.path) > 0:
+        known = found
+    return known, min(max(root, lower), known.cost)
+
+
+@_part
+def _best_bottleneck(graph, costs, resources, ahead, dual, max_labels):
+    """Find the path whose largest loss is least, and a lower limit on that of all paths.
+
+    A path is sought whose every loss is below an aim: the cost so far does not matter then to what
+    dominates, labels with less trust than every completion needs are dropped, and the safest
+    completion is that over edges which the largest trust can take. The lower the aim, the fewer the
+    labels, so aims rise from the lower limit in growing steps until there is a path (exponential
+    search: Bentley and Yao 1976), then halve the interval between the lower limit and its cost.
+
+    Invariant: root <= least cost <= known.cost. A search that sees everything and finds no path
+    raises root to the aim; one that finds a path lowers known.cost below the aim.
+    """
+    known, root, complete = dual.known, dual.root, True
+    gap = known.cost - root if known.cost < np.inf else 1.0
+    step = gap / 32.0  # the first aim is low, and cheap where it is in vain
+    aim = root + step
+    for _ in range(_AIMS):
+        need = least_trust(graph, costs, aim)
+        narrowed = with_safest(graph, costs, resources, need)
+        found, lower = _search(graph, costs, narrowed, ahead, need, dual, aim, max_labels)
+        complete = lower == np.inf
+        if len(found.path) > 0:
+            known = found
+            aim, step = 0.5 * (root + known.cost), np.inf  # from now on halves
+        elif not complete or aim == known.cost:
+            break
+        else:
+            # Steps grow by a tenth, as labels multiply with the aim; past a quarter of the gap the
+            # next aim is the best cost known.
+            step = 1.1 * step if step < 0.25 * gap else np.inf
+            root, aim = aim, min(aim + step, known.cost)
+    proven = complete and (aim == known.cost or root >= known.cost)
+    return known, known.cost if proven else root
+
+
+class _Labels(NamedTuple):
+    """Labels, in the order in which they were made."""
+
+    link: np.ndarray  # (label, 4): node, move by which it came, parent, next of the node
+    state: np.ndarray  # (label, 4): cost, trust, sum of prices, lower limit of completions
+    used: np.ndarray  # (label, resource): sums of the resources
+
+
+@_part
+def _search(graph, costs, resources, ahead, need, dual, below, max_labels):
+    """Find the best path that costs less than `below`, no cells if none.
+
+    Also a lower limit on the cost of all paths where labels were left at the limit on their number,
+    inf where all was seen.
+    """
+    labels = _Labels(
+        np.empty((256, 4), np.int64), np.empty((256, 4)), np.empty((256, len(resources.limits)))
+    )
+    heads = np.empty(len(graph.rank), np.int64)
+    for node in range(len(heads)):
+        heads[node] = -1
+    n = np.int64(0)  # no literal, for which callees are compiled again
+    for length in range(len(graph.starts)):
+        node = graph.starts[length]
+        if node >= 0 and costs.start_cost[length] < np.inf:
             labels = _with_room(labels, n + 1)
-            first = -np.inf if law == LEAST else bounds.start_cost[length]
-            link, state = labels.link[n], labels.state[n]
-            link[0], link[1], link[2], link[3] = node, -1, -1, -1
-            state[0], state[1], state[2] = first, bounds.x0, 0.0
+            link, state, used = labels
+            link[n, 0], link[n, 1], link[n, 2], link[n, 3] = node, -1, -1, -1
+            state[n, 0] = -np.inf if costs.loss == LEAST else costs.start_cost[length]
+            state[n, 1], state[n, 2], state[n, 3] = costs.x0, 0.0, -np.inf
+            for k in range(len(resources.limits)):
+                used[n, k] = 0.0
             heads[node] = n
             n += 1
-    of_risk = priced.price - bounds.toll
+    if graph.layered:
+        return _by_rank(
+            graph, costs, resources, ahead, need, dual, below, max_labels, labels, heads, n
+        )
+    return _best_first(
+        graph, costs, resources, ahead, need, dual, below, max_labels, labels, heads, n
+    )
+
+
+@_part
+def _by_rank(graph, costs, resources, ahead, need, dual, best, max_labels, labels, heads, n):
+    """Process nodes by rank: all labels of a node are then known when the first is expanded."""
+    F, goal = resources.failure_cost, np.int64(-1)
     for node in range(len(heads) - 1, -1, -1):
         label = heads[node]
         while label >= 0:
-            if layers.left[node] == 0:
-                cost = labels.state[label, 0] + failure(risk, labels.risk[label, 0])
+            if graph.rank[node] == 0:
+                first = labels.used[label, 0] if len(resources.limits) > 0 else 0.0
+                cost = labels.state[label, 0] + failure(F, first)
                 if cost < best:
-                    best, found = cost, label
-            elif not _is_dominated(layers, risk, labels, heads[node], label, law):
-                if n + layers.n_moves > len(labels.state):
+                    best, goal = cost, label
+            elif not _is_dominated(graph, resources, labels, heads[node], label, costs.loss):
+                most = n + graph.first[node + 1] - graph.first[node]
+                if most > len(labels.state):
                     if n >= max_labels:
-                        return _path_of(layers, labels, found), best, False
-                    labels = _with_room(labels, n + layers.n_moves)
+                        return _found(graph, labels, goal, best), dual.root
+                    labels = _with_room(labels, most)
                 n = _extend(
-                    layers, bounds, risk, ahead, need, cheap, priced, of_risk, offset, best, label,
-                    labels, heads, n,
-                )  # fmt: skip
+                    graph, costs, resources, ahead, need, dual, best, label, labels, heads, n
+                )
             label = labels.link[label, 3]
-    return _path_of(layers, labels, found), best, True
+    return _found(graph, labels, goal, best), np.inf
+
+
+@_part
+def _best_first(graph, costs, resources, ahead, need, dual, best, max_labels, labels, heads, n):
+    """Process labels by the lower limit of their completions: the first at the goal is the best."""
+    queue = [(dual.root, np.int64(0))]
+    while queue:
+        estimate, label = heapq.heappop(queue)
+        node = labels.link[label, 0]
+        if graph.rank[node] == 0:
+            return _found(graph, labels, label, labels.state[label, 3]), np.inf
+        if _is_dominated(graph, resources, labels, heads[node], label, costs.loss):
+            continue
+        most = n + graph.first[node + 1] - graph.first[node]
+        if most > len(labels.state):
+            if n >= max_labels:
+                return _found(graph, labels, np.int64(-1), best), estimate
+            labels = _with_room(labels, most)
+        before = n
+        n = _extend(graph, costs, resources, ahead, need, dual, best, label, labels, heads, n)
+        for new in range(before, n):
+            heapq.heappush(queue, (labels.state[new, 3], np.int64(new)))
+    return _found(graph, labels, np.int64(-1), best), np.inf
 
 
 @_part
 def _with_room(labels, n):
     """Labels with room for `n` of them."""
-    return _Labels(with_room(labels.link, n), with_room(labels.state, n), with_room(labels.risk, n))
+    return _Labels(with_room(labels.link, n), with_room(labels.state, n), with_room(labels.used, n))
 
 
 @_part
-def _extend(
-    layers, bounds, risk, ahead, need, cheap, priced, of_risk, offset, best, label, labels, heads, n
-):
-    """Add the labels of one more bound that may lead to less than `best`; their number so far."""
-    law, node, came = bounds.law, labels.link[label, 0], labels.link[label, 1]
-    cost, x, so_far = labels.state[label]
-    for e in range(layers.first[node], layers.first[node + 1]):
-        h, m, b = layers.head[e], layers.move[e], risk.bound[e]
-        if not layers.u_turns and came >= 0 and m == layers.n_moves - 1 - came:
+def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, heads, n):
+    """Add the labels of one more edge that may lead to less than `best`; their number so far."""
+    # Arrays of records by names of their own: a loop counts the references of a record's.
+    link, state, used = labels
+    first, head, move, cell, bound = graph.first, graph.head, graph.move, graph.cell, graph.bound
+    drift, toll, beta0, by_bound = costs.drift, costs.toll, costs.beta0, costs.by_bound
+    hi, own, fall, slope, _ = ahead
+    _, free, free_second, free_by = dual.free
+    paid_toll, priced, priced_second, priced_by = dual.priced
+    of_bounds, limits, safest = resources.of_bounds, resources.limits, resources.safest
+    loss, sd, F, n_resources = costs.loss, costs.noise_sd, resources.failure_cost, len(limits)
+    u_turns, last = graph.u_turns, graph.n_moves - 1
+    node, came = link[label, 0], link[label, 1]
+    cost, x, prices = state[label, 0], state[label, 1], state[label, 2]
+    for e in range(first[node], first[node + 1]):
+        h, m, b, within = head[e], move[e], bound[e], 0
+        if not u_turns and came >= 0 and m == last - came:
             continue
-        for k in range(len(risk.limits)):
-            labels.risk[n, k] = labels.risk[label, k] + risk.of_bounds[b, k]
-        if not can_be_feasible(risk, labels.risk[n], h):
+        for k in range(n_resources):
+            used[n, k] = used[label, k] + of_bounds[b, k]
+            within += used[n, k] + safest[h, k] <= limits[k]
+        if within < resources.needed:
             continue
-        after = bounds.beta0 * x + bounds.drift[e]
-        if after < need[h]:
+        after, lack = x, 0.0
+        if loss != NONE:
+            after = beta0 * x + (drift[b] if by_bound else drift[cell[h]])
+            lack = hi[h] - after
+        if loss == LEAST and after < need[h]:
             continue
-        now = joined(law, cost, loss_of(law, after, bounds.noise_sd)) + bounds.toll[e]
-        lack = ahead.slope[h] * (ahead.hi[h] - after)
-        least = joined(law, now, least_to_come(layers, cheap, h, m) + lack)
-        if least + failure(risk, labels.risk[n, 0] + risk.safest[h, 0]) >= best:
+        to_come = free[h] if u_turns or free_by[h] != last - m else free_second[h]
+        to_come += slope[h] * lack
+        if n_resources == 0 and loss != LEAST:  # before the loss, which takes longer
+            if cost + toll[e] + own[h] + fall[h] * lack + to_come >= best:
+                continue
+        now = joined(loss, cost, loss_of(loss, after, sd)) + toll[e]
+        least, paid = joined(loss, now, to_come), prices + (paid_toll[e] - toll[e])
+        if n_resources > 0:
+            least += failure(F, used[n, 0] + safest[h, 0])  # (a)
+            if least >= best:
+                continue
+            to_come = priced[h] if u_turns or priced_by[h] != last - m else priced_second[h]
+            to_come += slope[h] * lack
+            least = max(least, joined(loss, now, to_come) + paid + dual.offset)  # (b)
+        if least >= best:
             continue
-        paid = so_far + of_risk[e]
-        least = joined(law, now, least_to_come(layers, priced, h, m) + lack)
-        if least + paid + offset >= best:
-            continue
-        link, state = labels.link[n], labels.state[n]
-        link[0], link[1], link[2], link[3] = h, m, label, heads[h]
-        state[0], state[1], state[2] = now, after, paid
+        link[n, 0], link[n, 1], link[n, 2], link[n, 3] = h, m, label, heads[h]
+        state[n, 0], state[n, 1], state[n, 2], state[n, 3] = now, after, paid, least
         heads[h] = n
         n += 1
     return n
 
 
 @_part
-def _is_dominated(layers, risk, labels, other, label, law):
+def _is_dominated(graph, resources, labels, other, label, loss):
     """True if labels of the same node have all the completions of one, at no higher cost."""
-    came, by = labels.link[label, 1], -1
+    link, state, used = labels  # no call below: each would count the references of all arrays
+    limits, safest, u_turns = resources.limits, resources.safest, graph.u_turns
+    node, came, by = link[label, 0], link[label, 1], -1
+    cost, x = state[label, 0], state[label, 1]
     while other >= 0:
-        if other != label:
-            verdict = _covers(risk, labels, other, label, labels.link[label, 0], law)
-            # Of two that are equal, the earlier one stays.
-            if verdict == 2 or (verdict == 1 and other < label):
-                if layers.u_turns or labels.link[other, 1] == came:
-                    return True
-                if by >= 0 and labels.link[other, 1] != by:
-                    return True
-                by = labels.link[other, 1]
-        other = labels.link[other, 3]
+        # Whether the other is as good in all that matters, and if so, whether it is equal.
+        covers = loss == LEAST or state[other, 0] <= cost
+        covers = covers and other != label and (loss == NONE or state[other, 1] >= x)
+        equal = loss == LEAST or state[other, 0] == cost
+        equal = equal and (loss == NONE or state[other, 1] == x)
+        k = 0
+        while covers and k < len(limits):
+            r_other, r = used[other, k], used[label, k]
+            if limits[k] < np.inf:  # a limit that is exceeded anyway matters no more
+                most = limits[k] - safest[node, k]
+                r_other = r_other if r_other <= most else np.inf
+                r = r if r <= most else np.inf
+            covers, equal, k = r_other <= r, equal and r_other == r, k + 1
+        if covers and (not equal or other < label):  # of two that are equal, the earlier stays
+            if u_turns or link[other, 1] == came:
+                return True
+            if by >= 0 and link[other, 1] != by:
+                return True
+            by = link[other, 1]
+        other = link[other, 3]
     return False
 
 
 @_part
-def _covers(risk, labels, a, b, node, law):
-    """2 if label a is better than b, 1 if it is equal, in all that matters; else 0."""
-    cost_a, x_a, _ = labels.state[a]
-    cost_b, x_b, _ = labels.state[b]
-    if law == LEAST:
-        cost_a = cost_b
-    if cost_a > cost_b or (law != NONE and x_a < x_b):
-        return 0
-    equal = cost_a == cost_b and (law == NONE or x_a == x_b)
-    for k in range(len(risk.limits)):
-        r_a, r_b = labels.risk[a, k], labels.risk[b, k]
-        if risk.limits[k] < np.inf:  # a limit that is exceeded anyway matters no more
-            most = risk.limits[k] - risk.safest[node, k]
-            r_a, r_b = r_a if r_a <= most else np.inf, r_b if r_b <= most else np.inf
-        if r_a > r_b:
-            return 0
-        equal = equal and r_a == r_b
-    return 1 if equal else 2
-
-
-@_part
-def _path_of(layers, labels, label):
-    """Cells of the path of a label; none for label -1."""
-    n, at = 0, label
-    while at >= 0:
-        n, at = n + 1, labels.link[at, 2]
+def _found(graph, labels, label, cost):
+    """Path of a label, no cells for label -1, and its cost."""
+    n, k = 0, label
+    while k >= 0:
+        n, k = n + 1, labels.link[k, 2]
     path = np.empty(n, np.int64)
     for k in range(n - 1, -1, -1):
-        path[k] = layers.cell[labels.link[label, 0]]
+        path[k] = graph.cell[labels.link[label, 0]]
         label = labels.link[label, 2]
-    return path
+    return Found(path, cost)

@@ -30,16 +30,30 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART
+from trustbo.errors import TrustboError
+from trustbo.parallel import PART, over_rows, plain
+from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
-from trustbo.planning.search.contact_loss import CLIPPED, LOGISTIC, expected_loss
-from trustbo.planning.search.dominance import Heuristic
+from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.search.dominance import Heuristic, build_heuristic, dominance_tests
+from trustbo.planning.search.graph import Best, Resources
+from trustbo.planning.search.losses import (
+    CLIPPED,
+    LOGISTIC,
+    SOFTPLUS,
+    TINY_SD,
+    expected_loss,
+    loss_of,
+)
 from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
 SUCCESS, BOTTLENECK, LOGISTIC_LOSS, CLIPPED_LOSS, TERMINAL, MEAN = range(6)
 _LOSSES = {"identity": MEAN, "logistic": LOGISTIC_LOSS, "clipped": CLIPPED_LOSS}
+_TOLERANCES = (0.0, 1e-3, 1e-2, 3e-2, 0.1)
+MAX_LABELS = 300_000
+"""Limit on the labels of a search."""
 _MODES = {"success": SUCCESS, "bottleneck": BOTTLENECK, "terminal": TERMINAL, "mean": MEAN}
 
 
@@ -48,16 +62,6 @@ def mode_of(objective: Objective) -> int:
     if objective.name == "lost_contact":
         return _LOSSES[objective.family.expected_rate]
     return _MODES[objective.name]
-
-
-class LabelRisk(NamedTuple):
-    """Risks -log(1 - p) of bounds, which a path adds up, and their limits; see `RiskTable`."""
-
-    of_bounds: np.ndarray  # (bound, resource), index move * cells + cell entered
-    limits: np.ndarray  # (resource,)
-    needed: int
-    failure_cost: float
-    safest: np.ndarray  # (cell, resource), least sums from a cell to the goal
 
 
 class LabelSearch(NamedTuple):
@@ -79,7 +83,112 @@ class LabelSearch(NamedTuple):
     u_turns: bool
     revisit: bool
     noise_sd: float  # of a rate
-    risk: LabelRisk
+    risk: Resources  # with the safest sums from each cell, (cell, resource)
+
+
+def best_paths(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, resources: Resources
+) -> Best:
+    """Find the best path of every draw; no cells where none is feasible.
+
+    The safest sums of `resources` are those from each cell to the goal, (cell, resource).
+    TrustboError: more labels than the limit, even with the largest tolerance.
+    """
+    n_draws = len(dynamics.start)
+    found: list[_OfDraw] = [_OfDraw(np.empty(0), np.inf, np.inf)] * n_draws
+
+    def work(first: int, last: int) -> None:
+        for d in range(first, last):
+            found[d] = _best_of_draw(admissible, dynamics.take(d), objective, resources)
+
+    work(0, n_draws) if n_draws == 1 else over_rows(work, n_draws)
+    paths = np.full((n_draws, max(1, *(len(best.path) for best in found))), -1, np.int64)
+    for row, best in zip(paths, found, strict=True):
+        row[: len(best.path)] = best.path
+    cost, lower = np.array([(best.cost, best.lower) for best in found]).T
+    return Best(paths, cost, lower)
+
+
+class _OfDraw(NamedTuple):
+    """Best path of one draw, no cells without one; its cost and a lower limit on all costs."""
+
+    path: np.ndarray
+    cost: float
+    lower: float
+
+
+def _best_of_draw(
+    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, resources: Resources
+) -> _OfDraw:
+    lengths = [admissible.longest]
+    if not objective.has_labels:  # costs fall along a path, so that lengths are searched apart
+        lengths = list(range(admissible.shortest, admissible.longest + 1))
+    best = _OfDraw(np.empty(0, np.int64), np.inf, np.inf)
+    for n_bounds in lengths:
+        scale = n_bounds if objective.name == "mean" else 1
+        path, cost, lower = _within_limit(
+            _problem(admissible, dynamics, objective, n_bounds, scale, resources)
+        )
+        # Linear rates lose 1 - trust in each bound.
+        lost = n_bounds if objective.name == "lost_contact" and not objective.has_labels else 0
+        cost, lower = cost / scale + lost, lower / scale + lost
+        if len(path) == 0 or cost >= best.cost:
+            path, cost = best.path, best.cost
+        best = _OfDraw(path, cost, min(lower, best.lower))
+    return best
+
+
+def _problem(
+    admissible: AdmissiblePaths,
+    dynamics: Dynamics,
+    objective: Objective,
+    n_bounds: int,
+    scale: int,
+    resources: Resources,
+) -> LabelSearch:
+    goal = admissible.flat(admissible.goal)
+    at_goal = objective.name == "terminal"
+    return LabelSearch(
+        mode_of(objective),
+        plain(dynamics.transition),
+        plain(dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)),
+        plain(dynamics.start),
+        dynamics.views,
+        dominance_tests(dynamics, n_bounds),
+        build_heuristic(dynamics, n_bounds, admissible.neighbours, goal, at_goal=at_goal),
+        admissible.neighbours,
+        scale * objective.length_weight * admissible.lengths,
+        admissible.bounds_to_goal.ravel(),
+        admissible.flat(admissible.start),
+        goal,
+        n_bounds,
+        admissible.u_turns,
+        admissible.revisit or not objective.has_labels,
+        max(float(dynamics.noise_sd), TINY_SD),
+        resources,
+    )
+
+
+def _within_limit(problem: LabelSearch) -> _OfDraw:
+    """Search exactly, or with the least tolerance that stays within the limit on labels."""
+    if not len(problem.heuristic.powers) and problem.mode >= TERMINAL:
+        raise TrustboError(
+            f"a team's least trust over {problem.max_bounds} bounds on {len(problem.to_goal)} "
+            "cells is too much for sums over paths; use larger cells, or team='mean'."
+        )
+    if not problem.revisit:
+        # If the best walk of all enters no cell twice, it is the best simple path too.
+        free = search(problem._replace(revisit=True), 0.0, MAX_LABELS)
+        if free.path is not None and len(set(free.path.tolist())) == len(free.path):
+            return _OfDraw(free.path, free.cost, free.lower)
+    for tolerance in _TOLERANCES:
+        found = search(problem, tolerance, MAX_LABELS)
+        if found.path is not None:
+            return _OfDraw(found.path, found.cost, found.lower)
+    raise TrustboError(
+        f"more than {MAX_LABELS} partial paths are worth keeping; lower max_bounds = "
+        f"{problem.max_bounds}, use larger cells, or team='mean'."
+    )
 
 
 class SearchResult(NamedTuple):
@@ -87,8 +196,8 @@ class SearchResult(NamedTuple):
 
     path: np.ndarray | None  # flat indices of cells
     cost: float
-    bound: float
-    """Lower bound on the cost of every path."""
+    lower: float
+    """Lower limit on the cost of every path."""
 
 
 def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchResult:
@@ -96,8 +205,8 @@ def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchRes
 
     A dropped label may be better by `tolerance` than the label that replaces it; 0 is exact.
     """
-    path, cost, bound, complete = _search(problem, tolerance, max_labels)
-    return SearchResult(path if complete else None, cost, bound)
+    path, cost, lower, complete = _search(problem, tolerance, max_labels)
+    return SearchResult(path if complete else None, cost, lower)
 
 
 @_compiled
@@ -108,13 +217,14 @@ def _search(problem, tolerance, max_labels):
     fixed, n_before = mode >= TERMINAL, 1 if u_turns else n_moves + 1
     heads = np.full(n_cells * n_before * (most + 1 if fixed else 1), -1, np.int64)
     size = min(max_labels, 1024)
-    labels, cost = np.empty((size, 5), np.int64), np.empty(size)  # cell, bounds, parent, move, next
+    # Of a label: cell, bounds, parent, move, next.
+    labels, cost = np.empty((size, 5), np.int64), np.empty((size, 1))
     n_tests, n_risks = len(problem.tests), len(problem.risk.limits)
     # Tests of trust, then minus the sums of risks.
     tested, state = np.zeros((size, n_tests + n_risks)), np.empty((size, len(problem.start_state)))
     seen = np.zeros((size, 1 if revisit else n_cells // 64 + 1), np.uint64)
     _fill(labels[0], problem.start, 0, -1, -1)
-    cost[0] = -np.inf if mode == BOTTLENECK else 0.0
+    cost[0, 0] = -np.inf if mode == BOTTLENECK else 0.0
     _copy(problem.start_state, state[0])
     n, least_dropped = 1, np.inf
     queue = [(-np.inf, np.int64(0))]
@@ -148,7 +258,7 @@ def _search(problem, tolerance, max_labels):
                 continue
             x = problem.transition @ state[label] + problem.drift[:, m * by_move, other]
             total = _add_cost(
-                mode, cost[label], (problem.views @ x).min(), problem.length_cost[m],
+                mode, cost[label, 0], _least(problem.views @ x), problem.length_cost[m],
                 problem.noise_sd,
             )  # fmt: skip
             left = most - n_bounds - 1 if fixed else to_goal[other]
@@ -158,12 +268,21 @@ def _search(problem, tolerance, max_labels):
                 reach -= problem.risk.failure_cost * math.expm1(-least)
             if reach < np.inf:
                 _fill(labels[n], other, n_bounds + 1, label, m)
-                cost[n] = total
+                cost[n, 0] = total
                 _copy(x, state[n])
                 _copy(seen[label], seen[n])
                 heapq.heappush(queue, (reach, np.int64(n)))
                 n += 1
     return np.empty(0, np.int64), np.inf, least_dropped, True
+
+
+@_part
+def _least(values):
+    """Least of some numbers; `min` of an array takes half a second to compile."""
+    least = values[0]
+    for value in values:
+        least = min(least, value)
+    return least
 
 
 @_part
@@ -221,7 +340,7 @@ def _add_cost(mode, cost, trust, length_cost, noise_sd):
     if mode == CLIPPED_LOSS:
         return cost + length_cost + expected_loss(CLIPPED, trust, noise_sd)
     if mode == SUCCESS:
-        return cost + _softplus(-trust)
+        return cost + loss_of(SOFTPLUS, trust, noise_sd)
     if mode == BOTTLENECK:
         return max(cost, -trust)
     return cost + length_cost - (trust if mode == MEAN else 0.0)
@@ -258,12 +377,12 @@ def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
     """1 if an expanded label dominates, 2 if one does up to the tolerance, 0 if none does."""
     verdict = 0
     while other >= 0:
-        if labels[other, 1] <= labels[label, 1] and cost[other] <= cost[label] + tolerance:
+        if labels[other, 1] <= labels[label, 1] and cost[other, 0] <= cost[label, 0] + tolerance:
             shortfall = 0.0
             for k in range(tested.shape[1]):
                 shortfall = max(shortfall, tested[label, k] - tested[other, k])
             if shortfall <= tolerance:
-                same = shortfall == 0.0 and cost[other] <= cost[label]
+                same = shortfall == 0.0 and cost[other, 0] <= cost[label, 0]
                 if same and not revisit:
                     for w in range(seen.shape[1]):
                         same = same and (seen[other, w] & ~seen[label, w]) == 0
@@ -273,11 +392,6 @@ def _dominance(label, other, labels, cost, tested, seen, tolerance, revisit):
                     verdict = 2
         other = labels[other, 4]
     return verdict
-
-
-@_part
-def _softplus(x):
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
 
 
 @_part

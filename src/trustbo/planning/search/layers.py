@@ -26,26 +26,14 @@ from numba import njit
 from trustbo.parallel import PART, over_rows
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
+from trustbo.planning.search.graph import Graph
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
 
 
-class Layers(NamedTuple):
-    """Nodes in the order of the bounds left, and the edges from each."""
-
-    cell: np.ndarray  # (node,), flat index
-    left: np.ndarray  # (node,), bounds left
-    first: np.ndarray  # (node + 1,), index of its first edge
-    head: np.ndarray  # (edge,), node that it leads to
-    move: np.ndarray  # (edge,), index in `MOVES`
-    starts: np.ndarray  # (length,), node of the start with that many bounds left, or -1
-    n_moves: int
-    u_turns: bool
-
-
 @_compiled
-def build_layers(to_goal, from_start, steps, longest, u_turns) -> Layers:
+def build_layers(to_goal, from_start, steps, longest, u_turns) -> Graph:
     """Unroll a grid over the bounds left, for paths of at most `longest` bounds.
 
     Fewest bounds `to_goal` and `from_start`, (row, col), -1 where there is no way; moves `steps`
@@ -54,58 +42,59 @@ def build_layers(to_goal, from_start, steps, longest, u_turns) -> Layers:
     """
     rows, cols = to_goal.shape
     # base: number of nodes of earlier cells; the goal is entered by the last bound only.
-    base = np.empty(rows * cols + 1, np.int64)
-    base[0] = 0
-    per_layer = np.zeros(longest + 2, np.int64)
+    base, place = np.empty(rows * cols + 1, np.int64), np.empty(longest + 2, np.int64)
+    base[0] = start = 0
+    for k in range(longest + 2):
+        place[k] = 0
     for c in range(rows * cols):
-        i, j = c // cols, c % cols
-        near, far = to_goal[i, j], from_start[i, j]
+        near, far = to_goal[c // cols, c % cols], from_start[c // cols, c % cols]
         n = 0
         if near >= 0 and far >= 0:
             n = 1 if near == 0 else max(0, longest - far - near + 1)
+        if far == 0:
+            start = c
         base[c + 1] = base[c] + n
         for k in range(n):
-            per_layer[near + k + 1] += 1
-    place = np.cumsum(per_layer)
+            place[near + k + 1] += 1
+    for k in range(longest + 1):  # from the numbers of nodes by bounds left to the first of each
+        place[k + 1] += place[k]
     n_nodes = base[rows * cols]
     node_of = np.empty(n_nodes, np.int32)  # in the order of cells, then of bounds left
     cell, left = np.empty(n_nodes, np.int32), np.empty(n_nodes, np.int32)
-    start = 0
     for c in range(rows * cols):
         near = to_goal[c // cols, c % cols]
-        if from_start[c // cols, c % cols] == 0:
-            start = c
         for k in range(base[c + 1] - base[c]):
             node = place[near + k]
             place[near + k] += 1
             node_of[base[c] + k] = node
             cell[node], left[node] = c, near + k
     first = np.empty(n_nodes + 1, np.int64)
-    head, move = np.empty(0, np.int32), np.empty(0, np.int8)
+    head, move, bound = np.empty(0, np.int32), np.empty(0, np.int8), np.empty(0, np.int32)
     for fill in range(2):  # first count, then write
-        if fill == 1:
-            head, move = np.empty(first[n_nodes], np.int32), np.empty(first[n_nodes], np.int8)
         n = 0
         for node in range(n_nodes):
             first[node] = n
             c = cell[node]
-            if left[node] > 0:
-                for m in range(len(steps)):
-                    i, j = c // cols + steps[m, 0], c % cols + steps[m, 1]
-                    if not (0 <= i < rows and 0 <= j < cols):
-                        continue
-                    b = i * cols + j
-                    k = left[node] - 1 - to_goal[i, j]
-                    if to_goal[i, j] >= 0 and 0 <= k < base[b + 1] - base[b]:
-                        if fill == 1:
-                            head[n], move[n] = node_of[base[b] + k], m
-                        n += 1
+            for m in range(len(steps) if left[node] > 0 else 0):
+                i, j = c // cols + steps[m, 0], c % cols + steps[m, 1]
+                if not (0 <= i < rows and 0 <= j < cols):
+                    continue
+                b = i * cols + j
+                k = left[node] - 1 - to_goal[i, j]
+                if to_goal[i, j] >= 0 and 0 <= k < base[b + 1] - base[b]:
+                    if fill == 1:
+                        head[n], move[n] = node_of[base[b] + k], m
+                        bound[n] = m * rows * cols + b
+                    n += 1
         first[n_nodes] = n
-    starts = np.full(longest + 1, -1, np.int64)
+        if fill == 0:
+            head, move, bound = np.empty(n, np.int32), np.empty(n, np.int8), np.empty(n, np.int32)
+    starts = np.empty(longest + 1, np.int64)
     near = to_goal[start // cols, start % cols]
-    for k in range(base[start + 1] - base[start]):
-        starts[near + k] = node_of[base[start] + k]
-    return Layers(cell, left, first, head, move, starts, len(steps), u_turns)
+    for length in range(longest + 1):
+        k = length - near
+        starts[length] = node_of[base[start] + k] if 0 <= k < base[start + 1] - base[start] else -1
+    return Graph(first, head, left, cell, move, bound, starts, len(steps), u_turns, True)
 
 
 class Weights(NamedTuple):
@@ -148,7 +137,7 @@ def additive_weights(
 
 
 def best_additive(
-    layers: Layers,
+    layers: Graph,
     drift: np.ndarray,
     weights: Weights,
     length_cost: np.ndarray,
@@ -184,10 +173,12 @@ class _Best(NamedTuple):
 @_compiled
 def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, begin, end):
     n_nodes, (n_states, n_drifts) = len(layers.cell), drift.shape[1:3]
-    left, cell, per_bound = layers.left, layers.cell, weights.per_bound
+    left, cell, per_bound = layers.rank, layers.cell, weights.per_bound
     u = drift.reshape(len(drift), n_states, n_drifts * drift.shape[3])
     # Gain of each edge, or of each node where all edges into it are alike.
-    by_edge, costly = n_drifts > 1, length_cost.max() > 0.0
+    by_edge, costly = n_drifts > 1, False
+    for cost in length_cost:
+        costly = costly or cost > 0.0
     gain = np.empty(len(layers.head) if by_edge else n_nodes)
     # Its bounds left, and the index of its drift; unsigned: no test for a negative index.
     gain_left, gain_drift = np.empty(len(gain), np.uint64), np.empty(len(gain), np.uint64)
@@ -222,7 +213,7 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
 @_part
 def _pass_back(layers, gain, length_cost, costly, by_edge, found):
     """Compute the best and second-best sum of every node, in the order of the bounds left."""
-    left, first, head, move = layers.left, layers.first, layers.head, layers.move
+    left, first, head, move = layers.rank, layers.first, layers.head, layers.move
     n_moves, u_turns = layers.n_moves, layers.u_turns
     best, second, edge, by = found
     for n in range(len(left)):

@@ -222,13 +222,23 @@ def best_stationary(
     admissible: AdmissiblePaths, cost: np.ndarray, length_weight: float, backend: str | None
 ) -> Path:
     """Find the simple path with the least cost of bounds, (move, row, col), and its metres."""
-    weighted = nx.DiGraph()
-    weighted.add_weighted_edges_from(
-        (a, b, float(_of_bound(cost, a, b)) + length_weight * length)
-        for a, b, length in admissible.graph.edges(data="length")
-    )
-    ends = admissible.start, admissible.goal
-    return tuple(_dijkstra(weighted, *ends, weight="weight", backend=backend))
+    graph, ends = with_costs(admissible, cost, length_weight), (admissible.start, admissible.goal)
+    return tuple(_dijkstra(graph, *ends, weight="cost", backend=backend))
+
+
+def with_costs(
+    admissible: AdmissiblePaths, cost: np.ndarray, length_weight: float, **values: np.ndarray
+) -> nx.DiGraph:
+    """Build the graph of bounds with their `cost`, that of their metres included.
+
+    Further edge attributes by name; like costs these are of bounds, (move, row, col), of one move
+    where all into a cell are alike.
+    """
+    graph = admissible.graph.copy()
+    for a, b, edge in graph.edges(data=True):
+        edge["cost"] = float(_of_bound(cost, a, b)) + length_weight * edge["length"]
+        edge.update({name: float(_of_bound(value, a, b)) for name, value in values.items()})
+    return graph
 
 
 class _Label(NamedTuple):

@@ -12,7 +12,17 @@ from trustbo.parallel import PART
 
 @njit(nogil=True, error_model="numpy", **PART)
 def with_room(rows, n) -> np.ndarray:
-    """Array for at least `n` rows: the same one, or one doubled as often as need be."""
-    while len(rows) < n:
-        rows = np.concatenate((rows, rows))
-    return rows
+    """Array (row, column) for at least `n` rows: the same one, or one doubled as often as need be.
+
+    Number by number: `np.concatenate` takes a second to compile.
+    """
+    size = len(rows)
+    if size >= n:
+        return rows
+    while size < n:
+        size *= 2
+    grown = np.empty((size, rows.shape[1]), rows.dtype)
+    for i in range(len(rows)):
+        for j in range(rows.shape[1]):
+            grown[i, j] = rows[i, j]
+    return grown

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import networkx as nx
 import numpy as np
 from scipy.special import expit, logit
 
@@ -12,15 +13,12 @@ from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.risk import FailureRule, InfeasibleError, Risk, RiskTable
-from trustbo.planning.search.compiled import expected_path, plan_compiled
-from trustbo.planning.search.compiled_risk import safest_path
-from trustbo.planning.search.reference import plan_networkx
+from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
+from trustbo.planning.search.reference import plan_networkx, with_costs
+from trustbo.planning.values import entry_cost
+from trustbo.workspace.moves import move_indices
 
 ENGINES = ("auto", "networkx", "numba")
-LARGEST_FOR_NETWORKX = 2500
-"""Number of cells up to which `auto` plans single paths with networkx."""
-LARGEST_FOR_LABELS = 100
-"""The same where partial paths are labels: success, bottleneck, and least trust of a team."""
 EXACT = 1e-12
 """Largest optimality gap, in trust or log probability, of a path that counts as exact."""
 
@@ -31,20 +29,10 @@ class Engine(NamedTuple):
     name: str = "auto"
     backend: str | None = None
 
-    def choose(
-        self, n_cells: int, n_draws: int, *, labels: bool = False, risk: bool = False
-    ) -> str:
-        """Resolve the name; `auto` goes by the number of cells and draws, and the kind of search.
-
-        The reference engine has no heuristic for labels: 41 s for `success` on 30 x 30 cells, and
-        1 s within a risk on 10 x 10.
-        """
-        if require_choice("engine", self.name, ENGINES) != "auto":
-            return self.name
-        if risk:
-            return "numba"
-        most = LARGEST_FOR_LABELS if labels else LARGEST_FOR_NETWORKX
-        return "networkx" if n_draws == 1 and n_cells <= most else "numba"
+    @property
+    def is_reference(self) -> bool:
+        """Whether it is networkx; `auto` and `numba` are compiled."""
+        return require_choice("engine", self.name, ENGINES) == "networkx"
 
 
 class FoundPath(NamedTuple):
@@ -63,17 +51,15 @@ def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> F
     paths, objective = problem.paths, problem.objective
     require_valid(dynamics, objective)
     dynamics = objective.capped(dynamics)
-    labels, risk = _has_labels(problem), problem.risk_table is not None
-    name = engine.choose(paths.passable.size, 1, labels=labels, risk=risk)
 
     def best(risk: RiskTable | None) -> FoundPath | None:
-        if name == "networkx":
+        if engine.is_reference:
             path = plan_networkx(paths, dynamics, objective, engine.backend, risk)
-            return None if path is None else FoundPath(path, 0.0, name)
+            return None if path is None else FoundPath(path, 0.0, "networkx")
         found = plan_compiled(paths, dynamics.flat(), objective, risk)
         if found is None:
             return None
-        return FoundPath(paths.cells(found.paths[0]), float(found.gap[0]), name)
+        return FoundPath(paths.cells(found.paths[0]), float(found.gap[0]), "numba")
 
     return _feasible(problem, best)
 
@@ -112,11 +98,6 @@ def _infeasible(rule: FailureRule, risk: Risk, path: tuple[Cell, ...]) -> Infeas
     )
 
 
-def _has_labels(problem: PlanningProblem) -> bool:
-    objective = problem.objective
-    return objective.has_labels or (problem.team == "min" and objective.name != "stationary")
-
-
 def find_paths(
     problem: PlanningProblem, dynamics: Dynamics, engine: Engine
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -127,8 +108,9 @@ def find_paths(
     paths, objective, n_draws = problem.paths, problem.objective, len(dynamics.start)
     require_valid(dynamics, objective)
     dynamics = objective.capped(dynamics)
-    if engine.choose(paths.passable.size, n_draws, labels=_has_labels(problem)) == "numba":
-        return _feasible(problem, lambda risk: plan_compiled(paths, dynamics, objective, risk))
+    if not engine.is_reference:
+        found = _feasible(problem, lambda risk: plan_compiled(paths, dynamics, objective, risk))
+        return found.paths, found.gap
 
     def best(risk: RiskTable | None) -> list[tuple[Cell, ...]] | None:
         found = [
@@ -161,6 +143,19 @@ def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, .
         )
     found = _feasible(problem, lambda risk: expected_path(paths, dynamics, objective, risk))
     return paths.cells(found)
+
+
+def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
+    """Build the graph of `Planner.graph_of`, `dynamics` without leading axes."""
+    paths, values = problem.paths, {}
+    require_valid(dynamics, problem.objective._replace(name="stationary"))
+    if problem.risk is not None:
+        p_fail = problem.risk.p_fail[move_indices(paths.connectivity)]
+        with np.errstate(divide="ignore"):
+            values["risk"] = -np.log1p(-p_fail)
+    values["drift"] = np.tensordot(dynamics.views.mean(0), dynamics.drift, 1)
+    cost = entry_cost(paths.passable, dynamics)
+    return with_costs(paths, cost, problem.objective.length_weight, **values)
 
 
 def require_valid(dynamics: Dynamics, objective: Objective) -> None:
