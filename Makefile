@@ -11,7 +11,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
-PYTEST := TRUSTBO_FAST=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 # Where a container's shell says so, Python would compile all modules anew at each start, 7 s.
 unexport PYTHONDONTWRITEBYTECODE
@@ -25,7 +25,7 @@ test: $(VENV)/.installed-dev
 	$(PYTEST) -m "not slow" tests
 
 notebooks: $(VENV)/.installed-dev
-	$(PYTEST) --nbmake notebooks
+	TRUSTBO_FAST=1 $(PYTEST) --nbmake notebooks
 
 slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow tests

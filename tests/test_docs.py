@@ -68,9 +68,9 @@ def page_of(namespace):
     return ROOT / "docs" / "api" / f"{namespace.split('.')[-1]}.md"
 
 
-# All figures; programs that compile for this alone; campaigns of many missions.
+# All figures; programs that compile for this alone; campaigns of many missions; README's again.
 _SLOW = ("api/plots", "gallery", "howto/use-arviz", "howto/your-own-model", "howto/compare-models",
-         "howto/criticise")  # fmt: skip
+         "howto/criticise", "api/models", "index")  # fmt: skip
 SLOW = {f"docs/{page}.md" for page in _SLOW}
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rasterio
 import xarray as xr
-from worlds import terrain_of
+from worlds import CORNER, terrain_of
 
 from trustbo.errors import ShapeError, TerrainError, TrustboError
 from trustbo.terrain import (
@@ -190,7 +190,7 @@ def test_exposure_is_the_share_of_observers_that_see_a_pixel():
     dem = np.zeros((30, 30))
     dem[:, 15] = 10.0  # a wall
     terrain = terrain_of(dem)
-    west, east = (2002.5, 985.5), (2027.5, 985.5)
+    west, east = CORNER + np.array([[2.5, -14.5], [27.5, -14.5]])
     seen = exposure(terrain, [west, east], eye=2.0, target=1.0).values
     np.testing.assert_allclose(seen[:, :14], 0.5)
     np.testing.assert_allclose(seen[:, 17:], 0.5)
@@ -198,7 +198,7 @@ def test_exposure_is_the_share_of_observers_that_see_a_pixel():
     near = exposure(terrain, [west], reach=5.0).values
     assert near[14, 2] == 1.0
     with pytest.raises(
-        TerrainError, match=r"observer \(0, 0\) is off the terrain, which covers x 2000"
+        TerrainError, match=r"observer \(0, 0\) is off the terrain, which covers x 100 "
     ):
         exposure(terrain, [(0.0, 0.0)])
     with pytest.raises(ShapeError, match=r"must be \(observer, 2\)"):
