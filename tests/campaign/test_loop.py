@@ -147,7 +147,7 @@ def test_a_result_is_saved_and_read_back(result, tmp_path):
         assert a.attrs["sampler"] == b.attrs["sampler"]
     lines = (tmp_path / "kept" / "history.csv").read_text().splitlines()
     assert len(lines) == 4
-    assert lines[0].startswith("mission,status,state,reason,contact_rate,objective")
+    assert lines[0].startswith("mission,status,state,reason,where,contact_rate,objective")
     hidden = [f.name for f in (tmp_path / "kept").rglob(".*") if f.suffix != ".sha256"]
     assert hidden == [".trustbo.lock"]  # no temporary file is left
 

@@ -146,12 +146,12 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--objective", "best"), "unknown objective 'best'; choose one of lost_contact, terminal"),
         (
             ("--model", "own"),
-            "unknown model 'own'; choose one of pooled, places, hierarchical, coupled",
+            "unknown model 'own'; choose one of places, pooled, hierarchical, coupled",
         ),
         (("--sampler", "gibbs"), "unknown sampler 'gibbs'; choose one of auto, exact, nuts, joint"),
         (
             ("--observation", "odd"),
-            "unknown observation 'odd'; choose one of auto, gaussian, censored",
+            "unknown observation 'odd'; choose one of gaussian, censored",
         ),
         (("--awareness", "none"), "unknown awareness 'none'; choose one of map, belief"),
         (("--replan", "tick"), "unknown replan 'tick'; choose one of mission, bound"),

@@ -351,14 +351,10 @@ def test_a_posterior_from_a_file_finds_its_function_or_says_that_it_is_gone(post
 
 
 def test_a_study_imports_a_model_of_its_own():
-    study = tb.study.Study(terrains=["random"], models={"mine": {"kind": "own", "source": HERE}})
-    assert study.models["mine"].model() is OWN
-    with pytest.raises(
-        TrustboError, match=r"model 'nowhere:OWN' cannot be imported: No module named"
-    ):
-        tb.study.Study(
-            terrains=["random"], models={"mine": {"kind": "own", "source": "nowhere:OWN"}}
-        )
+    study = tb.study.Study(terrains=["random_workspace"], models={"mine": HERE})
+    assert study.models["mine"] is OWN
+    with pytest.raises(TrustboError, match="'nowhere:OWN' cannot be imported: No module named"):
+        tb.study.Study(terrains=["random_workspace"], models={"mine": "nowhere:OWN"})
 
 
 HERE = f"{__name__}:OWN"

@@ -176,7 +176,7 @@ def _whitening(
     """Whitening of the rates of one robot, for each pattern.
 
     Returns:
-        What a bound adds to each x_k (bound + 1, bound); what x_0 does; and of each pattern the
+        Share of a bound in each x_k (bound + 1, bound); share of x_0; and of each pattern the
         inverse of the factor of V, the log of its diagonal, and its product with T.
     """
     n = patterns.shape[1]
