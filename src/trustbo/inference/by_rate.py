@@ -29,7 +29,7 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
         missions: Missions that it was fitted to; needed where it holds no data.
 
     Returns:
-        DataTree with `posterior`, `sample_stats`, `prior` and `log_prior` as they were, and
+        DataTree with `posterior`, `sample_stats`, `prior` and `log_prior` unchanged, and
         `observed_data`, `posterior_predictive` and `log_likelihood` of `contact_rate`, over (chain,
         draw, rate), with the mission, bound and robot of each rate as coordinates. Rates that were
         not measured are left out. Where missions have weights, the last is called

@@ -12,8 +12,8 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """All draws of a posterior by name, chains joined: leading axis (draw,)."""
     draws = posterior["posterior"].to_dataset()
     n = draws.sizes["chain"] * draws.sizes["draw"]
-    # In one layout, whether they were just sampled or read from a file: sums over draws then round
-    # alike, and a campaign that resumes is the campaign it was.
+    # In one layout, whether just sampled or read from a file: sums over draws then round alike, and
+    # a resumed campaign has the same bits.
     arrays = {
         str(name): each.transpose("chain", "draw", ...).values for name, each in draws.items()
     }

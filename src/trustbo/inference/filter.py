@@ -84,11 +84,10 @@ class TrustFilter:
 
         Args:
             posterior: DataTree from `fit`, or draws with leading axis (draw,).
-            n_robots: Number of robots; needed with `TrustParams`, others know their own.
-            response: `"level"` or `"change"`, of draws; `"level"` by default. A posterior knows
-                its own.
-            observation: Family of observations, of draws; `"gaussian"` by default. A posterior
-                knows its own.
+            n_robots: Number of robots; needed with `TrustParams`, which all robots share.
+            response: `"level"` or `"change"`, with draws; `"level"` by default. A posterior records
+                it.
+            observation: Family of observations, with draws; `"gaussian"` by default. A posterior records it.
             max_draws: Largest number of draws to follow; they are evenly spaced.
             belief: Belief about awareness: a map drawn from it goes with each draw, and gives what
                 was not measured in a bound.
@@ -180,8 +179,8 @@ class TrustFilter:
         Raises:
             ShapeError: Another number of robots or features.
             TrustboError: Awareness that is NaN, a value outside [0, 1], ticks that are missing or
-                that the rate is no share of, a bound that is missing, leaves the grid or is none,
-                or one that is running.
+                of which the rate is no share, a bound that is missing, off the grid or between
+                cells that are no neighbours, or one that is running.
         """
         self._require_running(running=False)
         z, effect = self._bound(awareness, bound)
@@ -204,7 +203,7 @@ class TrustFilter:
         """Take in one tick of the bound that runs.
 
         Args:
-            in_contact: Whether each robot has contact, (robot,); NaN where it did not look.
+            in_contact: Whether each robot has contact, (robot,); NaN where it was not measured.
 
         Returns:
             Trust after the bound if it ended now, with the rate so far; shapes (robot,).
@@ -276,7 +275,7 @@ class TrustFilter:
         self.n_bounds += 1
 
     def _require_running(self, *, running: bool) -> Any:
-        """The bound that runs, or None; refused where it should be the other."""
+        """Running bound, or None; TrustboError unless a bound runs as `running` asks."""
         if running and self._running is None:
             raise TrustboError("no bound runs: call begin_bound(awareness) first.")
         if not running and self._running is not None:
@@ -284,7 +283,7 @@ class TrustFilter:
         return self._running
 
     def _cells(self, path: Sequence[Cell] | None, n_bounds: int) -> list[Cell] | None:
-        """The cells of a path of so many bounds, checked; None where there are none."""
+        """Cells of a path of `n_bounds` bounds, checked; None where there is no path."""
         if path is None:
             return None
         path = list(path) if isinstance(path, Iterable) else []
@@ -347,10 +346,7 @@ class TrustFilter:
     def _bound(
         self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None
     ) -> tuple[np.ndarray, np.ndarray | float]:
-        """Awareness of one bound, (robot, feature) or, filled in, (draw, robot, feature); effect.
-
-        The effect is that of its place.
-        """
+        """Awareness of a bound, (robot, feature) or, filled in, (draw, robot, feature); effect."""
         z, cells = self._checked(awareness, 2), self._cells(bound, 1)
         return self._filled(z, None if cells is None else cells[1]), self._effects(cells, 1)[0]
 
@@ -386,7 +382,7 @@ def _robots_of(posterior: xr.DataTree) -> int | None:
 
 
 def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
-    """The posterior's own response or observation; TrustboError if another is given."""
+    """Response or observation of the posterior; TrustboError if another is given."""
     own = posterior.attrs[name]
     if given not in (None, own):
         raise TrustboError(f"the posterior has {name}={own!r}; got {given!r}. Leave it out.")

@@ -61,24 +61,24 @@ def fit(
         missions: All missions to learn from; contact rates that are NaN were not measured.
         model: Trust model; by default `PooledTrust()`.
         sampler: `"auto"`: the exact sampler where it applies, else NUTS; the posterior's
-            attributes say which, and why. `"exact"`: near-independent draws by importance sampling,
-            without compiling, for robots that share their parameters, have nothing in common, are
-            partially pooled or influence each other; where its weights are too uneven, rates are
-            taken for Gaussian ones if observation is `"auto"`, else NUTS is used, with a warning.
-            `"nuts"`. Or `"joint"`: NUTS on
+            attributes record which, and why. `"exact"`: near-independent draws by importance
+            sampling, without compiling, for robots that share their parameters, have nothing in
+            common, are partially pooled or influence each other; where its weights are too uneven,
+            rates are taken for Gaussian ones if observation is `"auto"`, else NUTS is used, with a
+            warning. `"nuts"`. Or `"joint"`: NUTS on
             parameters and latent trust together, which `"nuts"` is too where trust does not
             integrate out.
         workspace: Workspace of the missions. Their features and robots are then in its order, and
             awareness that they lack, such as line of sight, is filled in, see `Workspace.fill`. A
-            model with effects of places knows them over the whole grid, else up to the last row and
-            column that was visited.
+            model with effects of places has them over the whole grid, else up to the last row and
+            column visited.
         earlier: Posterior of earlier missions, to begin the exact sampler of effects of places or
             coupled robots from; the posterior is the same but for Monte Carlo error.
         weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
             observations.
         seed: Seed; the same seed gives the same posterior.
-        progress: Whether NUTS shows its chains in a bar, and first what they will take if that is
-            long. A file, which has no bar, gets the line about a long run, and one about a retry.
+        progress: Whether NUTS shows a progress bar, and first an estimate of a long run's time. A
+            file, which has no bar, gets the line about a long run, and one about a retry.
         n_chains: Number of chains; the exact sampler's draws are divided among them.
         warmup: Warm-up draws per chain of NUTS, not kept.
         draws: Draws kept per chain.
@@ -101,7 +101,7 @@ def fit(
         `sample_stats`, `observed_data` and
         `constant_data`. Bound k is labelled k = 1, 2, ...; short missions are padded with NaN.
         Where all rates have an n_ticks, log-likelihoods are of the counts of ticks, on equal terms
-        for all families of observations; the attribute `log_likelihood_of` says so.
+        for all families of observations; the attribute `log_likelihood_of` states it.
 
     Raises:
         ShapeError: There are no missions, or they disagree on robots or features.
@@ -139,7 +139,7 @@ def fit(
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
         start = _proposal(earlier)
         faster = "" if chosen == "exact" else faster_than_nuts(model)
-        # Of a campaign, the first fit says it for all.
+        # Of a campaign, only the first fit warns.
         watch = Watch(place_of(progress), faster, estimates=earlier is None)
         drawn, complaints = draw_posterior(
             floored, chosen, settings, seed, batch, weight, places, start, check=check,
@@ -201,7 +201,7 @@ def _require_sound(posterior: xr.DataTree, complaints: Sequence[str]) -> xr.Data
 
 
 class _Drawn(NamedTuple):
-    """Draws of a model's parameters, and what they came by."""
+    """Draws of a model's parameters, and the sampler that drew them."""
 
     model: TrustModel
     prior: dict[str, np.ndarray]
@@ -212,7 +212,7 @@ class _Drawn(NamedTuple):
 
 
 def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, object]:
-    """Attributes of a posterior that say what it is of; `finest` is the resolution of the rates."""
+    """Attributes of a posterior: model, data, sampler; `finest` is the resolution of the rates."""
     return {
         "model": type(model).__name__,
         "inter_robot": "none",
@@ -230,7 +230,7 @@ def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, 
 
 
 def _of_rates(model: TrustModel, batch: MissionBatch, *, weighted: bool) -> tuple[TrustModel, str]:
-    """Model of the family that suits the rates, and why; weights are for Gaussian ones."""
+    """Model with the family that suits the rates, and why; weights require Gaussian rates."""
     if weighted and model.observation == AUTO:
         return model.observing("gaussian"), "missions have weights"
     return model.for_rates(batch)
@@ -260,7 +260,7 @@ def _proposal(earlier: xr.DataTree | None) -> Student | None:
 
 
 def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:
-    """Weight of the rates by their ticks; refused where there is nothing to learn from."""
+    """Weight of the rates by their ticks; TrustboError if no rate was measured."""
     ticks = weigh_ticks(batch, weight)
     if not ticks:
         raise TrustboError(

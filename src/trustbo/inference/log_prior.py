@@ -12,10 +12,10 @@ from trustbo.models.record import model_from_record
 
 
 def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Log prior density of each parameter that has a prior of its own, up to a constant.
+    """Log prior density of each parameter with an independent prior, up to a constant.
 
-    Deviations of robots from a common mean are no priors to be doubted, but part of the model: of a
-    `HierarchicalTrust` the means and spreads are here. The LKJ prior of correlations R of the
+    Deviations of robots from a common mean belong to the model, not to the prior: of a
+    `HierarchicalTrust` only means and spreads are here. The LKJ prior of correlations R of the
     coupled model has density det(R)^(concentration - 1).
 
     Args:
@@ -50,7 +50,7 @@ def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> 
     try:
         record = json.loads(posterior.attrs["model_record"])
         recorded = model or model_from_record(record, features=features)
-    except (KeyError, TrustboError):  # of an older version, or with priors of the user's own
+    except (KeyError, TrustboError):  # of an older version, or with custom priors
         return None
     recorded = recorded.observing(posterior.attrs["observation"]).for_features(features)
     sites = {str(n): a.transpose("chain", "draw", ...).values for n, a in draws.items()}

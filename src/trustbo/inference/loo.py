@@ -16,9 +16,9 @@ from trustbo.inference.posterior_tree import require_posterior
 def loo(posterior: xr.DataTree) -> ELPDData:
     """Expected log predictive density of a mission left out, by Pareto-smoothed importance weights.
 
-    A posterior with weights w_j holds p(y_j | parameters)^w_j, so that to leave mission j out takes
-    importance ratios p(y_j | parameters)^-w_j; `az.loo` would take a whole power, and does not read
-    such a posterior. Without weights the result is that of `az.loo`. Missions without any rate have
+    A posterior with weights w_j holds p(y_j | parameters)^w_j, so that leaving mission j out takes
+    importance ratios p(y_j | parameters)^-w_j; `az.loo` assumes power 1, and refuses such a
+    posterior. Without weights the result is that of `az.loo`. Missions without any rate have
     nothing to predict and are left out of the sum.
 
     Args:
@@ -47,7 +47,7 @@ def loo(posterior: xr.DataTree) -> ELPDData:
         )
     counted = np.flatnonzero(weight > 0.0)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the second call says it again
+        warnings.simplefilter("ignore", UserWarning)  # the second call warns again
         powers = each.isel(mission=counted) * xr.DataArray(weight[counted], dims="mission")
         found: Any = unweighted(_tree(posterior, powers), pointwise=True)
     # The posterior is already without a mission of weight 0: equal weights.
@@ -62,7 +62,7 @@ def loo(posterior: xr.DataTree) -> ELPDData:
 
 
 def _tree(posterior: xr.DataTree, log_likelihood: xr.DataArray) -> xr.DataTree:
-    """The tree that `az.loo` reads; the draws tell it how many of them are independent."""
+    """Build the tree that `az.loo` reads, whose draws give the relative effective sample size."""
     return xr.DataTree.from_dict(
         {
             "posterior": posterior["posterior"].to_dataset(),

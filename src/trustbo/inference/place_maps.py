@@ -6,8 +6,8 @@ covariance (Dietrich and Newsam 1997), on a torus so large that the correlation 
 way round. e at the other bounds has its prior. Length scales are rounded to steps of 10 %, which
 changes the correlation of neighbouring cells by less than .01.
 
-What is drawn at random has mean 0 over the draws, so that the mean of the maps is the posterior
-mean of the effects, without Monte Carlo error where nothing was measured.
+The random part has mean 0 over the draws, so that the mean of the maps is the posterior mean of the
+effects, without Monte Carlo error where nothing was measured.
 """
 
 from collections.abc import Iterator, Mapping
@@ -34,7 +34,7 @@ _OF_CELL, _OF_BOUND = ("effect", "row", "col"), ("effect", "move", "row", "col")
 
 
 class PlaceScales(NamedTuple):
-    """Hyperparameters of places, each (draw,); 0 for an effect there is not."""
+    """Hyperparameters of places, each (draw,); 0 for an absent effect."""
 
     tau_s: np.ndarray
     length_scale: np.ndarray
@@ -55,11 +55,12 @@ def draw_maps(
         places: Visited places, the grid's shape among them.
         s: Effects of visited cells (draw, cell); None where cells have none.
         e: Effects of visited bounds (draw, unit); None where bounds have none.
-        seed: Seed of all that is not known.
+        seed: Seed of the effects of places not visited.
 
     Returns:
         place (draw, effect, row, col) and place_bound (draw, effect, move, row, col), None where
-        there is no such effect. The axis effect is of robots, of length 1 where all share them.
+        the model has no such effect. The axis effect is of robots, of length 1 where all share
+        them.
     """
     n, n_effects = len(scales.tau_s), places.n_effects
     place = place_bound = None
@@ -91,7 +92,7 @@ def _cells(
     known: np.ndarray,
     seed: list[int],
 ) -> np.ndarray:
-    """S over the grid, (draw, row, col), given some cells."""
+    """Effect s over the grid, (draw, row, col), given some cells."""
     flat = cells[:, 1] * shape[1] + cells[:, 2]
     centre = np.zeros((len(known), shape[0] * shape[1]))
     off = np.empty(centre.shape)
@@ -141,7 +142,7 @@ def _prior(
 
 
 def _centre(draws: np.ndarray) -> np.ndarray:
-    """The same draws with mean 0 and the variance they had, in place; a single one as it is."""
+    """Centre draws at mean 0 with unchanged variance, in place; a single one is left alone."""
     n = len(draws)
     if n > 1:
         draws -= draws.mean(0)
@@ -218,9 +219,9 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     Returns:
         place_mean and place_sd (row, col) of s, the effect of entering a cell, and place_bound_mean
         and place_bound_sd (move, row, col) of e, the further effect of entering it by that move, as
-        the model has them. Where robots have effects of their own, axis `robot` is first. Effects
-        are added to trust at each such bound. Moves have the names of `workspace.bound_awareness`,
-        "n" towards row 0; NaN where a move would come from outside the grid.
+        the model has them. Where robots have separate effects, axis `robot` is first. Effects are
+        added to trust at each such bound. Moves have the names of `workspace.bound_awareness`, "n"
+        towards row 0; NaN where a move would come from outside the grid.
 
     Raises:
         TrustboError: No posterior of `fit`, or its model has no effects of places.
@@ -289,7 +290,7 @@ def _known(group: xr.Dataset) -> dict[str, np.ndarray]:
 
 
 def scales_of(sites: Mapping[str, np.ndarray]) -> PlaceScales:
-    """Hyperparameters by name; 0 for those of an effect there is not."""
+    """Hyperparameters by name; 0 for those of an absent effect."""
     nothing = np.zeros(len(sites["beta0"]))
     return PlaceScales(
         sites.get("tau_s", nothing), sites.get("length_scale", nothing + 1.0),

@@ -41,7 +41,7 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
 
 
 class Law(NamedTuple):
-    """Law of contact rates given parameters."""
+    """Conditional distribution of contact rates given parameters."""
 
     family: Family
     lag: float
@@ -50,7 +50,7 @@ class Law(NamedTuple):
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
-        """Law of a posterior."""
+        """Read the conditional distribution from the attributes of a posterior."""
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
@@ -60,7 +60,7 @@ class Law(NamedTuple):
 
     @property
     def keeps_trust(self) -> bool:
-        """Whether trust follows from the parameters, without what was sampled with them."""
+        """Whether latent trust can be redrawn from the parameters alone."""
         return self.by_numpy or self.family.integrates_out
 
 
@@ -80,7 +80,7 @@ def complete(
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Missions that it was fitted to; needed where it holds no data.
-        model: Its model, for `log_prior`; needed where the priors are your own.
+        model: Its model, for `log_prior`; needed with custom priors.
         n_trajectories: Number of draws, spread evenly over the chains, to keep latent trust of.
         latents: Innovations of latent trust, where they were sampled with the parameters.
 
@@ -92,7 +92,7 @@ def complete(
 
     Raises:
         TrustboError: The posterior holds no data and no missions are given; or its trust does not
-            integrate out, so that only `fit` can tell.
+            integrate out, so that only `fit` can compute it.
     """
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
@@ -168,7 +168,7 @@ def _groups(
 
 
 def _likelihood_name(posterior: xr.DataTree) -> str:
-    """The name that `az.loo` reads, unless missions have weights, which it would not know of."""
+    """Name that `az.loo` reads, unless missions have weights, which it would ignore."""
     return LIKELIHOODS[is_weighted(posterior)]
 
 
@@ -219,7 +219,7 @@ def _trust_compiled(
     batch: MissionBatch,
     seed: int,
 ) -> dict[str, np.ndarray]:
-    """The same for coupled robots, and changes of trust that do not integrate out."""
+    """Latent trust, log-likelihood and predictions of the other models, compiled by JAX."""
     few_latents = latents
     if (innovations := latents.innovations) is not None:
         shape = (-1, *innovations.shape[2:])

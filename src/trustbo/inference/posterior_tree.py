@@ -1,4 +1,4 @@
-"""Layout of a posterior for ArviZ: named axes, no padding, the data beside it."""
+"""Layout of a posterior for ArviZ: named axes, no padding, the data included."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any

@@ -23,7 +23,7 @@ def prior_from(posteriors: Sequence[xr.DataTree], model: TrustModel | None = Non
     """Model whose priors have the moments of earlier posteriors and of the default, mixed.
 
     The mixture gives each posterior and the default prior the same weight: n campaigns leave
-    1 / (n + 1) of the default, so that ground unlike theirs is not excluded. Coefficients stay
+    1 / (n + 1) of the default, so that the prior still covers unlike ground. Coefficients stay
     normal, the autoregression a Beta, noises and the spreads of places half-normal and the length
     scale log-normal, of the mixture's first two moments (scales: its mean square).
 
@@ -71,7 +71,7 @@ def prior_from(posteriors: Sequence[xr.DataTree], model: TrustModel | None = Non
 
 
 def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
-    """Names of the features of the posteriors."""
+    """Names of the features; TrustboError if posteriors differ in model or features."""
     if isinstance(posteriors, xr.DataTree):
         raise TrustboError("prior_from takes a list of posteriors; got one. Write [posterior].")
     for each in posteriors:
@@ -94,7 +94,7 @@ def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
 def _stationary(
     sites: list[dict[str, np.ndarray]], stationary: bool
 ) -> list[dict[str, np.ndarray]]:
-    """Coefficients, or those of stationary trust, which the priors are of."""
+    """Coefficients, converted to those of stationary trust where the priors are of these."""
     if not stationary:
         return sites
     rest = [1.0 - s["beta0"] for s in sites]
@@ -106,7 +106,7 @@ def _stationary(
 def _mixed(
     draws: list[np.ndarray], mean: np.ndarray, sd: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and sd of an equal mixture of posteriors and of a prior of that mean and sd."""
+    """Mean and sd of an equal mixture of posteriors and a prior, given the prior's mean and sd."""
     means = np.stack([*(np.median(each, axis=0) for each in draws), np.asarray(mean)])
     # Medians and quantiles: beta / (1 - beta0) has heavy tails as beta0 comes near 1.
     spreads = [0.5 * np.subtract(*np.quantile(each, [0.841, 0.159], axis=0)) for each in draws]
@@ -120,7 +120,7 @@ def _moments(prior: dist.Distribution) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _beta(mean: np.ndarray, sd: np.ndarray) -> dist.Beta:
-    """Beta of these moments."""
+    """Beta distribution with given mean and sd."""
     center = float(np.clip(mean, _EDGE, 1.0 - _EDGE))
     count = max(center * (1.0 - center) / float(sd) ** 2 - 1.0, 0.5)
     return dist.Beta(center * count, (1.0 - center) * count)

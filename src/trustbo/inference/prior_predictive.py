@@ -101,7 +101,7 @@ def sample_prior(
         n_features: Number of features.
         n_draws: Number of draws.
         seed: Seed; the same seed gives the same draws.
-        n_robots: Number of robots, for models whose robots have parameters of their own.
+        n_robots: Number of robots, for models with separate parameters for each robot.
     """
     require_model(model)
     sizes = {"n_features": n_features, "n_robots": n_robots, "n_draws": n_draws}
@@ -117,7 +117,7 @@ def draw_sites(
 ) -> dict[str, np.ndarray]:
     """Draws of the parameters from the prior for (robots, features), by name.
 
-    TrustboError: they show the model to be none, see `TrustModel.check`.
+    TrustboError: the model is invalid at these draws, see `TrustModel.check`.
     """
     found = model.draw_prior(shape, n_draws, np.random.default_rng(seed))
     if found is None:
@@ -129,7 +129,7 @@ def draw_sites(
 def _compiled_draws(
     model: TrustModel, shape: tuple[int, int], n_draws: int, seed: int
 ) -> dict[str, np.ndarray]:
-    """The same by the model's sample statements, those of places apart."""
+    """Draws of the parameters by the model's sample statements, without those of places."""
     # Whole batches: any number of draws meets one compiled program.
     rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1).reshape(-1, _BATCH)
     with own_settings():

@@ -98,8 +98,8 @@ def sample_statistics(
 def moment_matched(params: TrustParams, priors: Priors) -> Priors:
     """Priors with the mean and sd of posterior draws, as in the later code; not exact.
 
-    Each parameter keeps its own moments only: dependence and skewness of the posterior are lost,
-    and means are off by up to 1.15 posterior sd over 20 missions.
+    Only marginal moments are kept: dependence and skewness of the posterior are lost, and means are
+    off by up to 1.15 posterior sd over 20 missions.
 
     Args:
         params: Draws of the last posterior, leading axis (draw,).

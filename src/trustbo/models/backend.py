@@ -1,11 +1,11 @@
 """numpyro, whole; and the JAX settings that results are computed under.
 
 Without ipywidgets, a kernel of Jupyter is warned of it when numpyro is imported ("IProgress not
-found"), which is of no use: bars of text are as good.
+found"); the warning is silenced, as text bars suffice.
 
-arviz_base leaves a lazy numpyro in `sys.modules`. Whoever then imports a submodule of it first, as
-in `import arviz; import numpyro.distributions`, gets packages that miss their own submodules, and
-numpyro fails ("numpyro.distributions has no attribute 'distribution'"). To ask the package for
+arviz_base leaves a lazy numpyro in `sys.modules`. A caller that then imports a submodule of it
+first, as in `import arviz; import numpyro.distributions`, gets packages without their submodules,
+and numpyro fails ("numpyro.distributions has no attribute 'distribution'"). To ask the package for
 something first avoids it; where it has happened already, the submodules are put in their places.
 """
 
@@ -44,7 +44,7 @@ def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Compute in float64 with one random number generator, whatever the caller's JAX flags are."""
+    """Compute in float64 with one random number generator, for any JAX flags of the caller."""
     with (
         jax.enable_x64(True),
         jax.default_prng_impl("threefry2x32"),

@@ -21,7 +21,7 @@ INTER_ROBOT = ("full", "none", "ordered")
 @register
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
-    """Every robot with parameters of its own, equations (1)-(2).
+    """Trust model with separate parameters for each robot, equations (1)-(2).
 
     Attributes:
         inter_robot: `"full"`, the paper's: matrices B0 and B_m, shrunk towards their diagonals by
@@ -185,7 +185,7 @@ class CoupledTrust(TrustModel):
 
     @property
     def robot_sets(self) -> str | None:
-        """Each robot has its own, if nothing couples them."""
+        """Statistics of each robot where nothing couples them."""
         return "each" if self.robots_are_apart else None
 
 

@@ -1,4 +1,4 @@
-"""A trust model whose drift is the user's own function of awareness and sampled parameters."""
+"""Trust model with a custom drift: a function of awareness and sampled parameters."""
 
 import contextlib
 from collections.abc import Callable, Mapping
@@ -32,7 +32,7 @@ from trustbo.models.priors_numpy import draw, quantile_at
 @jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True, repr=False, init=False)
 class DriftTrust(TrustModel):
-    """Trust x^k = beta0 x^{k-1} + u^k + eps_w, u = `drift(z, **theta)` a function of your own.
+    """Trust x^k = beta0 x^{k-1} + u^k + eps_w, u = `drift(z, **theta)` a custom function.
 
     Rates are as in (4), and trust integrates out as it does in `PooledTrust`, whose drift is
     z @ beta + b. All robots share beta0 and the noises, whose priors are those of `priors`.
@@ -46,8 +46,8 @@ class DriftTrust(TrustModel):
             name, each (), (robot,), (feature,) or (robot, feature).
 
     Raises:
-        TrustboError: The drift takes a parameter that there is not, or does not take one that there
-            is; a name that the model has itself; or no prior.
+        TrustboError: The drift takes a parameter without a prior, or lacks one with a prior; a name
+            that the model uses; or no prior.
     """
 
     drift: Callable[..., Any]
@@ -157,7 +157,7 @@ class DriftTrust(TrustModel):
 
     @cached_property
     def why_not_exact(self) -> str | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Reason why scores of priors do not do: other rates than Gaussian, or a prior."""
+        """Reason against normal scores: rates not Gaussian, or a prior without quantiles."""
         if not self.family.integrates_out:
             return "its drift is a function of your own, and its observations are not Gaussian"
         return self._why_no_scores
@@ -268,7 +268,7 @@ class DriftTrust(TrustModel):
             )
 
     def marks(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """See `TrustModel.marks`: `find_drift` knows the function by them."""
+        """See `TrustModel.marks`: `find_drift` identifies the function by them."""
         return {"drift_shape": list(shape), "drift_mark": self.form.mark(shape)}
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:

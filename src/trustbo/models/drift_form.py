@@ -1,8 +1,8 @@
-"""A drift of the user's own: its function, the axes of its parameters, and values of these.
+"""Custom drift: its function, the axes of its parameters, and their values.
 
-A file cannot hold a function. A posterior has its name, and its values at one point: the function
-is found again among those that this process made a model with, and known by these values. Nothing
-that a file names is imported.
+A file cannot hold a function. A posterior stores its name and its values at one point: the function
+is looked up among those that this process has built a model with, and identified by these values.
+Nothing that a file names is imported.
 """
 
 from collections.abc import Callable, Mapping
@@ -57,7 +57,7 @@ class DriftForm:
         return u
 
     def mark(self, shape: tuple[int, int]) -> list[float]:
-        """Drift of each robot at one point of awareness (robot, feature), to know it by."""
+        """Drift of each robot at one point of awareness (robot, feature): its fingerprint."""
 
         def ramp(low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
             return np.linspace(low, high, int(np.prod(shape))).reshape(shape)
@@ -86,7 +86,7 @@ class Drift:
     n_features: int = field(metadata={"static": True})
 
     def map(self, function: Callable[[Any, int], Any]) -> Self:
-        """The same with a function of each value and the number of its own axes in its place."""
+        """Apply a function to each value and the number of its trailing axes."""
         theta = {name: function(self.theta[name], len(axes)) for name, axes in self.form.axes}
         return replace(self, theta=theta)
 
@@ -161,6 +161,6 @@ def find_drift(about: Mapping[Any, Any], sites: Mapping[str, np.ndarray]) -> Dri
 
 
 def name_of(function: object) -> str:
-    """Module and name of a function of the user's."""
+    """Module and name of a custom function."""
     own = getattr(function, "__qualname__", type(function).__name__)
     return f"{getattr(function, '__module__', '')}:{own}"

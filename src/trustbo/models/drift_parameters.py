@@ -1,4 +1,4 @@
-"""Parameters of a drift of the user's own: their priors, and their axes."""
+"""Parameters of a custom drift: priors and axes."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -55,7 +55,7 @@ def prior_text(name: str, given: Any) -> str:
 
 @lru_cache(maxsize=64)
 def traced_axes(parameters: Callable[[int, int], Mapping[str, Any]]) -> tuple[Axes, Axes]:
-    """The same of a function, from its shapes for sizes that tell robots and features apart."""
+    """Axes of a function's parameters, from shapes at unequal numbers of robots and features."""
     try:
         inspect.signature(parameters).bind(5, 7)
     except TypeError:
@@ -89,7 +89,7 @@ def traced_axes(parameters: Callable[[int, int], Mapping[str, Any]]) -> tuple[Ax
 
 
 def require_names(drift: Callable[..., Any], arguments: Axes, sites: Axes) -> None:
-    """Refuse names that the drift and its parameters do not have in common, or that are taken."""
+    """Refuse names that only the drift or only the priors have, and names that the model uses."""
     for name in arguments | sites:
         if name in _RESERVED:
             raise TrustboError(f"parameter {name!r} is the model's own; give yours another name.")

@@ -8,7 +8,7 @@ from numpyro.distributions.transforms import Transform, biject_to
 
 
 class _AboveFloor(type(constraints.greater_than(0.0))):
-    """Numbers from a floor on, whose coordinate is log sqrt(x^2 - floor^2)."""
+    """Constraint x > floor, whose unconstrained coordinate is log sqrt(x^2 - floor^2)."""
 
 
 class _HypotTransform(Transform):
@@ -52,7 +52,7 @@ class Floored(Distribution):
     pytree_data_fields = ("base", "low", "log_above", "moment_below", "_support")
 
     def __init__(self, base: Distribution, low: float, below: tuple[float, float]) -> None:
-        """Take the moments of what is cut off.
+        """Truncate `base` at `low`, given the moments of the part below.
 
         Args:
             base: Scalar prior on (0, inf) or part of it.

@@ -1,4 +1,4 @@
-"""Robots with coefficients of their own, drawn from a common distribution."""
+"""Separate coefficients for each robot, drawn from a common distribution."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -129,7 +129,7 @@ class HierarchicalTrust(TrustModel):
         return all(support is constraints.real for support in supports)
 
     def mean_sites(self, mu: Array) -> dict[str, Array]:
-        """Sites of the means, on their own real lines."""
+        """Unconstrained sites of the means."""
         return {"mean_beta0": mu[0], "mean_beta": mu[1:-1], "mean_b": mu[-1]}
 
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:

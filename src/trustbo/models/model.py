@@ -42,10 +42,10 @@ class TrustModel(Displayed, ABC):
             names of the features, see `Priors.of`.
         observation: Family of observations: `"gaussian"`, the paper's; `"censored"`, rates of 0
             and 1 being limits; `"beta_binomial"`, ticks in contact out of `Bound.n_ticks` ticks,
-            trust being a logit; `"student_t"`, rates with odd values, 4 degrees of freedom;
-            `"auto"`: that which suits the rates of a fit, see `for_rates`.
+            trust being a logit; `"student_t"`, rates with outliers, 4 degrees of freedom; `"auto"`:
+            that which suits the rates of a fit, see `for_rates`.
         response: Quantity that a rate measures: trust, `"level"`, or its `"change"` over the bound.
-        place: Effects of places beyond what awareness says of them; None is the paper's model.
+        place: Effects of places that awareness does not explain; None is the paper's model.
 
     Raises:
         TrustboError: A name is unknown, the family does not allow `"change"`, or robots that
@@ -83,7 +83,7 @@ class TrustModel(Displayed, ABC):
         """Distance of each intercept below the average level of trust.
 
         Args:
-            sites: Parameters as they are sampled.
+            sites: Sampled parameters.
             mean_y: Mean rate, or its logit.
             mean_z: Mean awareness, shape (feature,).
 
@@ -94,7 +94,7 @@ class TrustModel(Displayed, ABC):
     @property
     @abstractmethod
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """Axes of each parameter that a posterior has."""
+        """Axes of each parameter in a posterior."""
 
     @property
     def place_dims(self) -> dict[str, tuple[str, ...]]:
@@ -115,7 +115,7 @@ class TrustModel(Displayed, ABC):
         return False
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
-        """Field of `Priors` and values of each parameter that has a prior of its own, by label.
+        """Field of `Priors` and values of each parameter with an independent prior, by label.
 
         Args:
             sites: Parameters of a posterior, leading axes (...), with the axes of `dims`.
@@ -123,7 +123,7 @@ class TrustModel(Displayed, ABC):
         return {name: (name, sites[name]) for name in self.dims if name not in self.place_dims}
 
     def own_log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Log prior density (chain, draw), by label, of parameters that `Priors` does not know."""
+        """Log prior density (chain, draw), by label, of parameters without a field in `Priors`."""
         return {}
 
     def draw_prior(
@@ -131,7 +131,7 @@ class TrustModel(Displayed, ABC):
     ) -> dict[str, np.ndarray] | None:
         """Draws of the parameters but those of places, (draw, ...), by name.
 
-        None where the model's own sample statements have to be run, which takes long to compile.
+        None where only the numpyro model can draw them, which takes long to compile.
         """
         if not self.priors_are_independent:
             return None
@@ -143,7 +143,7 @@ class TrustModel(Displayed, ABC):
         return priors.of_stationary(drawn)
 
     def check(self, sites: Mapping[str, np.ndarray], shape: tuple[int, int]) -> None:
-        """Refuse a model that draws from its prior show to be none: TrustboError.
+        """Refuse a model that is invalid at draws from its prior: TrustboError.
 
         Args:
             sites: Draws by name, leading axis (draw,).
@@ -151,7 +151,7 @@ class TrustModel(Displayed, ABC):
         """
 
     def marks(self, shape: tuple[int, int]) -> dict[str, Any]:
-        """Attributes that a posterior of so many robots and features knows the model by."""
+        """Attributes that identify the model in a posterior of that many robots and features."""
         return {}
 
     @property
@@ -160,9 +160,9 @@ class TrustModel(Displayed, ABC):
         return None
 
     def for_features(self, features: Sequence[str]) -> Self:
-        """The model with the default priors of features of these names; its own, if it has any.
+        """The model with default priors for features of these names; custom priors stay.
 
-        See `Priors.of`. `fit` and campaigns do this by themselves.
+        See `Priors.of`. `fit` and campaigns call it.
         """
         if self.priors is not Priors.default(self.observation) or self.lag:
             return self
@@ -173,8 +173,8 @@ class TrustModel(Displayed, ABC):
     def for_rates(self, batch: MissionBatch) -> tuple[Self, str]:
         """The model with the family of observations that suits measured rates, and the reason.
 
-        With `observation="auto"`: censored rates if 5 % of them are 0 or 1; else Gaussian ones, and
-        too where the exact sampler treats the model with these alone. Any other model as it is.
+        With `observation="auto"`: censored rates if 5 % of them are 0 or 1; else Gaussian ones,
+        also where the exact sampler applies to these alone. Any other model is returned unchanged.
         """
         if self.observation != AUTO:
             return self, "asked for"
@@ -185,7 +185,7 @@ class TrustModel(Displayed, ABC):
         return chosen, reason
 
     def observing(self, observation: str) -> Self:
-        """The model of rates of that family, if its own is `"auto"`, else as it is."""
+        """The model with that family of observations if `"auto"`, else unchanged."""
         if self.observation != AUTO:
             return self
         own = self.priors is not Priors.default(AUTO)
@@ -208,7 +208,7 @@ class TrustModel(Displayed, ABC):
         return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
 
     def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
-        """Shape of each parameter that a posterior has, those of places apart."""
+        """Shape of each parameter in a posterior, without those of places."""
         length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
         length["feature"] = n_features
         own = {name: axes for name, axes in self.dims.items() if name not in self.place_dims}
@@ -220,7 +220,7 @@ class TrustModel(Displayed, ABC):
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
     def params(self, sites: Mapping[str, Any], n_features: int) -> Params:
-        """Parameters from their values by name, leading axes (draw,) or none.
+        """Build parameters from values by name, leading axes (draw,) or none.
 
         Args:
             sites: Values with the axes of `dims`.

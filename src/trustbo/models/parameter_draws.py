@@ -1,4 +1,4 @@
-"""Draws of parameters: tuples of arrays with leading axes such as (draw,), whatever the model."""
+"""Draws of parameters of any model: tuples of arrays with leading axes such as (draw,)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -94,12 +94,12 @@ class ParameterDraws(Displayed):
 
     @property
     def places(self) -> dict[str, np.ndarray]:
-        """Effects of places there are, place and place_bound, by name."""
+        """Effects of places in the model, place and place_bound, by name."""
         found = {name: getattr(self, name, None) for name in PLACES}
         return {name: np.asarray(value) for name, value in found.items() if value is not None}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Effect of each bound, its cell's and its own; shape (..., bound, effect).
+        """Effect of each bound, that of the cell entered included; shape (..., bound, effect).
 
         Args:
             bounds: Move, row and column of each bound (bound, 3), moves as in `MOVES[8]`; the
@@ -174,7 +174,7 @@ class ParameterDraws(Displayed):
         return np.shape(getattr(self, name))[axes.index(axis) - len(axes)] if axis in axes else None
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
-        """The same with a function of each field and the number of its own axes in its place."""
+        """Apply a function to each field and the number of its trailing axes."""
         core = {name: len(self.AXES.get(name, ())) for name in self._fields}
         values = {
             name: value.map(function) if isinstance(value, Drift) else function(value, n)
@@ -185,7 +185,7 @@ class ParameterDraws(Displayed):
 
 
 def _written(draws: np.ndarray) -> str:
-    """Mean and sd over draws (draw, ...) of a field: of each number, or of many together."""
+    """Text of the mean and sd over draws (draw, ...) of a field."""
     mean, sd = draws.mean(0), draws.std(0)
     if mean.size > 6:
         return f"{mean.shape}, {mean.min():.3g} to {mean.max():.3g}"

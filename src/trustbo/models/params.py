@@ -69,7 +69,7 @@ class TrustParams(_Apart, _Trust):
 
 
 class RobotParams(_Apart, _Trust):
-    """Parameters of robots with coefficients of their own, that do not influence each other.
+    """Parameters of robots with separate coefficients and no influence on each other.
 
     Fields: beta0 (..., robot), beta (..., robot, feature), b, delta_w and delta_v (..., robot),
     x0_mean, x0_sd, place and place_bound as in `TrustParams`.
@@ -138,8 +138,8 @@ class _OwnDrift(NamedTuple):
 class DriftParams(_Apart, _OwnDrift):
     """Parameters of `DriftTrust`; made by its `params`.
 
-    Fields: beta0 (...,), the drift with its own parameters, delta_w and delta_v (...,), x0_mean,
-    x0_sd, place and place_bound as in `TrustParams`; b is 0, for effects of places to enter by.
+    Fields: beta0 (...,), the drift with its parameters, delta_w and delta_v (...,), x0_mean, x0_sd,
+    place and place_bound as in `TrustParams`; b is 0, for effects of places to enter by.
     """
 
     __slots__ = ()
@@ -201,7 +201,7 @@ def ordered_params(sites: Mapping[str, Numbers], x0_mean: Numbers, x0_sd: Number
 def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Params:
     """Parameters from draws by name, leading axis (draw,), and the attributes of a posterior.
 
-    TrustboError: they are of a drift that is not known here.
+    TrustboError: the drift was not built in this process.
     """
     x0 = {name: about[name] for name in ("x0_mean", "x0_sd")}
     if "drift" not in about:

@@ -25,17 +25,17 @@ _MOST = {
 
 @dataclass(frozen=True)
 class PlaceEffect:
-    """Effect of a place on trust, beyond what awareness says of it.
+    """Effect of a place on trust that awareness does not explain.
 
     The drift of trust by the bound from cell a to cell c is u(a -> c) = beta . z(a -> c) + b + s(c)
     + e(a -> c). s is a Gaussian process over cells, of sd tau_s and covariance Matern 3/2 with a
     length scale in cells; e(a -> c) ~ N(0, tau_e^2), independent for each directed bound.
 
     Attributes:
-        cells: Whether there is s.
-        bounds: Whether there is e.
-        shared: Whether all robots share s and e; else each robot has its own, of the same tau_s,
-            tau_e and length scale.
+        cells: Whether the model has s.
+        bounds: Whether the model has e.
+        shared: Whether all robots share s and e; else each robot has separate ones, with the same
+            tau_s, tau_e and length scale.
         tau_s: Scale of the half-normal prior of the sd of s.
         tau_e: Scale of the half-normal prior of the sd of e.
         length_scale: Median of the log-normal prior of the length scale, in cells.
@@ -117,7 +117,7 @@ class Visited(NamedTuple):
 
     @property
     def n_effects(self) -> int:
-        """Number of robots with effects of their own, 1 where all share them."""
+        """Number of robots with separate effects, 1 where all share them."""
         return 1 if self.unit.shape[2] == 1 else int(self.unit.shape[2])
 
 
@@ -131,7 +131,7 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
         shape = len(missions), max(len(mission.bounds) for mission in missions)
     found = np.full((*shape, 3), -1)
     for j, mission in enumerate(missions):
-        path = mission.path[: len(mission.bounds) + 1]  # one that failed has not made the rest
+        path = mission.path[: len(mission.bounds) + 1]  # a failed mission did not run the rest
         try:
             found[j, : len(mission.bounds)] = bounds_along(path)
         except TrustboError as error:

@@ -40,10 +40,10 @@ class PooledTrust(TrustModel):
 
     @property
     def robot_sets(self) -> str:
-        """All robots share their parameters."""
+        """Statistics of all robots together."""
         return "all"
 
     @property
     def priors_are_independent(self) -> bool:
-        """Each parameter has a prior of its own."""
+        """Whether priors are independent: yes."""
         return True

@@ -34,7 +34,7 @@ class Priors(Displayed):
     Attributes:
         beta0: Autoregression; the diagonal of B0 in the coupled model.
         beta: Weight of each feature, independent; the diagonals of B_m in the coupled model. A
-            distribution of batch shape (feature,) gives each feature its own.
+            distribution of batch shape (feature,) gives each feature a separate prior.
         b: Intercept.
         delta_w: Standard deviation of the process noise.
         delta_v: Standard deviation of the observation noise, cut off below the resolution of the
@@ -46,8 +46,8 @@ class Priors(Displayed):
         x0_mean: Mean of trust before the first bound.
         x0_sd: Its standard deviation; 0 fixes it.
         stationary: True if `beta` and `b`, both Normal, are priors of the weights and intercept of
-            stationary trust, beta / (1 - beta0) and b / (1 - beta0), to which features that stay
-            as they are lead in the end.
+            stationary trust, beta / (1 - beta0) and b / (1 - beta0), the limit under constant
+            features.
 
     Raises:
         TrustboError: A prior is no such distribution, a noise or tau can be negative, `x0_sd` is
@@ -175,13 +175,13 @@ class Priors(Displayed):
         """Vague priors in the manner of the authors' later code, for comparison.
 
         All are normal with sd 10, noises half-Cauchy. With few missions the posterior is
-        multimodal in practice (beta0 near 1 with small weights, or near 0 with large ones): look at
-        R-hat before you use it.
+        multimodal in practice (beta0 near 1 with small weights, or near 0 with large ones): check
+        R-hat.
         """
         return cls(**zheng2023.vague_priors())
 
     def above_resolution(self, resolution: float) -> Self:
-        """The same, delta_v being no less than the resolution of a rate."""
+        """The same priors with delta_v truncated below at the resolution of a rate."""
         return replace(self, delta_v=floored(self.delta_v, resolution))
 
     def mean(self, n_features: int) -> dict[str, np.ndarray]:
@@ -194,7 +194,7 @@ class Priors(Displayed):
         return self.of_stationary(means)
 
     def of_stationary(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Parameters of values whose `beta` and `b` are drawn from the priors of these names."""
+        """Convert `beta` and `b` of stationary trust to weights and intercept."""
         if not self.stationary:
             return values
         rest = 1.0 - values["beta0"]

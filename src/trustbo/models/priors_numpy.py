@@ -112,7 +112,7 @@ def bijection(support: Any) -> tuple[Callable[..., np.ndarray], Callable[..., np
 
 
 def floored(prior: Distribution, low: float) -> Distribution:
-    """Prior of a standard deviation cut off below `low`; as it is, if it starts there or above.
+    """Prior of a standard deviation truncated at `low`; unchanged if its support starts above.
 
     Raises:
         TrustboError: It has next to no mass above.

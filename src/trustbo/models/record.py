@@ -1,4 +1,4 @@
-"""A model's settings as a record that JSON can hold, and the model again."""
+"""JSON record of a model's settings, and the model rebuilt from it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ _MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, C
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Class, options, and priors as text; whether they go by the names of the features."""
+    """Record of class, options, priors as text, and whether these depend on the features' names."""
     own = {
         "class": type(model).__name__,
         **model.options(),
@@ -30,10 +30,10 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
 def model_from_record(
     record: dict[str, Any], given: TrustModel | None = None, features: Sequence[str] = ()
 ) -> TrustModel:
-    """Model of a record; one with priors or a class of the user's own has to be given again.
+    """Rebuild the model of a record; one with custom priors or class has to be passed again.
 
-    `features` are those that a posterior has, whose default priors its model may have.
-    TrustboError: it has to be given and was not, or another was given.
+    `features` are those of the posterior, for default priors by feature. TrustboError: it has to be
+    passed and was not, or another was passed.
     """
     record = {"place": None, **record}  # version 0.1 had none
     if given is not None:

@@ -14,7 +14,7 @@ NO_TICKS = (
     '(Mission.from_arrays(..., n_ticks=...)), or use observation "censored".'
 )
 UNKNOWN_RESOLUTION, COARSEST_RESOLUTION = 0.005, 0.1
-"""Resolution of a rate whose ticks are not known, and that which fewer ticks do not exceed."""
+"""Resolution of a rate with an unknown number of ticks, and the coarsest resolution."""
 
 TickWeights = dict[float, float]
 """Weight of the measured rates by their number of ticks, NaN ticks being 0; adds up."""

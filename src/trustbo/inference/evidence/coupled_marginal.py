@@ -11,7 +11,7 @@ they are the rows of a regression e = y - X c with unit noise. With prior precis
                                                              [ h'  s ],
 
 and -2 log p(y) = s^2 + sum log S + 2 log |F| - log |L| + n log 2 pi, c | y ~ N(F'^-1 h, (F F')^-1).
-A rate that is missing is no row; a mission's weight multiplies its rows' squares.
+A missing rate gives no row; a mission's weight multiplies the squares of its rows.
 """
 
 from typing import NamedTuple
@@ -26,11 +26,11 @@ LOG_2PI = np.log(2.0 * np.pi)
 
 
 class Sequences(NamedTuple):
-    """Missions, those of like gaps together, and the layout of the coefficients."""
+    """Missions grouped by pattern of gaps, and the layout of the coefficients."""
 
     y: np.ndarray  # (mission, bound, robot), 0 where missing
     seen: np.ndarray  # (mission, bound, robot)
-    inputs: np.ndarray  # (mission, bound, coefficient), what a coefficient is multiplied by
+    inputs: np.ndarray  # (mission, bound, coefficient), covariate of each coefficient
     weight: np.ndarray  # (mission,)
     length: np.ndarray  # (mission,), bounds up to the last rate
     kind: np.ndarray  # (mission,), missions of one kind have the same gaps up to their lengths
@@ -61,13 +61,13 @@ def gather_sequences(
 ) -> Sequences:
     """Missions of awareness (mission, bound, robot, feature) and rates (mission, bound, robot).
 
-    A coefficient moves the trust of `robot`. `source` is what it is multiplied by, an index into
-    the awareness of all robots, (robot x feature), with a 1 behind.
+    A coefficient moves the trust of `robot`. `source` is its covariate, an index into the awareness
+    of all robots, (robot x feature), with a 1 behind.
     """
     seen = ~np.isnan(contact_rate)
     length = np.where(seen.any(2), np.arange(1, seen.shape[1] + 1), 0).max(1)
     kept = np.flatnonzero((weight > 0.0) & (length > 0))
-    # Longest first within the same gaps: covariances of a long mission are a short one's too.
+    # Longest first within the same gaps: a short mission has the leading covariances of a long one.
     gaps = [~seen[j, : length[j]] for j in range(len(seen))]
     where = [np.argwhere(each).tobytes() for each in gaps]
     order = sorted(kept, key=lambda j: (where[j], -length[j]))
@@ -111,7 +111,7 @@ def _integrate(data, at, first, last, value, factor):
         for c in range(p):
             for i in range(n):
                 spread[i, c] = at.G[t, i, data.robot[c]]
-        total, n_rows = 0.0, np.int64(0)  # a plain 0 has a type of its own, compiled for too
+        total, n_rows = 0.0, np.int64(0)  # an int64 throughout
         for s in range(n_missions):
             if s == 0 or data.kind[s] != data.kind[s - 1]:
                 _filter(data.seen[s], data.length[s], at.B0[t], at.Q[t], at.R[t], data.x0[1],
@@ -123,7 +123,8 @@ def _integrate(data, at, first, last, value, factor):
         for c in range(p):
             of_prior = at.precision[t, c]
             A[c, c] += of_prior
-            A[p, c] = of_prior * at.mean[t, c] - A[p, c]  # the columns are of -X
+            # The recursion gives columns of -X: drifts enter the innovations with a minus.
+            A[p, c] = of_prior * at.mean[t, c] - A[p, c]
             A[p, p] += of_prior * at.mean[t, c] ** 2
             total -= np.log(of_prior)
         _cholesky(A)

@@ -59,11 +59,11 @@ class LengthGram(NamedTuple):
     corner: np.ndarray  # (bound, bound, column, column)
 
     def scaled(self, factor: float) -> Self:
-        """The same data with other weight."""
+        """Multiply the weight of the data by a factor."""
         return type(self)(factor * self.weight, factor * self.spectral, factor * self.corner)
 
     def plus(self, other: Self) -> Self:
-        """The data of both."""
+        """Add the data of both."""
         return type(self)(
             self.weight + other.weight,
             self.spectral + other.spectral,
@@ -101,7 +101,7 @@ class GapSequences(NamedTuple):
     x0_mean: float
 
     def scaled(self, factor: float) -> Self:
-        """The same data with other weight."""
+        """Multiply the weight of the data by a factor."""
         return self._replace(weight=factor * self.weight)
 
     def evaluate(self, theta: np.ndarray, x0_sd: float, lag: float) -> Quadratic:

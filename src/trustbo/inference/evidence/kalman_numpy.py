@@ -116,7 +116,7 @@ class _Draws(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Sequences side by side that share their pattern of missing rates, or each have their own."""
+    """Sequences filtered in one batch, with common or separate patterns of missing rates."""
 
     draws: _Draws
     mission: np.ndarray  # (sequence,)

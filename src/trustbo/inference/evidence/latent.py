@@ -17,7 +17,7 @@ _BATCH = 64  # draws computed at once
 
 
 class Latents(NamedTuple):
-    """Parts of latent trust that were sampled with the parameters, if it does not integrate out."""
+    """Innovations of latent trust sampled with the parameters, where it does not integrate out."""
 
     innovations: Array | np.ndarray | None = None
     """Standard normal numbers, (draw, bound, mission, robot)."""

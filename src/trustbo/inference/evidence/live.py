@@ -11,7 +11,7 @@ from trustbo.models.state_space import kalman
 Moments = tuple[np.ndarray, np.ndarray]
 Effect = np.ndarray | float
 """Effect of a place, shape (draw, robot or 1)."""
-_TICKS = np.asarray(200.0)  # of bounds to come, whose ticks nobody knows
+_TICKS = np.asarray(200.0)  # of future bounds, whose number of ticks is unknown
 
 
 class Rates(NamedTuple):
@@ -55,7 +55,7 @@ class ApartFilter:
     def update(
         self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, rates: Rates, effect: Effect = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same given rates, and their log density but for a constant, (draw,)."""
+        """Moments given rates, and the log density of these up to a constant, (draw,)."""
         family, y, n_ticks = rates
         seen, drift = ~np.isnan(y), self._drift(z) + effect
         if family.observes_trust:
@@ -103,7 +103,7 @@ class ApartFilter:
 
 
 class DriftFilter(ApartFilter):
-    """Robots whose drift is a function of the user's own."""
+    """Robots with a custom drift."""
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
         own = z[:, None] if z.ndim == 3 else z[None]

@@ -6,10 +6,10 @@ bounds enter x by T, T_kj = beta0^(k - j). Whitened by the covariance of its rat
 missions and robots add up to the precision W that the data lend to g, and then, with L_g L_g' the
 prior covariance of g, det(V + T K T') = det(V) det(I + L_g' W L_g).
 
-NUTS asks for ten thousands of gradients, so that little is done twice. V and T depend on awareness
-in nothing, and those of a short mission lead those of a long one: there is one whitening of each
-pattern of gaps, not of each mission and robot. The part of all units has its gradient in closed
-form, which takes no derivative of a Cholesky factor.
+NUTS takes tens of thousands of gradients, so that common factors are shared. V and T do not depend
+on awareness, and those of a short mission are leading blocks of those of a long one: there is one
+whitening for each pattern of gaps, not for each mission and robot. The term of all units has its
+gradient in closed form, without the derivative of a Cholesky factor.
 """
 
 from typing import NamedTuple
@@ -24,11 +24,11 @@ from trustbo.models.place import Visited
 from trustbo.models.state_space.scalar import ScalarSSM
 
 _BUCKET = 32
-_JITTER = 1e-10  # of tau_s^2, where bounds have no effect of their own
+_JITTER = 1e-10  # of tau_s^2, where bounds have no effect
 
 
 class PlaceIndex(NamedTuple):
-    """Visited places as data of compiled code, padded so that the next mission meets the same."""
+    """Visited places as data of compiled code, padded so that the next mission reuses it."""
 
     cells: Array | np.ndarray  # (cell, 3): effect, row, col
     cell_of: Array | np.ndarray  # (unit,)
@@ -38,10 +38,10 @@ class PlaceIndex(NamedTuple):
 
     @classmethod
     def of(cls, places: Visited, contact_rate: np.ndarray) -> "PlaceIndex":
-        """Pad cells, each an effect of its own, and units, which nobody measured.
+        """Pad with cells of separate effects and with unmeasured units.
 
-        Rates (mission, bound, robot) have the pattern of their gaps, the end of a mission being
-        none. Patterns without gaps pad to a power of four.
+        A pattern is that of the gaps in rates (mission, bound, robot); the end of a mission is no
+        gap. Patterns without gaps pad to a power of four.
         """
         more = -len(places.cells) % _BUCKET
         apart = np.column_stack([-1 - np.arange(more), np.zeros((more, 2), dtype=int)])
@@ -60,7 +60,7 @@ class PlaceIndex(NamedTuple):
 
 
 class PlaceHyper(NamedTuple):
-    """Hyperparameters of places; 0, and a length scale of 1, for an effect there is not."""
+    """Hyperparameters of places; 0, and a length scale of 1, for an absent effect."""
 
     tau_s: Array
     length_scale: Array
@@ -113,7 +113,7 @@ def _log_marginal(K: Array, W: Array, h: Array) -> Array:
 
 
 def _with_posterior(K: Array, W: Array, h: Array) -> tuple[Array, tuple[Array, ...]]:
-    """The same; and W, the mean m and covariance C of g under that weight, and h - W m."""
+    """Log marginal; and W, the mean m and covariance C of g under that weight, and h - W m."""
     L = jnp.linalg.cholesky(K)
     root = _root(L, W)
     X = solve_triangular(root, L.T, lower=True)
@@ -154,7 +154,7 @@ def _statistics(
     mean = start[robot] * ssm.x0_mean + jnp.einsum("ikj,jmi->mik", carried[robot[0]], ssm.drift)
     r = jnp.where(seen, jnp.nan_to_num(jnp.swapaxes(y, 1, 2)) - mean @ H.T, 0.0)
     pattern = places.pattern_of
-    # What comes after the end of a mission moves nothing before it, and is left out here.
+    # Bounds after the end of a mission do not affect those before, and are left out here.
     r = seen * jnp.einsum("mikj,mij->mik", inverse[robot, pattern], r)
     T = seen[..., None] * T[robot, pattern]  # (mission, robot, bound, bound)
     w = weight[:, None]
@@ -176,8 +176,8 @@ def _whitening(
     """Whitening of the rates of one robot, for each pattern.
 
     Returns:
-        Share of a bound in each x_k (bound + 1, bound); share of x_0; and of each pattern the
-        inverse of the factor of V, the log of its diagonal, and its product with T.
+        Returns the response of each x_k to a bound (bound + 1, bound) and to x_0; and for each
+        pattern the inverse of the factor of V, the log of its diagonal, and its product with T.
     """
     n = patterns.shape[1]
     step = jnp.arange(n + 1)

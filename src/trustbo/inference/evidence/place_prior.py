@@ -7,7 +7,7 @@ bounds into cell c, W = diag(sqrt(n_c)) and M = tau_e^2 I + tau_s^2 W K W (Woodb
     log |K_g| = 2 (D - C) log tau_e + log |M|
 
 so that D visited bounds cost one factor of C visited cells. Without bounds' effects the units are
-cells, n_c = 1, and tau_e is but a jitter; without cells' effects tau_s = 0.
+cells, n_c = 1, and tau_e is only a jitter; without cells' effects tau_s = 0.
 """
 
 import numba as nb
@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs  # pyright: ignore
 
 JITTER = 1e-4
-"""Least tau_e in units of tau_s or the noise: below, K_g is singular to rounding."""
+"""Lower limit of tau_e in units of tau_s or the noise: below, K_g is singular to rounding."""
 LENGTH_SCALES = 1e-6, 1e6
-"""Least and largest length scale, in cells: beyond, cells are independent, or equal."""
+"""Lower and upper limit of the length scale, in cells: outside, cells are independent, or equal."""
 
 _compiled = nb.njit(cache=True, error_model="numpy")
 
@@ -66,7 +66,7 @@ def fill_units(A, M_inverse, cell_of, n_c, tau_e):
 
 @_compiled
 def add_rows(A, h, S, R, a, weight, length, kind, unit):
-    """Add what rows say of g: A += sum w a^2 S to a lower triangle, h (c, unit) += sum w a R."""
+    """Add the rows' information on g: lower triangle A += sum w a^2 S, h (c, unit) += sum w a R."""
     for s in range(len(a)):
         if a[s] > 0.0:
             w = weight[s]
@@ -88,7 +88,7 @@ def factor(A: np.ndarray) -> bool:
 
 
 def invert(A: np.ndarray) -> None:
-    """Lower triangle of the inverse, in place, of a matrix that `factor` took."""
+    """Lower triangle of the inverse, in place, of a matrix factored by `factor`."""
     dpotri(A.T, lower=0, overwrite_c=1)
 
 

@@ -1,4 +1,4 @@
-"""Rates of missions as rows of numbers whose noise is independent, for models with place effects.
+"""Rates of missions as rows with independent noise, for models with place effects.
 
 All robots share the effect g of a bound, so rates of different missions and robots depend on each
 other through it. Given parameters, a row of rates is y = T (X c + a g) + noise, T_kj =
@@ -78,7 +78,7 @@ def filter_rows(theta, x0_sd, y, seen, X, a, weight, length, kind):
     """S (point, kind, K, K), R (point, row, K, c), G (point, c, c) and log |L L'| (point,).
 
     theta (point, 3): beta0, delta_w, delta_v. The columns c are those of X without the last, and
-    then the rates less what x0_mean alone makes of them.
+    then the rates less their mean from x0_mean alone.
     """
     n, (n_rows, K), q = len(theta), y.shape, X.shape[2]
     S = np.zeros((n, kind[-1] + 1, K, K))

@@ -32,7 +32,7 @@ def split_robots(model: TrustModel, batch: MissionBatch) -> list[MissionBatch]:
 
 
 def require_statistics(model: TrustModel) -> None:
-    """Refuse a model without sufficient statistics.
+    """Refuse a model without sufficient statistics of fixed size.
 
     Raises:
         TrustboError: See `TrustModel.why_no_statistics`.

@@ -14,8 +14,8 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
     """Refuse a sampler that cannot treat the model.
 
     Raises:
-        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` says why it cannot
-            be; or it is `"joint"`, and trust integrates out.
+        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` gives a reason; or it
+            is `"joint"`, and trust integrates out.
     """
     if sampler == "exact" and (reason := model.why_not_exact):
         raise TrustboError(
@@ -54,7 +54,7 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
 
 
 def slow_places(reason: str) -> str:
-    """Warning that NUTS samples effects of places, for that reason."""
+    """Text of the warning that NUTS samples effects of places, with the reason."""
     return (
         f"effects of places are sampled by NUTS, as {reason}: minutes for some 10 missions. Fast "
         "are PooledTrust(place=...) and the same model with place=None."

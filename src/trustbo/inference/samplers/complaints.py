@@ -1,4 +1,4 @@
-"""Complaints about draws: limits of diagnostics that they exceed, and modes that they missed."""
+"""Failed diagnostics of draws: limits exceeded, and modes missed."""
 
 from collections.abc import Mapping
 
@@ -15,7 +15,7 @@ _MAX_SHARE_ERROR = 0.015  # Monte Carlo error of a mode's share of the draws
 
 
 def complaints_of(params: Mapping[str, np.ndarray], stats: Mapping[str, np.ndarray]) -> list[str]:
-    """Limits that the draws exceed, parameter by parameter; empty if none."""
+    """Limits exceeded by the draws, parameter by parameter; empty if none."""
     sites = arviz_base.from_dict({"posterior": params})["posterior"].to_dataset()
     found = []
     for name, (worst, fewest) in convergence(sites).items():
@@ -30,7 +30,7 @@ def complaints_of(params: Mapping[str, np.ndarray], stats: Mapping[str, np.ndarr
 
 
 def complaints_of_modes(raw: NutsDraws) -> list[str]:
-    """Modes that chains left out, or whose share of the draws is not settled; empty if none."""
+    """Modes that no chain visited, or whose share of the draws has not converged; empty if none."""
     found, around = [], visits(raw.modes, np.asarray(raw.theta))
     if len(around) == 1:
         return found
@@ -50,7 +50,7 @@ def complaints_of_modes(raw: NutsDraws) -> list[str]:
 
 
 def _telling(raw: NutsDraws, i: int) -> str:
-    """The parameter that tells a mode from the largest other best, and its value there."""
+    """Parameter that best separates a mode from the largest other, and its value there."""
     gaps, other = [], int(np.argmax(np.delete(raw.modes.share, i)))
     other += other >= i
     for name, values in raw.params.items():

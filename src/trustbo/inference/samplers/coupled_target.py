@@ -2,8 +2,8 @@
 
 Given B0, the noises and, of robots in order, gamma, all weights and intercepts integrate out
 (`coupled_marginal`), with the couplings among them. Left are scores of the priors: three robots
-have 9 numbers of B0 and 6 of each covariance, 21 in all (in order 3 + 2 + 6 = 11), whatever the
-number of features. beta0 and the noises are scored as in `scores`, size and angle robot by robot;
+have 9 numbers of B0 and 6 of each covariance, 21 in all (in order 3 + 2 + 6 = 11), for any number
+of features. beta0 and the noises are scored as in `scores`, size and angle robot by robot;
 couplings are normal; correlations are the partial ones of the LKJ prior. With b = concentration +
 (n - 2 - k) / 2, the correlation of robots i and k < i given those before k is 2 Beta(b, b) - 1, and
 row i of the factor of the correlations is p_0, p_1 (1 - p_0^2)^1/2, p_2 (1 - p_0^2)^1/2 (1 -
@@ -41,7 +41,7 @@ class CoupledTarget:
         """Take missions and their weights.
 
         Raises:
-            TrustboError: A prior is of another kind than integrates out.
+            TrustboError: A prior is not conjugate.
         """
         priors, ordered = model.priors, model.inter_robot == "ordered"
         if reason := why_not_conjugate(priors, coupled=True):
@@ -86,7 +86,7 @@ class CoupledTarget:
         def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
             values = -self.log_density(np.vstack([z, z + steps]))
             up, down = np.split(values[1:], 2)
-            with np.errstate(invalid="ignore"):  # beside a point without density
+            with np.errstate(invalid="ignore"):  # next to a point of zero density
                 return values[0], np.nan_to_num((up - down) / 2e-4)
 
         mode = optimize.minimize(cost, start, jac=True, method="BFGS", options={"maxiter": 60}).x
@@ -96,7 +96,7 @@ class CoupledTarget:
         """Nothing: the density is exact everywhere."""
 
     def defensive(self, proposal: Student) -> Student:
-        """Wider proposal."""
+        """Defensive proposal: the given one widened."""
         return proposal.widened(1.1)._replace(nu=4.0)
 
     def draw(
@@ -119,7 +119,7 @@ class CoupledTarget:
         return named | {"Delta_w": at.Q[where], "Delta_v": at.R[where]}, None
 
     def constrain(self, z: np.ndarray) -> tuple[Dynamics, dict[str, np.ndarray]]:
-        """Dynamics of scores (point, score); with them, of robots in order, their parameters."""
+        """Dynamics at scores (point, score); for robots in order, their parameters too."""
         n, eye = self.n, np.eye(self.n)
         beta0, coupling, size, angle, *partial = np.split(z, self._ends[:-1], axis=1)
         each = np.stack([beta0, size, angle], axis=2).reshape(-1, 3)

@@ -1,11 +1,11 @@
-"""The posterior of a model with a drift of the user's own, Gaussian rates and few parameters.
+"""The posterior of a model with a custom drift, Gaussian rates and few parameters.
 
 Trust and effects of places integrate out. All else is a score of its prior (`scores`), the user's
 parameters in the order of their statements: each is the quantile of its prior, given those before
-it, at Phi(score). So where data say nothing the posterior is a sphere, and a hierarchy is
+it, at Phi(score). So where data carry no information the posterior is a sphere, and a hierarchy is
 non-centred. The density is compiled for 256 points at a time. The first proposal is Laplace's at
-the best of the modes found from the best prior points; where two modes matter, weights would not
-tell, and NUTS is left to treat them.
+the best of the modes found from the best prior points; where a second mode matters, weights would
+not reveal it, and NUTS takes over.
 """
 
 from typing import cast
@@ -119,7 +119,7 @@ class DriftTarget:
         return params | hyper | split_units(flat, hyper, self._visited, place, rng), None
 
     def _theta(self, z: np.ndarray) -> np.ndarray:
-        """Parameters (point, 3), or (point, 6) with those of places, besides the drift's."""
+        """Parameters (point, 3), or (point, 6) with those of places, without those of the drift."""
         if self.model.place is None:
             return scores.beta0_and_noises(self.model.priors, z)
         return hyperparameters(self.model.priors, self.model.place, z)

@@ -10,13 +10,13 @@ in three dimensions; s^2 = delta_v^2 - floor^2, so that the floor of delta_v is 
    densities, one for each mode; the posterior is skewed, and its curvature at a mode alone makes a
    far worse proposal (`proposal`).
 3. 4096 scrambled Sobol points of the proposal get Pareto-smoothed importance weights (Vehtari,
-   Simpson, Gelman, Yao and Gabry 2024). Where k-hat says that they are uneven, a mixture fitted to
-   the weighted points takes the proposal's place, up to four times (adaptive importance sampling).
+   Simpson, Gelman, Yao and Gabry 2024). Where k-hat shows them uneven, a mixture fitted to the
+   weighted points takes the proposal's place, up to four times (adaptive importance sampling).
 4. Systematic resampling makes the points equally weighted; c is drawn from its normal conditional.
 
-State: weighted points with the conditional moments of c at each. Invariant: whatever the proposal,
+State: weighted points with the conditional moments of c at each. Invariant: for any proposal,
 weights are target over proposal density, so averages converge to the posterior's; k-hat measures
-how fast. It is exact but for the number of points and the smoothing of the largest weights. Above
+how fast. The only errors are the number of points and the smoothing of the largest weights. Above
 `MAX_KHAT` the caller falls back on NUTS. Derivation: docs/derivations/exact-sampler.md.
 """
 
@@ -111,7 +111,7 @@ class _Target(NamedTuple):
         return log_likelihood + log_jacobian + log_prior, backward(factor, half), factor
 
     def constrain(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """beta0, delta_w, delta_v, and the log Jacobian of the way there."""
+        """Parameters beta0, delta_w, delta_v of z, and the log Jacobian of the map."""
         x, t, r = z.T
         log_w = t - 0.5 * np.logaddexp(0.0, -2.0 * r)
         log_s = t - 0.5 * np.logaddexp(0.0, 2.0 * r)
@@ -230,7 +230,7 @@ def _weigh(
     log_p, mean, factor = target.evaluate(z)
     raw = log_p - proposal.log_density(z)
     finite = np.isfinite(raw)
-    if finite.sum() < _FEW:  # the proposal missed: equal weights, of which k-hat says so
+    if finite.sum() < _FEW:  # the proposal missed: equal weights, and an infinite k-hat
         nothing = np.full(len(z), -np.log(len(z)))
         return _Weighted(z, log_p, nothing, mean, factor, np.inf, -np.inf)
     log_w, khat, log_evidence = smoothed_weights(raw)
@@ -240,7 +240,7 @@ def _weigh(
 def _starts(target: _Target) -> np.ndarray:
     """Points to search a mode from: the local maxima of a grid around the scatter of the rates.
 
-    The first is the best point of a coarse one.
+    The first is the best point of a coarse grid.
     """
     unit = target.priors.beta0.support is constraints.unit_interval
     scatter = np.log(max(target.statistics.spread, target.floor, 1e-3))
@@ -260,7 +260,7 @@ def _starts(target: _Target) -> np.ndarray:
 
 
 def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
-    """Mixture around draws of weighted points, each component as wide as the mass nearby.
+    """Mixture around resampled points, each component as wide as the mass nearby.
 
     It follows any shape of the posterior. One component over all, for tails, has a share, and so
     has the first proposal: no mode is lost, no weight exceeds its first value over that share.
@@ -287,7 +287,7 @@ def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
 
 
 def why_not_conjugate(priors: Priors, *, coupled: bool = False) -> str | None:
-    """Reason why the sampler cannot treat these priors, of coupled robots if so; None if it can."""
+    """Reason why the sampler cannot treat these priors; None if it can."""
     for name, allowed, kind in (
         ("coupling", lambda p: not coupled or isinstance(p, dist.Normal), "a Normal distribution"),
         ("beta", lambda p: isinstance(p, dist.Normal), "a Normal distribution"),

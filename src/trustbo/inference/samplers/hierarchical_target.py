@@ -6,9 +6,9 @@ of mu, first e_i and then mu integrate out in closed form. Left are, for I robot
 coefficients, 4 + p + I scores: of mean_beta0, of the two noises, of the spreads tau_beta0 and tau,
 and of each beta0_i; three robots and two features make ten.
 
-mean_beta0 and beta0_i are not scores of their priors, which a small tau would make a funnel. On the
-real line, robot i's rates leave its beta0 a normal likelihood of some mean and variance, found on a
-grid at the mode of the noises. Given tau_beta0 the score of the mean is standard normal under these
+mean_beta0 and beta0_i are not scores of their priors, as a small tau would make these a funnel. On
+the real line, the likelihood of robot i's beta0 is approximated by a normal, fitted on a grid at
+the mode of the noises. Given tau_beta0 the score of the mean is standard normal under these
 likelihoods, and so is that of each robot given the mean and tau_beta0 (partially non-centred:
 Papaspiliopoulos, Roberts and Skold 2007). This only moves coordinates; the target keeps the priors.
 """
@@ -27,7 +27,7 @@ from trustbo.inference.samplers.student import Spanning, Student
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import log_prob, of_coefficients
 
-_WIDE = 0.01  # variance added to what a grid says of a robot's beta0
+_WIDE = 0.01  # variance added to a grid's estimate of a robot's beta0
 _LEAST_TAU = 1e-6
 
 
@@ -66,9 +66,9 @@ class HierarchicalScores(ABC):
 
     @abstractmethod
     def of_beta0(self, i: int, grid: np.ndarray, theta: dict[str, np.ndarray]) -> np.ndarray:
-        """Log likelihood, but for a constant, of robot i's beta0 on a grid, (point,).
+        """Log likelihood, up to a constant, of robot i's beta0 on a grid, (point,).
 
-        All else is that of theta, with one point.
+        Other parameters are those of theta, with one point.
         """
 
     def first(self) -> Student:
@@ -80,7 +80,7 @@ class HierarchicalScores(ABC):
         self.look(z[len(z) // 2])
         z = z[[self.log_density(z).argmax()]]
         scale = np.eye(z.shape[1])[None]
-        for n_steps in self.steps:  # coordinates move with what the noises leave of beta0
+        for n_steps in self.steps:  # the coordinates depend on the noises
             self.look(z[0])
             z[:, 0], z[:, -self.n_robots :] = 0.0, 0.0
             z, _, scale = laplace(self.log_density, z, n_steps)
@@ -143,7 +143,7 @@ class HierarchicalScores(ABC):
         return self.mean * rest, self.precision / rest**2
 
     def look(self, z: np.ndarray) -> None:
-        """See what rates leave of each robot's beta0 at the noises of one point."""
+        """Refit the normal approximation of each robot's beta0 at the noises of one point."""
         theta, _ = self.constrain(z[None])
         grid = np.linspace(-3.5, 4.5, 49) if self._unit else np.linspace(-1.5, 1.5, 49)
         for i in range(self.n_robots):
@@ -204,8 +204,8 @@ class HierarchicalTarget(HierarchicalScores):
     def _integrate(self, theta: dict[str, np.ndarray]):
         """Log likelihood (point,), coefficients integrated out.
 
-        With it Cholesky factors and half-solved right sides, (coefficient, ..., point): of the
-        precision of mu; and for each robot that of e_i, and how it depends on mu.
+        Also returns Cholesky factors and half-solved right sides, (coefficient, ..., point): for
+        the precision of mu; and for each robot that of e_i and its dependence on mu.
         """
         beta0, tau = theta["beta0"], theta["tau"].T  # (coefficient, point)
         mean, precision = (each.T for each in self.of_means(theta))

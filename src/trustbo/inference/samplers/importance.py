@@ -8,17 +8,17 @@ scores are left (`scores`). They are drawn in rounds:
    the mode that Newton's searches find.
 2. Rounds of 256 points, or more in ten dimensions, give the mean and covariance of the next
    proposal, until their effective number is fair. Half of the points are drawn from the target's
-   defensive proposal: it covers what moments do not tell of, such as a second mode far out, or a
+   defensive proposal: it covers regions that moments miss, such as a second mode far out, or a
    noise's thin tail to 0.
 3. Points of the last rounds and 512 to 4096 more are pooled, the mixture of all their proposals
-   being the density that weights are relative to, and the weights Pareto-smoothed. Where k-hat says
-   that they are uneven, more points follow.
+   being the density that weights are relative to, and the weights Pareto-smoothed. Where k-hat
+   shows them uneven, more points follow.
 4. Systematic resampling makes points equally weighted. The target draws the coefficients at each;
-   where its density was EP's, with weights that average to what EP left out, by which the draws
-   are resampled once more.
+   where its density was EP's, with weights that average to the ratio of posterior to EP density, by
+   which the draws are resampled once more.
 
-Invariant: weights are target over proposal density whatever the proposals are, and unbiased ones in
-4 leave the posterior exact (importance sampling squared). Their means' product is the evidence.
+Invariant: weights are target over proposal density for any proposals, and unbiased ones in 4 leave
+the posterior exact (importance sampling squared). Their means' product is the evidence.
 """
 
 from typing import NamedTuple, Protocol
@@ -41,7 +41,7 @@ _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1
 
 
 class ScoreTarget(Protocol):
-    """Posterior of scores, and of all else given them."""
+    """Posterior of scores, with everything else drawn given them."""
 
     @property
     def n_pilot(self) -> int:
@@ -60,7 +60,7 @@ class ScoreTarget(Protocol):
 
     @property
     def n_corrected(self) -> int | None:
-        """Most draws to weigh, where the density is approximate."""
+        """Maximum number of draws to weight where the density is approximate."""
         ...
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
@@ -72,11 +72,11 @@ class ScoreTarget(Protocol):
         ...
 
     def look(self, z: np.ndarray) -> None:
-        """Take a point (score,) as the middle of the posterior, to approximate the density from."""
+        """Re-expand the approximate density around a point (score,)."""
         ...
 
     def defensive(self, proposal: Student) -> Proposal:
-        """Proposal that covers what the given one may miss."""
+        """Defensive proposal for regions that the given one may miss."""
         ...
 
     def draw(
@@ -91,7 +91,7 @@ class ScoreTarget(Protocol):
 
 
 class ScoreDraws(NamedTuple):
-    """Draws of parameters, and what the next fit starts from."""
+    """Draws of parameters, and the proposal that the next fit starts from."""
 
     draws: ExactDraws
     proposal: Student
@@ -153,9 +153,9 @@ def sample_scores(
 def _draw(
     target: ScoreTarget, points: _Points, n: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[np.ndarray, float, float] | None]:
-    """Indices of resampled points, parameters there, and what `smoothed_weights` makes of theirs.
+    """Indices of resampled points, parameters there, and their smoothed weights.
 
-    Where n weights are uneven more are drawn: the k-hat of a few is one of chance.
+    Where n weights are uneven more are drawn: k-hat of few weights is noisy.
     """
     chosen = np.sort(systematic(np.exp(points.log_w), n, rng))
     params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
@@ -192,11 +192,11 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
         cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)
         points = cloud.points()
         proposal = _fitted(points)
-        if k == 1 and not warm:  # a curvature's proposal only serves to be replaced
+        if k == 1 and not warm:  # a proposal by curvature is only a start
             cloud = _Cloud(target)
         elif points.kish > _FAIR * target.n_pilot:
             break
-        elif k == 2 and points.kish < _LOST and warm:  # the posterior has moved far
+        elif k == 2 and points.kish < _LOST and warm:  # the posterior has moved far from the start
             cloud, proposal, warm = _Cloud(target), target.first(), False
     cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77)
     points = cloud.points()

@@ -33,8 +33,7 @@ def newton_direction(
 def inverse_hessian(xp: ModuleType, hessian: Any, floor: float) -> Any:
     """Covariance of the Gaussian fit at a mode.
 
-    The floor gives a direction that the data leave open the width of the priors, not an infinite
-    one.
+    The floor gives a direction without information the width of the priors, not an infinite one.
     """
     eigenvalues, vectors = xp.linalg.eigh(hessian)
     return (vectors / xp.maximum(eigenvalues, floor)[None]) @ vectors.T
@@ -63,7 +62,7 @@ def laplace(
         for i, (gradient, hessian) in enumerate(
             zip(*_derivatives(log_density, z[active]), strict=True)
         ):
-            if np.isfinite(hessian).all():  # else it stands beside a point without density
+            if np.isfinite(hessian).all():  # else it is next to a point of zero density
                 steps[i] = newton_direction(np, gradient, -hessian, 1e-3)
         candidates = z[active, None] + 0.5 ** np.arange(12)[:, None] * steps[:, None]
         values = log_density(candidates.reshape(-1, z.shape[1])).reshape(len(active), -1)
@@ -106,7 +105,7 @@ def newton(
     def step(carry):
         k, z, at, proposal, ridge, _ = carry
         new = everything(proposal)
-        # The Hessian may overflow where the value does not: such a point is not stepped on.
+        # The Hessian may overflow where the value does not: such a step is rejected.
         finite = jnp.isfinite(new[1]).all() & jnp.isfinite(new[2]).all()
         better = finite & (new[0] < at[0])
         z = jnp.where(better, proposal, z)

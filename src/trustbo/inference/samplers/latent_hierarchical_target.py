@@ -16,7 +16,7 @@ from trustbo.inference.samplers.latent_target import SWEEPS, draw_weighted
 from trustbo.models.priors import Priors
 
 _SETTLED = 8  # sweeps to find the sites' mode
-_LEAST_TAU = 1e-4  # far below what rates tell, and precisions do not cancel
+_LEAST_TAU = 1e-4  # far below the scale of data, but precisions do not cancel
 _LEAST_NOISE = 1e-6
 
 
@@ -36,7 +36,7 @@ class LatentHierarchicalTarget(HierarchicalScores):
         self._nu = max(8.0, 3.0 * n_robots * self.n_coefficients)
 
     def look(self, z: np.ndarray) -> None:
-        """Keep the sites of one point, and see what rates leave of each robot's beta0 there."""
+        """Recentre the sites, and the normal approximation of each robot's beta0, at one point."""
         theta, _ = self.constrain(z[None])
         (beta0, delta_w, delta_v, x0, P, g), _ = self._given(theta)
         known = x0, P[0], g[0], self.chains, self._sites

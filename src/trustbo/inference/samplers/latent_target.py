@@ -1,14 +1,14 @@
 """The posterior of hyperparameters where trust and coefficients do not integrate out exactly.
 
 Scores of (beta0, noises), and of tau_s, length scale and tau_e where places have effects, are those
-of `scores`. Expectation propagation gives log p(rates | scores) but for an error of a few
-hundredths of a nat, with trust, the coefficients (beta, b) and the effects of visited units
-integrated out (`ep.joint`). Draws of these, given scores, have weights that average to the ratio of
-the evidence to that of EP (`ep.draws`): importance sampling by them is exact whatever EP leaves
-(importance sampling squared: Tran, Scharth, Pitt and Kohn 2014), and so is their evidence.
+of `scores`. Expectation propagation gives log p(rates | scores) to a few hundredths of a nat, with
+trust, the coefficients (beta, b) and the effects of visited units integrated out (`ep.joint`).
+Draws of these, given scores, have weights that average to the ratio of the evidence to that of EP
+(`ep.draws`): importance sampling by them is exact for any error of EP (importance sampling squared:
+Tran, Scharth, Pitt and Kohn 2014), and so is their evidence.
 
-The rates tell the larger of two noises and leave the other's thin tail towards 0, which moments of
-points do not tell of: the defensive proposal spans all angles between the two.
+The data identify the larger noise; the other has a thin tail towards 0 that a moment-matched
+proposal misses: the defensive proposal spans all angles between the two.
 """
 
 from collections.abc import Iterable
@@ -29,7 +29,7 @@ from trustbo.models.priors_numpy import of_coefficients
 _ROUGH, SWEEPS, _SETTLED = 4, 2, 8  # sweeps far from the sites' mode, near it, and to find it
 _GRID = [-1.2, 0.0, 1.2], [-2.2, -1.2, -0.2, 0.6], [-1.2, 0.0, 1.2]
 _MEMORY = 4e6  # numbers of precisions at once
-_ROUNDS, _STILL = 4, 0.1  # of finding the mode and its sites; a step that is none, in sd
+_ROUNDS, _STILL = 4, 0.1  # rounds of mode search and sites; step taken as converged, in sd
 
 
 class LatentTarget:
@@ -78,7 +78,7 @@ class LatentTarget:
         return Student(z[0], scale[0])
 
     def look(self, z: np.ndarray) -> None:
-        """Keep the sites of one point, for sweeps to start from."""
+        """Recentre the sites at one point, for sweeps to start from."""
         (beta0, delta_w, delta_v, x0, P, g), _ = self._given(self._theta(z[None]))
         known = x0, P[0], g[0], self.chains, self._sites
         self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *known, _SETTLED)

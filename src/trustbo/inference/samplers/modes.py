@@ -1,8 +1,8 @@
 """Distinct modes of a posterior: where chains of NUTS start, and whether they were there.
 
-Chains that start at different modes and do not meet have an R-hat that says so. It cannot see a
-mode that all chains left in their warm-up: so the mass that a Gaussian fit at each mode holds
-(Laplace) is kept, to be compared with the share of the draws around it.
+Chains that start at different modes and do not meet have a large R-hat. It does not detect a mode
+that all chains left in their warm-up: so the mass that a Gaussian fit at each mode holds (Laplace)
+is kept, to be compared with the share of the draws around it.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from trustbo.inference.samplers.laplace import inverse_hessian, newton
 
 _SAME_MODE, _LEAST_LOG_MASS = 0.5, 5.0  # sd of the fit at a mode, and nats below the largest
 LEAST_SHARE = 0.03
-"""Mass from which on a mode is noteworthy."""
+"""Lower limit of the mass of a mode that counts."""
 
 
 class Modes(NamedTuple):
@@ -45,7 +45,7 @@ def find_modes(
     """Modes found from many starts.
 
     Args:
-        profile: Cost whose local minima are searched.
+        profile: Cost whose local minima are found.
         log_density: Log density, whose value at a mode goes into its mass.
         starts: Shape (start, unknown).
         longest: Longest step in each unknown, (unknown,). Those where it is finite stay at first,

@@ -29,9 +29,9 @@ from trustbo.models.model import TrustModel
 
 _DRAWS_PER_UNKNOWN = 10  # of the warm-up, to learn a covariance from
 _FIRST, _MOST = 1, 100
-"""Draws between two looks at the clock: of the first, and of any."""
+"""Draws between two readings of the clock: the first, and the largest."""
 _SECONDS = 0.5
-"""Time between two looks that the number of draws aims at."""
+"""Target time between two readings of the clock, s."""
 
 
 class NutsDraws(NamedTuple):
@@ -81,12 +81,12 @@ def run_nuts(
     """Draw from a model's posterior; call it in a float64 scope.
 
     Args:
-        settings: Length and care of the run.
+        settings: Length and adaptation settings of the run.
         key: Random key.
         model: Trust model; its priors are data, all else about it is compiled in.
         data: Missions.
         complete: Whether no rate is missing before the last of a mission.
-        watch: Observer of the progress, which changes nothing about the draws.
+        watch: Observer of the progress; the draws do not depend on it.
     """
     with watch.running(settings) as seen:
         length_free = settings._replace(draws=0)  # its programs serve any number of draws

@@ -1,9 +1,9 @@
 """Partially non-centred coordinates of coefficients that vary by robot.
 
-Deviations e = (c - mu) / tau make a funnel where the data know a robot better than the others tell
-(Papaspiliopoulos, Roberts and Skoeld 2007). With a Gaussian fit N(center_i, precision_i^-1) of each
-robot's likelihood, c given mu and tau is normal in closed form, and so is mu given tau: standard
-normal innovations of these two conditionals take the places of e and mu.
+Deviations e = (c - mu) / tau make a funnel where a robot's data are more informative than the other
+robots (Papaspiliopoulos, Roberts and Skoeld 2007). With a Gaussian fit N(center_i, precision_i^-1)
+of each robot's likelihood, c given mu and tau is normal in closed form, and so is mu given tau:
+standard normal innovations of these two conditionals take the places of e and mu.
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ def fit_robots(target: Target, pooling: HierarchicalTrust, site: Sites) -> Robot
     index = jnp.arange(len(c))
     gradient = jax.jacfwd(log_likelihood)(c)[index, index]
     hessian = jax.jacfwd(jax.jacfwd(log_likelihood))(c)[index, index, :, index]
-    # A robot whose likelihood is not concave here counts as known by the others only.
+    # A robot whose likelihood is not concave here is informed by the others only.
     eigenvalues, vectors = jnp.linalg.eigh(-hessian)
     eigenvalues = jnp.maximum(eigenvalues, 1e-3)
     precision = (vectors * eigenvalues[:, None, :]) @ jnp.swapaxes(vectors, 1, 2)

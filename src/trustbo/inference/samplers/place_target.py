@@ -30,7 +30,7 @@ _NUMBERS = 2e8  # bytes of factors kept at once
 
 
 class Conditional(NamedTuple):
-    """Law of coefficients and effects at each of some parameter values."""
+    """Conditional distribution of coefficients and effects at each of some parameter values."""
 
     theta: np.ndarray  # (point, 6): beta0, delta_w, delta_v, tau_s, length_scale, tau_e
     log_p: np.ndarray  # (point,)
@@ -48,7 +48,7 @@ def hyperparameters(priors: Priors, place: PlaceEffect, z: np.ndarray) -> np.nda
     if place.cells:
         theta[:, 3] = scores.half_normal(next(rest), place.tau_s)
         length_scale = place.length_scale * np.exp(place.length_scale_sd * next(rest))
-        # A search for the mode may step to where the exponential is 0 or infinite.
+        # Clip: trial points of the mode search can over- or underflow exp.
         theta[:, 4] = np.clip(length_scale, *place_prior.LENGTH_SCALES)
     if place.bounds:
         theta[:, 5] = scores.half_normal(next(rest), place.tau_e)
@@ -56,7 +56,7 @@ def hyperparameters(priors: Priors, place: PlaceEffect, z: np.ndarray) -> np.nda
 
 
 def prior_of_places(proposal: Student) -> Student:
-    """Proposal for beta0 and the noises as told, the prior for the scores of places."""
+    """Keep the fitted proposal of (beta0, noises); use the prior for the scores of places."""
     n, d = 3, len(proposal.center)
     cov = 1.5 * proposal.scale @ proposal.scale.T
     cov[n:], cov[:, n:] = 0.0, 0.0
@@ -87,12 +87,12 @@ class PlaceTarget:
         return hyperparameters(self.priors, self.place, z), scores.log_prior(z)
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Log posterior density, normalised by nothing but the evidence; shape (point,)."""
+        """Log posterior density, not divided by the evidence; shape (point,)."""
         parts = [self._evaluate(z[i : i + self._chunk]) for i in range(0, len(z), self._chunk)]
         return np.concatenate([part.log_p for part in parts])
 
     def conditional(self, z: np.ndarray) -> Conditional:
-        """Law of coefficients and effects given scores (point, score)."""
+        """Conditional distribution of coefficients and effects given scores (point, score)."""
         return self._evaluate(z, keep=True)
 
     def first(self) -> Student:

@@ -1,11 +1,11 @@
-"""A heavy-tailed density in three dimensions that costs next to nothing to draw from."""
+"""Heavy-tailed mixture proposal in three dimensions, sampled in closed form."""
 
 from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
 
-_TAIL, _WIDTH = 4.0, 1.6  # effective points of trust posteriors were most here
+_TAIL, _WIDTH = 4.0, 1.6  # maximised the effective number of points over trust posteriors
 
 
 class Mixture(NamedTuple):

@@ -1,7 +1,7 @@
 """Reparametrisation of a posterior for NUTS: coordinates in which it is close to a sphere.
 
 Method: a deterministic change of variables theta -> sites, with its Jacobian, before Laplace's
-scaling (`nuts`). Each step gives a badly determined direction of its own axis:
+scaling (`nuts`). Each step gives one badly determined direction a separate axis:
 
 - noises: the data fix delta_w^2 + delta_v^2 well and their ratio badly. t = log hypot(delta_w, s)
   and r = log(delta_w / s) stand in the places of log delta_w and log s, s^2 = delta_v^2 - floor^2
@@ -158,7 +158,7 @@ class Coordinates:
         self.collapsed = collapse and data.spectrum is not None and normal
 
     def to_sites(self, theta: Array, robots: RobotFit | None = None) -> tuple[Sites, Array]:
-        """Sites on their own real lines, and the log Jacobian of the way there."""
+        """Unconstrained sites, and the log Jacobian of the map."""
         site, log_jacobian = self.target.unravel(theta), jnp.zeros(())
         t, r = site["delta_w"], site["delta_v"]
         site = site | {
@@ -203,10 +203,10 @@ class _Means(NamedTuple):
     """Averages of the data."""
 
     y: Array
-    """Trust that the mean rate stands for."""
+    """Trust equivalent of the mean rate."""
     z: Array  # (feature,)
     log_unit: Array
-    """Log of the noise of trust that an observation noise of 1 is worth."""
+    """Log of the noise of trust equivalent to an observation noise of 1."""
     scatter: Array
     """Standard deviation of the rates, at least .005."""
 

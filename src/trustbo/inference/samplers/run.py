@@ -72,7 +72,7 @@ def draw_posterior(
     fallback: bool = True,
     watch: Watch = SILENT,
 ) -> tuple[Draws, list[str]]:
-    """Draws given a batch, and complaints about them.
+    """Draws given a batch, and their failed diagnostics.
 
     Args:
         model: Trust model.
@@ -129,7 +129,7 @@ def nuts_data(
                 batch.awareness[seen].mean(0),
                 np.asarray(rates.std()),
             )
-            # One bound and robot that measured nothing: the shape tells the number of features.
+            # One unmeasured bound and robot: the shape carries the number of features.
             nothing = np.full((1, 1, 1), np.nan)
             awareness = np.zeros((1, 1, 1, batch.awareness.shape[3]))
             return NutsData(awareness, nothing, nothing, np.ones(1), spectrum(statistics), means)
@@ -163,7 +163,7 @@ def _sample_scores(
     places: Visited | None,
     start: Student | None,
 ) -> Draws:
-    """The same for places, partial pooling, coupled robots, and rates that are not Gaussian."""
+    """Draws by importance sampling of scores: places, pooling, coupling, or rates not Gaussian."""
     shape = (settings.n_chains, settings.draws)
     targets = _targets(model, batch, weight, places)
     coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
@@ -221,7 +221,7 @@ def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
 
 
 def _require_even(each: list[ExactDraws]) -> None:
-    """Refuse importance weights that are too uneven to be used."""
+    """Refuse importance weights that are too uneven: UnevenWeightsError."""
     khat = max(exact.khat for exact in each)
     if not khat <= MAX_KHAT:
         raise UnevenWeightsError(f"weights are too uneven (k-hat {khat:.2f}, limit {MAX_KHAT})")
@@ -251,7 +251,7 @@ def _sample_nuts(
     *,
     check: bool,
 ) -> tuple[Draws, list[str]]:
-    """Draws by NUTS, longer ones if the first are bad, and complaints about the last."""
+    """Draws by NUTS, rerun for longer if diagnostics fail, and the failures of the last run."""
     complete = _is_complete(np.asarray(data.contact_rate))
     name = "nuts" if model.family.integrates_out else "joint"
 

@@ -1,9 +1,9 @@
-"""Hyperparameters as normal scores of their priors: where data say nothing, tails are Gaussian.
+"""Hyperparameters as normal scores of their priors: tails are Gaussian where data are silent.
 
 A parameter is the quantile of its prior at Phi(score), so a score is N(0, 1) a priori. The two
-noises are a size and an angle of their half-normal scores, as data tell the size best: with
-half-normal priors log size has the density of a Rayleigh variable's logarithm, and the angle over
-pi / 2 is uniform. On log and logit scales tails are exponential, and weights uneven.
+noises are a size and an angle of their half-normal scores, as the data determine the size best:
+with half-normal priors log size has the density of a Rayleigh variable's logarithm, and the angle
+over pi / 2 is uniform. On log and logit scales tails are exponential, and weights uneven.
 """
 
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Length and care of a run of NUTS: names, defaults and limits."""
+"""Length and adaptation of a run of NUTS: names, defaults and limits."""
 
 from collections.abc import Mapping
 from numbers import Real
@@ -17,7 +17,7 @@ _OF_ALL = ("n_chains", "draws")
 
 
 class NutsSettings(NamedTuple):
-    """Length and care of a NUTS run."""
+    """Length and adaptation of a NUTS run."""
 
     warmup: int = 300
     draws: int = 1000
@@ -79,7 +79,7 @@ class NutsSettings(NamedTuple):
         return {name: getattr(self, name) for name in _OF_ALL}
 
     def longer(self, *, collapse: bool) -> Self:
-        """Settings of another try, after draws that were refused."""
+        """Settings of a longer run, after failed diagnostics."""
         return self._replace(
             warmup=2 * self.warmup,
             draws=2 * self.draws,

@@ -37,7 +37,7 @@ class Student(NamedTuple):
         return cls(mean, np.linalg.cholesky(cov))
 
     def widened(self, factor: float) -> Self:
-        """The same, the scale times a factor."""
+        """Multiply the scale by a factor."""
         return self._replace(scale=factor * self.scale)
 
     def draw(self, n: int, seed: int) -> np.ndarray:
@@ -62,10 +62,10 @@ class Student(NamedTuple):
 
 
 class Spanning(NamedTuple):
-    """Proposal that spans the prior of one score, N(0, 1); the others follow as far as they can.
+    """Proposal with one score from its prior N(0, 1), the others from their regression on it.
 
-    They have a Student-t around their regression on the share Phi(score), which is smooth up to
-    the prior's ends: far out, where a score of a noise has a long, thin tail, they stay.
+    The others have a Student-t around their regression on Phi(score), which is bounded: far out,
+    where the score of a noise has a long, thin tail, they do not extrapolate.
     """
 
     axis: int
@@ -91,7 +91,7 @@ class Spanning(NamedTuple):
         return cls(axis, slope, Student(intercept, scale, proposal.nu))
 
     def draw(self, n: int, seed: int) -> np.ndarray:
-        """See `Student.draw`; the score in a sequence of its own."""
+        """See `Student.draw`; the score from a separate sequence."""
         rng = np.random.default_rng([seed, 1])
         u = stats.qmc.Sobol(1, scramble=True, rng=rng).random(n)[:, 0]
         score = self.sd * special.ndtri(np.clip(u, 1e-12, 1.0 - 1e-12))

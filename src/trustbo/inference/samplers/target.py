@@ -1,8 +1,8 @@
 """The log posterior that NUTS samples: a model's priors, and the likelihood in its fastest form.
 
 The numpyro model itself stays plain. Here its sample statements of the parameters stand with a
-likelihood that knows the weight of each mission, whether missions are complete, the sums that take
-the place of rates, and the linearisation point.
+likelihood that takes the weight of each mission, whether missions are complete, sums in place of
+rates, and the linearisation point.
 """
 
 from typing import NamedTuple, cast
@@ -45,7 +45,7 @@ class NutsData(NamedTuple):
 
 
 class Target:
-    """Log posterior of a model's sample sites, each on its own real line.
+    """Log posterior of a model's unconstrained sample sites.
 
     Attributes:
         start: Flat vector of the priors' means, to start a search from.

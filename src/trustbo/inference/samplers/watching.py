@@ -1,6 +1,6 @@
 """Progress of NUTS: a bar of its chains, and the time it will take, from its first draws.
 
-A trial of its own would be thrown away, so the trial is the start of the first chain. Its very
+A separate trial run would be discarded, so the trial is the start of the first chain. Its very
 first draws, while the step size is still sought, may take a hundred times the usual number of
 leapfrog steps: the time of a step is that of all, and their number a draw the median of the trial's
 second half. The estimate is a rough one all the same, and the bar corrects it.
@@ -16,7 +16,7 @@ from trustbo.display.bars import NOWHERE, bar_in, say
 from trustbo.inference.samplers.settings import NutsSettings
 
 LONG = 10.0
-"""Seconds from which on it is said what a run will take."""
+"""Estimated time of a run, s, from which the estimate is printed."""
 _TRIAL_DRAWS, _TRIAL_SECONDS = 30, 1.0
 
 
@@ -28,8 +28,8 @@ class Watch:
 
         Args:
             place: Place of `display.bars`.
-            faster: Advice on what takes less time than NUTS, for the estimate.
-            estimates: Whether to say what a run will take.
+            faster: Advice on faster alternatives to NUTS, for the estimate.
+            estimates: Whether to print an estimate of the time.
         """
         self._place, self._faster, self._estimates = place, faster, estimates
         self._name = "NUTS"
@@ -77,7 +77,7 @@ class Watch:
             self._estimate()
 
     def retry(self, settings: NutsSettings, complaints: Sequence[str]) -> None:
-        """Tell that NUTS runs again, and why."""
+        """Print that NUTS runs again, and why."""
         more = f" and {len(complaints) - 1} more" if len(complaints) > 1 else ""
         self._say(
             f"{self._name} again, for longer ({settings}, target_accept "

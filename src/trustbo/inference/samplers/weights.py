@@ -8,7 +8,7 @@ def smoothed_weights(raw: np.ndarray) -> tuple[np.ndarray, float, float]:
     """Pareto-smooth log importance weights (point,), some of them finite.
 
     Returns:
-        Normalised log weights, k-hat, and the log of the raw ones' mean, the evidence.
+        Normalised log weights, k-hat, and the log mean of the raw weights (the evidence).
     """
     finite = np.isfinite(raw)
     # Minus the log weights, points without density far below all others.

@@ -1,7 +1,8 @@
-"""Families of observations: the law of a contact rate given trust, one object and one file each.
+"""Families of observations: distributions of a contact rate given trust, one file each.
 
 To add one, write its file after `gaussian` (trust integrates out), `censored` (a filter that
-completes rates) or `beta_binomial` (any log-concave law, by its derivatives), and list it here.
+completes rates) or `beta_binomial` (any log-concave distribution, by its derivatives), and list it
+here.
 """
 
 import numpy as np
@@ -17,9 +18,9 @@ FAMILIES: dict[str, Family] = {
 }
 
 AUTO = "auto"
-"""Word for the family that suits the rates, see `choose`; Gaussian until there are rates."""
+"""Name of automatic choice by the rates, see `choose`; Gaussian until there are rates."""
 PILED_UP = 0.05
-"""Share of rates at 0 or 1 from which on they are no Gaussian ones."""
+"""Share of rates at 0 or 1 from which a Gaussian family is unsuitable."""
 
 
 def family_of(observation: str) -> Family:
@@ -30,8 +31,8 @@ def family_of(observation: str) -> Family:
 def choose(rates: np.ndarray) -> tuple[str, str]:
     """Family that suits measured rates (any shape, NaN where not measured), and the reason.
 
-    Never counts, though ticks be known: sight makes ticks of a bound alike, and their number varies
-    less than a binomial's (`benchmarks/families.py`).
+    Never counts, even where ticks are recorded: line of sight correlates the ticks of a bound
+    (`benchmarks/families.py`).
     """
     seen = rates[~np.isnan(rates)]
     share = float(np.mean((seen <= 0.0) | (seen >= 1.0))) if len(seen) else 0.0

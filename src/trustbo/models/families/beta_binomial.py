@@ -20,7 +20,7 @@ from trustbo.models.families.family import SSM, Observed
 from trustbo.models.families.linearised import Data, Linearised
 from trustbo.models.families.terms import COUNT, NONE, Terms, count_moments
 
-_N_TICKS = 200.0  # of missions to come, whose ticks nobody knows
+_N_TICKS = 200.0  # of future missions, whose number of ticks is unknown
 
 
 @dataclass(frozen=True)

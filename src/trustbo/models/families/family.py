@@ -1,9 +1,9 @@
 """The interface of a family of observations.
 
 Where latent trust does not integrate out, it is sampled with the parameters, as a smooth function
-of standard normal innovations that already knows the data. What this draw leaves of the density is
-a weight. So the innovations stay close to standard normal a posteriori, NUTS meets no funnel, and
-the mean weight over innovations is the likelihood of a mission with its trust integrated out: all
+of standard normal innovations conditioned on the data. The remaining factor of the density is a
+weight. So the innovations stay close to standard normal a posteriori, NUTS meets no funnel, and the
+mean weight over innovations is the likelihood of a mission with its trust integrated out: all
 families can be compared.
 """
 
@@ -48,9 +48,9 @@ class Family(ABC):
     """A family of observations; without state, so that compiled code takes it as static."""
 
     name: ClassVar[str]
-    """The user's word for it."""
+    """Name that users give."""
     integrates_out: ClassVar[bool] = False
-    """Latent trust integrates out in closed form: rates are linear in it, and Gaussian."""
+    """Whether latent trust integrates out in closed form: rates are linear in it, and Gaussian."""
     needs_ticks: ClassVar[bool] = False
     """Each measured rate needs its number of ticks."""
     linearises: ClassVar[bool] = False
@@ -65,10 +65,10 @@ class Family(ABC):
     """Observation noise may be correlated between robots."""
 
     propagates: ClassVar[bool] = True
-    """Expectation propagation knows its `terms`, and so the exact sampler treats it."""
+    """Whether expectation propagation has its `terms`, hence the exact sampler applies."""
 
     expected_rate: ClassVar[str] = "identity"
-    """E[rate | trust] as compiled planning knows it: `"identity"` (trust itself), `"logistic"`, or
+    """Form of E[rate | trust] in compiled planning: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (of a normal with sd delta_v, cut to [0, 1]); the mean of `rate_moments`."""
 
     @abstractmethod
@@ -129,7 +129,7 @@ class Family(ABC):
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """Terms of measured rates of any shape, for expectation propagation; see `ep.terms`.
 
-        TrustboError: the family has none, as its `propagates` says.
+        TrustboError: the family has none (`propagates` is False).
         """
         raise TrustboError(f'expectation propagation does not know observation "{self.name}".')
 
@@ -143,13 +143,13 @@ class Family(ABC):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean of a rate given trust, its slope in trust, and the variance of the rate.
 
-        `noise_sd` is delta_v, broadcast to trust. Where ticks count, there are those of a rate that
-        is known to .005.
+        `noise_sd` is delta_v, broadcast to trust. For counts, the number of ticks is that of a rate
+        recorded to .005.
         """
 
     @property
     def line_of_sight(self) -> tuple[float, float]:
-        """Trust that a line of sight of 1 is worth, and the line of sight of trust 0."""
+        """Trust equivalent of a line of sight of 1, and the line of sight of trust 0."""
         return 1.0, 0.0
 
     def priors(self) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class Family(ABC):
         return {}
 
     def mean_level(self, y: Array) -> tuple[Array, Array]:
-        """Trust that a mean rate stands for, and the log of how much delta_v = 1 is worth in it."""
+        """Trust equivalent of a mean rate, and the log scale of delta_v there."""
         return y, jnp.zeros(())
 
     def refine(self, ssm: SSM, observed: Observed) -> Observed:
@@ -183,8 +183,8 @@ class Family(ABC):
     def log_resolution(self, y: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
         """Log ratio of the probability of a count of ticks to the density of its rate.
 
-        A density covers 1/N per tick. Shape of `y`; 0 where not measured or where the rate has a
-        probability as it is, NaN where the number of ticks is not known.
+        A density covers 1/N per tick. Shape of `y`; 0 where not measured or where the rate itself
+        has a probability, NaN where the number of ticks is unknown.
         """
         is_density = ~np.isnan(y) & self.is_density(y)
         return np.where(is_density, -np.log(np.where(is_density, n_ticks, 1.0)), 0.0)

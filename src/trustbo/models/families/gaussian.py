@@ -27,7 +27,7 @@ class Gaussian(Family):
         return ssm.filter(observed.y, complete=complete)
 
     def draw_trust(self, ssm: SSM, observed: Observed, e: Array, key: Array) -> Array:
-        """See `Family.draw_trust`; a draw of its own, from `key`."""
+        """See `Family.draw_trust`; a separate draw, from `key`."""
         filtered = self.filter(ssm, observed, e)
         return ssm.sample_backward(filtered, random.normal(key, e.shape, e.dtype))
 
@@ -36,7 +36,7 @@ class Gaussian(Family):
         return ssm.smooth(self.filter(ssm, observed, e))
 
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
-        """See `Family.measure`: `y` as it is, which may leave [0, 1]."""
+        """See `Family.measure`: `y` unclipped, which may leave [0, 1]."""
         return y
 
     def rate_moments(
@@ -73,5 +73,5 @@ class Gaussian(Family):
         return Terms.of(np.where(np.isnan(y), NONE, GAUSSIAN))
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
-        """See `Family.is_density`: all have."""
+        """See `Family.is_density`: every rate has a density."""
         return np.ones(y.shape, dtype=bool)

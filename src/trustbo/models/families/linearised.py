@@ -2,8 +2,8 @@
 
 Around a linearisation point the log probability is a parabola: Gaussian rates with a variance each.
 Trust is drawn from the smoother of these rates as a function of the innovations, and weighted by
-the ratio of the two likelihoods, so the result is exact whatever the point (importance sampling
-from the Laplace approximation of a state space; Durbin and Koopman 1997).
+the ratio of the two likelihoods, so the result is exact for any point (importance sampling from the
+Laplace approximation of a state space; Durbin and Koopman 1997).
 """
 
 from abc import abstractmethod
@@ -37,15 +37,15 @@ class Linearised(Family):
 
     @abstractmethod
     def start(self, observed: Observed) -> Array:
-        """Trust that each rate alone stands for, finite where not measured too."""
+        """Trust equivalent of each rate alone, finite where not measured too."""
 
     def read(self, observed: Observed) -> Data:
-        """Numbers that the density is of, and their weight or ticks: both 0 where not measured."""
+        """Values of the observations, and their weight or ticks: both 0 where not measured."""
         seen = jnp.where(jnp.isnan(observed.y), 0.0, 1.0)
         return jnp.where(seen > 0.0, observed.y, 0.0), seen
 
     def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
-        """See `Family.log_density`; each rate has a variance of its own, complete or not."""
+        """See `Family.log_density`; each rate has a separate variance, complete or not."""
         approximate, filtered = self._approximate(ssm, observed)
         trust = approximate.sample_backward(filtered, e)
         data, R = self.read(observed), approximate.rate_variance

@@ -1,8 +1,8 @@
-"""Student-t rates: y = x + delta_v t, with 4 degrees of freedom, for logs with odd values.
+"""Student-t rates: y = x + delta_v t, with 4 degrees of freedom, for logs with outliers.
 
 Method: a rate is Gaussian with variance delta_v^2 / w given its weight w ~ Gamma(2, 2). The
 linearisation takes w at its mean given trust, 5 / (4 + e^2) for a standardised error e, as in
-iteratively reweighted least squares (Lange, Little and Taylor 1989): an odd value counts little.
+iteratively reweighted least squares (Lange, Little and Taylor 1989): an outlier has little weight.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from trustbo.models.families.family import SSM, Observed
 from trustbo.models.families.linearised import Data, Linearised
 
 NU = 4.0
-"""Degrees of freedom: the fewest whole ones of which rates have a variance and little more."""
+"""Degrees of freedom: small, for heavy tails, but with a finite variance."""
 _WIDER = 0.75  # precision of the Gaussian, for tails that are heavier
 _N_NODES = 32
 _LOG_NORM = float(
@@ -97,7 +97,7 @@ class StudentT(Linearised):
         return center, (share * spread).sum(-1), total
 
     def is_density(self, y: np.ndarray) -> np.ndarray:
-        """See `Family.is_density`: all have."""
+        """See `Family.is_density`: every rate has a density."""
         return np.ones(y.shape, dtype=bool)
 
 

@@ -2,9 +2,9 @@
 
 A rate's term t(x) is its density or probability given trust x: nothing measured, N(y; x, dv^2),
 Phi((x - 1) / dv) for a rate of 1, Phi(-x / dv) for one of 0, or the beta-binomial probability of a
-count. A site exp(-lam x^2 / 2 + eta x) stands for it. Given the cavity N(m, v), what all else says
-of x, the new site has the mean and variance of cavity times term: in closed form where rates are
-censored, by 7 Gauss-Hermite nodes on cavity times old site for counts, whose log probability is
+count. A site exp(-lam x^2 / 2 + eta x) stands for it. Given the cavity N(m, v), the rest of the
+posterior, the new site has the mean and variance of cavity times term: in closed form where rates
+are censored, by 7 Gauss-Hermite nodes on cavity times old site for counts, whose log probability is
 read from a table (concentration, count, trust), cubic in both; only sites see the table's error,
 never weights. Sites are log-concave, as terms are, so that lam > 0.
 """
@@ -56,7 +56,7 @@ class Terms(NamedTuple):
         case: np.ndarray | None = None,
         counts: np.ndarray | None = None,
     ) -> Self:
-        """Fill in what terms without counts, or without sites to guess, do not have."""
+        """Build terms, with defaults for counts and for first guesses of the sites."""
         zero = np.zeros(kind.shape)
         return cls(
             kind,
@@ -161,11 +161,11 @@ def _read(row, x):
 
 @njit(**PART_OPTIONS)
 def log_phi(h):
-    """Log Phi(h), and phi(h) / Phi(h)."""
+    """Log Phi(h) and phi(h) / Phi(h), with Phi and phi the normal distribution and density."""
     if h > -6.0:
         p = 0.5 * math.erfc(-0.7071067811865476 * h)
         return math.log(p), 0.3989422804014327 * math.exp(-0.5 * h * h) / p
-    i = 1.0 / (h * h)  # asymptotic: to 1e-6 at h = -6, of what only implausible parameters reach
+    i = 1.0 / (h * h)  # asymptotic: to 1e-6 at h = -6, which only implausible parameters reach
     s = 1.0 - i * (1.0 - 3.0 * i * (1.0 - 5.0 * i * (1.0 - 7.0 * i * (1.0 - 9.0 * i))))
     return -0.5 * h * h - math.log(-h / s) - 0.5 * LOG_2PI, -h / s
 
@@ -295,7 +295,7 @@ def draw_count(count, phi, row, mean, sd, lam, eta, choice, rng):
     """Trust drawn from N(mean, sd^2) times term over site, and a log weight whose mean is right.
 
     One of some stratified candidates by its weight from the table; the table's error at the chosen
-    one is made good. The weight lacks the count's constant; `choice` (2, candidate) is for work.
+    one is corrected. The weight lacks the count's constant; `choice` (2, candidate) is for work.
     """
     candidates, weights = choice
     J, shift, best = len(candidates), rng.random(), -1e300

@@ -98,12 +98,12 @@ def mission_log_likelihood(
 
     def one(p: Params) -> Array:
         observed = Observed.of(contact_rate, n_ticks)
-        # The same innovations for every draw: comparisons do not differ by luck.
+        # The same innovations for every draw: common random numbers.
         return family.marginal_log_likelihood(p.ssm(awareness, lag), observed, key)
 
     n_draws = len(params.b)
     if n_draws < _BATCH:
         return jax.vmap(one)(params)
-    # Whole batches: the rest would be compiled as a program of its own.
+    # Whole batches: a shorter last one would be compiled separately.
     rows = np.minimum(np.arange(-(-n_draws // _BATCH) * _BATCH), n_draws - 1)
     return lax.map(one, jax.tree.map(lambda a: a[rows], params), batch_size=_BATCH)[:n_draws]

@@ -73,7 +73,7 @@ class _Law(NamedTuple):
 
     @classmethod
     def apart(cls, params: Params, robots: list[int]) -> Self:
-        """Law of robots with the same parameters; b may be of bounds, see `Params.on`."""
+        """Dynamics of robots with the same parameters; b may vary by bound, see `Params.on`."""
         p: Any = params.of_robot(robots[0])
         b = np.asarray(p.b)
         b = b.reshape(*b.shape, *(1,) * (4 - b.ndim)).transpose(2, 1, 3, 0)
@@ -81,7 +81,7 @@ class _Law(NamedTuple):
 
     @classmethod
     def coupled(cls, p: CoupledParams) -> Self:
-        """Law of robots that influence each other."""
+        """Dynamics of robots that influence each other."""
         w, v = (np.linalg.cholesky(_regular(covariance)) for covariance in (p.Delta_w, p.Delta_v))
         sd = np.sqrt(np.einsum("dii->id", p.Delta_v))
         matrices = (np.ascontiguousarray(np.moveaxis(m, 0, -1)) for m in (p.B0, p.B, w, v))
@@ -102,5 +102,5 @@ def _times(M: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def _regular(covariance: np.ndarray) -> np.ndarray:
-    """Covariances (draw, robot, robot'), positive definite in spite of the error of rounding."""
+    """Covariances (draw, robot, robot') made positive definite against rounding."""
     return covariance * (1.0 + 1e-15 * covariance.shape[-1] * np.eye(covariance.shape[-1]))

@@ -24,10 +24,10 @@ def update(beta0: Numbers, Q: Numbers, P: Numbers, gain: Numbers, S: Numbers) ->
 def look_back(
     beta0: Numbers, Q: Numbers, P: Numbers, lag: Numbers, of_rate: Numbers
 ) -> tuple[Numbers, Numbers]:
-    """A and V with x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V), P being var(x_k | y_1..y_k).
+    """A and V of the backward conditional x_k | x_{k+1}, y ~ N(A x_{k+1} + a, V).
 
-    In information form, which cannot turn a variance negative. `of_rate` is lag / R where y_{k+1}
-    was measured, else 0.
+    P is var(x_k | y_1..y_k). In information form, which cannot turn a variance negative. `of_rate`
+    is lag / R where y_{k+1} was measured, else 0.
     """
     V = 1.0 / (1.0 / P + beta0**2 / Q + lag * of_rate)
     return V * (beta0 / Q + of_rate), V

@@ -53,7 +53,7 @@ class Smoothed(NamedTuple):
 
 
 class ScalarSSM(NamedTuple):
-    """Parameters of the recursion; shapes () or (robot,), unless said otherwise."""
+    """Parameters of the recursion; shapes () or (robot,), unless stated."""
 
     beta0: Array
     drift: Array  # (bound, mission, robot)
@@ -69,7 +69,7 @@ class ScalarSSM(NamedTuple):
         return self.delta_v**2
 
     def with_rate_variance(self, var: Array) -> Self:
-        """The same dynamics, each rate with a variance of its own, (bound, mission, robot)."""
+        """The same dynamics with a separate variance for each rate, (bound, mission, robot)."""
         return self._replace(delta_v=jnp.sqrt(var))
 
     def per_sequence(self, terms: Array) -> Array:

@@ -43,7 +43,7 @@ class VectorSSM(NamedTuple):
         return jnp.diagonal(self.R, axis1=-2, axis2=-1)
 
     def with_rate_variance(self, var: Array) -> Self:
-        """The same dynamics, each rate with a variance of its own, (bound, mission, robot)."""
+        """The same dynamics with a separate variance for each rate, (bound, mission, robot)."""
         return self._replace(R=var[..., None] * jnp.eye(var.shape[-1])[None, None])
 
     def per_sequence(self, terms: Array) -> Array:
@@ -163,7 +163,7 @@ class VectorSSM(NamedTuple):
             jnp.eye(n)[None, None],
             filtered.seen[1:, :, :, None] * filtered.seen[1:, :, None, :],
         )
-        # Robots that were not measured get unit noise of their own, then weight 0.
+        # Robots that were not measured get independent unit noise, then weight 0.
         R = jnp.broadcast_to(self.R, (*filtered.y.shape, n)) if self.R.ndim < 4 else self.R
         of_rate = self.lag * both * jnp.linalg.inv(R[1:] * both + eye * (1.0 - both))
         Q_inverse, P_inverse = jnp.linalg.inv(self.Q), jnp.linalg.inv(filtered.var[:-1])

@@ -24,9 +24,9 @@ def gather_chains(
         family: Family of observations.
         batch: Missions, padded with NaN.
         places: Visited places, where these have effects.
-        whole: Bounds of each mission, (mission,): chains are as long, and those without a rate
-            are kept; by default they end at their last rate.
-        apart: Whether each robot has its own beta0, weights and intercept.
+        whole: Bounds of each mission, (mission,): chains have these lengths, and those without a
+            rate are kept; by default they end at their last rate.
+        apart: Whether each robot has separate beta0, weights and intercept.
 
     Returns:
         Chains whose gamma is (weights, intercept, effects of visited units), or where robots are

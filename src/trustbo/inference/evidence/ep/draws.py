@@ -6,9 +6,9 @@ Given the hyperparameters and coefficients, trust is drawn bound by bound from
 
 with beta_k the Gaussian message from the sites behind and s_k the rate's own term where that can be
 drawn from (Gaussian, censored), else its site, by a choice among candidates. As the target is
-p(x) prod t_k, the weight prod c_k t_k / (s_k beta_k) averages to the chain's evidence whatever the
-sites are: importance sampling with look-ahead (twisted particles: Guarniero, Johansen and Lee
-2017), one particle. The closer EP's messages, the more even the weights.
+p(x) prod t_k, the weight prod c_k t_k / (s_k beta_k) averages to the chain's evidence for any
+sites: importance sampling with lookahead (twisted particles: Guarniero, Johansen and Lee 2017), one
+particle. The closer EP's messages, the more even the weights.
 """
 
 import math
@@ -42,7 +42,7 @@ def draw_chain(b0, delta_w, delta_v, x0, chains, c, u, table, constant, lam, eta
     """Trust of chain c given its drifts u, into x (bound,); the log weight."""
     n, q, phi = chains.length[c], delta_w * delta_w, concentration(delta_v)
     ahead[n - 1] = 0.0
-    for k in range(n - 1, 0, -1):  # what the sites from bound k + 1 on say of x_k
+    for k in range(n - 1, 0, -1):  # message on x_k from the sites of bounds k + 1 on
         p, e = lam[c, k] + ahead[k, 0], eta[c, k] + ahead[k, 1]
         D = 1.0 / (1.0 + p * q)
         ahead[k - 1, 0], ahead[k - 1, 1] = b0 * b0 * p * D, b0 * (e - p * u[k]) * D
@@ -81,7 +81,7 @@ def draw_chain(b0, delta_w, delta_v, x0, chains, c, u, table, constant, lam, eta
 
 @njit(**PART_OPTIONS)
 def _log_student(x, mean, L, nu):
-    """Log density of a Student-t of precision LL', but for (2 pi)^(-D / 2)."""
+    """Log density of a Student-t of precision LL', without the factor (2 pi)^(-D / 2)."""
     D, square = len(x), 0.0
     total = math.lgamma(0.5 * (nu + D)) - math.lgamma(0.5 * nu) - 0.5 * D * np.log(0.5 * nu)
     for i in range(D):
@@ -98,11 +98,12 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
     """Coefficients at one value of the hyperparameters, and the log weight of each draw.
 
     `gamma` (draw, coefficient) holds numbers of a standard Student-t of `nu` degrees, and then
-    draws of a mixture of two, with the mean and scale of EP's normal law, and of that under sites
-    of `_TEMPER` times the precision. Rates at a limit say little of one side, where the
-    coefficients' law has a tail as wide as their prior; and where many are of the same place, EP's
-    law is too narrow. A weight is the prior density times an unbiased estimate of each chain's
-    evidence, over the mixture's density: its mean is the evidence, but for |P|^(1/2).
+    draws of a mixture of two, with the mean and scale of EP's normal approximation, and of that
+    under sites of `_TEMPER` times the precision. Rates at a limit carry little information on one
+    side, where the posterior of the coefficients has a tail as wide as their prior; and where many
+    are of the same place, EP's normal is too narrow. A weight is the prior density times an
+    unbiased estimate of each chain's evidence, over the mixture's density: its mean is the
+    evidence, but for |P|^(1/2).
     """
     n, D = gamma.shape
     K, last = chains.y.shape[1], chains.of.shape[1]

@@ -14,7 +14,7 @@ smoother returns the marginals of each x, the cavities follow, and sites are mat
 Sweeps start from sites kept at the mode of the hyperparameters. The last only evaluates:
 log Z = log Gaussian integral + sum log(mass of cavity times term / mass of cavity times site) is
 stationary in the sites, so that their error enters squared, and two sweeps suffice. Where all terms
-are Gaussian the first sweep is exact. What is left of the error `draws` corrects by weights.
+are Gaussian the first sweep is exact. The remaining error is corrected by the weights of `draws`.
 """
 
 from typing import NamedTuple
@@ -48,7 +48,7 @@ class Chains(NamedTuple):
     length: np.ndarray  # (chain,), bounds up to the last rate
     first: np.ndarray  # (chain,), the first bound whose term is not Gaussian; else the length
     squares: np.ndarray  # (chain, 2), number of Gaussian terms and sum of their squared rates
-    drift: np.ndarray  # (chain, bound), drift besides
+    drift: np.ndarray  # (chain, bound), fixed part of the drift
     counts: np.ndarray  # (case, 2): ticks in contact, ticks
     tables: np.ndarray  # (phi, case, x), see `terms.count_tables`
 
@@ -97,7 +97,7 @@ def _filter(b0, q, x0, chain, u, drift, n, lam, eta, predicted, filtered, var, Q
 
 @njit(**PART_OPTIONS)
 def copy(source, target):
-    """Copy a matrix; the assignment of slices takes two seconds to compile, for its messages."""
+    """Copy a matrix by loops; slice assignment takes two seconds to compile."""
     for i in range(len(source)):
         for j in range(source.shape[1]):
             target[i, j] = source[i, j]
@@ -137,7 +137,7 @@ def _solve(Q, h, L, mean, covariance):
     if D > _BY_LOOPS:
         try:
             factor = np.linalg.cholesky(Q)
-        except Exception:  # not positive definite: numba knows no narrower one
+        except Exception:  # not positive definite: numba supports no narrower class
             return np.nan
         copy(factor, L)
     elif not cholesky(Q, L):
@@ -231,10 +231,10 @@ def start_sites(chains, delta_v, kept, lam, eta):
 @njit(**PART_OPTIONS)
 def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps, damp, mean, L,
               evaluate):  # fmt: skip
-    """Log evidence at one value of the hyperparameters, but for log |P| / 2.
+    """Log evidence at one value of the hyperparameters, without the term log |P| / 2.
 
     Sites are updated in place by all sweeps but the last; mean and L are those of gamma and of the
-    factor of its precision at the last. Without `evaluate` these are all that is to be had.
+    factor of its precision at the last. Without `evaluate` only these are computed.
     """
     (n_chains, K), D, last = chains.y.shape, len(g), chains.of.shape[1]
     predicted, filtered = np.empty((2, n_chains, K, last + 1))
@@ -262,7 +262,8 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
                 h[i] += own_h[a]
                 for b in range(a + 1):
                     j = chains.of[c, b]
-                    twice = 2.0 if i == j and a != b else 1.0  # a bound that was made twice
+                    # A bound made twice: both columns have one index in gamma.
+                    twice = 2.0 if i == j and a != b else 1.0
                     Q[max(i, j), min(i, j)] += twice * own_Q[a, b]
         quadratic = _solve(Q, h, L, mean, cov)
         total += 0.5 * quadratic
@@ -281,7 +282,7 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
 
 @njit(**OPTIONS)
 def log_evidence(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps):
-    """Log evidence (point,) but for log |P| / 2, at hyperparameters with a leading axis (point,).
+    """Log evidence (point,) without log |P| / 2, at hyperparameters with a leading axis (point,).
 
     Args:
         b0: Shape (point, robot).

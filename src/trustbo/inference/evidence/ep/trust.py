@@ -1,4 +1,4 @@
-"""Latent trust and likelihoods under parameter draws, for families that trust is no linear part of.
+"""Latent trust and likelihoods under parameter draws, for families not linear in trust.
 
 Given parameters chains are independent: EP's sites of each, settled in three sweeps, guide draws of
 its trust whose weights average to its evidence (`draws`). Averages over draws are weighted, and a
@@ -47,7 +47,7 @@ def summarize(
     for group in _groups(family, params, batch, n_bounds):
         _, first, index, count = np.unique(
             group.numbers, axis=0, return_index=True, return_inverse=True, return_counts=True
-        )  # resampled draws repeat: each is looked at once
+        )  # resampled draws repeat: each is evaluated once
         n_each = int(np.clip(_N_TRAJECTORIES // len(first), 2, 64))
         at = group.mission, slice(None), group.robot
         for rows in _chunks(group, len(first)):
@@ -86,7 +86,7 @@ def sample(
 
 
 class _Group(NamedTuple):
-    """Chains of robots that share their parameters, and these."""
+    """Chains of robots that share parameters, with their parameters."""
 
     chains: Chains
     sites: np.ndarray  # (2, chain, bound)
@@ -98,7 +98,7 @@ class _Group(NamedTuple):
 
     @property
     def numbers(self) -> np.ndarray:
-        """All numbers of each draw but effects of places, which differ where these do."""
+        """All numbers of each draw without effects of places, to find repeated draws."""
         return np.concatenate([self.theta, self.coefficients], axis=1)
 
     def trajectories(
@@ -144,7 +144,7 @@ def _groups(
 
 
 def _chunks(group: _Group, n: int) -> Iterator[slice]:
-    """Draws to look at together."""
+    """Yield chunks of draws to evaluate together."""
     step = max(1, _CELLS // group.chains.y.size)
     for start in range(0, n, step):
         yield slice(start, min(start + step, n))
