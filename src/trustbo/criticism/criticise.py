@@ -30,7 +30,7 @@ from trustbo.parallel import one_blas_thread
 
 _LEVEL = 0.05
 _LEAST = 1e-6
-"""Least probability in tables; a smaller one is 0."""
+"""Lower limit of probabilities in tables; a smaller one is 0."""
 _SITES = ({"beta0", "beta", "b", "delta_w", "delta_v"}, {"B0", "B", "b", "Delta_w", "Delta_v"})
 _ATTRIBUTES = ("observation", "response", "x0_mean", "x0_sd", "seed")
 
@@ -55,8 +55,8 @@ class Criticism(Displayed):
         curves: PIT (u, its distribution less the uniform one), autocorrelation (lag, in bounds;
             mission_lag) and coverage one mission ahead (level), each with `_low` and `_high` of its
             simultaneous 95 % band.
-        worth: Comparisons by LOO and the sensitivity to priors: what, difference, its standard
-            error and finding; empty if they were not asked for.
+        worth: Ablation: LOO with and without each component, and prior sensitivity: comparison,
+            difference, its standard error and finding; empty without `compare`.
     """
 
     verdict: str
@@ -97,9 +97,9 @@ def criticise(
         posterior: DataTree from `fit`, or one of `Result.posteriors`; Gaussian observations.
         missions: Missions that it was fitted to, or all of its campaign; needed where it holds no
             data.
-        model: Its model, needed for comparisons where its priors are your own.
+        model: Its model, needed for comparisons if its priors are custom.
         compare: Whether to compare, by LOO, with the model without each feature, and with and
-            without places and robots' own coefficients: each is a fit.
+            without places and separate coefficients of robots: each is a fit.
         n_replicates: Number of replicates for p-values and bands.
         seed: Seed of the replicates.
 
@@ -145,7 +145,7 @@ def _criticise(
     outcomes = _test_all(found, tests, of, seed)
     adjusted = holm(np.array([each.p for each in outcomes.values()]))
     wrong = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
-    # No part of a model accounts for the prior or the family: they leave all others.
+    # No component of a model accounts for the prior or the family: they leave all others.
     after: dict[str, dict[str, Outcome]] = {name: {} for name in wrong}
     for each in (each for each in tests if each.name in wrong):
         wider = _account_for(each, outcomes[each.name].label, found, data, by_parameter, draws)
@@ -182,7 +182,7 @@ def _test_all(
 def _most_explaining(
     outcomes: Mapping[str, Outcome], after: Mapping[str, Mapping[str, Outcome]]
 ) -> str:
-    """Finding with which in the model the least evidence of others is left; `"none"` if none.
+    """Finding that leaves the least evidence of others once in the model; `"none"` if none.
 
     `after` has, by finding, the outcomes of the others with it in the model. Of findings that leave
     no other one, it is that of least p.
@@ -204,7 +204,7 @@ def _account_for(
     by_parameter: Derivatives,
     draws: np.ndarray,
 ) -> Innovations:
-    """Innovations of the model with one label of a departure in it."""
+    """Innovations of the model extended by one label of a departure."""
     normal = found.normal
     if label in fault.sources:
         U = fault.sources[label]
@@ -249,9 +249,9 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
 
 
 def _learned(posterior: xr.DataTree, missions: Sequence[Mission]) -> list[Mission]:
-    """Missions that a posterior is of, among those given: a campaign may leave some out.
+    """Missions of a posterior, among those given: a campaign may leave some out.
 
-    TrustboError: some are not given, or are others than the posterior holds the data of.
+    TrustboError: some are not given, or differ from the posterior's data.
     """
     given, numbers = list(missions), np.atleast_1d(posterior.attrs.get("missions", []))
     if len(numbers) not in (0, len(given)):

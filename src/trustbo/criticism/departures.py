@@ -38,7 +38,7 @@ def departures(
     point: Point,
     place: PlaceEffect | None,
 ) -> tuple[list[Departure], dict[str, str]]:
-    """Departures to test for; and those that are not, with the reason."""
+    """Alternatives to test, and those that cannot be tested, with the reason."""
     found, left_out = [], {}
     mission, _, robot = data.slots.T
     first = missions[0]
@@ -136,6 +136,6 @@ def _drift(data: Data, normal: Normal) -> np.ndarray:
 
 
 def own_columns(mission: np.ndarray, robot: np.ndarray, n_robots: int) -> np.ndarray:
-    """Column of each robot in each mission, over the slots."""
+    """Indicator column of each robot in each mission, over the slots."""
     own = mission * n_robots + robot
     return (own[:, None] == np.unique(own)).astype(float)

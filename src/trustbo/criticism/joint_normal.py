@@ -124,7 +124,7 @@ def with_start(point: Point, data: Data) -> Point:
     """The point with the most likely mean and sd of trust before the first bound.
 
     Models fix them, most often far wider than the truth; residuals of first bounds would then be
-    too small, and others too large beside them.
+    too small, and the others relatively too large.
     """
     best, found = -np.inf, point
     for sd in float(point.params.x0_sd) * _STARTS:

@@ -1,4 +1,4 @@
-"""Test of the prior of coefficients against what the rates alone say of them."""
+"""Test of the prior of coefficients against their estimates from the rates alone."""
 
 import re
 from typing import NamedTuple

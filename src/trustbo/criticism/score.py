@@ -3,8 +3,8 @@
 Neyman's C(alpha): the score of a departure less its projection on the scores of the parameters that
 were estimated. An error of these then enters in second order only, whichever consistent estimate is
 plugged in, so that nothing is refitted: e = L^-1 (y - mean), projected off the whitened derivatives
-of the mean, has a known law, and replicates of it are standard normal vectors, projected alike and
-moved by one step of Fisher scoring, as a refit would.
+of the mean, has a known distribution, and replicates of it are standard normal vectors, projected
+alike and moved by one step of Fisher scoring, as a refit would.
 A departure's columns D have the statistic |Q'e|^2, Q an orthonormal basis of M L^-1 C D, chi^2; a
 source of correlation U has e'We, W = M L^-1 U L^-T M less its projection, in the Frobenius product,
 on the same of the derivatives of the covariance. The strongest label of a departure counts: its
@@ -42,17 +42,17 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Standardised innovations, and those of replicates, without the estimated parameters.
+    """Standardised innovations, and those of replicates, projected off the estimated parameters.
 
     Attributes:
         normal: Joint normal of the rates.
         L: Cholesky factor of its covariance.
-        white: Innovations as they are, (rate,).
+        white: Innovations before the projection, (rate,).
         X: Whitened derivatives of the mean by the parameters, (rate, parameter).
         basis: Orthonormal basis of these, (rate, rank).
         noises: Parameters that the covariance depends on.
-        e: Projected innovations and replicates, scaled to the norm expected of them, after one step
-            of scoring, (rate, 1 + replicate).
+        e: Projected innovations and replicates, scaled to their expected norm, after one step of
+            scoring, (rate, 1 + replicate).
     """
 
     normal: Normal
@@ -210,13 +210,13 @@ def _project(W: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _scaled(e: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Columns without a basis, scaled to the norm that is expected of them."""
+    """Columns projected off a basis, scaled to their expected norm."""
     left = e - basis @ (basis.T @ e)
     return left * (np.sqrt(len(e) - basis.shape[1]) / np.linalg.norm(left, axis=0))
 
 
 def _orthonormal(columns: np.ndarray, basis: np.ndarray | None = None) -> np.ndarray:
-    """Orthonormal basis of what the columns have beyond a basis."""
+    """Orthonormal basis of the columns projected off another basis."""
     scale = np.linalg.norm(columns, axis=0)
     columns = columns[:, scale > 0.0] / scale[scale > 0.0]
     if basis is not None:

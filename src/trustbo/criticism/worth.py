@@ -1,4 +1,4 @@
-"""Worth of the parts of a model: LOO with and without each, and the sensitivity to priors."""
+"""Ablation of a model: LOO with and without each component; prior sensitivity."""
 
 import json
 import logging
@@ -29,10 +29,10 @@ _SENSITIVE = 0.05  # threshold of the Cumulative Jensen-Shannon distance, as Arv
 def worth_of(
     posterior: xr.DataTree | None, missions: Sequence[Mission], model: TrustModel | None
 ) -> pd.DataFrame:
-    """Difference of elpd to the model without each part, or with it; empty without a posterior.
+    """Difference of elpd by component, left out or added; empty without a posterior.
 
     Rows: a feature left out, places and robots' coefficients in or out, and `prior`, whose `value`
-    is the largest sensitivity of a parameter to its prior. Positive: the model as it is is better.
+    is the largest sensitivity of a parameter to its prior. Positive: the fitted model is better.
     """
     rows: dict[str, tuple[float, float, str]] = {}
     if posterior is not None:
@@ -42,7 +42,7 @@ def worth_of(
             model = model or model_from_record(record, features=features)
             posterior = complete(posterior, missions, model=model)
             default = Priors.of(features, model.observation).describe()
-            if model.priors.describe() == default:  # by the names of those that are left, too
+            if model.priors.describe() == default:  # by the remaining features' names, too
                 model = replace(model, priors=Priors.default(model.observation))
             rows = _rows(posterior, missions, model)
         except (KeyError, TrustboError) as error:
@@ -111,7 +111,7 @@ def _sensitivity(posterior: xr.DataTree) -> tuple[float, float, str]:
         warnings.simplefilter("ignore", UserWarning)
         logger = logging.getLogger("arviz_stats")
         level = logger.level
-        logger.setLevel(logging.ERROR)  # it says at length that it found something
+        logger.setLevel(logging.ERROR)  # ArviZ prints a long message at a finding
         try:
             found = psense_summary(posterior)
         finally:

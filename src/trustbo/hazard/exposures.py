@@ -12,7 +12,7 @@ from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
-"""Statuses that a bound fails with; an aborted mission tells nothing about its last bound."""
+"""Statuses that a bound fails with; an aborted mission has no outcome of its last bound."""
 
 Bounds = np.ndarray
 """Bounds, shape (bound, 3): move of the eight of `MOVES`, row and column of the cell entered."""

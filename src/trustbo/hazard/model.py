@@ -41,13 +41,13 @@ class Hazard:
         coefficient: Prior of the weight of each measure of difficulty, from easy (0) to the robots'
             limit (1), but for the tilt.
         margin: Prior of the degrees by which the team's true slope limit is below the assumed one.
-            Bounds share it: a failure on one makes all that are as steep dangerous. The default has
-            a limit that is right, and one that is 4 degrees too high, both plausible; give a small
-            sd for a limit that was measured.
+            Bounds share it: a failure on one raises the chance of all that are as steep. By default
+            a correct limit and one that is 4 degrees too high are both plausible; a measured limit
+            takes a small sd.
         log_width: Prior of the log of the width of the limit in degrees: the chance to fail rises
             from .1 to .9 within 4.4 widths of tilt.
-        log_strength: Prior of the log of the strength s: the failures and successes that the mean
-            is worth, few where bounds fail always or never.
+        log_strength: Prior of the log of the strength s: the prior mean in units of observations,
+            few where bounds fail always or never.
         cause: Concentration of the Dirichlet over the causes of failure, for each.
 
     Raises:
@@ -69,9 +69,10 @@ class Hazard:
         require_positive("cause", self.cause)
 
     def law(self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float) -> Law:
-        """Law of bounds of these difficulties, (bound, measure), from the names of the measures.
+        """Prior of the bounds' chances given difficulties (bound, measure) and their names.
 
-        The tilt is judged by the limit, `max_slope` in rad less the margin, the others by weights.
+        The tilt is judged by the limit, `max_slope` in rad less the margin, the other measures by
+        weights.
         """
         has_weight = np.array([name != TILT for name in measures], dtype=bool)
         weights, limit, steepness = [self.coefficient] * int(has_weight.sum()), [], None
@@ -135,7 +136,7 @@ def fit_hazard(
     difficulty, names = workspace.difficulty.values, measures_of(workspace)
     _require_on_grid(exposures, difficulty.shape[1:3])
     met = difficulty[*exposures.bounds.T]
-    # A bound that the map says does not exist was driven all the same: as hard as can be.
+    # A driven bound that does not exist on the map: largest difficulty.
     law = hazard.law(np.nan_to_num(met, nan=1.0), names, workspace.team.max_slope)
     points = sample(law, exposures, seed)
     group = _dataset(hazard, law, exposures, points, workspace, n_draws, seed)
@@ -177,7 +178,7 @@ def _dataset(
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(systematic(points.weights, n_draws, rng))
     weights, limit, strength = law.parts(law.values(points.z[chosen]))
-    degrees = {"units": "degrees"}  # there may be no limit
+    degrees = {"units": "degrees"}  # absent without a limit
     of_limit = {n: ("draw", v, degrees) for n, v in zip(LIMIT_NAMES, limit.T, strict=False)}
     shape = workspace.difficulty.shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)

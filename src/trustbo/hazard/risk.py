@@ -29,7 +29,7 @@ class BoundRisk:
         difficulty: Difficulty less its reference, (move, row, col, measure).
         steepness: Degrees by which bounds are beyond the assumed slope limit, (move, row, col), or
             None without a limit.
-        exists: Whether there is a bound, (move, row, col).
+        exists: Whether the bound exists, (move, row, col).
         exposures: Known exposures, (move, row, col).
         failures: Known failures, (move, row, col).
         lost: Bounds of each mission lost somewhere unknown, each (bound, 3).
@@ -160,6 +160,6 @@ def _places_in(bounds: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _parts(n: int, other: int) -> list[slice]:
-    """Slices of n rows of `other` entries each, of bounded size."""
+    """Slices of n rows of `other` entries each, of limited size."""
     step = max(1, _ENTRIES // max(1, other))
     return [slice(i, min(i + step, n)) for i in range(0, n, step)]

@@ -8,10 +8,11 @@ mission lost somewhere unknown failed, with the chances of all bounds integrated
 a_e = s m_e, b_e = s (1 - m_e), n and f counting, for given k, exposures and failures of bound e.
 Points z come from Student-t densities around the modes; given z, places are imputed one mission
 after the other, each from its predictive distribution given those before (sequential imputation;
-Kong, Liu and Wong 1994), times a look ahead to later missions that share its bounds. The weight is
-the density of z and of the known outcomes, times the predictive probabilities of the places over
-those they were drawn with, over the density of the proposal: unbiased for any number of lost
-missions, paths that share bounds included, so that the weighted (z, k) are of the joint posterior.
+Kong, Liu and Wong 1994), times a lookahead factor for later missions that share its bounds. The
+weight is the density of z and of the known outcomes, times the predictive probabilities of the
+places over those they were drawn with, over the density of the proposal: unbiased for any number of
+lost missions, paths that share bounds included, so that the weighted (z, k) are of the joint
+posterior.
 
 The modes are those of a density in which lost missions are independent given z; only the proposal
 depends on it.
@@ -28,19 +29,19 @@ from trustbo.inference.samplers.weights import smoothed_weights
 
 LIMIT = 0.7
 """Largest k-hat of a posterior that is not refused."""
-_GOOD = 0.5  # k-hat beyond which the proposal is fitted to its own points
+_GOOD = 0.5  # k-hat beyond which the proposal is refitted to its weighted points
 _PASSES = 3  # at most
-_KERNELS, _NARROW = 32, 0.9  # components of that proposal, and their width in units of all points'
+_KERNELS, _NARROW = 32, 0.9  # components of the refitted proposal; width in units of all points'
 _STRONGEST = 50.0
-"""Largest log of a parameter, and minus the least: the mode search may try what overflows."""
+"""Clip for log parameters: Newton trial points can overflow exp."""
 _LOG2_POINTS = 11
 _DEGREES = 5.0
-_WIDTH = 1.2  # proposals are wider than the posterior's curvature says
-_DEFENCE = 0.1  # share of the prior, as wide as anything can be
+_WIDTH = 1.2  # scale of the proposals in units of the curvature's
+_DEFENCE = 0.1  # weight of the prior as defensive component
 FLOOR = 1e-12
-"""Least alpha and beta of a prior Beta: the logistic of a mean may round to 0 or 1."""
+"""Lower limit of alpha and beta of a prior Beta: the logistic of a mean may round to 0 or 1."""
 TILT = "tilt"
-"""Measure of difficulty that the slope limit is of."""
+"""Measure of difficulty to which the slope limit applies."""
 LIMIT_NAMES = ("margin", "width")
 """Parameters of the robots' slope limit, degrees."""
 _NORMAL = 0.5 * np.log(2.0 * np.pi)
@@ -65,7 +66,7 @@ class Law(NamedTuple):
     steepness: np.ndarray | None  # (bound,), degrees beyond the assumed limit; None: no limit
 
     def of(self, bounds: np.ndarray) -> Self:
-        """Law of some of the bounds."""
+        """Restrict to some of the bounds."""
         steepness = None if self.steepness is None else self.steepness[bounds]
         return self._replace(difficulty=self.difficulty[bounds], steepness=steepness)
 
@@ -121,11 +122,11 @@ def prior_betas(
 
 
 def sample(law: Law, exposures: Exposures, seed: int) -> Points:
-    """Draw weighted points of the posterior; whoever takes them judges k-hat."""
+    """Draw weighted points of the posterior; the caller checks k-hat."""
     density = _Density(law, exposures)
     d = len(law.center)
     starts = np.zeros((3, d))
-    starts[1:, -1] = -1.5, 1.5  # strengths of both kinds: nearly certain bounds, and alike ones
+    starts[1:, -1] = -1.5, 1.5  # modes of strength: certain outcomes, equal bounds
     modes, values, factors = laplace(density, starts)
     apart = [0]
     for i in (1, 2):
@@ -140,7 +141,7 @@ def sample(law: Law, exposures: Exposures, seed: int) -> Points:
         mean = points.weights @ points.z
         off = points.z - mean
         covariance = (off * points.weights[:, None]).T @ off + 1e-3 * np.eye(d)
-        # Kernels around points of equal weight follow a posterior that is bent.
+        # Kernels around resampled points follow a curved posterior.
         share = (np.arange(_KERNELS) + 0.5) / _KERNELS
         kernels = points.z[np.searchsorted(points.weights.cumsum()[:-1], share)]
         width = np.repeat(_NARROW * np.linalg.cholesky(covariance)[None], _KERNELS, axis=0)
