@@ -47,8 +47,8 @@ def read_terrain(
             nodata value and pixels hidden by a mask or an alpha band are missing; scale and offset
             are applied.
         dsm: Heights of the surface, likewise, on any grid that overlaps the DEM's. Without one, no
-            canopy is known, and the surface is the ground (a warning says so, and the terrain's
-            attribute `surface`).
+            canopy is known, and the surface is the ground (a warning and the terrain's attribute
+            `surface` state it).
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
         resolution: Pixel size in metres of rasters without a georeference; others with smaller
             pixels are averaged over whole numbers of pixels, to about this size.
@@ -111,7 +111,7 @@ def _say(rasters: list[Raster]) -> None:
 
 
 def _load(rasters: list[Raster], *, limited: bool) -> list[xr.DataArray]:
-    """Read the heights of rasters; TerrainError where the memory is, or surely would be, too small.
+    """Read the heights of rasters; TerrainError where the memory is, or would be, too small.
 
     The files may be small: a compressed or sparse one of a megabyte unpacks to gigabytes.
     """
@@ -178,7 +178,7 @@ def _side(raster: Raster) -> float:
 
 
 def _noted(terrain: xr.Dataset, rasters: list[Raster], crs: CRS) -> xr.Dataset:
-    """Note in the attributes of a terrain the things that `_say` says, and CRSs warped from."""
+    """Record in a terrain's attributes the warnings of `_say`, and the CRSs warped from."""
     for name, raster in zip(("dem", "dsm"), (rasters[0], rasters[-1]), strict=True):
         if raster.unit != METRE:
             terrain[name].attrs["stored_units"] = raster.unit.name

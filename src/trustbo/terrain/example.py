@@ -18,7 +18,7 @@ def example(name: str = "wellington") -> xr.Dataset:
     `"wellington"` is a steep hillside under bush in the Wairarapa, New Zealand: 195 m x 278 m at
     1 m, 211 m of relief, trees of up to 44.6 m. Copyright in this work is owned by Greater
     Wellington Regional Council; sourced from the LINZ Data Service, CC BY 4.0. The attribute
-    `attribution` says so, and `LICENCE.md` beside the files what of it is inferred.
+    `attribution` states this, and `LICENCE.md` in the folder of the files the inferred part of it.
 
     Args:
         name: Name of the terrain, one of `EXAMPLES`.

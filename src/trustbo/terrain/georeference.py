@@ -61,7 +61,7 @@ def _given_crs(name: str, crs: object) -> CRS:
 
 
 def known_crs(crs: object) -> CRS:
-    """Coordinate reference system that a user gave; refused if PROJ does not know it."""
+    """Coordinate reference system that a user gave; refused if unknown to PROJ."""
     try:
         return CRS.from_user_input(crs)
     except CRSError:

@@ -65,7 +65,7 @@ def decoder(
             heights += offset
         missing |= ~np.isfinite(heights)
         heights[missing] = np.nan
-        # Low ones in their own unit: -9999 feet are a fill value too.
+        # Low heights in the stored unit: -9999 feet are a fill value too.
         wrong = (heights >= HIGHEST / unit) | (heights <= -HIGHEST) | (heights == -999.0)
         if unit != 1.0:
             heights *= unit

@@ -158,7 +158,7 @@ def _from_array(
             for at in (array[y].values, array[x].values)
         )
         transform = Affine(width, 0.0, left - width / 2, 0.0, height, top - height / 2)
-        # Pixel numbers of a bare image look like this too, but it has no CRS.
+        # A bare image has pixel numbers of this form too, but no CRS.
         referenced = not transform.is_identity or crs is not None
     else:
         transform = array.rio.transform(recalc=False)

@@ -22,7 +22,7 @@ class PixelFeature(NamedTuple):
     sign: int
     """+1 if it raises an index, -1 if it lowers it."""
     halo: float = 0.0
-    """Radius of the surroundings that a pixel depends on, m; its neighbours are always there."""
+    """Radius of the surroundings that a pixel depends on, m, in addition to its 8 neighbours."""
     by_rows: bool = False
     """Whether `compute` takes `rows=`, the rows to compute; it may leave out the others."""
     kernel: Callable | None = None

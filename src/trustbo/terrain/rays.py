@@ -44,7 +44,7 @@ def ray_transmittance(ground, surface, pixel, start, end, mode, extinction, crow
     r0, c0, z0 = start
     r1, c1, z1 = end
     n_rows, n_cols = ground.shape
-    # Not the reverse: comparisons with NaN are false.
+    # Not the reverse comparison: it is false for NaN.
     if not (r0 >= 0.0 and r1 >= 0.0 and c0 >= 0.0 and c1 >= 0.0):
         return 0.0
     if not (max(r0, r1) <= n_rows - 1 and max(c0, c1) <= n_cols - 1):
@@ -86,7 +86,7 @@ def _crossings(x0, dx):
     way = 1 if dx > 0.0 else -1
     line = math.floor(x0) + 1 if dx > 0.0 else math.ceil(x0) - 1
     t, step = (line - x0) / dx, way / dx
-    # Not the end itself: the target stands on the ground.
+    # Not the end point: the target stands on the ground.
     return line, t, way, step, max(0, math.ceil((1.0 - t) / step - 1e-9))
 
 

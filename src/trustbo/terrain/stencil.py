@@ -18,7 +18,7 @@ _part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp
 
 @_part
 def _rises(up, mid, down, j):
-    """Horn's (1981) eastward and southward rise, each 8 pixels' worth."""
+    """Horn's (1981) eastward and southward rise over 8 pixels."""
     a, b = mid[j + 2] - mid[j], down[j + 1] - up[j + 1]
     x = (up[j + 2] - up[j]) + (a + a) + (down[j + 2] - down[j])
     y = (down[j] - up[j]) + (b + b) + (down[j + 2] - up[j + 2])

@@ -146,7 +146,7 @@ class AwarenessBelief:
             self._kernel, optimizer="fmin_l_bfgs_b" if learns else cast(Any, None)
         )
         with warnings.catch_warnings():
-            # A scale at its limit is no failure.
+            # A length scale at its limit is not an error.
             warnings.simplefilter("ignore", ConvergenceWarning)
             regression.fit(seen[:, :2], seen[:, 2])
         if not with_cov:

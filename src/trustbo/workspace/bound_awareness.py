@@ -75,12 +75,12 @@ def of_bounds(
     features: Sequence[str],
     traversability: np.ndarray | None,
 ) -> BoundMaps:
-    """Compute awareness of bounds, and of cells: their own, and the mean of the bounds into them.
+    """Compute awareness of bounds and of cells, the latter with means over the bounds into them.
 
     Of the maps of `cells` (robot, row, col, feature) under the names `features`, followed by the
     line of sight under each of `sights`; `traversability` is the map of pixels (row, col), if there
-    is one. Posts are those of `ways`, whatever the sight. TerrainError: a cell without standing
-    room for the team.
+    is one. Posts are those of `ways` under any sight. TerrainError: a cell without standing room
+    for the team.
     """
     exists = existing_bounds(passable)
     index = np.argwhere(exists)  # (bound, (move, row, col))

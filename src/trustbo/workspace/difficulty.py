@@ -1,7 +1,7 @@
-"""Difficulty of bounds: how near the ways come to what the robots can drive at all.
+"""Difficulty of bounds: measures of their routes relative to the robots' limits.
 
-Each measure is 0 where all ways are easy and about 1 at the robots' limit: that of the way which is
-worst in it, of the lead and of T2. T2's ways go on to the next cell straight ahead.
+Each measure is 0 on easy routes and about 1 at the robots' limit; a bound has the maximum over the
+routes of the lead and of T2. T2's routes assume the next cell straight ahead.
 """
 
 import math
@@ -68,7 +68,7 @@ def _of_bound(ways: Ways, maps: _Pixels, a: Cell, c: Cell, onward: Cell | None) 
     worst = np.zeros(len(MEASURES))
     for robot, way in zip(robots, (ways.lead(a, c), *ways.closing(a, c, onward)), strict=True):
         if way is None:
-            continue  # two posts may be in one pixel, and their way of no length
+            continue  # two posts may be in one pixel, with a route of length 0
         at = surface.nearest(*way.T)
         easy, room = (values[at] for values in maps)
         easy = easy[np.isfinite(easy)]

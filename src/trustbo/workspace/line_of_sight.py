@@ -12,9 +12,9 @@ p the probability of detection under the assumed sight, T_1 the lead's driving t
 the slowest robot; one that arrives before it is seen at its post until then. The next cell changes
 from sample to sample, over all that a path may go on to; at the goal T2 stands around the lead.
 
-The lead's way is the fastest route, as the simulator drives it. T2's is that route moved to its
-own ends: it differs from a route of its own by some metres, where sight hardly changes, and spares
-the search of some 50 routes a bound.
+The lead's way is the fastest route, as the simulator drives it. T2's is that route shifted to T2's
+posts: it differs from T2's fastest route by some metres, over which sight hardly changes, and saves
+the search of some 50 routes for each bound.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Locations as people have them: cells, positions in metres of a CRS, longitude and latitude."""
+"""Locations in user coordinates: cells, positions in metres of a CRS, longitude and latitude."""
 
 import math
 import re
@@ -34,7 +34,7 @@ class Named(NamedTuple):
     Attributes:
         names: `CELL`, `METRES` or `DEGREES`.
         values: Number of each name.
-        typed: Location as it was given, for messages.
+        typed: Location in the user's spelling, for messages.
     """
 
     names: tuple[str, str]
@@ -90,12 +90,12 @@ def cell_of(
         what: Name of the location, for messages.
         location: Location, see `Location`.
         grid: Grid of the cells.
-        passable: Whether each cell is passable, (row, col); None where it is not known yet.
+        passable: Whether each cell is passable, (row, col); None where passability is unknown.
         why: Function of a row and a column that gives the reason of an impassable cell.
 
     Raises:
         TrustboError: The location is none, off the grid, or impassable; degrees on a grid without a
-            CRS. The message has what was typed and understood, the extent, and the nearest cell.
+            CRS. The message has the location as typed and parsed, the extent, and the nearest cell.
     """
     found = _named_on(grid, what, location)
     cell = _cell(grid, found.names, found.values)
@@ -234,7 +234,7 @@ def _moved(source: CRS, target: CRS, x: float, y: float) -> tuple[float, float] 
     """Position in another CRS; None if it is no place on Earth in one of them."""
     try:
         (u,), (v,) = transform_points(source, target, [x], [y])[:2]
-    except Exception:  # PROJ's errors are GDAL's, without a base of their own
+    except Exception:  # PROJ's errors are GDAL's, without a common base
         return None
     return (u, v) if np.isfinite([u, v]).all() else None
 
@@ -255,7 +255,7 @@ def _cell(grid: "Grid", names: tuple[str, str], values: Iterable[float]) -> Cell
 
 
 def _understood(found: Named, grid: "Grid") -> str:
-    """Location as it was typed, and as it was understood."""
+    """Text of a location in the user's spelling and as parsed."""
     (a, b), names = found.values, found.names
     if names == CELL:
         return (

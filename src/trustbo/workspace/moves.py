@@ -80,7 +80,7 @@ def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     """Values of the bounds of a path, shape (..., bound, feature).
 
     From maps (..., move, row, col, feature), whose axis of moves has length 1 where values are
-    those of the cell entered, whichever way it is.
+    those of the cell entered, for any move.
     """
     rows, cols = np.asarray(path)[1:].T
     moves = moves_along(path) if maps.shape[-4] > 1 else 0

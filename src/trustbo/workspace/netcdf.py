@@ -41,7 +41,7 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     terrain = pixels = None
     if "terrain" in tree:
         terrain = tree["terrain"].to_dataset().set_coords("spatial_ref")
-        for array in terrain.data_vars.values():  # where rioxarray has it, and a file's reader not
+        for array in terrain.data_vars.values():  # rioxarray's place for it
             if "grid_mapping" in array.attrs:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])

@@ -69,10 +69,10 @@ class Posts:
         )
 
     def are_linked(self, a: Cell, c: Cell) -> bool:
-        """Whether the robots have a way from cell to cell: their posts are in one region.
+        """Whether the robots have a route from cell to cell: their posts are in one region.
 
         T2's posts in a cell are linked to its waypoint within half a cell around, so that one test,
-        of the waypoints, holds for all robots and whatever cell comes next.
+        of the waypoints, holds for all robots and any next cell.
         """
         ends = [self.surface.pixel_at(*self.waypoint(cell).tolist()) for cell in (a, c)]
         return are_linked(self.surface.passable, self.window(a, c), ends[0], ends[1])
@@ -103,14 +103,14 @@ class Posts:
         return position[np.argmax(self._traversability[row, col] - off_center)]
 
     def _posts(self, cell: Cell) -> dict[Cell | None, np.ndarray]:
-        """Posts of T2 by the next cell, for all that a bound leads to."""
+        """Posts of T2 by the next cell, for all admissible next cells."""
         rows, cols = self.grid.shape
         near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
         inside = [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
         return self._aimed(cell, [None, *inside])
 
     def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> dict[Cell | None, np.ndarray]:
-        """Posts of T2 by the next cell: of equal sight the closer one, none on top of another."""
+        """Posts of T2 by the next cell, of equal sight the closer one, with a least distance."""
         here, robots = self.waypoint(cell), self.team.robots
         position = self._position(*self._linked(cell))
         distance = np.linalg.norm(position - here, axis=1)
@@ -172,7 +172,7 @@ class Posts:
         return row + top, col + left
 
     def _linked(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of those pixels of a cell that are linked to its waypoint.
+        """Rows and columns of a cell's pixels that are linked to its waypoint.
 
         Linked within half a cell around, which the window of every bound contains.
         """

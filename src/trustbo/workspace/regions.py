@@ -1,8 +1,8 @@
-"""Regions of passable pixels: the one labelling that posts, ways, planner and simulator go by.
+"""Regions of passable pixels: the labelling that posts, routes, planner and simulator share.
 
 Two pixels are in one region if a chain of passable pixels that share edges links them. Routes pass
 neither between two impassable pixels nor round the corner of one (see `routes`), so that they link
-the same pixels: a way exists where a region does.
+the same pixels: a route exists exactly within a region.
 """
 
 from typing import Any

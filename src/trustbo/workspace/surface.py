@@ -1,4 +1,4 @@
-"""Rasters on which robots stand, drive and look."""
+"""Rasters for the robots' position, motion and sight."""
 
 from typing import Any, NamedTuple
 

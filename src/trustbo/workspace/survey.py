@@ -27,7 +27,7 @@ _BANDS = 4
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey(Displayed):
-    """Grid of a terrain, and the cells that robots can stand in, as far as heights tell.
+    """Grid of a terrain, and the cells that robots can stand in, from heights alone.
 
     Attributes:
         grid: Positions of the cells.
@@ -163,7 +163,7 @@ def survey(
 
 
 def reason_impassable(missing: float, team: Team) -> str:
-    """Reason of a cell to be impassable, given its share of pixels without data, for a message."""
+    """Text of the reason why a cell is impassable, given its share of pixels without data."""
     if missing > MAX_MISSING:
         return f": {missing:.0%} of it has no data"
     steep = np.rad2deg(team.max_slope)

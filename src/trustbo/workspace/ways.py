@@ -1,6 +1,6 @@
-"""Ways: what each robot drives within a bound, from post to post, by the fastest routes.
+"""Ways: the route of each robot within a bound, from post to post.
 
-The simulator drives these, exports carry them, and line of sight is computed along them.
+The simulator drives them, exports contain them, and line of sight is computed along them.
 """
 
 import numpy as np

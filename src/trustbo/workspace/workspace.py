@@ -60,7 +60,7 @@ class Workspace(Displayed):
         composites: Fitted composites by feature.
         of_bounds: DataArray (robot, move, row, col, feature) of what the bound into a cell by a
             move meets, in [0, 1], NaN where there is no such bound; None where awareness is that of
-            the cell entered, whichever way.
+            the cell entered, for any move.
         sights: Assumed models of sight; posts go by the first. Empty without a terrain, and in
             files of version 0.1.
         formation_radius: Largest distance of T2's posts from the lead's waypoint, m.
@@ -98,11 +98,11 @@ class Workspace(Displayed):
         Openness is measured over the lidar's range, at most the diagonal of a cell: sight beyond
         one bound does not matter to overwatch.
 
-        Overwatch is about pairs of places, so a bound from one cell to the next has awareness of
-        its own, `bound_awareness`: traversability along the way, the visibility of the cell
-        entered, and `line_of_sight`, the share of the bound's time in which a robot and the lead
-        should see each other under the assumed sight. The features of `awareness` are those of
-        cells, with the mean line of sight of the bounds into each.
+        Overwatch relates two cells, so a bound from one to the next has separate awareness,
+        `bound_awareness`: traversability along the way, the visibility of the cell entered, and
+        `line_of_sight`, the share of the bound's time in which a robot and the lead should see each
+        other under the assumed sight. The features of `awareness` are those of cells, with the mean
+        line of sight of the bounds into each.
 
         Args:
             terrain: Dataset of `read_terrain` or `synthetic_terrain`; of a lazily read one, only a
@@ -112,7 +112,7 @@ class Workspace(Displayed):
             scaling: See `CompositeIndex`.
             features: Definitions of the awareness features by name: names of pixel features for a
                 composite (see `terrain.FEATURES`), a mapping of names to `PixelFeature`, or one
-                `PixelFeature` in [0, 1] that is used as it is. By default traversability and
+                `PixelFeature` in [0, 1] that is used unchanged. By default traversability and
                 visibility, of `terrain.TRAVERSABILITY` and `terrain.VISIBILITY`.
             observers: Positions of enemies, shape (observer, 2), x and y in CRS metres: the share
                 of them that see a pixel becomes one more feature, `exposure`.
@@ -274,7 +274,7 @@ class Workspace(Displayed):
         like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
         made = dataclasses.replace(self, awareness=like.copy(data=found.cells))
         made = made.with_bounds(found.bounds)
-        made.__dict__["ground"] = ways  # with the posts and routes that are known by now
+        made.__dict__["ground"] = ways  # with the posts and routes cached so far
         return made
 
     @cached_property
@@ -284,7 +284,7 @@ class Workspace(Displayed):
 
     @cached_property
     def surface(self) -> Surface | None:
-        """Rasters to stand, drive and look on; None without a terrain in memory."""
+        """Rasters for position, motion and sight; None without a terrain in memory."""
         if self.terrain is None or self.pixels is None:
             return None
         return surface_of(self.terrain, self.pixels["passable"].values.astype(bool))
@@ -387,8 +387,7 @@ class Workspace(Displayed):
         """Return a mission with its robots and features in the order of the workspace's.
 
         A mission need not have a line of sight, which is predicted, not measured: it is NaN then.
-        Features without names of their own, z3, z4, ..., have those of the workspace's in the same
-        places.
+        Features with default names, z3, z4, ..., take the workspace's names at the same positions.
 
         Raises:
             ShapeError: It has other robots or features.
