@@ -76,14 +76,14 @@ def write_missions(
     since: int = 0,
     notes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write missions to a netCDF file, and the ticks of each to a file in a folder beside it.
+    """Write missions to a netCDF file, and the ticks of each to a file in a folder next to it.
 
-    That is `ticks/` for the files of a campaign, and has the name of any other file.
+    The folder is `ticks/` for the files of a campaign, else named after the file.
 
     Args:
         path: File of all missions.
         missions: Missions, at least one.
-        since: Number of first missions whose ticks are there already.
+        since: Number of leading missions whose ticks are written already.
         notes: Attributes of the table of missions.
 
     TrustboError: states with another shape than (tick, robot, state).
@@ -99,7 +99,7 @@ def write_missions(
 
 
 def ticks_file(path: FilePath, folder: str, j: int) -> Path:
-    """Name of the file with the ticks of mission j, from 0, in a folder beside the missions'."""
+    """Name of the file with the ticks of mission j, from 0, in a folder next to the missions'."""
     return Path(path).parent / Path(folder).name / f"{j + 1:04d}.nc"
 
 
@@ -113,7 +113,7 @@ def read_missions(path: FilePath) -> list[Mission]:
     """Read missions from a netCDF file, such as `measured.nc` of a campaign, and their ticks.
 
     Args:
-        path: File of missions; ticks are read where they are beside it.
+        path: File of missions; ticks are read from the folder next to it, if any.
 
     Raises:
         DamagedFileError: There is no such file, it was changed, or it holds no missions.
@@ -141,7 +141,7 @@ def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
 
 @contextmanager
 def _holding_missions(path: FilePath) -> Iterator[None]:
-    """Name what a file of missions lacks."""
+    """Convert errors to one that names what a file of missions lacks."""
     with interpreting(path):
         try:
             yield

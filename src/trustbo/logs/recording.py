@@ -119,7 +119,7 @@ class Recording:
         contacts = [series.between(marker.time, end) for series in self.contact]
         if not len(said.time):
             end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=marker.time)
-        looks = [~np.isnan(c.value) for c in contacts]  # a failed look is no tick
+        looks = [~np.isnan(c.value) for c in contacts]  # an unmeasured contact is no tick
         contacts = [
             Series(c.time[own], c.value[own] > 0.5) for c, own in zip(contacts, looks, strict=True)
         ]
@@ -152,7 +152,7 @@ def _aligned(contact: Series, ticks: np.ndarray) -> np.ndarray:
 
 
 def _held(series: Series, ticks: np.ndarray) -> np.ndarray:
-    """Last record at each tick, shape (tick, ...); NaN before the first."""
+    """Latest record at each tick, shape (tick, ...); NaN before the first."""
     last = np.searchsorted(series.time, ticks, side="right") - 1
     known = np.concatenate([np.full((1, *series.value.shape[1:]), np.nan), series.value])
     return known[last + 1]

@@ -16,7 +16,7 @@ from trustbo.workspace.grid import Grid
 KEYS = ("mission", "bound", "robot", "row", "col")
 NUMBERS = ("contact_rate", "contact_time", "duration", "n_ticks", "t0")
 COLUMNS = (*KEYS, *NUMBERS, "status", "mission_status")
-"""Columns with a meaning of their own; any other is an awareness feature."""
+"""Columns with a fixed meaning; any other is an awareness feature."""
 POSITIONS = (("row", "col"), ("x", "y"), ("lon", "lat"))
 """Pairs of columns with the cell, or with a position in it."""
 _TICKS_BEFORE = "exposure"
@@ -83,8 +83,8 @@ def parse_rows(
     """Parse the rows of a table from the columns of `read_columns`.
 
     Awareness is NaN for features without a column; positions need the grid of the cells.
-    TrustboError: a feature without a column beside columns without a meaning, positions without a
-    grid, or a value of the wrong kind.
+    TrustboError: a feature without a column while other columns have no meaning, positions without
+    a grid, or a value of the wrong kind.
     """
     wanted = [column_of(name) for name in features]
     missing = [name for name in wanted if name not in columns]

@@ -1,9 +1,9 @@
-"""Table of what every bound gives, by the bound that follows it, and best paths on it.
+"""Table of the expected contact of every bound, by the bound that follows it, and best paths on it.
 
-In a simulator whose robots stop and drive where the workspace says, the expected contact of a bound
-is a function of three cells: left, entered, and next. The best path is then found by dynamic
-programming over bounds (cell left, cell entered) with the number of bounds that are left, which
-is exact, as the loss of a bound depends on the state and the decision only.
+In a simulator whose robots stop and drive at the workspace's posts and routes, the expected contact
+of a bound is a function of three cells: left, entered, and next. The best path is then found by
+dynamic programming over bounds (cell left, cell entered) with the number of bounds that are left,
+which is exact, as the loss of a bound depends on the state and the decision only.
 """
 
 import sys
@@ -23,7 +23,7 @@ from trustbo.workspace.moves import MOVE_NAMES, MOVES, move_indices, moves_along
 _LEAST = 3
 """Replicates of every bound."""
 _FAILURE_ERROR = 0.1
-"""Standard error of the share of failures, beyond which a bound that has failed is repeated."""
+"""Standard error of the share of failures above which a bound that has failed is repeated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +100,8 @@ def tabulate(
 ) -> BoundTable:
     """Replicate bounds until the standard error of their contact, mean over robots, is small.
 
-    Its root mean square over all is then as asked for, and that of no bound twice as large. The
-    variance of a bound is that of its own replicates, shrunk to the mean over all.
+    The root mean square over all bounds meets the target, and no bound exceeds twice the target.
+    The variance of a bound is estimated from its replicates, shrunk to the mean over all.
     """
     edges, tally = edges_of(workspace), _Tally(workspace)
     todo, number = edges, 0
@@ -184,7 +184,7 @@ class _Tally:
 
 
 def _root_mean_square(values: np.ndarray) -> float:
-    """Root mean square of what is known; NaN if nothing is."""
+    """Root mean square of finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
 

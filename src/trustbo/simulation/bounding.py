@@ -17,7 +17,7 @@ class State:
 
     cells: tuple[Cell, Cell]  # of the lead, and of T2
     poses: np.ndarray  # (1 + robot, 3), the lead first
-    stops: np.ndarray  # (1 + robot, 2), where they were to stop: their ways begin there
+    stops: np.ndarray  # (1 + robot, 2), planned posts: the routes start there
     time: float
     seed: int
     tracks: np.ndarray  # (phase, robot, 2), see `sensing.new_tracks`
@@ -40,7 +40,7 @@ class Drive(NamedTuple):
 
 
 def turns(bounding: str, k: int, is_last: bool) -> tuple[str, ...]:
-    """Order of those that move in bound k: `"lead"`, `"t2"`."""
+    """Order of the movers in bound k: `"lead"`, `"t2"`."""
     if bounding == "successive":
         return "lead", "t2"
     first, other = ("lead", "t2") if k % 2 else ("t2", "lead")

@@ -54,8 +54,8 @@ class ModelSimulator(DescribedSimulator):
                 along their path.
             n_ticks: Ticks of each bound, for `"beta_binomial"`.
             p_fail: Chance that each bound ends the mission, shape (move, row, col), such as a draw
-                of `models.BoundRisk`; None for no failures.
-            causes: Share of each of `models.CAUSES` among failures; all "stuck" by default.
+                of `hazard.BoundRisk`; None for no failures.
+            causes: Share of each of `hazard.CAUSES` among failures; all "stuck" by default.
 
         Raises:
             ShapeError: Parameters or awareness of other robots or features, or of many draws; or

@@ -1,11 +1,11 @@
 """Expected contact of a simulator that draws rates from a trust model, in closed form.
 
-Trust has memory, so what a bound gives depends on all bounds before it. Expected trust m and its
-variance v roll by the Kalman recursion without measurements; v depends on the number of bounds
+Trust has memory, so the contact of a bound depends on all bounds before it. Expected trust m and
+its variance v roll by the Kalman recursion without measurements; v depends on the number of bounds
 only. The expected rate is that of N(m, v + delta_v^2) clipped to [0, 1], or E[sigma(N(m, v))] for
-counts. It rises with m, and m with the trust before: so of two ways to reach a bound in as many
-bounds, one with less loss and at least as much trust of every robot dominates the other (label
-setting with dominance; Martins 1984), and the best path found is exact.
+counts. It rises with m, and m with the trust before: so of two paths to a bound in as many bounds,
+one with less loss and at least as much trust of every robot dominates the other (label setting with
+dominance; Martins 1984), and the best path found is exact.
 """
 
 from collections.abc import Sequence
@@ -120,7 +120,7 @@ class ModelContact:
         return u.reshape(*u.shape[:2], -1)
 
     def _spread(self, n_bounds: int) -> np.ndarray:
-        """Standard deviation of what a rate measures, shape (bound, robot)."""
+        """Standard deviation of the measured quantity, shape (bound, robot)."""
         process, observed = self._noise
         covariance = np.eye(len(process)) * np.asarray(self._params.x0_sd, float) ** 2
         variances = []

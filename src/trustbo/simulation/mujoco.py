@@ -143,12 +143,12 @@ class MujocoSimulator(KinematicSimulator):
 
 
 class _Convoy:
-    """Group of robots that drive at the same time, each along its own route."""
+    """Group of robots that drive at the same time, each along one route."""
 
     def __init__(
         self, physics: Physics, legs: "list[_Leg]", surface: Surface, stuck_after: float
     ) -> None:
-        """Begin; the surface's gradient tells which robots lie on their side."""
+        """Begin; the surface's gradient determines which robots lie on their side."""
         self._physics, self._legs = physics, legs
         self._surface, self._stuck_after = surface, stuck_after
         self._untouched = np.full(len(legs), np.inf)  # s

@@ -209,12 +209,12 @@ class KinematicSimulator(DescribedSimulator):
         rng: np.random.Generator,
         state: State | None = None,
     ) -> list[tuple[np.ndarray, str, State]]:
-        """Run a successive bound once for each cell that may follow it, the lead's move shared.
+        """Simulate a bound for each admissible next cell; the lead's trajectory is computed once.
 
-        It leads from a cell to the next, from a state of the team there, by default in position.
-        Returns for each the contact rate (robot,), the status and the state after it. The rate is
-        the mean probability of contact over the ticks where looks are independent; where tracks
-        outlast misses, or lost contact ends a mission, that of simulated looks.
+        The bound starts from a state of the team, by default at the planned posts. Returns for each
+        the contact rate (robot,), the status and the state after it. The rate is the mean
+        probability of contact over the ticks where scans are independent; where tracks outlast
+        misses, or lost contact ends a mission, that of simulated scans.
         """
         max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
         state = self._start(way[0], 0, cell) if state is None else state
@@ -354,7 +354,7 @@ class KinematicSimulator(DescribedSimulator):
     ) -> tuple[np.ndarray, str]:
         """Drive the lead (i = 0) or T2 while the others stand: poses (tick, 1 + robot, 3), status.
 
-        Their ways begin at the `stops` that were planned, the robots where they are now.
+        Routes start at the planned posts `stops`, robots at their current poses.
         """
         members = slice(1, None) if i else slice(0, 1)
         robots = self.team.robots if i else (self.team.lead,)
@@ -373,7 +373,7 @@ class KinematicSimulator(DescribedSimulator):
         poses: np.ndarray,
         window: tuple[int, int, int, int],
     ) -> list[np.ndarray | None]:
-        """Planned ways of the lead (i = 0) or T2, begun where the robots really are."""
+        """Planned routes of the lead (i = 0) or T2, started at the robots' current positions."""
         team = self.workspace.team
         routes = []
         for robot, start, goal, pose in zip(

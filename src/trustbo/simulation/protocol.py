@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError
 
 
 class Simulator(Protocol):
-    """Simulator that runs a path: one of this package, a user's own, or real robots.
+    """Simulator that runs a path: one of this package, a custom one, or real robots.
 
     One more method is optional: `describe() -> dict` gives settings that a campaign records. A
     simulator whose world changes takes the number of the mission as a keyword `mission` of `run`
@@ -71,7 +71,7 @@ def takes(function: Callable[..., object], name: str) -> bool:
 
 
 def require_call(simulator: object, name: str, *arguments: object, **named: object) -> None:
-    """Refuse a simulator whose method cannot be called so, without calling it: TrustboError."""
+    """Check the signature of a simulator's method, without calling it: TrustboError."""
     method = getattr(simulator, name)
     if takes(method, "mission"):
         named["mission"] = 0

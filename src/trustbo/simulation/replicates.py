@@ -1,4 +1,4 @@
-"""Replicates of bounds: what each gives, followed by each bound that can come next."""
+"""Replicates of bounds: contact and status of each, for each bound that can follow."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -37,7 +37,7 @@ class Replicates(Protocol):
     """Source of replicates of bounds."""
 
     most: int
-    """Largest number of replicates that are worth their time."""
+    """Maximum number of replicates."""
 
     def run(self, edges: Sequence[Edge], number: int) -> Iterator[list[Outcome]]:
         """Run each bound once for each that can follow it: outcomes in the order of the edges."""
@@ -45,7 +45,7 @@ class Replicates(Protocol):
 
 
 def edges_of(workspace: Workspace) -> list[Edge]:
-    """All bounds of a workspace that its robots have a way for."""
+    """All bounds of a workspace for which its robots have a route."""
     exists = workspace.passable_bounds.values
     edges = []
     for move, row, col in np.argwhere(exists).tolist():
@@ -63,7 +63,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
 
 
 class KinematicReplicates:
-    """Replicates of the kinematic simulator, without the noise of looks.
+    """Replicates of the kinematic simulator, without detection noise.
 
     Robots stop within half a metre of where they should, hence a replicate begins where one of the
     bounds before it, each in turn, ended in the replicate before, as in missions. In the zeroth,

@@ -1,6 +1,6 @@
-"""Contact by lidar: looks, which detect a robot or not, and tracks, which outlast some misses.
+"""Contact by lidar: scans, which detect a robot or not, and tracks, which outlast some misses.
 
-At each tick, one look goes from each robot that stands to each that moves.
+At each tick, each standing robot scans each moving one once.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from trustbo.workspace.sight import Sight, detection_probability, optics
 
 
 def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) -> list[np.ndarray]:
-    """Probability that a look detects its target, shape (tick, robot) for each bound."""
+    """Probability that a scan detects its target, shape (tick, robot) for each bound."""
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
     t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
     lead, t2 = np.repeat(poses[:, :1], len(team.robots), axis=1), poses[:, 1:]
@@ -36,16 +36,16 @@ def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) 
 
 
 def new_tracks(n_robots: int) -> np.ndarray:
-    """Tracks of nobody: (phase, robot, (tracked, run of contrary looks))."""
+    """Tracks without a target: (phase, robot, (tracked, run of contrary scans))."""
     return np.zeros((2, n_robots, 2), np.int64)
 
 
 def contact_of(found: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
-    """Contact from looks: a track begins after some detections in a row, and ends after misses.
+    """Contact from scans: a track begins after some detections in a row, and ends after misses.
 
-    `found`, shape (tick, robot), says whether each look detected its target; the watchers' lidars,
-    one per robot, give the numbers of looks; the state of the tracks (robot, 2) is updated in
-    place. Returns shape (tick, robot), bool.
+    `detected`, shape (tick, robot), has the outcome of each scan; the watchers' lidars, one per
+    robot, give the numbers of scans; the state of the tracks (robot, 2) is updated in place.
+    Returns shape (tick, robot), bool.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
     contact = np.empty(found.shape, bool)

@@ -50,7 +50,7 @@ class PathContact(NamedTuple):
 
 
 class Contact(Protocol):
-    """Source of a truth: a table of bounds, a model's recursion, or the user's own."""
+    """Source of a truth: a table of bounds, a model's recursion, or a custom one."""
 
     @property
     def standard_error(self) -> float:
@@ -73,7 +73,8 @@ class Contact(Protocol):
 class Truth(Displayed):
     """Expected contact of every path of a simulator, in the world of a mission.
 
-    Contact is expected given that no bound fails; `PathContact.p_arrive` says how probable that is.
+    Contact is expected given that no bound fails; `PathContact.p_arrive` is the probability of
+    that.
 
     Attributes:
         workspace: Workspace of the paths.
@@ -84,7 +85,7 @@ class Truth(Displayed):
     def __init__(
         self, workspace: Workspace, bounds: Contact, at: "Callable[[int], Truth] | None" = None
     ) -> None:
-        """Hold what bounds give; `at(mission)` is the truth of another mission's world."""
+        """Store the contact of bounds; `at(mission)` is the truth of another mission's world."""
         self.workspace, self.bounds, self._at = workspace, bounds, at
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
 
@@ -111,9 +112,8 @@ class Truth(Displayed):
         """Find the truth of a simulator.
 
         Of a `ModelSimulator` it is known in closed form. Of another, every bound, followed by each
-        that can follow it, is replicated until the standard error is reached; what was found is
-        kept on disk, and found again by a hash of the simulator's `describe()`, the workspace and
-        the code.
+        that can follow it, is replicated until the standard error is reached; the result is cached
+        on disk under a hash of the simulator's `describe()`, the workspace and the code.
 
         Args:
             simulator: Simulator with a `workspace`, and with `reset` and `run_bound`.
@@ -265,10 +265,10 @@ def _table(
     folder: FilePath | None,
     progress: bool,
 ) -> BoundTable:
-    """Table of a simulator, from disk if it is known."""
+    """Table of a simulator, from the disk cache if present."""
     describe = getattr(simulator, "describe", None)
     file = None
-    if describe is not None:  # else nobody knows whether it is the same
+    if describe is not None:  # else its identity is unknown
         about = [describe(), world, seed, standard_error, VERSIONS["trustbo"], _code()]
         kept = cache_folder("truth") if folder is None else require_folder(folder)
         digest = hashlib.sha256(to_json(about).encode())
@@ -279,7 +279,7 @@ def _table(
             try:
                 return BoundTable(read_tree(file)["bounds"].to_dataset())
             except (DamagedFileError, KeyError):
-                pass  # found anew
+                pass  # computed again
     kind = type(simulator) is KinematicSimulator
     source = (KinematicReplicates if kind else PlainReplicates)(simulator, mission, seed)
     table = tabulate(simulator.workspace, source, standard_error=standard_error, progress=progress)
@@ -289,7 +289,7 @@ def _table(
 
 
 def _content(simulator: Any) -> list[bytes]:
-    """Contents of the workspace on which contact depends, besides the simulator's settings."""
+    """Contents of the workspace on which contact depends."""
     workspace: Workspace = simulator.workspace
     own = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
     parts = [to_json(own).encode(), _bytes(workspace.passable)]
@@ -305,7 +305,7 @@ def _bytes(array: xr.DataArray) -> bytes:
 
 @cache
 def _code() -> str:
-    """Hash of the code that decides what a simulator gives, for work on it between versions."""
+    """Source hash of the simulator: invalidates cached truths during development."""
     digest, root = hashlib.sha256(), Path(__file__).parents[1]
     for room in ("simulation", "terrain", "workspace"):
         for file in sorted((root / room).glob("*.py")):

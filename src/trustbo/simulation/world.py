@@ -81,7 +81,7 @@ class Worlds:
         return World(self.surface, ways, jams, detection)
 
     def _planned(self, closing: Sequence[Threat]) -> Ways:
-        """Posts and ways, which keep out of closed areas; jams and worse lidars change none."""
+        """Posts and routes, which avoid closed areas; jams and degraded lidars change neither."""
         key = tuple(map(id, closing))
         if key not in self._ways:
             ground = self._workspace.ground
