@@ -1,1 +1,1 @@
-"""Objects as a person looks at them: text in a terminal, HTML in a notebook."""
+"""Display of objects: text in a terminal, HTML in a notebook."""

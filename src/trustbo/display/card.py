@@ -1,4 +1,4 @@
-"""A card: the few numbers of an object that matter, a picture of it, and what opens on a click."""
+"""Summary of an object for display: its main numbers, a picture, and sections that unfold."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +18,7 @@ _STYLE = (
 
 
 class Card(NamedTuple):
-    """Card of an object.
+    """Summary of an object for display.
 
     Attributes:
         title: Name of the object, in a line.
@@ -57,7 +57,7 @@ class Card(NamedTuple):
 
 
 class Displayed:
-    """Object that a notebook shows as a card, and a terminal as its text."""
+    """Object with a summary as its HTML in a notebook and its text in a terminal."""
 
     __slots__ = ()
 
@@ -79,7 +79,7 @@ def number(value: float, unit: str = "", digits: int = 3) -> str:
 def arrival(mean: float, band: tuple[float, float] | None) -> str:
     """Text of a chance to arrive, its mean and its 90 % band over the posterior.
 
-    The mean is said to be one, as few draws that are much worse may leave it outside the band.
+    The mean is labelled, as a few far worse draws may leave it outside the band.
     """
     if band is None or not math.isfinite(band[0]):
         return _chance(mean)
@@ -89,7 +89,7 @@ def arrival(mean: float, band: tuple[float, float] | None) -> str:
 
 
 def _chance(p: float) -> str:
-    """Text of a chance of three decimals, of which one below 1 is told from it."""
+    """Text of a chance to three decimals, where a value below 1 is not rounded to 1."""
     return "over 0.999" if 0.9995 <= p < 1.0 else f"{p:.3f}"
 
 

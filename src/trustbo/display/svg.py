@@ -124,7 +124,7 @@ def _svg(width: float, height: float, parts: list[str], legend: str) -> str:
 
 def _png(cells: np.ndarray, low: float, high: float) -> str:
     """Cells as a data URL, a pixel for each."""
-    import matplotlib as mpl  # it is dear, and only needed where something is looked at
+    import matplotlib as mpl  # slow to import, and needed for display only
     from PIL import Image
 
     share = (cells - low) / (high - low) if high > low else np.where(np.isfinite(cells), 0.5, cells)

@@ -76,12 +76,12 @@ def frame_of(
 
 
 def frame_file(path: Path) -> Path:
-    """Return the file beside a map or a bag that says where its frame is."""
+    """Return the file with the frame of a map or a bag, in the same folder."""
     return require_file(path.with_name(f"{path.stem}_frame.yaml"))
 
 
 def write_frame(path: Path, frame: Frame, workspace: Workspace) -> None:
-    """Write where a frame is, beside the map or bag at `path`; nothing for that of the CRS."""
+    """Write the frame of the map or bag at `path` to a file; nothing for that of the CRS."""
     if frame == Frame():
         return
     record: dict[str, object] = {

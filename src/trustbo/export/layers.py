@@ -21,7 +21,7 @@ _LEAST = 1e-6
 
 
 def plan_of(plan: Plan | Result, workspace: Workspace | None) -> Plan:
-    """Return a plan, or that of a result, on a workspace; by default on its own.
+    """Return a plan, or that of a result, on a workspace; by default the plan's.
 
     ShapeError: they differ in their numbers of robots. TrustboError: the path leaves the workspace,
     or a robot is called as the lead.

@@ -50,7 +50,7 @@ def path_frame(
 
     Args:
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default its own.
+        workspace: Workspace of the plan; by default the plan's.
         layer: "bounds", "posts" or "ways"; the last two need a terrain.
         crs: CRS of the geometry, anything that pyproj accepts; None for that of the grid, if any.
 
@@ -87,8 +87,8 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
     .gpkg    GeoPackage: layers `path` (LineString), `bounds` (points), `posts` and
              `ways`, in the terrain's CRS.
     .csv     The points of cells as a table, with longitude and latitude if there is a
-             CRS; beside it, tables of posts, and of the points of ways, whose names
-             end in _posts.csv and _ways.csv.
+             CRS; in the same folder, tables of posts, and of the points of ways, whose names end in
+             _posts.csv and _ways.csv.
     ======== ========================================================================
 
     Columns and properties are those of `path_frame`. Posts and ways are left out where the
@@ -97,7 +97,7 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
     Args:
         path: File to write, or to replace.
         plan: Plan, or result whose recommended path is meant.
-        workspace: Workspace of the plan; by default its own. Without a terrain, only a table can
+        workspace: Workspace of the plan; by default the plan's. Without a terrain, only a table can
             be written.
 
     Raises:
@@ -111,7 +111,7 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
 
 
 def tables_beside(file: Path) -> tuple[Path, Path]:
-    """Return the files of posts and of ways that are written beside the table of a path."""
+    """Return the files of posts and of ways that belong to the table of a path."""
     posts, ways = (file.with_name(f"{file.stem}_{name}{file.suffix}") for name in ("posts", "ways"))
     return posts, ways
 

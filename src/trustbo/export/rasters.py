@@ -31,7 +31,7 @@ def write_geotiff(
         maps: Maps (row, col), e.g. `Result.maps()`.
         workspace: Workspace of the cells, made from a terrain.
         cog: Whether to write a Cloud Optimized GeoTIFF, for maps on a web server.
-        style: Whether to write a style for QGIS beside it, the .qml file of the same name.
+        style: Whether to write a style for QGIS too, the .qml file of the same name.
 
     Raises:
         ShapeError: The dims or the number of cells differ.

@@ -111,7 +111,7 @@ def write_ros_map(
     rotation: float = 0.0,
     frame: str = "map",
 ) -> None:
-    """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml file, and a .pgm beside it.
+    """Write a cost map for map_server of ROS 1 and of Nav2: a .yaml and a .pgm file.
 
     Args:
         path: .yaml or .yml file to write, or to replace.
@@ -124,8 +124,8 @@ def write_ros_map(
             `"lon=174.7,lat=-41.3"`; by default that of the CRS.
         rotation: Angle from east to the x axis of the frame, rad, anticlockwise. Pixels lie along
             its axes: they take the cost of the cell at their centre.
-        frame: Name of the frame. Unless all three are left out, a file whose name ends in
-            _frame.yaml, beside the map, says where it is.
+        frame: Name of the frame. Unless all three are left out, a file with the suffix _frame.yaml
+            in the map's folder defines it.
 
     Raises:
         ShapeError: The dims or the number of cells differ.

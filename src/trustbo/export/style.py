@@ -19,8 +19,8 @@ _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 def write_style(path: FilePath, maps: Maps) -> None:
     """Write the style of a raster of `write_geotiff`: viridis over the values of its first band.
 
-    QGIS loads the style of the same name beside a raster. NaN is left out of the limits of the
-    colours. ShapeError: no maps. TrustboError: a file that cannot be written.
+    QGIS loads the style with the name of a raster from the same folder. NaN is left out of the
+    limits of the colours. ShapeError: no maps. TrustboError: a file that cannot be written.
     """
     target = require_file(path, ".qml")
     shown, *_ = as_dataset(maps).data_vars.values()

@@ -31,7 +31,7 @@ def write_csv(path: FilePath, result: Result) -> None:
     target = require_file(path)
     require_kind("result", result, Result, "give a Result, as iterate returns it")
     latent = result.posterior["latent"].to_dataset()
-    # A posterior need not cover all missions: some are set aside, or wait to be learned from.
+    # A posterior need not cover all missions: some are excluded, or wait to be learned from.
     numbers = [int(j) for j in latent["mission"].values]
     trust = {name: dict(zip(numbers, latent[name].values, strict=True)) for name in _TRUST}
     rows = []

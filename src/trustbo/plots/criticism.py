@@ -26,12 +26,12 @@ from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 _LEVEL = 0.05
 _LEAST_P = 1e-6
-"""Smallest p that is told from others."""
+"""Lower limit of the axis of p."""
 _KINDS = ("mission", "bound", "robot", "contact")
 
 
 def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
-    """Draw what a criticism looked at.
+    """Draw the tests, residuals and coverage of a criticism.
 
     Tests with their adjusted p, and once the fault that is named is accounted for (hollow); the
     distribution of PIT values less the uniform one; coverage one mission ahead; autocorrelation;

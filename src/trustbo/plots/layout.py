@@ -28,7 +28,7 @@ _LETTERS = 11
 
 MARKERS = "osD^vPX*<>"
 DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 1, 1, 1)))
-"""Line styles of curves in one panel, in order, to tell them apart without colour."""
+"""Line styles of curves in one panel, in order, distinct without colour."""
 
 
 class Panels(NamedTuple):
@@ -59,7 +59,7 @@ def small_multiples(
         n: Number of panels.
         size: Width and height of a panel, inches; a panel that has to be narrower keeps its height.
         style: Options of the user.
-        margin: Width beside the panels for a colour bar or a legend, inches.
+        margin: Width at the side of the panels for a colour bar or a legend, inches.
         columns: Panels per row, by default the number from three to five that leaves the fewest
             places empty; fewer where they would be narrower than `least` inches.
         least: Least width of a panel, inches.
@@ -137,7 +137,7 @@ def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
 
 
 def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: Any) -> None:
-    """Add a colour bar, unless left out; a label longer than the bar beside it is broken.
+    """Add a colour bar, unless left out; a label longer than its bar is broken.
 
     `axes=` are those it belongs to, by default all panels.
     """
@@ -177,7 +177,7 @@ def _whole(ax: Axes) -> Figure:
 def fit_height(made: Panels, style: Style) -> None:
     """Give a new figure of maps the height that they take at its width.
 
-    It depends on the proportions of the maps beside the width of bars and numbers; any other height
+    It depends on the proportions of the maps and on the width of bars and numbers; any other height
     would leave a gap above, or at the sides.
     """
     if style.ax is not None:

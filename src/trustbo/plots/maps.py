@@ -44,7 +44,7 @@ _CONTOURS = 12  # levels on a map, at most
 _SMOOTH = 1 / 60  # of a map's longer side: contour lines of rough ground are smoothed over it
 _MOST_PIXELS = 400  # a side, of the heights that contour lines are drawn of
 _LEAST_CHANCE = 1e-3
-"""Chance to fail from which a map of chances has colours."""
+"""Chance to fail at the first colour of a map of chances."""
 
 
 def trust_maps(
@@ -59,7 +59,7 @@ def trust_maps(
     """Draw the trust map that missions were planned on, with their paths, Fig. 5 of the paper.
 
     The last panel shows the map and the recommended path after the last mission. All are on one
-    scale, from the 2 % to the 98 % quantile of what missions taught, the start cell left out, whose
+    scale, from the 2 % to the 98 % quantile of the learned maps, the start cell left out, whose
     trust is assumed: a draw of the prior may be far off. A trust of 1 is that of unbroken contact;
     above it there is no other colour.
 
@@ -300,7 +300,7 @@ def draw_relief(
 ) -> None:
     """Draw contour lines of the terrain, see `contours`, over a map.
 
-    They are thin, and leave a map's colours as they are; a shade would change them.
+    They are thin, and do not change a map's colours, as a shade would.
     """
     lines = contours(workspace, heights)
     style = {"colors": colour, "alpha": opacity, "linewidths": 0.5}

@@ -1,4 +1,4 @@
-"""Trust of each robot along a mission: expected, learned, and beside measured contact rates."""
+"""Trust of each robot along a mission: expected, learned, and with measured contact rates."""
 
 from collections.abc import Sequence
 from typing import Unpack

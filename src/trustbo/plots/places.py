@@ -1,4 +1,4 @@
-"""Maps of the effects of places: what was learned beyond the terrain, and how surely."""
+"""Maps of the effects of places that the terrain does not explain: mean and standard deviation."""
 
 from typing import Unpack
 
@@ -38,7 +38,7 @@ _TIP, _TAIL = 0.2, 0.47
 def place_map(
     posterior: xr.DataTree, workspace: Workspace, **style: Unpack[StyleOptions]
 ) -> np.ndarray:
-    """Draw where contact is better or worse than the terrain says, and how sure that is.
+    """Draw effects of places: contact better or worse than the terrain explains, and its sd.
 
     The left panel has the mean effect of each cell, with + or -, large where that sign has a
     probability of 95 %; the right one the standard deviation. Arrows, in the cell entered, are the
@@ -51,8 +51,8 @@ def place_map(
         **style: Options of `Style`; `cmap` is that of the standard deviation.
 
     Returns:
-        Axes of the mean and of the standard deviation, shape (2,); where robots have effects of
-        their own, those of each robot in turn, shape (2 robot,).
+        Axes of the mean and of the standard deviation, shape (2,); where robots have separate
+        effects, those of each robot in turn, shape (2 robot,).
 
     Raises:
         TrustboError: The model has no effects of places.

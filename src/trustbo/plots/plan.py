@@ -22,7 +22,7 @@ from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, d
 from trustbo.plots.style import Style, StyleOptions, theme
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
-"""Colours of Okabe and Ito (2008), by robot; in grey, markers tell robots apart."""
+"""Colours of Okabe and Ito (2008), by robot; in grey, markers distinguish robots."""
 _DASHED = (0, (3, 1.5))
 _ROOM = (0.5, 0.2)
 """Room of a scale bar in its corner, shares of the axes."""
@@ -35,7 +35,7 @@ def plan_map(
 
     Of a bound, the lead's way between its stops, T2's posts with their sight lines to where the
     lead stops, and the ways on which T2 then closes up to its next posts (hollow). Vegetation is
-    grey; each panel has its own scale.
+    grey; each panel has a separate scale.
 
     Args:
         plan: Plan on a terrain in memory, such as `Result.plan`.

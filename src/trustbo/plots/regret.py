@@ -40,7 +40,7 @@ def regret_curves(
     """Draw the regret of a study after each mission: its median and its spread over the runs.
 
     Thin bars hold 90 % of the runs, thick ones 50 %. Curves differ in colour, lightness, dashes and
-    marker, to be told apart without colour as well.
+    marker, to be distinct without colour as well.
 
     Args:
         dataset: Runs of a study, dims (run, mission), from `study.load_study`.
@@ -53,8 +53,8 @@ def regret_curves(
         Axes, shape (panel,).
 
     Raises:
-        TrustboError: This is no dataset; a coordinate is unknown; or no regret is, as no simulator
-            of the study knows the truth.
+        TrustboError: This is no dataset; a coordinate is unknown; or regret is missing, as no
+            simulator of the study has a truth.
     """
     such = "give a study's dataset, from study.load_study"
     require_kind("plots.regret_curves", dataset, xr.Dataset, such)

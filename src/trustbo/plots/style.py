@@ -157,6 +157,6 @@ class Style:
 
 
 def curve_colours(n: int, style: Style) -> np.ndarray:
-    """Colours of n curves that can be told from the paper, also in grey; shape (n, 4)."""
+    """Colours of n curves that stand out from the paper, also in grey; shape (n, 4)."""
     ends = (0.35, 1.0) if luminance(theme().paper) < 0.5 else (0.0, 0.8)
     return style.colours("viridis")(np.linspace(*ends, max(n, 1)))

@@ -12,7 +12,7 @@ class Table:
         caption: Caption, one sentence.
         head: Names of the columns.
         rows: Cells as text, one per column.
-        text_columns: Columns of words, besides the first; they are set flush left.
+        text_columns: Further columns of words after the first; they are set flush left.
     """
 
     caption: str

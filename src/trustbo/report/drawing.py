@@ -38,7 +38,7 @@ def picture(draw: Callable[[], Axes | np.ndarray], alt: str, caption: str) -> Pi
         figure = first.get_figure(root=True)
         assert figure is not None  # noqa: S101
         figure.set_dpi(_DOTS)
-        # The same bytes as of `savefig`, which draws once more to know its layout.
+        # The same bytes as of `savefig`, which draws once more for the layout.
         FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None})
     plt.close(figure)
     width, height = (round(_PIXELS * inches) for inches in figure.get_size_inches())

@@ -33,7 +33,7 @@ def trust_maps(result: Result) -> Picture:
 
 
 def orders(result: Result) -> Picture:
-    """Draw what robots are to do along the recommended path."""
+    """Draw posts and routes of robots along the recommended path."""
     n, names = len(result.path) - 1, joined(result.workspace.team.names)
     shown = np.unique(np.linspace(1, n, min(n, MOST_BOUNDS)).round().astype(int)).tolist()
     caption = (
@@ -160,7 +160,7 @@ def parameters(result: Result) -> Picture | None:
 
 
 def criticism(found: Criticism) -> Picture:
-    """Draw what the criticism of the model looked at."""
+    """Draw the tests and residuals of the model's criticism."""
     odd = found.groups.loc[found.groups["stands_out"].to_numpy(), :]
     said = f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
     return picture(

@@ -16,14 +16,14 @@ from trustbo.report.page import render, write_report
 from trustbo.report.summary import facts_of
 
 _REFRESH = 5
-"""Seconds between two looks at the file."""
+"""Seconds between two reloads of the page."""
 
 
 class LivePage:
     """Page of a campaign under way: a callback of campaigns, renewed after each mission.
 
     The file is replaced as a whole, so that there is a page to be read at any time, after a crash
-    too: it tells as of which mission and what time it is, and what it means if that is long ago.
+    too: it states its mission and time, and the meaning if that is long ago.
     """
 
     def __init__(self, path: FilePath, total: int) -> None:
@@ -74,7 +74,7 @@ class LivePage:
 
 
 def _if_long_ago(campaign: Campaign | None) -> str:
-    """Sentence that tells the page of a run that was killed, which no process renews any more."""
+    """Sentence for the page of a killed run, which no process renews any more."""
     last = {} if campaign is None else campaign.log.entries[-1].row
     seconds = sum(value for name, value in last.items() if name.startswith("seconds_"))
     took = f", of which the last took {max(seconds, 1.0):.0f} s" if last else ""

@@ -67,7 +67,7 @@ def render(
         title: Title.
         facts: Facts of the summary.
         sections: Sections below it.
-        explorer: Name of the interactive page beside it; None without one.
+        explorer: Name of the interactive page in the same folder; None without one.
         refresh: Seconds after which the page of a campaign that did not end reloads itself, 0 for
             never; None for the report of one that did.
         version: Version that made the result.
@@ -146,7 +146,7 @@ def _criticism(result: Result) -> Section:
 
 def _meaning_of_parameters(result: Result) -> str:
     itself, awareness = ("B0", "B") if "B0" in result.posterior["posterior"] else ("beta0", "beta")
-    awareness = result.posterior.attrs.get("drift", awareness)  # a function of the user's own
+    awareness = result.posterior.attrs.get("drift", awareness)  # a custom function
     return (
         f"The parameters of the model, {result.settings['model']}: trust follows itself by "
         f"{itself}, and the awareness of the bound by {awareness}."

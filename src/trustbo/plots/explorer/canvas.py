@@ -104,7 +104,7 @@ def _draw_path(plot: Any) -> None:
 
 
 def draw_chart(scene: Scene) -> Any:
-    """Make the figure of trust along the path, beside the contact that was measured.
+    """Make the figure of trust along the path, with the measured contact.
 
     Its sources are named `trust` (bound, q0, ..., q4), `rates` (bound, rate, marker, colour) and
     `chosen` (bound).
@@ -151,7 +151,7 @@ def _source(name: str, **columns: Any) -> Any:
 
 
 def _plain(plot: Any) -> Any:
-    """Remove what the page has of its own, or takes from its colours."""
+    """Remove frames and colours that the page's style sets."""
     plot.toolbar.logo = None
     plot.background_fill_color = plot.border_fill_color = plot.outline_line_color = None
     plot.grid.visible = plot.name == "chart"

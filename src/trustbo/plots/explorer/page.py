@@ -39,7 +39,7 @@ class Explorer:
         write_text(require_file(path, ".html", ".htm"), self.html)
 
     def _repr_html_(self) -> str:
-        """Page in a frame of its own, so that neither its style nor its script meets others."""
+        """Page in a separate frame, so that its style and script do not affect the notebook."""
         return (
             f'<iframe title="{html.escape(self.title)}" srcdoc="{html.escape(self.html)}" '
             'style="width:100%;height:820px;border:0" loading="lazy"></iframe>'
