@@ -236,8 +236,8 @@ class Mission(Displayed):
         Raises:
             ShapeError: Axes that do not fit together.
             TrustboError: A value outside [0, 1]; an unknown status or reason; or `failed_at` beyond
-                the path, more than a bound after the arrays, before measurements, or beside a
-                status.
+                the path, more than a bound after the arrays, before measurements, or together with
+                a status.
         """
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
         if failed_at is not None or reason:
@@ -411,7 +411,7 @@ def _require_none_after(last: int, what: str, values: np.ndarray) -> None:
 
 
 def as_names(what: str, given: Iterable[str]) -> tuple[str, ...]:
-    """Names as a tuple; TrustboError where one is no text, or there twice."""
+    """Names as a tuple; TrustboError where one is no text, or repeated."""
     listed = isinstance(given, Iterable) and not isinstance(given, str)
     names = tuple(given) if listed else ()
     if not listed or not all(isinstance(name, str) for name in names):

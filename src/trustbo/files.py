@@ -23,9 +23,9 @@ from trustbo.errors import DamagedFileError, TrustboError
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
 _LEAST_FREE = 1 << 20
-"""Bytes; libraries that write files by themselves do not say why they failed."""
+"""Free bytes below which a failed write is blamed on the disk: libraries give no reason."""
 _MOST, _MOST_TEXT, _MOST_YAML = 1 << 35, 1 << 28, 1 << 22
-"""Bytes of the largest file that is read, the largest record, and the largest configuration."""
+"""Upper limits in bytes of a file that is read, a record, and a configuration."""
 
 FilePath = str | PathLike[str]
 
@@ -34,15 +34,15 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
     """Write a file atomically: `write` gets a temporary name of the same suffix, then renamed.
 
     Ctrl-C and SIGTERM take effect after the write, a second one at once. A link of that name is
-    replaced by the file, and what it leads to is left alone.
+    replaced by the file, its target is unchanged.
 
     Args:
         path: File to write; its folder is made if it does not exist.
-        write: Function that writes to the path it is given, which has the same suffix.
+        write: Function that writes to a given path of the same suffix.
 
     Raises:
         TrustboError: The disk is full, or the folder may not be written to; a file of that name is
-            as it was.
+            unchanged.
     """
     path = Path(path)
     with naming_refusal(path.parent):
@@ -57,7 +57,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
     except Exception as error:
         full = isinstance(error, OSError) and error.errno in _FULL
         disk = shutil.disk_usage(path.parent)
-        if full or (disk.free < _LEAST_FREE and disk.total > 0):  # /proc has no bytes at all
+        if full or (disk.free < _LEAST_FREE and disk.total > 0):  # /proc reports no free bytes
             raise TrustboError(
                 f"the disk is full: {str(path)!r} was not written. What was there before is as it "
                 "was; make room and go on, or run the same again."
@@ -69,7 +69,7 @@ def write_file(path: FilePath, write: Callable[[Path], object]) -> None:
 
 
 def temporary_name(path: Path) -> Path:
-    """Name beside a file to write it under; with a mark that no other program's files have.
+    """Temporary name in the folder of a file, with a mark that no other program uses.
 
     The suffix is the file's: libraries choose a format by it.
     """
@@ -94,9 +94,9 @@ def folder_to_disk(folder: Path) -> None:
 
 @contextmanager
 def naming_refusal(folder: Path, file: Path | None = None, remedy: str = "") -> Iterator[None]:
-    """Make the system's refusal to write to a folder a TrustboError that says what to do.
+    """Convert the system's refusal to write to a folder to a TrustboError with the remedy.
 
-    Only that of one `file` in it, if given: others may be read meanwhile.
+    With `file`, only refusals of that file: others may be read meanwhile.
     """
     try:
         yield
@@ -141,10 +141,10 @@ def defer_interrupt() -> Iterator[None]:
 
 
 def write_checked(path: FilePath, content: bytes) -> None:
-    """Write a file atomically and durably, and its SHA-256 to a hidden file beside it.
+    """Write a file atomically and durably, and its SHA-256 to a hidden file in the same folder.
 
-    The hidden file, which is written first, also keeps the sum of the file before: whichever of
-    the two a process dies between, the pair agrees.
+    The hidden file, which is written first, also keeps the sum of the previous file: if the process
+    dies between the two writes, the pair still agrees.
     """
     path = Path(path)
     # Of the file that is there: its kept sum may be that of one whose writing died.
@@ -173,10 +173,11 @@ def read_checked(path: FilePath, most: int = _MOST) -> bytes:
 
 
 def require_regular(path: FilePath, most: int = _MOST) -> Path:
-    """Return a file to read: no pipe, which would wait, no device, and not endless.
+    """Return a file to read; pipes, devices and files above a size limit are refused.
 
     Raises:
-        DamagedFileError: There is no such file, it is none, or it has more than `most` bytes.
+        DamagedFileError: There is no such file, it is not regular, or it has more than `most`
+            bytes.
     """
     path = as_path(path)
     try:
@@ -221,9 +222,9 @@ def read_record(path: FilePath, *, checked: bool = True) -> Any:
 
 @contextmanager
 def interpreting(path: FilePath) -> Iterator[None]:
-    """Make the error of code that meets what it does not expect in a file a DamagedFileError.
+    """Convert errors from unexpected contents of a file to a DamagedFileError.
 
-    Errors that are TrustboError are left as they are.
+    A TrustboError passes unchanged.
     """
     try:
         yield
@@ -240,7 +241,7 @@ def interpreting(path: FilePath) -> Iterator[None]:
 
 
 def not_ours(path: Path, remedy: str = "another folder") -> TrustboError:
-    """Error of a file of another program in the place of one of ours."""
+    """Error for a file of another program under one of our names."""
     return TrustboError(
         f"{str(path)!r} was not written by trustbo, and would be replaced; move it, or choose "
         f"{remedy}."
@@ -253,7 +254,7 @@ def checksum(path: Path) -> str | None:
 
 
 def remove_checked(path: Path) -> None:
-    """Remove a file of `write_checked` and its sum; one without a sum is another's, and stays."""
+    """Remove a file of `write_checked` and its sum; a file without a sum is foreign, and stays."""
     with naming_refusal(path.parent):
         if sum_file(path).is_file():
             path.unlink(missing_ok=True)
@@ -261,7 +262,7 @@ def remove_checked(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files that a process which died left; no other may be at work there.
+    """Remove temporary files of a dead process; no other process may write there.
 
     Those in the folder itself, by the mark of `temporary_name`; never through a link.
     """

@@ -18,7 +18,7 @@ _here = threading.local()
 PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 """Options of compiled functions that only compiled ones call: a quarter less time to compile.
 
-They are not kept on disk either, where those that call them are.
+They are not cached on disk; their compiled callers are.
 """
 
 

@@ -18,12 +18,12 @@ _RUNS = re.compile("'*[=+\\-@\t\r\n\N{FULLWIDTH EQUALS SIGN}\N{FULLWIDTH PLUS SI
 
 
 def harmless(text: str) -> str:
-    """Text of a cell as it is written."""
+    """Escape the text of a cell for writing."""
     return f"'{text}" if _RUNS.match(text) and not _is_number(text) else text
 
 
 def meant(cell: str) -> str:
-    """Text of a cell as it was before `harmless`."""
+    """Invert `harmless`."""
     return cell[1:] if cell.startswith("'") and _RUNS.match(cell) else cell
 
 

@@ -22,13 +22,14 @@ class Robot(Displayed):
         sensor_height: Height of the lidar above ground, m.
         target_height: Height of the point others aim at, m above ground; by default the lidar.
         max_slope: Steepest pitch or roll that the robot withstands, rad.
-        detection: Quality of the lidar: share of clear looks that find their target, in (0, 1].
-        acquire: Number of successive looks that must find a target before contact begins.
-        drop: Number of successive looks that must miss it before contact ends.
+        detection: Quality of the lidar: share of unobstructed scans that detect their target, in
+            (0, 1].
+        acquire: Number of successive scans that must detect a target before contact begins.
+        drop: Number of successive scans that must miss it before contact ends.
 
     Raises:
         TrustboError: A value is not positive, an angle exceeds a quarter turn, a share exceeds 1,
-            or a number of looks is not whole.
+            or a number of scans is not whole.
     """
 
     speed: float = 2.0
@@ -115,7 +116,7 @@ class Team(Displayed):
 
     @classmethod
     def of(cls, team: Self | None, n_robots: int = 3) -> Self:
-        """Team as it is, or one of equal robots for None; TrustboError: it is no team."""
+        """Return the team, by default one of equal robots; TrustboError: it is no team."""
         if team is not None and not isinstance(team, Team):
             raise TrustboError(f"team must be a Team, e.g. Team(n_robots=3); got {team!r}.")
         return cls(n_robots=n_robots) if team is None else team

@@ -87,7 +87,8 @@ class TrustFilter:
             n_robots: Number of robots; needed with `TrustParams`, which all robots share.
             response: `"level"` or `"change"`, with draws; `"level"` by default. A posterior records
                 it.
-            observation: Family of observations, with draws; `"gaussian"` by default. A posterior records it.
+            observation: Family of observations, with draws; `"gaussian"` by default. A posterior
+                records it.
             max_draws: Largest number of draws to follow; they are evenly spaced.
             belief: Belief about awareness: a map drawn from it goes with each draw, and gives what
                 was not measured in a bound.

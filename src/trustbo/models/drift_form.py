@@ -1,7 +1,7 @@
 """Custom drift: its function, the axes of its parameters, and their values.
 
 A file cannot hold a function. A posterior stores its name and its values at one point: the function
-is looked up among those that this process has built a model with, and identified by these values.
+is searched among those that this process has built a model with, and identified by these values.
 Nothing that a file names is imported.
 """
 

@@ -93,7 +93,7 @@ class CoupledTarget:
         return Student(mode, laplace(self.log_density, mode[None], 0)[2][0])
 
     def look(self, z: np.ndarray) -> None:
-        """Nothing: the density is exact everywhere."""
+        """No-op: the density is exact everywhere."""
 
     def defensive(self, proposal: Student) -> Student:
         """Defensive proposal: the given one widened."""

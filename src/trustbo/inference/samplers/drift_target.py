@@ -90,7 +90,7 @@ class DriftTarget:
         return Student(modes[top], scale[top])
 
     def look(self, z: np.ndarray) -> None:
-        """Nothing: the density is exact wherever it is looked at from."""
+        """No-op: the density is exact everywhere."""
 
     def defensive(self, proposal: Student) -> Spanning:
         """Proposal that spans all angles between the two noises."""

@@ -109,7 +109,7 @@ class PlaceTarget:
         return prior_of_places(proposal)
 
     def look(self, z: np.ndarray) -> None:
-        """Nothing: the density is exact everywhere."""
+        """No-op: the density is exact everywhere."""
 
     def draw(
         self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
