@@ -253,7 +253,7 @@ MISTAKES = {
     ),
     "LOO of a result": (lambda c: loo(c.result), "a posterior from fit; .* Give its .posterior"),
     "curves of a result": (
-        lambda c: regret_curves(c.result), "got Result .* give a study.s dataset, from study.load_study"
+        lambda c: regret_curves(c.result), "got Result .* give a study.s dataset, from study.load"
     ),
     "a number for a truth": (lambda c: c.iterate(truth=3), "must be Truth.of.simulator.; got 3"),
     "a policy of two": (

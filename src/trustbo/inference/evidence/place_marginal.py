@@ -176,7 +176,7 @@ def _whitening(
     """Whitening of the rates of one robot, for each pattern.
 
     Returns:
-        Returns the response of each x_k to a bound (bound + 1, bound) and to x_0; and for each
+        Response of each x_k to a bound (bound + 1, bound) and to x_0; and for each
         pattern the inverse of the factor of V, the log of its diagonal, and its product with T.
     """
     n = patterns.shape[1]
