@@ -177,12 +177,12 @@ class Mission(Displayed):
         took = self.bounds[-1].t1
         first, last = path_text(self.path[:1]), path_text(self.path[-1:])
         with np.errstate(all="ignore"):
-            each = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
+            means = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
         rows = [
             ("path", f"{first} to {last}, {len(self.path) - 1} bounds planned"),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
             ("contact rate", f"{mean} on average; {(~measured).sum()} of {rates.size} missing"),
-            *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, each, strict=True)),
+            *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, means, strict=True)),
             ("takes", number(took, "s", 4) if took > 0.0 else "not measured"),
         ]
 
@@ -302,18 +302,18 @@ class Mission(Displayed):
             return self
         lacks = [name for name in features if name in unmeasured and name not in self.features]
         own_features = (*self.features, *lacks)
-        for what, own, wanted in (
+        for what, names_of, wanted in (
             ("robots", self.robots, robots),
             ("features", own_features, features),
         ):
-            if sorted(own) != sorted(wanted):
+            if sorted(names_of) != sorted(wanted):
                 raise ShapeError(
                     f"the mission has {what} {getattr(self, what)}, not {tuple(wanted)}; give "
                     f"{what}= these names, or use the workspace of this team."
                 )
         i, m = (
-            [own.index(n) for n in names]
-            for own, names in ((self.robots, robots), (own_features, features))
+            [names_of.index(n) for n in names]
+            for names_of, names in ((self.robots, robots), (own_features, features))
         )
         bounds = []
         for b in self.bounds:

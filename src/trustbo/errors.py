@@ -113,9 +113,9 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     return first, second
 
 
-def unknown(what: str, name: str, known: Iterable[str]) -> TrustboError:
+def unknown(what: str, name: str, names: Iterable[str]) -> TrustboError:
     """Error for an unknown name, with those that may be meant."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(known)}."
+    names = list(names)
+    near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+    advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(names)}."
     return TrustboError(f"unknown {what} {name!r}; {advice}")

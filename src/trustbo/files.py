@@ -234,9 +234,9 @@ def interpreting(path: FilePath) -> Iterator[None]:
         ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError,
         ValueError,
     ) as error:  # fmt: skip
-        said = " ".join(str(error).split())[:200]
+        message = " ".join(str(error).split())[:200]
         raise DamagedFileError(
-            f"{str(path)!r} is damaged: it does not hold what it should ({said})."
+            f"{str(path)!r} is damaged: it does not hold what it should ({message})."
         ) from error
 
 

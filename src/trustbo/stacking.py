@@ -75,7 +75,7 @@ def require_same_team(missions: Sequence[Mission]) -> None:
             )
 
 
-def fill_awareness(mission: Mission, known: np.ndarray) -> Mission:
+def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
     """Fill awareness that a mission did not measure (NaN) with what is known of its bounds.
 
     `known` has shape (bound, robot, feature).
@@ -83,7 +83,7 @@ def fill_awareness(mission: Mission, known: np.ndarray) -> Mission:
     if not np.isnan(mission.awareness).any():
         return mission
     bounds = tuple(
-        replace(b, awareness=np.where(np.isnan(b.awareness), known[k], b.awareness))
+        replace(b, awareness=np.where(np.isnan(b.awareness), awareness[k], b.awareness))
         for k, b in enumerate(mission.bounds)
     )
     return replace(mission, bounds=bounds)

@@ -40,7 +40,7 @@ def exposures(n, failed, lost=(), weights=None):
 
 def law(difficulty):
     x = np.asarray(difficulty, dtype=float)
-    return Hazard().law(x, ("tilt", "narrowness")[: x.shape[1]], LIMIT)
+    return Hazard().beta_priors(x, ("tilt", "narrowness")[: x.shape[1]], LIMIT)
 
 
 def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
@@ -52,7 +52,9 @@ def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
     alpha, beta = of(z)
     binomial = stats.betabinom.logpmf(failed, n, alpha, beta) - np.log(special.comb(n, failed))
     expected = binomial.sum(1) + stats.norm.logpdf(z).sum(1)
-    np.testing.assert_allclose(_Density(of, exposures(n, failed)).known(z), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        _Density(of, exposures(n, failed)).log_observed(z), expected, rtol=1e-9
+    )
 
 
 def test_a_bound_is_passed_if_neither_its_difficulty_nor_the_limit_stops_robots():
@@ -60,7 +62,7 @@ def test_a_bound_is_passed_if_neither_its_difficulty_nor_the_limit_stops_robots(
     tilt = np.tan(np.deg2rad([22.0, 18.0, 10.0])) / np.tan(np.deg2rad(22.0))
     x = np.column_stack([tilt, [0.5, 0.9, 0.1]])
     prior = Hazard(intercept=(-3.0, 0.5), coefficient=(1.0, 2.0), margin=(1.0, 3.0))
-    of = prior.law(x, ("tilt", "narrowness"), LIMIT)
+    of = prior.beta_priors(x, ("tilt", "narrowness"), LIMIT)
     alpha, beta = (part[0] for part in of(np.array([[0.2, 0.5, -0.4, 1.2, 2.0]])))
     logit = -2.9 + 2.0 * (x[:, 1] - 0.5)
     over = (np.array([0.0, -4.0, -12.0]) + 1.0 - 0.4 * 3.0) / np.exp(0.5 * 1.2)
@@ -75,7 +77,9 @@ def test_fractional_weights_have_the_ratio_of_beta_functions():
     alpha, beta = of(z)
     ratio = special.betaln(alpha + failed, beta + n - failed) - special.betaln(alpha, beta)
     expected = ratio.sum(1) + stats.norm.logpdf(z).sum(1)
-    np.testing.assert_allclose(_Density(of, exposures(n, failed)).known(z), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        _Density(of, exposures(n, failed)).log_observed(z), expected, rtol=1e-9
+    )
 
 
 def test_imputing_places_integrates_lost_missions_out_as_quadrature_does():
@@ -137,7 +141,7 @@ def test_the_posterior_of_the_margin_equals_quadrature_with_chances_integrated_o
     degrees, narrow = np.array([22.0, 19.0, 10.0]), np.array([0.2, 0.6, 0.5])
     tilt = np.tan(np.deg2rad(degrees)) / np.tan(LIMIT)
     n, failed = np.array([2, 2, 3]), np.array([2, 1, 0])
-    law = prior.law(np.column_stack([tilt, narrow]), ("tilt", "narrowness"), LIMIT)
+    law = prior.beta_priors(np.column_stack([tilt, narrow]), ("tilt", "narrowness"), LIMIT)
     points = sample(law, exposures(n, failed), seed=0)
     axis = np.linspace(-6.0, 6.0, 401)
     margin, log_width = np.meshgrid(1.0 + 3.0 * axis, 0.5 * axis, indexing="ij")
@@ -165,7 +169,7 @@ def test_the_hazard_is_calibrated():
     ranks = []
     for seed in range(n_sets):
         x = rng.uniform(size=(n_bounds, 2)) * (1.2, 1.5)
-        of = prior.law(x, ("tilt", "narrowness"), LIMIT)
+        of = prior.beta_priors(x, ("tilt", "narrowness"), LIMIT)
         z = rng.standard_normal((1, 5))
         p = rng.beta(*(part[0] for part in of(z)))
         n, failed, lost = np.zeros(n_bounds), np.zeros(n_bounds), []

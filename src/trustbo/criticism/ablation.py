@@ -26,7 +26,7 @@ from trustbo.models.record import model_from_record
 _SENSITIVE = 0.05  # threshold of the Cumulative Jensen-Shannon distance, as ArviZ has it
 
 
-def worth_of(
+def ablate(
     posterior: xr.DataTree | None, missions: Sequence[Mission], model: TrustModel | None
 ) -> pd.DataFrame:
     """Difference of elpd by component, left out or added; empty without a posterior.
@@ -75,33 +75,33 @@ def _rows(
         others["robots"] = missions, wider, how
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of single influential missions, by k-hat
-        own = loo(posterior)
-        without_places = own
+        fitted = loo(posterior)
+        without_places = fitted
         for name, (data, other, how) in others.items():
             if other.place is not None and model.place is None and not _has_places(missions):
                 continue
-            beside = own
+            beside = fitted
             if other.why_not_exact and not model.why_not_exact:  # NUTS would take minutes
                 bare = replace(other, place=None)
                 if other.place is None or model.place is None or bare.why_not_exact:
                     rows[name] = np.nan, np.nan, f"not compared: {other.why_not_exact}."
                     continue
                 other, how, beside = bare, f"{how}, both without places", without_places
-            found = loo(fit(data, other, seed=int(posterior.attrs["seed"]), check=False))
-            without_places = found if name == "places" else without_places
-            gap = np.asarray(beside.elpd_i) - np.asarray(found.elpd_i)  # pyright: ignore
+            other_loo = loo(fit(data, other, seed=int(posterior.attrs["seed"]), check=False))
+            without_places = other_loo if name == "places" else without_places
+            gap = np.asarray(beside.elpd_i) - np.asarray(other_loo.elpd_i)  # pyright: ignore
             rows[name] = _compared(gap, how)
     return rows
 
 
 def _compared(gap: np.ndarray, how: str) -> tuple[float, float, str]:
     value, se = float(gap.sum()), float(gap.std(ddof=1) * np.sqrt(len(gap)))
-    said = f"elpd {-value:+.1f} +- {se:.1f} {how}"
+    sentence = f"elpd {-value:+.1f} +- {se:.1f} {how}"
     if value > 2.0 * se:
-        return value, se, f"{said}: the model as it is predicts better."
+        return value, se, f"{sentence}: the model as it is predicts better."
     if value < -2.0 * se:
-        return value, se, f"{said}: the model as it is predicts worse."
-    return value, se, f"{said}: no difference that these missions show."
+        return value, se, f"{sentence}: the model as it is predicts worse."
+    return value, se, f"{sentence}: no difference that these missions show."
 
 
 def _sensitivity(posterior: xr.DataTree) -> tuple[float, float, str]:
@@ -113,18 +113,20 @@ def _sensitivity(posterior: xr.DataTree) -> tuple[float, float, str]:
         level = logger.level
         logger.setLevel(logging.ERROR)  # ArviZ prints a long message at a finding
         try:
-            found = psense_summary(posterior)
+            table = psense_summary(posterior)
         finally:
             logger.setLevel(level)
-    names = [str(name) for name in found.index]
-    by_prior, by_rates = (found[name].to_numpy(dtype=float) for name in ("prior", "likelihood"))
+    names = [str(name) for name in table.index]
+    by_prior, by_rates = (table[name].to_numpy(dtype=float) for name in ("prior", "likelihood"))
     sensitive = [name for name, d in zip(names, by_prior, strict=True) if d > _SENSITIVE]
     both = [n for n, d in zip(names, by_rates, strict=True) if d > _SENSITIVE and n in sensitive]
-    said = "no parameter is sensitive to its prior (power scaling)."
+    sentence = "no parameter is sensitive to its prior (power scaling)."
     if sensitive:
-        said = f"sensitive to priors (power scaling): {', '.join(sensitive)}"
-        said += f"; to priors and rates, a conflict of both: {', '.join(both)}." if both else "."
-    return float(by_prior.max()), np.nan, said
+        sentence = f"sensitive to priors (power scaling): {', '.join(sensitive)}"
+        sentence += (
+            f"; to priors and rates, a conflict of both: {', '.join(both)}." if both else "."
+        )
+    return float(by_prior.max()), np.nan, sentence
 
 
 def _has_places(missions: Sequence[Mission]) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from trustbo.criticism.ablation import ablate
 from trustbo.criticism.departures import Departure, departures
 from trustbo.criticism.findings import coverage_row, family_test, finding, verdict_of
 from trustbo.criticism.joint_normal import (
@@ -20,7 +21,6 @@ from trustbo.criticism.joint_normal import (
 from trustbo.criticism.prior_moments import Coefficients, coefficients_of, test_prior
 from trustbo.criticism.residuals import curves_of, groups_of, table_of_rates
 from trustbo.criticism.score import Derivatives, Innovations, Outcome, derivatives, holm
-from trustbo.criticism.worth import worth_of
 from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
@@ -139,44 +139,51 @@ def _criticise(
         )
     rng = np.random.default_rng([seed, len(data.y)])
     draws = rng.standard_normal((len(data.y), n_replicates))
-    found = Innovations.of(normal, data.y, by_parameter, draws)
+    innovations = Innovations.of(normal, data.y, by_parameter, draws)
     tests, left_out = departures(missions, data, normal, point, place)
-    of = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
-    outcomes = _test_all(found, tests, of, seed)
-    adjusted = holm(np.array([each.p for each in outcomes.values()]))
+    coefficients = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
+    outcomes = _test_all(innovations, tests, coefficients, seed)
+    adjusted = holm(np.array([outcome.p for outcome in outcomes.values()]))
     wrong = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
     # No component of a model accounts for the prior or the family: they leave all others.
     after: dict[str, dict[str, Outcome]] = {name: {} for name in wrong}
-    for each in (each for each in tests if each.name in wrong):
-        wider = _account_for(each, outcomes[each.name].label, found, data, by_parameter, draws)
-        after[each.name] = _test_all(wider, [o for o in tests if o is not each], of, seed)
+    for outcome in (outcome for outcome in tests if outcome.name in wrong):
+        wider = _account_for(
+            outcome, outcomes[outcome.name].label, innovations, data, by_parameter, draws
+        )
+        after[outcome.name] = _test_all(
+            wider, [o for o in tests if o is not outcome], coefficients, seed
+        )
     fault = _most_explaining(outcomes, after)
     rows = {}
     for (name, one), p in zip(outcomes.items(), adjusted, strict=True):
-        said = "nothing found."
+        sentence = "nothing found."
         if p <= _LEVEL:
-            said = finding(name, one, found, data, missions, tests, of)
+            sentence = finding(name, one, innovations, data, missions, tests, coefficients)
         p_after = after[fault][name].p if name in after.get(fault, {}) else np.nan
-        rows[name] = one.label, one.statistic, one.p, p, p_after, said
+        rows[name] = one.label, one.statistic, one.p, p, p_after, sentence
     rows |= {name: ("", *[np.nan] * 4, f"not tested: {why}") for name, why in left_out.items()}
-    rates = table_of_rates(missions, data, found)
-    groups = groups_of(rates, missions, data, found)
-    curves, rates["ahead"] = curves_of(data, found, of, draws)
+    rates = table_of_rates(missions, data, innovations)
+    groups = groups_of(rates, missions, data, innovations)
+    curves, rates["ahead"] = curves_of(data, innovations, coefficients, draws)
     rows["coverage"] = coverage_row(curves)
     head = ["label", "statistic", "p", "p_adjusted", "p_after", "finding"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=head).rename_axis("check")
     chances = ["p", "p_adjusted", "p_after"]
     table[chances] = table[chances].mask(table[chances] < _LEAST, 0.0)
-    worth = worth_of(posterior, missions, model) if compare else worth_of(None, missions, None)
+    worth = ablate(posterior, missions, model) if compare else ablate(None, missions, None)
     return Criticism(verdict_of(fault, table), fault, table, rates, groups, curves, worth)
 
 
 def _test_all(
-    found: Innovations, tests: Sequence[Departure], of: Coefficients, seed: int
+    innovations: Innovations, tests: Sequence[Departure], coefficients: Coefficients, seed: int
 ) -> dict[str, Outcome]:
     """Outcome of each departure, of the prior and of the family."""
-    outcomes = {each.name: found.test(each) for each in tests}
-    return outcomes | {"prior": test_prior(found, of, seed), "family": family_test(found)}
+    outcomes = {test.name: innovations.test(test) for test in tests}
+    return outcomes | {
+        "prior": test_prior(innovations, coefficients, seed),
+        "family": family_test(innovations),
+    }
 
 
 def _most_explaining(
@@ -199,16 +206,16 @@ def _most_explaining(
 def _account_for(
     fault: Departure,
     label: str,
-    found: Innovations,
+    innovations: Innovations,
     data: Data,
     by_parameter: Derivatives,
     draws: np.ndarray,
 ) -> Innovations:
     """Innovations of the model extended by one label of a departure."""
-    normal = found.normal
+    normal = innovations.normal
     if label in fault.sources:
         U = fault.sources[label]
-        wider = Normal(normal.mean, normal.cov + found.size_of(U) * U, normal.carry)
+        wider = Normal(normal.mean, normal.cov + innovations.size_of(U) * U, normal.carry)
         return Innovations.of(wider, data.y, by_parameter, draws)
     columns = normal.carry @ fault.effects[label]
     names = [*by_parameter.names, *[label] * columns.shape[1]]
@@ -224,7 +231,7 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
         )
     missing = [name for name in _ATTRIBUTES if name not in posterior.attrs]
     sites = set(posterior["posterior"].data_vars)
-    linear = "gamma" in sites or any(each <= sites for each in _SITES)
+    linear = "gamma" in sites or any(sites_of <= sites for sites_of in _SITES)
     if missing or not linear or "prior" not in posterior.children:
         what = f"the attribute {missing[0]!r}" if missing else "the group 'prior'"
         what = what if linear else "beta0, beta, b, delta_w and delta_v of a linear drift"
@@ -262,14 +269,14 @@ def _learned(posterior: xr.DataTree, missions: Sequence[Mission]) -> list[Missio
             )
         given = [given[j] for j in numbers]
     if "constant_data" in posterior.children:
-        known = missions_of(posterior)
-        if len(known) != len(given):
+        held = missions_of(posterior)
+        if len(held) != len(given):
             raise TrustboError(
-                f"the posterior is of {len(known)} missions, and {len(given)} are given; give "
+                f"the posterior is of {len(held)} missions, and {len(given)} are given; give "
                 "those it was fitted to, or none, as it holds their data."
             )
-        for j, (own, other) in enumerate(zip(known, given, strict=True)):
-            rates = own.contact_rate, np.asarray(other.contact_rate)
+        for j, (mission, other) in enumerate(zip(held, given, strict=True)):
+            rates = mission.contact_rate, np.asarray(other.contact_rate)
             if rates[0].shape != rates[1].shape or not np.allclose(*rates, equal_nan=True):
                 raise TrustboError(
                     f"mission {j} has other contact rates than the posterior was fitted to; give "

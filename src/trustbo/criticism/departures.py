@@ -39,14 +39,14 @@ def departures(
     place: PlaceEffect | None,
 ) -> tuple[list[Departure], dict[str, str]]:
     """Alternatives to test, and those that cannot be tested, with the reason."""
-    found, left_out = [], {}
+    tests, left_out = [], {}
     mission, _, robot = data.slots.T
     first = missions[0]
     local = np.column_stack([np.ones(len(data.slots)), data.z])  # intercept and weights
     if (sources := _places(missions, data, normal, place)) is None:
         left_out["place"] = "paths jump between cells, so that bounds have no places."
     elif sources:
-        found.append(Departure("place", sources=sources))
+        tests.append(Departure("place", sources=sources))
     else:
         left_out["place"] = "the model has effects of cells and bounds."
     if data.n_robots == 1:
@@ -55,23 +55,23 @@ def departures(
         left_out["robot"] = "each robot has coefficients of its own in the model."
     else:
         of_robots = {r: local * (robot == i)[:, None] for i, r in enumerate(first.robots)}
-        found.append(Departure("robot", of_robots))
+        tests.append(Departure("robot", of_robots))
     if len(missions) < 4:
         left_out["change"] = f"{len(missions)} missions are fewer than 4."
     else:
         starts = range(2, len(missions) - 1)  # two missions on each side
         steps = {str(j): local * (mission >= j)[:, None] for j in starts}
-        found.append(Departure("change", steps, {"drift": _drift(data, normal)}))
+        tests.append(Departure("change", steps, {"drift": _drift(data, normal)}))
     curves = {}
     for m, feature in enumerate(first.features):
         if len(np.unique(data.z[:, m])) > 2:
             curves[feature] = (data.z[:, m : m + 1] - data.z[:, m].mean()) ** 2
     if curves:
-        found.append(Departure("curvature", curves))
+        tests.append(Departure("curvature", curves))
     else:
         left_out["curvature"] = "every feature has two values at most."
-    found.append(Departure("correlation", sources=_correlations(data, normal, point)))
-    return found, left_out
+    tests.append(Departure("correlation", sources=_correlations(data, normal, point)))
+    return tests, left_out
 
 
 def cell_columns(
@@ -79,9 +79,9 @@ def cell_columns(
 ) -> tuple[list[tuple[int, int]], np.ndarray]:
     """Cells entered, and the column of each over the slots, (slot, cell)."""
     cells = np.array([missions[j].bounds[k].cell for j, k, _ in data.slots])
-    known, index = np.unique(cells, axis=0, return_inverse=True)
-    names = [(int(row), int(col)) for row, col in known]
-    return names, (index.ravel()[:, None] == np.arange(len(known))).astype(float)
+    entered, index = np.unique(cells, axis=0, return_inverse=True)
+    names = [(int(row), int(col)) for row, col in entered]
+    return names, (index.ravel()[:, None] == np.arange(len(entered))).astype(float)
 
 
 def _places(
@@ -118,9 +118,9 @@ def _correlations(data: Data, normal: Normal, point: Point) -> dict[str, np.ndar
         sources["robots in one bound"] = (
             w**2 * (C @ shared) @ (C @ shared).T + v**2 * of_rates @ of_rates.T
         )
-    own = (mission * data.n_robots + robot)[data.seen]
+    sequence = (mission * data.n_robots + robot)[data.seen]
     gap = np.abs(np.subtract.outer(bound[data.seen], bound[data.seen]))
-    sources["successive bounds"] = _MEMORY**gap * np.equal.outer(own, own)
+    sources["successive bounds"] = _MEMORY**gap * np.equal.outer(sequence, sequence)
     levels = C @ (own_columns(mission, robot, data.n_robots))
     sources["a robot's rates of one mission"] = levels @ levels.T
     of_mission = C @ (mission[:, None] == np.arange(len(data.n_bounds)))
@@ -137,5 +137,5 @@ def _drift(data: Data, normal: Normal) -> np.ndarray:
 
 def own_columns(mission: np.ndarray, robot: np.ndarray, n_robots: int) -> np.ndarray:
     """Indicator column of each robot in each mission, over the slots."""
-    own = mission * n_robots + robot
-    return (own[:, None] == np.unique(own)).astype(float)
+    sequence = mission * n_robots + robot
+    return (sequence[:, None] == np.unique(sequence)).astype(float)

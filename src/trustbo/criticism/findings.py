@@ -17,9 +17,9 @@ _MOST_CELLS = 3
 _LEVEL = 0.05
 
 
-def family_test(found: Innovations) -> Outcome:
+def family_test(innovations: Innovations) -> Outcome:
     """Test the residuals for a normal shape, by their third and fourth moments."""
-    moments = np.array([(found.e**power).mean(0) for power in (3, 4)])
+    moments = np.array([(innovations.e**power).mean(0) for power in (3, 4)])
     sd = moments[:, 1:].std(1, keepdims=True)
     z = (moments - moments[:, 1:].mean(1, keepdims=True)) / sd
     log_p = np.log(2.0) + stats.norm.logsf(np.abs(z))
@@ -43,39 +43,41 @@ def coverage_row(curves: xr.Dataset) -> tuple[str, float, float, float, float, s
 def finding(
     name: str,
     outcome: Outcome,
-    found: Innovations,
+    innovations: Innovations,
     data: Data,
     missions: Sequence[Mission],
     tests: Sequence[Departure],
-    of: Coefficients,
+    coefficients: Coefficients,
 ) -> str:
     """Finding of a test in a sentence."""
     mission, _, robot = data.slots.T
     label, one = outcome.label, np.ones(len(data.slots))
     if name == "place":
-        return _of_places(label, found, data, missions, tests)
+        return _of_places(label, innovations, data, missions, tests)
     if name == "robot":
         here = (robot == missions[0].robots.index(label)) * one
-        shift = _shift(found, here)
+        shift = _shift(innovations, here)
         return f"{label} differs from the other robots: {shift} of trust per bound on average."
     if name == "change":
         starts = np.arange(2, len(missions) - 1)
-        effect, se = found.estimate((mission[:, None] >= starts) * 1.0)
+        effect, se = innovations.estimate((mission[:, None] >= starts) * 1.0)
         start = starts[np.argmax(np.abs(effect / se))] if label == "drift" else int(label)
-        shift = _shift(found, (mission >= start) * one)
+        shift = _shift(innovations, (mission >= start) * one)
         return f"from mission {start} on (counted from 0) trust changes by {shift} per bound."
     if name == "curvature":
-        (test,) = (each for each in tests if each.name == name)
-        (effect,), _ = found.estimate(test.effects[label])
+        (test,) = (departure for departure in tests if departure.name == name)
+        (effect,), _ = innovations.estimate(test.effects[label])
         bend = "flattens (saturates)" if effect < 0.0 else "steepens"
         return f"the response to {label} bends: it {bend} as {label} grows."
     if name == "prior":
-        alone = estimate(found, of)
-        i = of.labels.index(label.removeprefix("sign of "))
+        alone = estimate(innovations, coefficients)
+        i = coefficients.labels.index(label.removeprefix("sign of "))
         data_say = f"{alone.mean[i]:.2f} +- {np.sqrt(alone.cov[i, i]):.2f}"
-        prior = f"{of.mean[i]:.2f} +- {np.sqrt(of.cov[i, i]):.2f}"
+        prior = f"{coefficients.mean[i]:.2f} +- {np.sqrt(coefficients.cov[i, i]):.2f}"
         what = "has the wrong sign" if label.startswith("sign") else "conflicts with its prior"
-        return f"{of.labels[i]} {what}: {data_say} by the rates alone, {prior} by the prior."
+        return (
+            f"{coefficients.labels[i]} {what}: {data_say} by the rates alone, {prior} by the prior."
+        )
     if name == "correlation":
         return f"noise is correlated: {label} go together beyond what the model says."
     limits = ((data.y <= 0.0) | (data.y >= 1.0)).mean()
@@ -85,28 +87,28 @@ def finding(
 
 def _of_places(
     label: str,
-    found: Innovations,
+    innovations: Innovations,
     data: Data,
     missions: Sequence[Mission],
     tests: Sequence[Departure],
 ) -> str:
-    (test,) = (each for each in tests if each.name == "place")
-    sd = np.sqrt(found.size_of(test.sources[label]))
+    (test,) = (departure for departure in tests if departure.name == "place")
+    sd = np.sqrt(innovations.size_of(test.sources[label]))
     names, columns = cell_columns(missions, data)
-    effect, se = found.estimate(columns)
+    effect, se = innovations.estimate(columns)
     z = effect / se
     limit = stats.norm.isf(0.5 * _LEVEL / len(names))
     strong = [i for i in np.argsort(-np.abs(z)) if np.abs(z[i]) > limit]
-    said = f"trust depends on {label} beyond awareness, sd {sd:.2g} per bound"
+    sentence = f"trust depends on {label} beyond awareness, sd {sd:.2g} per bound"
     if not strong:
-        return f"{said}; no single cell stands out."
+        return f"{sentence}; no single cell stands out."
     cells = ", ".join(f"{names[i]} {effect[i]:+.2f} +- {se[i]:.2f}" for i in strong[:_MOST_CELLS])
     more = f", and {len(strong) - _MOST_CELLS} more" if len(strong) > _MOST_CELLS else ""
-    return f"{said}; cells that stand out: {cells}{more}."
+    return f"{sentence}; cells that stand out: {cells}{more}."
 
 
-def _shift(found: Innovations, column: np.ndarray) -> str:
-    (effect,), (se,) = found.estimate(column[:, None])
+def _shift(innovations: Innovations, column: np.ndarray) -> str:
+    (effect,), (se,) = innovations.estimate(column[:, None])
     return f"{effect:+.3f} +- {se:.3f}"
 
 

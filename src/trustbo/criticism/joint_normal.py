@@ -109,9 +109,9 @@ def joint_normal(point: Point, data: Data) -> Normal:
     blocks = {int(K): _mission(int(K), B0, Q, R, params, point.lag) for K in set(data.n_bounds)}
     end = 0
     for K in data.n_bounds:
-        own = slice(end, end + K * n)
-        carry[own, own], cov[own, own], start = blocks[int(K)]
-        mean[own] = carry[own, own] @ drift[own] + start
+        block = slice(end, end + K * n)
+        carry[block, block], cov[block, block], start = blocks[int(K)]
+        mean[block] = carry[block, block] @ drift[block] + start
         end += K * n
     seen = data.seen
     carry, cov = carry[seen], cov[np.ix_(seen, seen)]
@@ -126,7 +126,7 @@ def with_start(point: Point, data: Data) -> Point:
     Models fix them, most often far wider than the truth; residuals of first bounds would then be
     too small, and the others relatively too large.
     """
-    best, found = -np.inf, point
+    best, likeliest = -np.inf, point
     for sd in float(point.params.x0_sd) * _STARTS:
         params = point.params._replace(x0_sd=sd)
         normal, moved = (
@@ -139,8 +139,8 @@ def with_start(point: Point, data: Data) -> Point:
         mean = (a @ e) / max(a @ a, 1e-300)
         fit = -0.5 * ((e - mean * a) ** 2).sum() - np.log(np.diag(L)).sum()
         if fit > best:
-            best, found = fit, point._replace(params=params._replace(x0_mean=mean))
-    return found
+            best, likeliest = fit, point._replace(params=params._replace(x0_mean=mean))
+    return likeliest
 
 
 def varied(point: Point) -> Iterator[tuple[str, tuple[int, ...], float, Point, Point]]:

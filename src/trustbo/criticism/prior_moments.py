@@ -45,14 +45,14 @@ def coefficients_of(
         if field not in fields:
             continue
         where: tuple[int, ...] = tuple(map(int, re.findall(r"\d+", rest)))
-        own = field != "b" and (not coupled or where[1] == where[2])
+        is_own = field != "b" and (not coupled or where[1] == where[2])
         label = name
         if field != "b":
             feature = features[where[0] if coupled else where[-1]]
             others = where[1:] if coupled else where[:-1]
             label = feature + "".join(f"[{i}]" for i in others)
         labels.append(label)
-        is_weight.append(own)
+        is_weight.append(is_own)
         columns.append(column)
         fitted.append(np.asarray(getattr(point.params, field))[where])
         draws.append(fields[field][:, *where])
@@ -75,35 +75,46 @@ class Estimate(NamedTuple):
     cov: np.ndarray
 
 
-def estimate(found: Innovations, of: Coefficients) -> Estimate:
+def estimate(innovations: Innovations, coefficients: Coefficients) -> Estimate:
     """Generalised least squares of all parameters of the mean, one step from the posterior's."""
-    inverse = np.linalg.pinv(found.X.T @ found.X, rcond=1e-10)
-    step = inverse @ (found.X.T @ found.white)
-    return Estimate(of.fitted + step[of.columns], inverse[np.ix_(of.columns, of.columns)])
+    inverse = np.linalg.pinv(innovations.X.T @ innovations.X, rcond=1e-10)
+    step = inverse @ (innovations.X.T @ innovations.white)
+    return Estimate(
+        coefficients.fitted + step[coefficients.columns],
+        inverse[np.ix_(coefficients.columns, coefficients.columns)],
+    )
 
 
-def test_prior(found: Innovations, of: Coefficients, seed: int) -> Outcome:
+def test_prior(innovations: Innovations, coefficients: Coefficients, seed: int) -> Outcome:
     """Test each coefficient for conflict with its prior, and each weight for a wrong sign.
 
     Conflict: the estimate is too far from the prior's mean for the spread of both (Evans and
     Moshonov 2006). Wrong sign: the estimate is beyond 0, on the side away from the prior's mean;
     where that is 0, awareness is taken to help.
     """
-    alone, n_replicates = estimate(found, of), found.e.shape[1] - 1
+    alone, n_replicates = estimate(innovations, coefficients), innovations.e.shape[1] - 1
     rng = np.random.default_rng([seed, 1])
-    sign = np.where(np.abs(of.mean) < 0.1 * np.sqrt(np.diag(of.cov)), 1.0, np.sign(of.mean))
-    both = alone.cov + of.cov
+    sign = np.where(
+        np.abs(coefficients.mean) < 0.1 * np.sqrt(np.diag(coefficients.cov)),
+        1.0,
+        np.sign(coefficients.mean),
+    )
+    both = alone.cov + coefficients.cov
     sd, se = np.sqrt(np.diag(both)), np.sqrt(np.diag(alone.cov))
     noise = [
-        np.linalg.cholesky(each + 1e-12 * np.trace(each) * np.eye(len(each)))
-        @ rng.standard_normal((len(each), n_replicates))
-        for each in (both, alone.cov)
+        np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(len(cov)))
+        @ rng.standard_normal((len(cov), n_replicates))
+        for cov in (both, alone.cov)
     ]
-    far = np.column_stack([alone.mean - of.mean, noise[0]]) / sd[:, None]
+    far = np.column_stack([alone.mean - coefficients.mean, noise[0]]) / sd[:, None]
     off = np.column_stack([alone.mean, noise[1]]) * (-sign / se)[:, None]
-    off = off[of.is_weight]
+    off = off[coefficients.is_weight]
     log_p = np.concatenate([np.log(2.0) + stats.norm.logsf(np.abs(far)), stats.norm.logsf(off)])
-    labels = [f"{name}" for name in of.labels]
-    labels += [f"sign of {name}" for name, own in zip(of.labels, of.is_weight, strict=True) if own]
+    labels = [f"{name}" for name in coefficients.labels]
+    labels += [
+        f"sign of {name}"
+        for name, is_weight in zip(coefficients.labels, coefficients.is_weight, strict=True)
+        if is_weight
+    ]
     statistic = np.concatenate([far, off])[:, 0]
     return judge(labels, statistic, log_p[:, 0], log_p[:, 1:])

@@ -18,11 +18,13 @@ LEVELS = (0.5, 0.8, 0.9, 0.95)
 _N_CLASSES, _N_LAGS, _GRID = 5, 5, np.linspace(0.0, 1.0, 101)[1:-1]
 
 
-def table_of_rates(missions: Sequence[Mission], data: Data, found: Innovations) -> pd.DataFrame:
+def table_of_rates(
+    missions: Sequence[Mission], data: Data, innovations: Innovations
+) -> pd.DataFrame:
     """Row of each measured rate: its place in the missions, its prediction and its residual."""
     j, k, i = data.slots[data.seen].T
     cells = np.array([missions[a].bounds[b].cell for a, b in zip(j, k, strict=True)])
-    before = found.L.copy()
+    before = innovations.L.copy()
     spread = np.diag(before).copy()
     np.fill_diagonal(before, 0.0)
     return pd.DataFrame(
@@ -33,16 +35,16 @@ def table_of_rates(missions: Sequence[Mission], data: Data, found: Innovations) 
             "row": cells[:, 0],
             "col": cells[:, 1],
             "contact_rate": data.y,
-            "expected": found.normal.mean + before @ found.white,
+            "expected": innovations.normal.mean + before @ innovations.white,
             "sd": spread,
-            "residual": found.e[:, 0],
-            "pit": stats.norm.cdf(found.e[:, 0]),
+            "residual": innovations.e[:, 0],
+            "pit": stats.norm.cdf(innovations.e[:, 0]),
         }
     )
 
 
 def groups_of(
-    rates: pd.DataFrame, missions: Sequence[Mission], data: Data, found: Innovations
+    rates: pd.DataFrame, missions: Sequence[Mission], data: Data, innovations: Innovations
 ) -> pd.DataFrame:
     """Mean residual of each mission, bound, robot, cell and class of expected rate.
 
@@ -63,7 +65,7 @@ def groups_of(
     for kind, (index, labels) in kinds.items():
         member = index == np.arange(len(labels))[:, None]
         n = member.sum(1)
-        means = member @ found.e / np.maximum(n, 1)[:, None]
+        means = member @ innovations.e / np.maximum(n, 1)[:, None]
         # Where parameters leave next to no residual, as at first bounds, it does not stand out.
         sd = np.maximum(means[:, 1:].std(1), 0.2 / np.sqrt(np.maximum(n, 1)))
         reach = np.quantile(np.abs(means[:, 1:] / sd[:, None]).max(0), PROBABILITY)
@@ -78,18 +80,18 @@ def groups_of(
 
 
 def curves_of(
-    data: Data, found: Innovations, coefficients: Coefficients, draws: np.ndarray
+    data: Data, innovations: Innovations, coefficients: Coefficients, draws: np.ndarray
 ) -> tuple[xr.Dataset, np.ndarray]:
     """Curves of PIT, autocorrelation and coverage, each with its band; and residuals one ahead.
 
     Args:
         data: Missions.
-        found: Innovations.
+        innovations: Innovations.
         coefficients: Prior of the coefficients, for predictions one mission ahead.
         draws: White noise (rate, replicate).
     """
     mission, bound, robot = data.slots[data.seen].T
-    e, curves = found.e, {}
+    e, curves = innovations.e, {}
     below = np.array([(e <= stats.norm.ppf(u)).mean(0) for u in _GRID]) - _GRID[:, None]
     curves["pit"] = ("u", below)
     shape = len(data.n_bounds), data.n_bounds.max(), data.n_robots, e.shape[1]
@@ -106,7 +108,7 @@ def curves_of(
     apart = range(1, min(_N_LAGS, shape[0] - 1) + 1)
     between = [(levels[lag:] * levels[:-lag]).mean(0) / (levels**2).mean(0) for lag in apart]
     curves["autocorrelation_missions"] = ("mission_lag", np.array(between))
-    ahead = _one_mission_ahead(data, found, coefficients, draws)
+    ahead = _one_mission_ahead(data, innovations, coefficients, draws)
     later = mission > 0
     if later.any():
         inside = [(np.abs(ahead[later]) <= stats.norm.ppf(0.5 + 0.5 * p)).mean(0) for p in LEVELS]
@@ -129,19 +131,19 @@ def curves_of(
 
 
 def _one_mission_ahead(
-    data: Data, found: Innovations, coefficients: Coefficients, draws: np.ndarray
+    data: Data, innovations: Innovations, coefficients: Coefficients, draws: np.ndarray
 ) -> np.ndarray:
     """Standardised residuals given earlier missions, coefficients unknown: (rate, 1 + replicate).
 
     Noises and beta0 are those of the posterior, of all missions.
     """
     J = coefficients.jacobian
-    L = np.linalg.cholesky(found.normal.cov + J @ coefficients.cov @ J.T)
-    gap = data.y - found.normal.mean - J @ (coefficients.mean - coefficients.fitted)
+    L = np.linalg.cholesky(innovations.normal.cov + J @ coefficients.cov @ J.T)
+    gap = data.y - innovations.normal.mean - J @ (coefficients.mean - coefficients.fitted)
     both = np.column_stack([np.linalg.solve(L, gap), draws])
     ahead, mission = np.empty_like(both), data.slots[data.seen, 0]
     for j in np.unique(mission):
-        own = mission == j
-        block = L[np.ix_(own, own)]
-        ahead[own] = block @ both[own] / np.linalg.norm(block, axis=1)[:, None]
+        rows = mission == j
+        block = L[np.ix_(rows, rows)]
+        ahead[rows] = block @ both[rows] / np.linalg.norm(block, axis=1)[:, None]
     return ahead

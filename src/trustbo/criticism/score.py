@@ -73,9 +73,9 @@ class Innovations:
         X = solve_triangular(L, by_parameter.mean, lower=True)
         every = np.column_stack([white, draws])
         mixed = list(by_parameter.cov)
-        own = [i for i in range(X.shape[1]) if i not in mixed]
-        part = _orthonormal(X[:, own])
-        W = [_project(_whiten(L, each), part) for each in by_parameter.cov.values()]
+        mean_only = [i for i in range(X.shape[1]) if i not in mixed]
+        part = _orthonormal(X[:, mean_only])
+        W = [_project(_whiten(L, derivative), part) for derivative in by_parameter.cov.values()]
         slopes = X[:, mixed] - part @ (part.T @ X[:, mixed])
         gram = np.array([[(a * b).sum() for a in W] for b in W]) + 2.0 * slopes.T @ slopes
         precision = np.linalg.pinv(gram, rcond=1e-10)
@@ -92,9 +92,9 @@ class Innovations:
     def test(self, departure: Departure) -> Outcome:
         """Test one departure."""
         labels = [*departure.effects, *departure.sources]
-        found = [self._effect(columns) for columns in departure.effects.values()]
-        found += [self._source(U) for U in departure.sources.values()]
-        statistic, log_p = np.swapaxes(found, 0, 1)
+        outcomes = [self._effect(columns) for columns in departure.effects.values()]
+        outcomes += [self._source(U) for U in departure.sources.values()]
+        statistic, log_p = np.swapaxes(outcomes, 0, 1)
         return judge(labels, statistic[:, 0], log_p[:, 0], log_p[:, 1:])
 
     def estimate(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,19 +123,19 @@ class Innovations:
         return np.array([statistic, np.maximum(stats.chi2.logsf(statistic, Q.shape[1]), _LEAST)])
 
     def _source(self, U: np.ndarray) -> np.ndarray:
-        of = self.noises
-        W = _project(_whiten(self.L, U), of.basis)
-        shares = np.array([(a * W).sum() for a in of.W])
-        forms = (of.e * (W @ of.e)).sum(0) - shares @ of.steps - np.trace(W)
-        shares = of.precision @ shares
-        W = W - sum(share * a for share, a in zip(shares, of.W, strict=True))
-        v = -of.slopes @ shares
+        noises = self.noises
+        W = _project(_whiten(self.L, U), noises.basis)
+        shares = np.array([(a * W).sum() for a in noises.W])
+        forms = (noises.e * (W @ noises.e)).sum(0) - shares @ noises.steps - np.trace(W)
+        shares = noises.precision @ shares
+        W = W - sum(share * a for share, a in zip(shares, noises.W, strict=True))
+        v = -noises.slopes @ shares
         square = W @ W
         var = 2.0 * np.trace(square) + 4.0 * v @ v
         third = 8.0 * (square * W).sum() + 24.0 * v @ W @ v
         z, skewness = forms / np.sqrt(var), third / var**1.5
-        law = stats.pearson3(skewness) if skewness > _NORMAL else stats.norm()
-        return np.array([z, np.maximum(law.logsf(z), _LEAST)])
+        tail = stats.pearson3(skewness) if skewness > _NORMAL else stats.norm()
+        return np.array([z, np.maximum(tail.logsf(z), _LEAST)])
 
 
 class Noises(NamedTuple):

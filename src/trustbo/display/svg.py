@@ -34,10 +34,10 @@ def map_picture(
     rows, cols = cells.shape
     scale = min(_WIDTH / cols, _WIDTH / (rows * aspect))
     width, height = cols * scale, rows * aspect * scale
-    known = np.isfinite(cells)
+    finite = np.isfinite(cells)
     if apart is not None:
-        known[apart] = False
-    limits = cells[known]
+        finite[apart] = False
+    limits = cells[finite]
     low, high = (float(limits.min()), float(limits.max())) if limits.size else (0.0, 0.0)
     parts = [
         f'<image width="{width:.0f}" height="{height:.0f}" preserveAspectRatio="none" '
@@ -70,9 +70,9 @@ def curve_picture(
     """
     lines = np.atleast_2d(np.asarray(curves, dtype=float))
     shown = [lines.ravel(), *(np.ravel(edge) for edge in band or ())]
-    known = np.concatenate(shown)
-    known = known[np.isfinite(known)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    finite = np.concatenate(shown)
+    finite = finite[np.isfinite(finite)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     if high - low < 1e-9:
         low, high = low - 0.05, high + 0.05
     n, left, top = lines.shape[1], 40.0, 8.0
@@ -141,8 +141,8 @@ def _points(points: Sequence[tuple[float, float]]) -> str:
 
 def _runs(line: np.ndarray) -> list[np.ndarray]:
     """Indices of the stretches without NaN."""
-    known = np.flatnonzero(np.isfinite(line))
-    return [run for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if len(run)]
+    finite = np.flatnonzero(np.isfinite(line))
+    return [run for run in np.split(finite, np.flatnonzero(np.diff(finite) > 1) + 1) if len(run)]
 
 
 def _circle(x: float, y: float, radius: float, colour: str = "#fff") -> str:

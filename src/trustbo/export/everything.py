@@ -105,8 +105,8 @@ def export_result(
             )
     for name in chosen:
         _require_possible(name, result, target)
-    at = None if origin is None else place.origin  # "auto" is not known to a map alone
-    content = _Content(result, given | {"origin": at})
+    origin_xy = None if origin is None else place.origin  # "auto" is not known to a map alone
+    content = _Content(result, given | {"origin": origin_xy})
     if for_ros:
         occupancy(content.maps["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():

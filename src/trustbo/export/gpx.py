@@ -25,10 +25,10 @@ def gpx_routes(plan: Plan, name: str) -> str:
     centers = bounds_layer(plan).drop(columns="geometry")
     rows = centers.to_dict("records")
     names = ["start", *(f"bound {k}" for k in range(1, len(rows) - 1)), "goal"]
-    said = ["start", *(_trust(row, plan.workspace.team.names) for row in rows[1:])]
+    descriptions = ["start", *(_trust(row, plan.workspace.team.names) for row in rows[1:])]
     about = "expected trust in each robot after each bound, and its 90 % band"
     place = centers[["x", "y"]].to_numpy()
-    _add(root, plan, name, about, place, list(zip(names, said, strict=True)))
+    _add(root, plan, name, about, place, list(zip(names, descriptions, strict=True)))
     if (surface := plan.workspace.surface) is not None:
         near = 0.5 * min(surface.pixel)
         for robot, ways in routes_of(plan).items():
@@ -54,14 +54,14 @@ def _route(
         about = f"ways of {robot}; it watches the lead from points with a name"
         first = plan.posts[:, names.index(robot) - 1] if plan.posts is not None else None
     assert first is not None  # noqa: S101  # there is a terrain
-    points, said = [first[0]], stops[:1]
+    points, texts = [first[0]], stops[:1]
     for way, stop in zip(ways, stops[1:], strict=False):
         thin = shapely.get_coordinates(shapely.LineString(way).simplify(near))
         points += list(thin[1:])
-        said += [("", "")] * (len(thin) - 2) + [stop]
+        texts += [("", "")] * (len(thin) - 2) + [stop]
     if len(ways) < n_bounds:
         about += f"; it has no way in bound {len(ways) + 1}"
-    return about, np.array(points), said
+    return about, np.array(points), texts
 
 
 def _add(
@@ -70,7 +70,7 @@ def _add(
     name: str,
     about: str,
     place: np.ndarray,
-    said: list[tuple[str, str]],
+    texts: list[tuple[str, str]],
 ) -> None:
     """Add a route through places (point, 2) in CRS metres, with the name and text of each."""
     route = ET.SubElement(root, "rte")
@@ -79,7 +79,7 @@ def _add(
     crs = require_crs(plan.workspace).to_wkt()
     degrees = gpd.points_from_xy(*place.T, crs=crs).to_crs("EPSG:4326")
     heights = _ground(place, plan.workspace.terrain)
-    for point, height, (stop, text) in zip(degrees, heights, said, strict=True):
+    for point, height, (stop, text) in zip(degrees, heights, texts, strict=True):
         element = ET.SubElement(route, "rtept", lat=f"{point.y:.8f}", lon=f"{point.x:.8f}")
         # The order is that of the schema.
         if np.isfinite(height):

@@ -111,8 +111,10 @@ def routes_of(plan: Plan) -> dict[str, list[np.ndarray]]:
     names = (LEAD, *plan.workspace.team.names)
     ways = zip(*_required(plan, plan.ways), strict=True)
     return {
-        robot: [way for way in takewhile(lambda way: way is not None, own) if way is not None]
-        for robot, own in zip(names, ways, strict=True)
+        robot: [
+            way for way in takewhile(lambda way: way is not None, robot_ways) if way is not None
+        ]
+        for robot, robot_ways in zip(names, ways, strict=True)
     }
 
 

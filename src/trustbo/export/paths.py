@@ -143,8 +143,8 @@ def _features(layer: str, frame: gpd.GeoDataFrame) -> list[dict[str, object]]:
     for row, place in zip(rows.to_dict("records"), frame.geometry, strict=True):
         if "row" in row:
             row["cell"] = [row.pop("row"), row.pop("col")]
-        known = {name: value for name, value in row.items() if value == value}
-        features.append(_feature(layer, place, known))
+        properties = {name: value for name, value in row.items() if value == value}
+        features.append(_feature(layer, place, properties))
     return features
 
 
@@ -183,13 +183,13 @@ def _write_csv(file: Path, plan: Plan) -> None:
     if _of_terrain(plan):
         posts, ways = map(require_file, tables_beside(file))
         tables |= {posts: posts_layer(plan).drop(columns="geometry"), ways: way_points(plan)}
-    for own, table in tables.items():
+    for target, table in tables.items():
         if (crs := find_crs(plan.workspace)) is not None:
             place = gpd.points_from_xy(table["x"], table["y"], crs=crs.to_wkt()).to_crs(_WGS84)
             after = 1 + list(table.columns).index("y")
             table.insert(after, "longitude", place.x)
             table.insert(after + 1, "latitude", place.y)
-        write_text(own, frame_as_csv(table, index=False))
+        write_text(target, frame_as_csv(table, index=False))
 
 
 def _of_terrain(plan: Plan) -> tuple[str, ...]:

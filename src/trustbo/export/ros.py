@@ -79,13 +79,13 @@ def _raster(
     values = np.full((n_y, n_x), UNKNOWN, np.int8)
     # From the lower left corner on: along a row of pixels, and from row to row.
     axes = frame.axes
-    at = frame.to_crs(corner) - grid.corner if frame.rotation else np.zeros(2)
+    offset = frame.to_crs(corner) - grid.corner if frame.rotation else np.zeros(2)
     along = (np.arange(n_x)[:, None] + 0.5) * side * axes[0]
     for i in range(n_y):
-        x, y = (at + along + (i + 0.5) * side * axes[1]).T
+        x, y = (offset + along + (i + 0.5) * side * axes[1]).T
         row, col = rows - 1 - np.floor(y / grid.cell_height), np.floor(x / grid.cell_width)
-        known = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-        values[i, known] = cells[row[known].astype(int), col[known].astype(int)]
+        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        values[i, inside] = cells[row[inside].astype(int), col[inside].astype(int)]
     x, y = corner.tolist()
     return _Raster(values, side, (x, y))
 
@@ -93,11 +93,11 @@ def _raster(
 def _cells(cost: xr.DataArray, workspace: Workspace) -> np.ndarray:
     """Occupancy of the cells, (row, col), int8, the northern row first."""
     (values,) = require_maps(cost.rename("cost"), workspace).data_vars.values()
-    known = values.values
-    if (bad := (known < 0.0) | (known > 1.0)).any():
+    costs = values.values
+    if (bad := (costs < 0.0) | (costs > 1.0)).any():
         cell = tuple(int(i) for i in np.argwhere(bad)[0])
-        raise TrustboError(f"cost{list(cell)} = {known[cell]:g} is outside [0, 1].")
-    cells = np.where(np.isnan(known), UNKNOWN, np.fmin(np.rint(100.0 * known), WORST_PASSABLE))
+        raise TrustboError(f"cost{list(cell)} = {costs[cell]:g} is outside [0, 1].")
+    cells = np.where(np.isnan(costs), UNKNOWN, np.fmin(np.rint(100.0 * costs), WORST_PASSABLE))
     return np.where(workspace.passable.values, cells, IMPASSABLE).astype(np.int8)
 
 
@@ -258,8 +258,8 @@ def _topics(plan: Plan, frame: Frame) -> dict[str, tuple[str, np.ndarray]]:
     waypoints = frame.of_crs(plan.waypoints)
     topics[f"{LEAD}/waypoints"] = POSES, _onward(waypoints)
     for i, robot in enumerate(plan.workspace.team.names):
-        own = frame.of_crs(plan.posts[:, i])
-        topics[f"{robot}/posts"] = POSES, _towards(own, waypoints[1:] - own)
+        posts = frame.of_crs(plan.posts[:, i])
+        topics[f"{robot}/posts"] = POSES, _towards(posts, waypoints[1:] - posts)
     for robot, ways in routes_of(plan).items():
         if ways:
             # The end of a way is the start of the next.

@@ -71,22 +71,24 @@ class Exposures(NamedTuple):
         weight = _weights("weights", weights, len(missions))
         lost_weight = _weights("lost_weights", lost_weights, len(lost))
         runs = [_reported(m, w) for m, w in zip(missions, weight, strict=True)]
-        known = [_known_place(m, w) for m, w in zip(lost, lost_weight, strict=True) if m.where]
+        located = [_known_place(m, w) for m, w in zip(lost, lost_weight, strict=True) if m.where]
         unknown = [m for m in lost if m.where is None]
-        met = [run.bounds for run in (*runs, *known)]
+        met = [run.bounds for run in (*runs, *located)]
         planned = [_bounds_of(m.path) for m in unknown]
         rows = np.concatenate([np.empty((0, 3), int), *met, *planned])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
         n, failed, causes = np.zeros(len(bounds)), np.zeros(len(bounds)), np.zeros(len(CAUSES))
-        at = 0
-        for run in (*runs, *known):
-            own = index[at : at + len(run.bounds)]
-            at += len(run.bounds)
-            np.add.at(n, own, run.weight)
+        start = 0
+        for run in (*runs, *located):
+            indices = index[start : start + len(run.bounds)]
+            start += len(run.bounds)
+            np.add.at(n, indices, run.weight)
             if run.cause is not None:
-                failed[own[-1]] += run.weight
+                failed[indices[-1]] += run.weight
                 causes[CAUSES.index(run.cause)] += run.weight
-        places = np.split(index[at:], np.cumsum([len(p) for p in planned])[:-1]) if planned else []
+        places = (
+            np.split(index[start:], np.cumsum([len(p) for p in planned])[:-1]) if planned else []
+        )
         kept = np.array([w for m, w in zip(lost, lost_weight, strict=True) if m.where is None])
         for mission, w in zip(unknown, kept, strict=True):
             causes[CAUSES.index(require_choice("cause", mission.cause, CAUSES))] += w

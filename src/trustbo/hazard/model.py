@@ -23,7 +23,15 @@ from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_positive, require_whole
 from trustbo.hazard.exposures import CAUSES, Exposures, LostMission
 from trustbo.hazard.risk import BoundRisk
-from trustbo.hazard.sampler import LIMIT, LIMIT_NAMES, TILT, Law, Points, sample, steepness_of
+from trustbo.hazard.sampler import (
+    LIMIT,
+    LIMIT_NAMES,
+    TILT,
+    BetaPriors,
+    Points,
+    sample,
+    steepness_of,
+)
 from trustbo.inference.samplers.weights import systematic
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES
@@ -68,7 +76,9 @@ class Hazard:
             object.__setattr__(self, name, value)
         require_positive("cause", self.cause)
 
-    def law(self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float) -> Law:
+    def beta_priors(
+        self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float
+    ) -> BetaPriors:
         """Prior of the bounds' chances given difficulties (bound, measure) and their names.
 
         The tilt is judged by the limit, `max_slope` in rad less the margin, the other measures by
@@ -81,7 +91,7 @@ class Hazard:
             steepness = steepness_of(difficulty[:, list(measures).index(TILT)], max_slope)
         center, scale = np.array([self.intercept, *weights, *limit, self.log_strength]).T
         is_log = np.array([*[False] * (1 + len(weights)), *[False, True][: len(limit)], True])
-        return Law(center, scale, is_log, difficulty[:, has_weight] - REFERENCE, steepness)
+        return BetaPriors(center, scale, is_log, difficulty[:, has_weight] - REFERENCE, steepness)
 
     def prior(self, workspace: Workspace, *, seed: int = 0, n_draws: int = 1000) -> BoundRisk:
         """Risk of the bounds of a workspace before any mission."""
@@ -137,9 +147,9 @@ def fit_hazard(
     _require_on_grid(exposures, difficulty.shape[1:3])
     met = difficulty[*exposures.bounds.T]
     # A driven bound that does not exist on the map: largest difficulty.
-    law = hazard.law(np.nan_to_num(met, nan=1.0), names, workspace.team.max_slope)
-    points = sample(law, exposures, seed)
-    group = _dataset(hazard, law, exposures, points, workspace, n_draws, seed)
+    betas = hazard.beta_priors(np.nan_to_num(met, nan=1.0), names, workspace.team.max_slope)
+    points = sample(betas, exposures, seed)
+    group = _dataset(hazard, betas, exposures, points, workspace, n_draws, seed)
     risk = BoundRisk.of(group, workspace)
     dims = ("move", "row", "col")
     group = group.assign(p_fail=(dims, risk.mean), p_fail_sd=(dims, risk.sd))
@@ -167,7 +177,7 @@ def measures_of(workspace: Workspace) -> list[str]:
 
 def _dataset(
     hazard: Hazard,
-    law: Law,
+    betas: BetaPriors,
     exposures: Exposures,
     points: Points,
     workspace: Workspace,
@@ -177,7 +187,7 @@ def _dataset(
     """The group without the maps of chances."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(systematic(points.weights, n_draws, rng))
-    weights, limit, strength = law.parts(law.values(points.z[chosen]))
+    weights, limit, strength = betas.parts(betas.values(points.z[chosen]))
     degrees = {"units": "degrees"}  # absent without a limit
     of_limit = {n: ("draw", v, degrees) for n, v in zip(LIMIT_NAMES, limit.T, strict=False)}
     shape = workspace.difficulty.shape[:3]

@@ -141,10 +141,10 @@ class BoundRisk:
 
     def _betas(self, draws: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Alpha and beta of the posterior Betas of bounds, flat indices; each (draw, bound)."""
-        at = np.unravel_index(bounds, self.exists.shape)
-        steepness = None if self.steepness is None else self.steepness[at]
+        where = np.unravel_index(bounds, self.exists.shape)
+        steepness = None if self.steepness is None else self.steepness[where]
         drawn = self.coefficients[draws], self.limit[draws], self.strength[draws]
-        a, b = prior_betas(*drawn, self.difficulty[at], steepness)
+        a, b = prior_betas(*drawn, self.difficulty[where], steepness)
         n, failed = self.exposures.ravel()[bounds], self.failures.ravel()[bounds]
         a, b = a + failed, b + n - failed
         for j, (path, weight) in enumerate(zip(self.lost, self.lost_weights, strict=True)):
@@ -155,8 +155,8 @@ class BoundRisk:
 
 def _places_in(bounds: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Indices of wanted bounds in ascending `bounds`; -1 for one that is not there."""
-    at = np.minimum(np.searchsorted(bounds, wanted), len(bounds) - 1)
-    return np.where(bounds[at] == wanted, at, -1)
+    nearest = np.minimum(np.searchsorted(bounds, wanted), len(bounds) - 1)
+    return np.where(bounds[nearest] == wanted, nearest, -1)
 
 
 def _parts(n: int, other: int) -> list[slice]:

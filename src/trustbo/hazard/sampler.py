@@ -56,7 +56,7 @@ class Points(NamedTuple):
     k_hat: float
 
 
-class Law(NamedTuple):
+class BetaPriors(NamedTuple):
     """Means and strength of the Betas of the bounds that were met, from hyperparameters."""
 
     center: np.ndarray  # (parameter,), means of the priors
@@ -121,10 +121,10 @@ def prior_betas(
     return strength[:, None] * fails + FLOOR, strength[:, None] * passes + FLOOR
 
 
-def sample(law: Law, exposures: Exposures, seed: int) -> Points:
+def sample(betas: BetaPriors, exposures: Exposures, seed: int) -> Points:
     """Draw weighted points of the posterior; the caller checks k-hat."""
-    density = _Density(law, exposures)
-    d = len(law.center)
+    density = _Density(betas, exposures)
+    d = len(betas.center)
     starts = np.zeros((3, d))
     starts[1:, -1] = -1.5, 1.5  # modes of strength: certain outcomes, equal bounds
     modes, values, factors = laplace(density, starts)
@@ -134,7 +134,7 @@ def sample(law: Law, exposures: Exposures, seed: int) -> Points:
         if min(gap) > 1.0 and values[i] > values.max() - 8.0:
             apart.append(i)
     proposal = _Mixture.around(modes[apart], _WIDTH * factors[apart], values[apart])
-    points = best = _weigh(law, exposures, density, proposal, seed)
+    points = best = _weigh(betas, exposures, density, proposal, seed)
     for _ in range(_PASSES):
         if best.k_hat <= _GOOD:
             break
@@ -150,23 +150,23 @@ def sample(law: Law, exposures: Exposures, seed: int) -> Points:
             np.concatenate([_WIDTH * factors[apart], width]),
             np.zeros(len(apart) + _KERNELS),
         )
-        points = _weigh(law, exposures, density, again, seed)
-        best = min(best, points, key=lambda found: found.k_hat)
+        points = _weigh(betas, exposures, density, again, seed)
+        best = min(best, points, key=lambda candidate: candidate.k_hat)
     return best
 
 
 def _weigh(
-    law: Law, exposures: Exposures, density: "_Density", proposal: "_Mixture", seed: int
+    betas: BetaPriors, exposures: Exposures, density: "_Density", proposal: "_Mixture", seed: int
 ) -> Points:
     z = proposal.draw(2**_LOG2_POINTS, seed)
-    places, log_fail = impute(law, exposures, z, np.random.default_rng([seed, 1]))
-    raw = density.known(z) + log_fail - proposal.log_density(z)
+    places, log_fail = impute(betas, exposures, z, np.random.default_rng([seed, 1]))
+    raw = density.log_observed(z) + log_fail - proposal.log_density(z)
     log_w, k_hat, _ = smoothed_weights(raw)
     return Points(z, places, np.exp(log_w), k_hat)
 
 
 def impute(
-    law: Law, exposures: Exposures, z: np.ndarray, rng: np.random.Generator
+    betas: BetaPriors, exposures: Exposures, z: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw where lost missions failed, one after the other, given each point's hyperparameters.
 
@@ -176,7 +176,7 @@ def impute(
     places, log_weight = np.zeros((len(z), len(exposures.lost)), int), np.zeros(len(z))
     if not exposures.lost:
         return places, log_weight
-    alpha, beta = law(z)
+    alpha, beta = betas(z)
     a, b = alpha + exposures.failed, beta + exposures.n - exposures.failed
     uniform = rng.random(places.shape)
     for j, (path, weight) in enumerate(zip(exposures.lost, exposures.lost_weights, strict=True)):
@@ -237,27 +237,27 @@ def add_lost(
 class _Density:
     """Log density of z, with and without an approximation for lost missions."""
 
-    def __init__(self, law: Law, exposures: Exposures) -> None:
-        self._law, self._exposures = law, exposures
+    def __init__(self, betas: BetaPriors, exposures: Exposures) -> None:
+        self._betas, self._exposures = betas, exposures
         self._met = exposures.n > 0.0
-        self._known_law = law.of(self._met)
+        self._known_betas = betas.of(self._met)
 
-    def known(self, z: np.ndarray) -> np.ndarray:
+    def log_observed(self, z: np.ndarray) -> np.ndarray:
         """Prior and outcomes of known exposures, shape (point,)."""
-        alpha, beta = self._known_law(z)
+        alpha, beta = self._known_betas(z)
         n, failed = self._exposures.n[self._met], self._exposures.failed[self._met]
         bad = failed > 0.0
         total = -(0.5 * z**2 + _NORMAL).sum(1)
         total += _rising(beta, n - failed).sum(1) + _rising(alpha[:, bad], failed[bad]).sum(1)
         many, index = np.unique(n, return_inverse=True)
         counts = np.bincount(index, minlength=len(many))
-        strength = self._law.values(z)[:, -1:]
+        strength = self._betas.values(z)[:, -1:]
         return total - _rising(strength + 2.0 * FLOOR, many) @ counts
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        total, lost = self.known(z), self._exposures.lost
+        total, lost = self.log_observed(z), self._exposures.lost
         if lost:
-            alpha, beta = self._law(z)
+            alpha, beta = self._betas(z)
             a = alpha + self._exposures.failed
             chance = a / (alpha + beta + self._exposures.n)
             for path, weight in zip(lost, self._exposures.lost_weights, strict=True):
@@ -271,12 +271,12 @@ def _rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
     out = np.zeros(np.broadcast_shapes(x.shape, k.shape))
     few = (k == np.round(k)) & (k <= 8.0)
     for i in range(8):  # logs of few factors take a tenth of the time of two gamma functions
-        own = np.flatnonzero(few & (k > i))
-        if len(own):
-            out[:, own] += np.log((x[:, own] if x.shape[1] > 1 else x) + i)
-    if (own := np.flatnonzero(~few)).size:
-        part = x[:, own] if x.shape[1] > 1 else x
-        out[:, own] = special.gammaln(part + k[own]) - special.gammaln(part)
+        columns = np.flatnonzero(few & (k > i))
+        if len(columns):
+            out[:, columns] += np.log((x[:, columns] if x.shape[1] > 1 else x) + i)
+    if (columns := np.flatnonzero(~few)).size:
+        part = x[:, columns] if x.shape[1] > 1 else x
+        out[:, columns] = special.gammaln(part + k[columns]) - special.gammaln(part)
     return out
 
 
@@ -303,8 +303,8 @@ class _Mixture(NamedTuple):
         which = np.searchsorted(np.cumsum(self.shares), uniform[:, d + 1], side="right")
         heavy = normal * np.sqrt(_DEGREES / radius)[:, None]
         for i, (center, factor) in enumerate(zip(self.centers, self.factors, strict=True)):
-            own = which == i
-            normal[own] = center + heavy[own] @ factor.T
+            mine = which == i
+            normal[mine] = center + heavy[mine] @ factor.T
         return normal
 
     def log_density(self, z: np.ndarray) -> np.ndarray:

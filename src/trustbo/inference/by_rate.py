@@ -9,7 +9,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of
 from trustbo.inference.evidence import kalman_numpy
-from trustbo.inference.posterior_groups import Law, complete, is_weighted
+from trustbo.inference.posterior_groups import Conditional, complete, is_weighted
 from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.models.place import bounds_of
 from trustbo.stacking import stack_missions
@@ -39,11 +39,11 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
         TrustboError: Trust does not integrate out under its observations, or robots influence each
             other; no posterior of `fit`; or see `complete`.
     """
-    law = Law.of(require_posterior("by_rate", posterior))
-    if not (law.by_numpy and law.family.integrates_out):
+    conditional = Conditional.of(require_posterior("by_rate", posterior))
+    if not (conditional.by_numpy and conditional.family.integrates_out):
         raise TrustboError(
             "rates are predicted one by one for Gaussian observations of robots that do not "
-            f'influence each other; this posterior has observation "{law.family.name}" and '
+            f'influence each other; this posterior has observation "{conditional.family.name}" and '
             f'inter_robot="{posterior.attrs["inter_robot"]}". Use its own groups, by mission.'
         )
     posterior = complete(posterior, missions)
@@ -53,13 +53,13 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
     if params.places:
         params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
     measured = np.isfinite(batch.contact_rate)
-    mean, sd = (a[:, measured] for a in kalman_numpy.one_step(params, law.lag, batch))
+    mean, sd = (a[:, measured] for a in kalman_numpy.one_step(params, conditional.lag, batch))
     y = batch.contact_rate[measured]
     rng = np.random.default_rng([posterior.attrs["seed"], 2])
     drawn = mean + sd * rng.standard_normal(mean.shape)
     density = -0.5 * ((y - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi))
     if posterior.attrs["log_likelihood_of"] == "ticks":
-        density += law.family.log_resolution(batch.contact_rate, batch.n_ticks)[measured]
+        density += conditional.family.log_resolution(batch.contact_rate, batch.n_ticks)[measured]
     draws = posterior["posterior"].to_dataset()
     shape = draws.sizes["chain"], draws.sizes["draw"], len(y)
     j, k, i = np.nonzero(measured)

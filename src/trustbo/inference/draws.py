@@ -15,7 +15,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     # In one layout, whether just sampled or read from a file: sums over draws then round alike, and
     # a resumed campaign has the same bits.
     arrays = {
-        str(name): each.transpose("chain", "draw", ...).values for name, each in draws.items()
+        str(name): array.transpose("chain", "draw", ...).values for name, array in draws.items()
     }
     return {name: np.ascontiguousarray(a).reshape(n, *a.shape[2:]) for name, a in arrays.items()}
 

@@ -100,12 +100,13 @@ class TrustFilter:
         """
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
-            own = _robots_of(posterior)
-            if n_robots is not None and own not in (None, n_robots):
+            recorded = _robots_of(posterior)
+            if n_robots is not None and recorded not in (None, n_robots):
                 raise ShapeError(
-                    f"the posterior is of {own} robots; got n_robots={n_robots!r}. Leave it out."
+                    f"the posterior is of {recorded} robots; got n_robots={n_robots!r}. "
+                    "Leave it out."
                 )
-            n_robots = n_robots if own is None else own
+            n_robots = n_robots if recorded is None else recorded
             response = _of_posterior(posterior, "response", response)
             observation = _of_posterior(posterior, "observation", observation)
             posterior = params_of(posterior)
@@ -263,14 +264,14 @@ class TrustFilter:
             below = np.cumsum(self.weights[order], axis=0)
             low, high = (np.argmax(below >= share, axis=0) for share in (0.05, 0.95))
             ranked = np.take_along_axis(rates, order, axis=0)
-            each = np.arange(self._n_robots)
-            forecast = self.weights @ rates, ranked[low, each], ranked[high, each]
+            robots = np.arange(self._n_robots)
+            forecast = self.weights @ rates, ranked[low, robots], ranked[high, robots]
             ahead.append((*self._average(mean, var), *forecast))
         return TrustForecast(*(np.stack(column) for column in zip(*ahead, strict=True)))
 
     def _commit(self, z: np.ndarray, effect: Effect, rates: Rates) -> None:
-        known = self._mean, self._var, z, rates, effect
-        self._mean, self._var, increment = self._core.update(*known)
+        predicted = self._mean, self._var, z, rates, effect
+        self._mean, self._var, increment = self._core.update(*predicted)
         self._log_weight += increment
         self.weights = _normalised(self._log_weight)
         self.n_bounds += 1
@@ -384,10 +385,10 @@ def _robots_of(posterior: xr.DataTree) -> int | None:
 
 def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
     """Response or observation of the posterior; TrustboError if another is given."""
-    own = posterior.attrs[name]
-    if given not in (None, own):
-        raise TrustboError(f"the posterior has {name}={own!r}; got {given!r}. Leave it out.")
-    return own
+    recorded = posterior.attrs[name]
+    if given not in (None, recorded):
+        raise TrustboError(f"the posterior has {name}={recorded!r}; got {given!r}. Leave it out.")
+    return recorded
 
 
 def _normalised(log_weight: np.ndarray) -> np.ndarray:

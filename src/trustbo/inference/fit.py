@@ -14,7 +14,7 @@ from trustbo.data import Mission, as_array
 from trustbo.display.bars import place_of
 from trustbo.errors import PosteriorError, ShapeError, TrustboError, require_kind, require_whole
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.posterior_groups import Law, complete
+from trustbo.inference.posterior_groups import Conditional, complete
 from trustbo.inference.posterior_tree import require_posterior, to_datatree
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.choice import faster_than_nuts, resolve_sampler, slow_places
@@ -173,7 +173,7 @@ def fit(
         counted = xr.DataArray(weight[: len(missions)], dims="mission")
         posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
         posterior.attrs["weights"] = counted.values.tolist()
-    if whole or not Law.of(posterior).keeps_trust:
+    if whole or not Conditional.of(posterior).keeps_trust:
         posterior = complete(
             posterior, missions, model=model, n_trajectories=n_trajectories, latents=sampled.latents
         )

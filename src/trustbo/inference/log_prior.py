@@ -27,7 +27,7 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
     """
     terms = model.prior_terms(sites)
     (beta0,) = (values for field, values in terms.values() if field == "beta0")
-    found = {
+    densities = {
         label: model.priors.log_density(field, values, beta0)
         for label, (field, values) in terms.items()
     }
@@ -36,11 +36,14 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
             sd = np.sqrt(np.einsum("...ii->...i", sites[noise]))
             correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
             log_det = np.linalg.slogdet(correlation)[1]
-            found[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
+            densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
     if model.place is not None:
-        found |= model.place.log_prior(sites)
-    found |= model.own_log_prior(sites)
-    return {label: each.reshape(*each.shape[:2], -1).sum(-1) for label, each in found.items()}
+        densities |= model.place.log_prior(sites)
+    densities |= model.own_log_prior(sites)
+    return {
+        label: density.reshape(*density.shape[:2], -1).sum(-1)
+        for label, density in densities.items()
+    }
 
 
 def log_prior_group(posterior: xr.DataTree, model: TrustModel | None = None) -> xr.Dataset | None:

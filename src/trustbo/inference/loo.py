@@ -35,11 +35,11 @@ def loo(posterior: xr.DataTree) -> ELPDData:
         raise TrustboError("loo leaves out missions; of a view by rate, give the posterior itself.")
     posterior = complete(posterior)
     (group,) = (name for name in LIKELIHOODS if name in posterior.children)
-    each = posterior[group].to_dataset()["contact_rate"]
+    log_p = posterior[group].to_dataset()["contact_rate"]
     rates = posterior["observed_data"].to_dataset()["contact_rate"]
     measured = rates.notnull().any(("bound", "robot")).values
     weight = np.broadcast_to(posterior.attrs.get("weights", 1.0), measured.shape)[measured]
-    each = each.isel(mission=np.flatnonzero(measured))
+    log_p = log_p.isel(mission=np.flatnonzero(measured))
     if len(weight) < 2:
         raise TrustboError(
             f"LOO leaves out one of several missions; {len(weight)} of {len(measured)} have rates. "
@@ -48,15 +48,15 @@ def loo(posterior: xr.DataTree) -> ELPDData:
     counted = np.flatnonzero(weight > 0.0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the second call warns again
-        powers = each.isel(mission=counted) * xr.DataArray(weight[counted], dims="mission")
-        found: Any = unweighted(_tree(posterior, powers), pointwise=True)
+        powers = log_p.isel(mission=counted) * xr.DataArray(weight[counted], dims="mission")
+        elpd: Any = unweighted(_tree(posterior, powers), pointwise=True)
     # The posterior is already without a mission of weight 0: equal weights.
-    log_weights = xr.full_like(each, -np.log(each.sizes["chain"] * each.sizes["draw"]))
-    log_weights = log_weights.transpose(*found.log_weights.dims)
-    log_weights[{"mission": counted}] = found.log_weights.values
-    pareto_k = xr.zeros_like(each.isel(chain=0, draw=0, drop=True))
-    pareto_k[counted] = found.pareto_k.values
-    tree = _tree(posterior, each)
+    log_weights = xr.full_like(log_p, -np.log(log_p.sizes["chain"] * log_p.sizes["draw"]))
+    log_weights = log_weights.transpose(*elpd.log_weights.dims)
+    log_weights[{"mission": counted}] = elpd.log_weights.values
+    pareto_k = xr.zeros_like(log_p.isel(chain=0, draw=0, drop=True))
+    pareto_k[counted] = elpd.pareto_k.values
+    tree = _tree(posterior, log_p)
     result = unweighted(tree, pointwise=True, log_weights=log_weights, pareto_k=pareto_k)
     return cast(ELPDData, result)
 

@@ -89,17 +89,17 @@ def _cells(
     scales: PlaceScales,
     shape: tuple[int, int],
     cells: np.ndarray,
-    known: np.ndarray,
+    values: np.ndarray,
     seed: list[int],
 ) -> np.ndarray:
     """Effect s over the grid, (draw, row, col), given some cells."""
     flat = cells[:, 1] * shape[1] + cells[:, 2]
-    centre = np.zeros((len(known), shape[0] * shape[1]))
+    centre = np.zeros((len(values), shape[0] * shape[1]))
     off = np.empty(centre.shape)
     for step, rows, length_scale, weights, _ in _kriging(scales.length_scale, shape, cells):
         rng = np.random.default_rng([*seed, step + 1000])
         free = _prior(shape, length_scale, int(rows.sum()), rng) * scales.tau_s[rows, None]
-        centre[rows] = known[rows] @ weights
+        centre[rows] = values[rows] @ weights
         off[rows] = free - free[:, flat] @ weights
     return (centre + _centre(off)).reshape(-1, *shape)
 
@@ -113,15 +113,15 @@ def _kriging(
     variance (all,) that is left of a prior variance of 1.
     """
     grid = np.column_stack([np.zeros(shape[0] * shape[1]), *np.indices(shape).reshape(2, -1)])
-    own = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
+    same_robot = np.column_stack([np.zeros(len(cells)), cells[:, 1:]])
     # Beyond, all cells are nearly equal, and `_prior` would need a far larger grid in memory.
     length_scale = np.minimum(length_scale, _LARGEST * max(shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
     for step in np.unique(steps):
-        scale, weights = float(np.exp(_STEP * step)), np.zeros((len(own), len(grid)))
-        cross = correlation(own, grid, scale)
-        if len(own):
-            K = correlation(own, own, scale) + _JITTER * np.eye(len(own))
+        scale, weights = float(np.exp(_STEP * step)), np.zeros((len(same_robot), len(grid)))
+        cross = correlation(same_robot, grid, scale)
+        if len(same_robot):
+            K = correlation(same_robot, same_robot, scale) + _JITTER * np.eye(len(same_robot))
             weights = cho_solve(cho_factor(K), cross)
         left = np.maximum(1.0 - (weights * cross).sum(0), 0.0)
         yield int(step), steps == step, scale, weights, left
@@ -189,9 +189,9 @@ def place_maps_of(
         group: Group `places` of a posterior.
         sites: Its hyperparameters by name, (draw,), chains joined.
     """
-    known = _known(group)
+    visited = _visited_draws(group)
     maps = draw_maps(
-        scales_of(sites), visited_of(group), known.get("place"), known.get("place_bound"),
+        scales_of(sites), visited_of(group), visited.get("place"), visited.get("place_bound"),
         int(group.attrs["seed"]),
     )  # fmt: skip
     return dict(zip(_AXIS, maps, strict=True))
@@ -236,21 +236,21 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
     draws = posterior["posterior"].to_dataset()
     names = ("beta0", "tau_s", "length_scale", "tau_e")
     scales = scales_of({n: draws[n].values.reshape(-1) for n in names if n in draws})
-    places, known, maps = visited_of(group), _known(group), xr.Dataset()
-    if "place" in known:
+    places, visited, maps = visited_of(group), _visited_draws(group), xr.Dataset()
+    if "place" in visited:
         moments = [
-            _moments_of_cells(scales, places.shape, places.cells[mine], known["place"][:, mine])
+            _moments_of_cells(scales, places.shape, places.cells[mine], visited["place"][:, mine])
             for i in range(places.n_effects)
             for mine in [places.cells[:, 0] == i]
         ]
         _add(maps, "place", "effect of the cell", ("row", "col"), np.stack(moments, axis=1))
-    if "place_bound" in known:
-        e, axes = known["place_bound"], ("move", "row", "col")
-        found = np.zeros((2, places.n_effects, N_MOVES, *places.shape))
-        found[1] = np.sqrt((scales.tau_e**2).mean())
-        found[:, *places.units.T] = e.mean(0), e.std(0)
-        found[..., ~existing_bounds(np.ones(places.shape, bool))] = np.nan
-        _add(maps, "place_bound", "effect of the bound by a move", axes, found)
+    if "place_bound" in visited:
+        e, axes = visited["place_bound"], ("move", "row", "col")
+        effects_by_bound = np.zeros((2, places.n_effects, N_MOVES, *places.shape))
+        effects_by_bound[1] = np.sqrt((scales.tau_e**2).mean())
+        effects_by_bound[:, *places.units.T] = e.mean(0), e.std(0)
+        effects_by_bound[..., ~existing_bounds(np.ones(places.shape, bool))] = np.nan
+        _add(maps, "place_bound", "effect of the bound by a move", axes, effects_by_bound)
         maps = maps.assign_coords(move=list(MOVE_NAMES))
     maps = maps.assign_coords({axis: np.arange(maps.sizes[axis]) for axis in ("row", "col")})
     if places.n_effects == 1:
@@ -260,14 +260,14 @@ def place_maps(posterior: xr.DataTree) -> xr.Dataset:
 
 @one_blas_thread()
 def _moments_of_cells(
-    scales: PlaceScales, shape: tuple[int, int], cells: np.ndarray, known: np.ndarray
+    scales: PlaceScales, shape: tuple[int, int], cells: np.ndarray, draws: np.ndarray
 ) -> np.ndarray:
     """Mean and standard deviation of s over the grid, (2, row, col)."""
-    centre = np.zeros((len(known), shape[0] * shape[1]))
+    centre = np.zeros((len(draws), shape[0] * shape[1]))
     variance = np.zeros(shape[0] * shape[1])
     for _, rows, _, weights, left in _kriging(scales.length_scale, shape, cells):
-        centre[rows] = known[rows] @ weights
-        variance += (scales.tau_s[rows] ** 2).sum() * left / len(known)
+        centre[rows] = draws[rows] @ weights
+        variance += (scales.tau_s[rows] ** 2).sum() * left / len(draws)
     return np.stack([centre.mean(0), np.sqrt(centre.var(0) + variance)]).reshape(2, *shape)
 
 
@@ -280,7 +280,7 @@ def _add(
         maps[f"{name}_{kind}"] = ("robot", *axes), values, attrs
 
 
-def _known(group: xr.Dataset) -> dict[str, np.ndarray]:
+def _visited_draws(group: xr.Dataset) -> dict[str, np.ndarray]:
     """Draws at visited places by name, chains joined: (draw, cell) and (draw, unit)."""
     return {
         name: group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])

@@ -40,7 +40,7 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     return alone
 
 
-class Law(NamedTuple):
+class Conditional(NamedTuple):
     """Conditional distribution of contact rates given parameters."""
 
     family: Family
@@ -96,7 +96,7 @@ def complete(
     """
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
-    law = Law.of(posterior)
+    conditional = Conditional.of(posterior)
     if missions is None:
         if "constant_data" not in posterior.children:
             raise TrustboError(
@@ -104,19 +104,21 @@ def complete(
                 "as complete(result.posteriors[j], result.missions[: j + 1])."
             )
         missions = missions_of(posterior)
-    if not law.keeps_trust and latents is None:
+    if not conditional.keeps_trust and latents is None:
         raise TrustboError(
-            f'trust under observation "{law.family.name}" was sampled with the parameters and not '
-            "kept; fit these missions anew."
+            f'trust under observation "{conditional.family.name}" was sampled with the parameters '
+            "and not kept; fit these missions anew."
         )
     n_trajectories = require_whole("n_trajectories", n_trajectories, 1)
-    groups, of = _groups(posterior, law, missions, n_trajectories, latents or latent.Latents())
+    groups, data_name = _groups(
+        posterior, conditional, missions, n_trajectories, latents or latent.Latents()
+    )
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
     if (densities := log_prior_group(posterior, model)) is not None:
         whole["log_prior"] = xr.DataTree(densities)
-    whole.attrs = posterior.attrs | {"log_likelihood_of": of}
+    whole.attrs = posterior.attrs | {"log_likelihood_of": data_name}
     if "weights" in posterior.attrs:
         weight = xr.DataArray(np.atleast_1d(posterior.attrs["weights"]), dims="mission")
         whole["constant_data"] = whole["constant_data"].assign(weight=weight)
@@ -125,14 +127,14 @@ def complete(
 
 def _groups(
     posterior: xr.DataTree,
-    law: Law,
+    conditional: Conditional,
     missions: Sequence[Mission],
     n_trajectories: int,
     latents: latent.Latents,
 ) -> tuple[dict[str, dict[str, Any]], str]:
     """Arrays by group and name, (chain, draw) leading, and the data of the log-likelihoods."""
     # NumPy needs no padding.
-    batch = stack_missions(missions, pad=not law.by_numpy)
+    batch = stack_missions(missions, pad=not conditional.by_numpy)
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
     every = params_of(posterior).flat()
@@ -141,11 +143,11 @@ def _groups(
     index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     few = every.map(lambda values, _: values[index])
     seed = posterior.attrs["seed"]
-    if law.by_numpy:
+    if conditional.by_numpy:
         n_bounds = np.array([len(mission.bounds) for mission in missions])
-        found = _trust_by_numpy(law, every, few, batch, n_bounds, seed)
+        arrays = _trust_by_numpy(conditional, every, few, batch, n_bounds, seed)
     else:
-        found = _trust_compiled(law, every, few, latents, kept, batch, seed)
+        arrays = _trust_compiled(conditional, every, few, latents, kept, batch, seed)
     prior = _prior_of(posterior).on(bounds)
 
     rng = np.random.default_rng(seed + 3)
@@ -153,18 +155,20 @@ def _groups(
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
 
-    likelihood, of = _count_ticks(law.family, batch, found["log_likelihood"], len(missions))
+    likelihood, data_name = _count_ticks(
+        conditional.family, batch, arrays["log_likelihood"], len(missions)
+    )
     return {
         _likelihood_name(posterior): {"contact_rate": by_chain(likelihood)},
         "latent": {
-            "trust": by_chain(found["trust"]),
-            "trust_mean": found["trust_mean"],
-            "trust_sd": found["trust_sd"],
+            "trust": by_chain(arrays["trust"]),
+            "trust_mean": arrays["trust_mean"],
+            "trust_sd": arrays["trust_sd"],
             "draw": kept,
         },
-        "posterior_predictive": {"contact_rate": by_chain(found["predicted"])},
-        "prior_predictive": {"contact_rate": _predict(law, prior, batch, rng)[None]},
-    }, of
+        "posterior_predictive": {"contact_rate": by_chain(arrays["predicted"])},
+        "prior_predictive": {"contact_rate": _predict(conditional, prior, batch, rng)[None]},
+    }, data_name
 
 
 def _likelihood_name(posterior: xr.DataTree) -> str:
@@ -186,7 +190,7 @@ def _prior_of(posterior: xr.DataTree) -> Params:
 
 
 def _trust_by_numpy(
-    law: Law,
+    conditional: Conditional,
     every: Params,
     few: Params,
     batch: MissionBatch,
@@ -195,23 +199,23 @@ def _trust_by_numpy(
 ) -> dict[str, np.ndarray]:
     """Latent trust, log-likelihood and predictions of robots apart, without JAX."""
     rng = np.random.default_rng([seed, 1])
-    if law.family.integrates_out:
-        summary = kalman_numpy.summarize(every, law.lag, batch, n_bounds)
-        trajectories = kalman_numpy.sample(few, law.lag, batch, rng, n_bounds)
+    if conditional.family.integrates_out:
+        summary = kalman_numpy.summarize(every, conditional.lag, batch, n_bounds)
+        trajectories = kalman_numpy.sample(few, conditional.lag, batch, rng, n_bounds)
     else:
-        summary = trust.summarize(law.family, every, batch, n_bounds, rng)
-        trajectories = trust.sample(law.family, few, batch, n_bounds, rng)
+        summary = trust.summarize(conditional.family, every, batch, n_bounds, rng)
+        trajectories = trust.sample(conditional.family, few, batch, n_bounds, rng)
     return {
         "log_likelihood": summary.log_likelihood,
         "trust": trajectories,
         "trust_mean": summary.mean,
         "trust_sd": summary.sd,
-        "predicted": _predict(law, every, batch, rng),
+        "predicted": _predict(conditional, every, batch, rng),
     }
 
 
 def _trust_compiled(
-    law: Law,
+    conditional: Conditional,
     every: Params,
     few: Params,
     latents: latent.Latents,
@@ -227,20 +231,28 @@ def _trust_compiled(
         few_latents = latents._replace(innovations=innovations[:, kept].reshape(shape))
     with own_settings():
         keys = random.split(random.fold_in(random.key(seed), 1))
-        moments = latent.trust_moments(law.family, law.lag, every, latents, batch)
-        found = {
-            "log_likelihood": mission_log_likelihood(law.family, law.lag, every, *batch, keys[0]),
-            "trust": latent.trust_draws(law.family, law.lag, few, few_latents, batch, keys[1]),
+        moments = latent.trust_moments(conditional.family, conditional.lag, every, latents, batch)
+        arrays = {
+            "log_likelihood": mission_log_likelihood(
+                conditional.family, conditional.lag, every, *batch, keys[0]
+            ),
+            "trust": latent.trust_draws(
+                conditional.family, conditional.lag, few, few_latents, batch, keys[1]
+            ),
             "trust_mean": moments.mean,
             "trust_sd": moments.sd,
-            "predicted": _predict(law, every, batch, np.random.default_rng([seed, 1])),
+            "predicted": _predict(conditional, every, batch, np.random.default_rng([seed, 1])),
         }
-        return {name: np.asarray(array) for name, array in found.items()}
+        return {name: np.asarray(array) for name, array in arrays.items()}
 
 
-def _predict(law: Law, params: Params, batch: MissionBatch, rng: np.random.Generator) -> np.ndarray:
+def _predict(
+    conditional: Conditional, params: Params, batch: MissionBatch, rng: np.random.Generator
+) -> np.ndarray:
     """Contact rates of missions drawn anew, one set per draw: (draw, mission, bound, robot)."""
-    drawn = draw_missions(law.family, params, law.lag, batch.awareness, batch.n_ticks, rng)
+    drawn = draw_missions(
+        conditional.family, params, conditional.lag, batch.awareness, batch.n_ticks, rng
+    )
     return drawn.contact_rate
 
 

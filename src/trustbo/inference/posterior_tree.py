@@ -79,8 +79,8 @@ def to_datatree(
             used |= set(dims)
         index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
         index = index if draw is None else index | {"draw": draw}
-        own = {name: labels for name, labels in (coords | index).items() if name in used}
-        tree[group] = xr.Dataset(variables, own)
+        labelled = {name: labels for name, labels in (coords | index).items() if name in used}
+        tree[group] = xr.Dataset(variables, labelled)
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
     return xr.DataTree.from_dict(tree)
 
@@ -94,8 +94,8 @@ def _data_groups(
         duration[j, : len(mission.bounds)] = mission.duration
         cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
-    own = {name: coords[name] for name in dims}
-    rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, own)
+    labelled = {name: coords[name] for name in dims}
+    rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)
     constant = xr.Dataset(
         {
             "awareness": ((*dims, "feature"), observed.awareness),
@@ -107,7 +107,7 @@ def _data_groups(
             "start_row": (("mission",), [mission.path[0][0] for mission in missions]),
             "start_col": (("mission",), [mission.path[0][1] for mission in missions]),
         },
-        own | {"feature": coords["feature"]},
+        labelled | {"feature": coords["feature"]},
     )
     return rates, constant
 
@@ -117,7 +117,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
     robots, features = ([str(n) for n in data[dim].values] for dim in ("robot", "feature"))
-    found = []
+    missions = []
     for j in range(data.sizes["mission"]):
         one = data.isel(mission=j)
         one = one.isel(bound=one["row"].values >= 0)
@@ -127,7 +127,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
         if "start_row" in one:
             start = (int(one["start_row"]), int(one["start_col"]))
         z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
-        found.append(
+        missions.append(
             Mission.from_arrays(
                 [start, *cells],
                 z,
@@ -139,7 +139,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
                 features=features,
             )
         )
-    return found
+    return missions
 
 
 def labelled_draws(sites: xr.Dataset) -> Iterator[tuple[str, str, tuple[int, ...], np.ndarray]]:

@@ -37,11 +37,11 @@ def prior_from(posteriors: Sequence[xr.DataTree], model: TrustModel | None = Non
         TrustboError: There are no posteriors, or they are of other models or features.
     """
     features = _require_alike(posteriors)
-    with_places = all("tau_e" in each["posterior"] for each in posteriors)
+    with_places = all("tau_e" in posterior["posterior"] for posterior in posteriors)
     if model is None:
         model = PooledTrust(place=PlaceEffect() if with_places else None)
     base = model.for_features(features).priors
-    sites = [sites_of(each) for each in posteriors]
+    sites = [sites_of(posterior) for posterior in posteriors]
     if not isinstance(base.beta, dist.Normal) or not isinstance(base.b, dist.Normal):
         raise TrustboError("prior_from needs Normal priors of beta and b to mix with.")
     beta = _mixed(
@@ -74,19 +74,19 @@ def _require_alike(posteriors: Sequence[xr.DataTree]) -> tuple[str, ...]:
     """Names of the features; TrustboError if posteriors differ in model or features."""
     if isinstance(posteriors, xr.DataTree):
         raise TrustboError("prior_from takes a list of posteriors; got one. Write [posterior].")
-    for each in posteriors:
-        require_posterior("prior_from", each)
+    for posterior in posteriors:
+        require_posterior("prior_from", posterior)
     if not posteriors:
         raise TrustboError("there are no posteriors to learn priors from; give one at least.")
     names = [
-        tuple(str(name) for name in each["posterior"].coords.get("feature", ()))
-        for each in posteriors
+        tuple(str(name) for name in posterior["posterior"].coords.get("feature", ()))
+        for posterior in posteriors
     ]
-    for j, (each, own) in enumerate(zip(posteriors, names, strict=True)):
-        if each.attrs["model"] != "PooledTrust" or own != names[0]:
+    for j, (posterior, features) in enumerate(zip(posteriors, names, strict=True)):
+        if posterior.attrs["model"] != "PooledTrust" or features != names[0]:
             raise TrustboError(
                 f"prior_from takes posteriors of PooledTrust with the same features; posterior {j} "
-                f"is of {each.attrs['model']} with {own}, posterior 0 has {names[0]}."
+                f"is of {posterior.attrs['model']} with {features}, posterior 0 has {names[0]}."
             )
     return names[0]
 
@@ -107,9 +107,9 @@ def _mixed(
     draws: list[np.ndarray], mean: np.ndarray, sd: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and sd of an equal mixture of posteriors and a prior, given the prior's mean and sd."""
-    means = np.stack([*(np.median(each, axis=0) for each in draws), np.asarray(mean)])
+    means = np.stack([*(np.median(values, axis=0) for values in draws), np.asarray(mean)])
     # Medians and quantiles: beta / (1 - beta0) has heavy tails as beta0 comes near 1.
-    spreads = [0.5 * np.subtract(*np.quantile(each, [0.841, 0.159], axis=0)) for each in draws]
+    spreads = [0.5 * np.subtract(*np.quantile(values, [0.841, 0.159], axis=0)) for values in draws]
     variances = np.stack([*(spread**2 for spread in spreads), np.asarray(sd) ** 2])
     center = means.mean(0)
     return center, np.sqrt(variances.mean(0) + ((means - center) ** 2).mean(0))
@@ -128,7 +128,7 @@ def _beta(mean: np.ndarray, sd: np.ndarray) -> dist.Beta:
 
 def _scale(draws: list[np.ndarray], prior: dist.Distribution) -> float:
     """Scale of the half-normal with the mean square of the mixture."""
-    squares = [float((each**2).mean()) for each in draws]
+    squares = [float((values**2).mean()) for values in draws]
     return float(np.sqrt(np.mean([*squares, number(prior, "scale") ** 2])))
 
 

@@ -119,11 +119,11 @@ def draw_sites(
 
     TrustboError: the model is invalid at these draws, see `TrustModel.check`.
     """
-    found = model.draw_prior(shape, n_draws, np.random.default_rng(seed))
-    if found is None:
-        found = _compiled_draws(model, shape, n_draws, seed)
-    model.check(found, shape)
-    return found | _place_draws(model, n_draws, seed)
+    sites = model.draw_prior(shape, n_draws, np.random.default_rng(seed))
+    if sites is None:
+        sites = _compiled_draws(model, shape, n_draws, seed)
+    model.check(sites, shape)
+    return sites | _place_draws(model, n_draws, seed)
 
 
 def _compiled_draws(
@@ -135,7 +135,7 @@ def _compiled_draws(
     with own_settings():
         keys = random.split(random.key(seed), n_draws)
         drawn = [_parameter_draws(model, shape, keys[row]) for row in rows]
-    return {name: np.concatenate([each[name] for each in drawn])[:n_draws] for name in drawn[0]}
+    return {name: np.concatenate([batch[name] for batch in drawn])[:n_draws] for name in drawn[0]}
 
 
 def _place_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:

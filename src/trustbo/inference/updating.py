@@ -81,17 +81,21 @@ def sample_statistics(
     require_statistics(model)
     require_whole("n_draws", n_draws, 1)
     model = model.at_resolution(add_ticks([s.ticks for s in statistics]))
-    each = [sample_exact(s, model.priors, n_draws, seed + i) for i, s in enumerate(statistics)]
+    posteriors = [
+        sample_exact(s, model.priors, n_draws, seed + i) for i, s in enumerate(statistics)
+    ]
     pooled = model.robot_sets == "all"
     sites = {
-        name: each[0].params[name] if pooled else np.stack([e.params[name] for e in each], axis=1)
-        for name in each[0].params
+        name: posteriors[0].params[name]
+        if pooled
+        else np.stack([e.params[name] for e in posteriors], axis=1)
+        for name in posteriors[0].params
     }
     return ExactPosterior(
         model.params(sites, statistics[0].n_features),
-        max(e.khat for e in each),
-        min(e.kish for e in each),
-        sum(e.log_evidence for e in each),
+        max(e.khat for e in posteriors),
+        min(e.kish for e in posteriors),
+        sum(e.log_evidence for e in posteriors),
     )
 
 

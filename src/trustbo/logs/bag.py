@@ -85,8 +85,8 @@ def read_bag(
         read |= dict.fromkeys(contact, CONTACT_TYPES)
         read |= dict.fromkeys(awareness, AWARENESS_TYPES) | dict.fromkeys(poses, POSE_TYPES)
         series = bag.collect(read)
-    found = (n or default_features(len(v)) for t in awareness for n, v in series[t].value)
-    features = features or next(found, FEATURES)
+    named = (n or default_features(len(v)) for t in awareness for n, v in series[t].value)
+    features = features or next(named, FEATURES)
     markers = zip(marked.time.tolist(), marked.value, strict=True)
     recording = Recording(
         [Marker(time, m["bound"], m["cell"], m["path"]) for time, m in markers],
@@ -141,9 +141,9 @@ def write_bag(
     def records(messages: Messages) -> Iterator[Record]:
         now = begin
         for j, mission in enumerate(missions):
-            own = sorted(_records(j, mission, now, names, messages), key=lambda r: r.time)
-            yield from own
-            now = own[-1].time + _NS
+            in_time = sorted(_records(j, mission, now, names, messages), key=lambda r: r.time)
+            yield from in_time
+            now = in_time[-1].time + _NS
 
     write_messages(target, of_path, storage, records)
 
@@ -209,8 +209,8 @@ def _records(
         yield Record(begin, names.bound, TEXT, make.text(json.dumps(marker)))
         contacts = np.asarray(bound.contact)
         tracks = np.empty((len(contacts), 0)) if bound.poses is None else bound.poses
-        known = np.empty((len(contacts), 0)) if bound.states is None else bound.states
-        ticks = zip(contacts, tracks, known, strict=True)
+        recorded = np.empty((len(contacts), 0)) if bound.states is None else bound.states
+        ticks = zip(contacts, tracks, recorded, strict=True)
         for tick, (flags, track, now) in enumerate(ticks, start=1):
             time = begin + (end - begin) * tick // len(contacts)
             for topic, flag in zip(contact, flags, strict=True):
@@ -230,10 +230,10 @@ def _by_feature(topic: str, named: Series, features: tuple[str, ...]) -> Series:
     """Vectors in the order of the features, NaN for those that they lack."""
     values = np.full((len(named.time), len(features)), np.nan)
     for row, (names, entries) in zip(values, named.value, strict=True):
-        own = names or features
-        unknown = [name for name in own if name not in features]
-        if unknown or len(own) != len(entries):
+        labels = names or features
+        unknown = [name for name in labels if name not in features]
+        if unknown or len(labels) != len(entries):
             what = ", ".join(unknown) or f"{len(entries)} unnamed values"
             raise TrustboError(f"{topic} has {what}; the features are {', '.join(features)}.")
-        row[[features.index(name) for name in own]] = entries
+        row[[features.index(name) for name in labels]] = entries
     return Series(named.time, values)

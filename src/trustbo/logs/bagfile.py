@@ -54,8 +54,8 @@ class Bag:
     def robots(self, topic: str) -> tuple[str, ...]:
         """Names of the robots with a topic, given with `{robot}` in place of a name."""
         pattern = re.escape(topic).replace(re.escape("{robot}"), "([^/]+)")
-        found = (re.fullmatch(pattern, name) for name in self.types)
-        return tuple(sorted(match[1] for match in found if match))
+        matches = (re.fullmatch(pattern, name) for name in self.types)
+        return tuple(sorted(match[1] for match in matches if match))
 
     def collect(self, topics: Mapping[str, tuple[str, ...]]) -> dict[str, Series]:
         """Records of several topics, each given with its admissible types.

@@ -153,16 +153,16 @@ def read_marker(message: Any) -> dict[str, Any]:
     """
     try:
         if isinstance(message.data, str):
-            said = json.loads(message.data)
+            content = json.loads(message.data)
         else:
             bound, *cell = message.data.tolist()
-            said = {"bound": bound, "cell": cell}
+            content = {"bound": bound, "cell": cell}
         return {
-            "bound": require_whole("bound", said["bound"], 0),
-            "cell": require_pair("cell", said["cell"]),
-            "path": tuple(require_pair("path", cell) for cell in said.get("path", ())),
-            "robots": tuple(map(str, said.get("robots", ()))),
-            "features": tuple(map(str, said.get("features", ()))),
+            "bound": require_whole("bound", content["bound"], 0),
+            "cell": require_pair("cell", content["cell"]),
+            "path": tuple(require_pair("path", cell) for cell in content.get("path", ())),
+            "robots": tuple(map(str, content.get("robots", ()))),
+            "features": tuple(map(str, content.get("features", ()))),
         }
     except (AttributeError, KeyError, TypeError, ValueError):
         raise TrustboError(

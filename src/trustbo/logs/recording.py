@@ -105,8 +105,8 @@ class Recording:
                 bounds.append(self._bound(marker, end, start.time, poses, len(features)))
             except TrustboError as error:
                 raise TrustboError(f"bound {marker.bound}: {error}") from None
-        said = self.status.between(markers[-1].time, until).value
-        status = str(said[-1]) if len(said) else "ok"
+        statuses = self.status.between(markers[-1].time, until).value
+        status = str(statuses[-1]) if len(statuses) else "ok"
         if status == "ok" and len(bounds) < len(path) - 1:
             status = "aborted"  # no record of the reason
         return Mission(path, tuple(bounds), status, features, robots)
@@ -114,14 +114,15 @@ class Recording:
     def _bound(
         self, marker: Marker, until: int, start: int, poses: Sequence[Series], n_features: int
     ) -> Bound:
-        said = self.status.between(marker.time, until)
-        end = int(said.time[0]) if len(said.time) else until
+        statuses = self.status.between(marker.time, until)
+        end = int(statuses.time[0]) if len(statuses.time) else until
         contacts = [series.between(marker.time, end) for series in self.contact]
-        if not len(said.time):
+        if not len(statuses.time):
             end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=marker.time)
         looks = [~np.isnan(c.value) for c in contacts]  # an unmeasured contact is no tick
         contacts = [
-            Series(c.time[own], c.value[own] > 0.5) for c, own in zip(contacts, looks, strict=True)
+            Series(c.time[mask], c.value[mask] > 0.5)
+            for c, mask in zip(contacts, looks, strict=True)
         ]
         n_ticks = np.array([len(c.time) for c in contacts])
         ticks = contacts[int(np.argmax(n_ticks))].time
@@ -135,7 +136,7 @@ class Recording:
             np.stack([values[-1] if len(values) else unknown for values in measured]),
             np.array([c.value.mean() if len(c.value) else np.nan for c in contacts]),
             np.full(len(contacts), seconds),
-            str(said.value[0]) if len(said.time) else "ok",
+            str(statuses.value[0]) if len(statuses.time) else "ok",
             (marker.time - start) / _NS,
             np.stack([_held(series, ticks) for series in poses], axis=1) if poses else None,
             np.stack([_aligned(c, ticks) for c in contacts], axis=1) if n_ticks.all() else None,
@@ -154,14 +155,14 @@ def _aligned(contact: Series, ticks: np.ndarray) -> np.ndarray:
 def _held(series: Series, ticks: np.ndarray) -> np.ndarray:
     """Latest record at each tick, shape (tick, ...); NaN before the first."""
     last = np.searchsorted(series.time, ticks, side="right") - 1
-    known = np.concatenate([np.full((1, *series.value.shape[1:]), np.nan), series.value])
-    return known[last + 1]
+    padded = np.concatenate([np.full((1, *series.value.shape[1:]), np.nan), series.value])
+    return padded[last + 1]
 
 
 def _continuous(poses: Series, start: int, until: int) -> Series:
     """Poses of a mission, and the last before it; headings without jumps from its start on."""
     first, last = np.searchsorted(poses.time, (start, until), side="right")
     values = poses.value[max(first - 1, 0) : last].copy()
-    own = slice(min(first, 1), None)
-    values[own, 2] = np.unwrap(values[own, 2])
+    kept = slice(min(first, 1), None)
+    values[kept, 2] = np.unwrap(values[kept, 2])
     return Series(poses.time[max(first - 1, 0) : last], values)

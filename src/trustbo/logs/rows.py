@@ -114,8 +114,8 @@ def features_of(columns: Mapping[str, object]) -> tuple[str, ...]:
     """Features by the names of a table's columns; those of `FEATURES` if it has none."""
     others = [name for name in columns if name not in (*COLUMNS, *position_of(columns))]
     bare = [name.removeprefix(_PREFIX) for name in others]
-    found = tuple(b if b in _RESERVED else name for b, name in zip(bare, others, strict=True))
-    return found or FEATURES
+    features = tuple(b if b in _RESERVED else name for b, name in zip(bare, others, strict=True))
+    return features or FEATURES
 
 
 def column_of(feature: str) -> str:
@@ -149,19 +149,19 @@ def _cell_at(line: int, place: tuple[str, str], texts: Sequence[str], grid: Grid
     """Cell at a position, (x, y) or (lon, lat)."""
     a, b = (_number(line, name, text) for name, text in zip(place, texts, strict=True))
     find = grid.cell_at if place[0] == "x" else grid.cell_at_lonlat
-    at = f"row {line}: {place[0]} = {texts[0]}, {place[1]} = {texts[1]}"
+    where = f"row {line}: {place[0]} = {texts[0]}, {place[1]} = {texts[1]}"
     try:
         return find(a, b)
     except Exception as error:  # off the grid; or NaN, infinite, or GDAL refuses it
         if place[0] != "x" and grid.crs is None:
-            raise TrustboError(f"{at}: {error}") from None
+            raise TrustboError(f"{where}: {error}") from None
     try:
         hint = f"; swapped? ({b:g}, {a:g}) is in cell {find(b, a)}"
     except Exception:  # as above
         (west, south), (rows, cols) = grid.corner, grid.shape
         east, north = west + cols * grid.cell_width, south + rows * grid.cell_height
         hint = f", x {west:g} to {east:g}, y {south:g} to {north:g} m in its CRS"
-    raise TrustboError(f"{at} is no position on the workspace's grid{hint}.")
+    raise TrustboError(f"{where} is no position on the workspace's grid{hint}.")
 
 
 def _from_file(file: Path) -> tuple[list[str], list[list[str]]]:

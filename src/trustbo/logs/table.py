@@ -85,7 +85,9 @@ def read_table(
                 f"rows {of_bound[row.robot].line} and {row.line}."
             )
         of_bound[row.robot] = row
-    return [_mission(label, own, start, names, tuple(team)) for label, own in missions.items()]
+    return [
+        _mission(label, rows_of, start, names, tuple(team)) for label, rows_of in missions.items()
+    ]
 
 
 def write_table(missions: Sequence[Mission], path: FilePath) -> None:
@@ -102,12 +104,12 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
         for k, cell in enumerate(mission.path):
             bound = mission.bounds[k - 1] if 1 <= k <= len(mission.bounds) else None
             for i, robot in enumerate(mission.robots):
-                own: list[object] = [""] * len(measured)
+                cells: list[object] = [""] * len(measured)
                 if bound is not None:
                     rates = (bound.contact_rate[i], bound.duration[i], bound.n_ticks[i], bound.t0)
-                    own = [*map(_text, rates), bound.status, mission.status]
-                    own += map(_text, bound.awareness[i])
-                lines.append([j, k, robot, *cell, *own])
+                    cells = [*map(_text, rates), bound.status, mission.status]
+                    cells += map(_text, bound.awareness[i])
+                lines.append([j, k, robot, *cell, *cells])
 
     write_text(path, rows_as_csv(lines))
 
@@ -134,8 +136,8 @@ def _mission(
                 f"{bounds[-1].t0:.9g} s; number the bounds in the order they were run."
             )
         bounds.append(bound)
-    said = [row.mission_status for own in rows.values() for row in own.values()]
-    status = _agreed(f"mission {label}", "mission_status", said) or bounds[-1].status
+    statuses = [row.mission_status for robots in rows.values() for row in robots.values()]
+    status = _agreed(f"mission {label}", "mission_status", statuses) or bounds[-1].status
     try:
         return Mission(cells, tuple(bounds), status, features, team)
     except TrustboError as error:
@@ -169,14 +171,16 @@ def _bound(where: str, cell: Cell, rows: dict[str, Row], team: tuple[str, ...], 
     for robot in team:
         if robot not in rows:
             raise TrustboError(f"{where} has no row for robot {robot!r}.")
-    own = [rows[robot] for robot in team]
-    said = [row.numbers["t0"] for row in own if not math.isnan(row.numbers["t0"])]
-    began = _agreed(where, "t0", said) if said else t0
-    status = _agreed(where, "status", [row.status for row in own]) or "ok"
-    awareness = np.array([row.awareness for row in own])
-    duration, n_ticks = (np.array([row.numbers[n] for row in own]) for n in ("duration", "n_ticks"))
+    team_rows = [rows[robot] for robot in team]
+    starts = [row.numbers["t0"] for row in team_rows if not math.isnan(row.numbers["t0"])]
+    began = _agreed(where, "t0", starts) if starts else t0
+    status = _agreed(where, "status", [row.status for row in team_rows]) or "ok"
+    awareness = np.array([row.awareness for row in team_rows])
+    duration, n_ticks = (
+        np.array([row.numbers[n] for row in team_rows]) for n in ("duration", "n_ticks")
+    )
     try:
-        rate = np.array([_rate(row) for row in own])
+        rate = np.array([_rate(row) for row in team_rows])
         return Bound(cell, awareness, rate, duration, status, began, n_ticks=n_ticks)
     except TrustboError as error:
         raise TrustboError(f"{where}: {error}") from None

@@ -65,8 +65,8 @@ class CoupledTrust(TrustModel):
         beta0 = sample("B0_diagonal", priors.beta0, (n_robots,))
         B0 = _matrix(beta0, sample("B0_coupling", priors.coupling, (off,)))
         # (robot, feature): a prior that differs by feature has it last.
-        own = sample("B_diagonal", priors.weights(beta0), (n_robots, n_features)).T
-        B = _matrix(own, sample("B_coupling", priors.coupling, (n_features, off)))
+        diagonal = sample("B_diagonal", priors.weights(beta0), (n_robots, n_features)).T
+        B = _matrix(diagonal, sample("B_coupling", priors.coupling, (n_features, off)))
         return CoupledParams(
             B0=numpyro.deterministic("B0", B0),
             B=numpyro.deterministic("B", B),
@@ -94,9 +94,9 @@ class CoupledTrust(TrustModel):
         fields = {name: name for name in RobotParams._fields[:5]}
         if self.inter_robot == "ordered":
             fields["gamma"] = "coupling"
-        own = {"beta": (n_robots, n_features), "gamma": (n_robots - 1,)}
+        shapes = {"beta": (n_robots, n_features), "gamma": (n_robots - 1,)}
         drawn = priors.of_stationary({
-            name: draw(getattr(priors, field), (n, *own.get(name, (n_robots,))), rng)
+            name: draw(getattr(priors, field), (n, *shapes.get(name, (n_robots,))), rng)
             for name, field in fields.items()
         })  # fmt: skip
         if self.inter_robot != "full":
@@ -149,8 +149,8 @@ class CoupledTrust(TrustModel):
         if self.inter_robot == "none":
             return super().prior_terms(sites)
         if self.inter_robot == "ordered":
-            own = {name: (name, sites[name]) for name in RobotParams._fields[:5]}
-            return own | {"gamma": ("coupling", sites["gamma"])}
+            terms = {name: (name, sites[name]) for name in RobotParams._fields[:5]}
+            return terms | {"gamma": ("coupling", sites["gamma"])}
         n = sites["b"].shape[-1]
         off = ~np.eye(n, dtype=bool)
         diagonal = {name: np.einsum("...ii->...i", sites[name]) for name in sites if name != "b"}

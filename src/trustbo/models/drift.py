@@ -71,8 +71,8 @@ class DriftTrust(TrustModel):
     @cached_property
     def _axes(self) -> tuple[Axes, Axes]:
         """Axes of the drift's arguments, and of the sample sites, by name."""
-        own = self.parameters
-        return traced_axes(own) if callable(own) else listed_axes(own)
+        parameters = self.parameters
+        return traced_axes(parameters) if callable(parameters) else listed_axes(parameters)
 
     @cached_property
     def form(self) -> DriftForm:
@@ -131,10 +131,10 @@ class DriftTrust(TrustModel):
 
     def params(self, sites: Mapping[str, Any], n_features: int) -> DriftParams:
         """See `TrustModel.params`."""
-        own = dict(sites)
+        values = dict(sites)
         try:
-            theta = {name: np.asarray(own[name], float) for name, _ in self.form.axes}
-            beta0, delta_w, delta_v = (own[name] for name in ("beta0", "delta_w", "delta_v"))
+            theta = {name: np.asarray(values[name], float) for name, _ in self.form.axes}
+            beta0, delta_w, delta_v = (values[name] for name in ("beta0", "delta_w", "delta_v"))
         except KeyError as error:
             raise TrustboError(
                 f"parameter {error} is missing; {self.describe()} needs {', '.join(self.dims)}."
@@ -152,8 +152,8 @@ class DriftTrust(TrustModel):
     def dims(self) -> Axes:
         """Axes of beta0, the drift's parameters, delta_w and delta_v."""
         arguments, sites = self._axes
-        own = sites | arguments
-        return {"beta0": (), **own, "delta_w": (), "delta_v": (), **self.place_dims}
+        axes = sites | arguments
+        return {"beta0": (), **axes, "delta_w": (), "delta_v": (), **self.place_dims}
 
     @cached_property
     def why_not_exact(self) -> str | None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -196,8 +196,8 @@ class DriftTrust(TrustModel):
             if site["type"] != "sample":
                 return None
             n = int(np.prod(site["fn"].shape()))
-            own, rest = rest[:n].reshape(site["fn"].shape()), rest[n:]
-            return quantile_at(site["fn"], own)
+            scores, rest = rest[:n].reshape(site["fn"].shape()), rest[n:]
+            return quantile_at(site["fn"], scores)
 
         with handlers.trace() as trace, handlers.substitute(substitute_fn=quantile):
             theta = self._sample_theta(n_robots, n_features)
@@ -207,8 +207,8 @@ class DriftTrust(TrustModel):
     def parameters_at(self, z: np.ndarray, shape: tuple[int, int]) -> dict[str, np.ndarray]:
         """The drift's parameters at scores (point, score), by name, see `at_scores`."""
         with own_settings():
-            found = _parameters_at(self, z, shape)
-        return {name: np.asarray(value) for name, value in found.items()}
+            parameters = _parameters_at(self, z, shape)
+        return {name: np.asarray(value) for name, value in parameters.items()}
 
     def draw_prior(
         self, shape: tuple[int, int], n: int, rng: np.random.Generator
@@ -217,8 +217,8 @@ class DriftTrust(TrustModel):
         if self._why_no_scores is not None:
             return None
         names = ("beta0", "delta_w", "delta_v")
-        own = self.parameters_at(rng.standard_normal((n, self.n_scores(*shape))), shape)
-        return {name: draw(getattr(self.priors, name), (n,), rng) for name in names} | own
+        draws = self.parameters_at(rng.standard_normal((n, self.n_scores(*shape))), shape)
+        return {name: draw(getattr(self.priors, name), (n,), rng) for name in names} | draws
 
     def for_features(self, features: Any) -> Self:
         """The model itself: no prior goes by the name of a feature."""
@@ -226,8 +226,12 @@ class DriftTrust(TrustModel):
 
     def options(self) -> dict[str, str]:
         """Options by name, function and parameters as text."""
-        own = self.parameters
-        text = name_of(own) if callable(own) else "; ".join(map(prior_text, own, own.values()))
+        parameters = self.parameters
+        text = (
+            name_of(parameters)
+            if callable(parameters)
+            else "; ".join(map(prior_text, parameters, parameters.values()))
+        )
         return {
             "observation": self.observation,
             "response": self.response,
@@ -243,7 +247,7 @@ class DriftTrust(TrustModel):
         some = drift.map(lambda value, _: value[:100])
         try:
             _require_indices(some, z[2])
-            found = some.values(z, many=True)
+            drifts = some.values(z, many=True)
         except TrustboError:
             raise
         except jax.errors.JAXTypeError as error:
@@ -257,12 +261,12 @@ class DriftTrust(TrustModel):
                 f"the drift {self.form.name} fails for awareness (robot, feature) = {shape}: "
                 f"{type(error).__name__}: {error}"
             ) from error
-        bad = ~np.isfinite(found)
+        bad = ~np.isfinite(drifts)
         if bad.any():
             draw, k, robot = np.argwhere(bad)[0]
             theta = ", ".join(f"{n} = {np.asarray(v[draw])}" for n, v in some.theta.items())
             raise TrustboError(
-                f"the drift {self.form.name} is {found[draw, k, robot]} at awareness "
+                f"the drift {self.form.name} is {drifts[draw, k, robot]} at awareness "
                 f"{z[k, robot].round(3).tolist()} with {theta}; it must be finite for all "
                 "awareness in [0, 1] and all parameters that their priors give."
             )
@@ -288,9 +292,9 @@ class DriftTrust(TrustModel):
             return {n: trace[n]["fn"].log_prob(trace[n]["value"]).sum() for n in values}
 
         with own_settings():
-            found = jax.jit(jax.vmap(one))(flat)
+            log_densities = jax.jit(jax.vmap(one))(flat)
         shape = sites["beta0"].shape
-        return {name: np.asarray(value).reshape(shape) for name, value in found.items()}
+        return {name: np.asarray(value).reshape(shape) for name, value in log_densities.items()}
 
 
 @partial(jax.jit, static_argnames="shape")

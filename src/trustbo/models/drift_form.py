@@ -41,9 +41,9 @@ class DriftForm:
 
     def keep(self) -> Self:
         """Remember the form, for posteriors to find it."""
-        known = _KNOWN.setdefault(self.name, [])
-        if self not in known:
-            known.append(self)
+        forms = _KNOWN.setdefault(self.name, [])
+        if self not in forms:
+            forms.append(self)
         return self
 
     def __call__(self, z: Any, theta: Mapping[str, Any]) -> Any:
@@ -110,8 +110,8 @@ class Drift:
         with own_settings():
             theta = {name: jnp.asarray(value, float) for name, value in self.theta.items()}
             each_own = z.ndim == 4
-            found = np.asarray(_values(self.form, theta, padded, many=many, each_own=each_own))
-        return np.where(missing, np.nan, found[..., :n, :])
+            drifts = np.asarray(_values(self.form, theta, padded, many=many, each_own=each_own))
+        return np.where(missing, np.nan, drifts[..., :n, :])
 
     def require(self, n_robots: int | None, n_features: int) -> None:
         """Refuse awareness of other sizes: ShapeError."""
@@ -152,7 +152,9 @@ def find_drift(about: Mapping[Any, Any], sites: Mapping[str, np.ndarray]) -> Dri
         if sites.keys() >= dict(form.axes).keys():
             mark, kept = form.mark(shape), np.ravel(about["drift_mark"])
             if np.allclose(mark, kept, rtol=1e-6, equal_nan=True):
-                return Drift(form, {own: sites[own] for own, _ in form.axes}, shape[1])
+                return Drift(
+                    form, {argument: sites[argument] for argument, _ in form.axes}, shape[1]
+                )
     reason = "gives other values by now" if name in _KNOWN else "is not known here"
     raise TrustboError(
         f"the drift {name} of the posterior {reason}: first make its DriftTrust again, with the "
@@ -162,5 +164,5 @@ def find_drift(about: Mapping[Any, Any], sites: Mapping[str, np.ndarray]) -> Dri
 
 def name_of(function: object) -> str:
     """Module and name of a custom function."""
-    own = getattr(function, "__qualname__", type(function).__name__)
-    return f"{getattr(function, '__module__', '')}:{own}"
+    qualname = getattr(function, "__qualname__", type(function).__name__)
+    return f"{getattr(function, '__module__', '')}:{qualname}"

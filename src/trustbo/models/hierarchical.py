@@ -62,14 +62,14 @@ class HierarchicalTrust(TrustModel):
         tau = {name: draw(priors.tau, (n, *size[name]), rng) for name in size}
         from_line, to_line = bijection(priors.beta0.support)
         centre = mean | {"beta0": to_line(mean["beta0"])}
-        own = {
+        draws = {
             name: centre[name][:, None]
             + tau[name][:, None] * rng.standard_normal((n, n_robots, *size[name]))
             for name in size
         }
         return {
-            **own,
-            "beta0": from_line(own["beta0"]),
+            **draws,
+            "beta0": from_line(draws["beta0"]),
             "delta_w": draw(priors.delta_w, (n,), rng),
             "delta_v": draw(priors.delta_v, (n,), rng),
             **{f"mean_{name}": mean[name] for name in size},

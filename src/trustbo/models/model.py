@@ -188,8 +188,8 @@ class TrustModel(Displayed, ABC):
         """The model with that family of observations if `"auto"`, else unchanged."""
         if self.observation != AUTO:
             return self
-        own = self.priors is not Priors.default(AUTO)
-        return replace(self, observation=observation, priors=self.priors if own else None)
+        custom_priors = self.priors is not Priors.default(AUTO)
+        return replace(self, observation=observation, priors=self.priors if custom_priors else None)
 
     def at_resolution(self, ticks: Mapping[float, float]) -> Self:
         """The model whose delta_v is no less than the resolution of rates of so many ticks.
@@ -211,8 +211,8 @@ class TrustModel(Displayed, ABC):
         """Shape of each parameter in a posterior, without those of places."""
         length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
         length["feature"] = n_features
-        own = {name: axes for name, axes in self.dims.items() if name not in self.place_dims}
-        return {name: tuple(length[axis] for axis in axes) for name, axes in own.items()}
+        dims = {name: axes for name, axes in self.dims.items() if name not in self.place_dims}
+        return {name: tuple(length[axis] for axis in axes) for name, axes in dims.items()}
 
     def options(self) -> dict[str, str]:
         """Options by name, without the priors and the effects of places."""

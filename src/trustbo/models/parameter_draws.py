@@ -51,11 +51,11 @@ class ParameterDraws(Displayed):
     @property
     def by_name(self) -> dict[str, Numbers]:
         """Values by name, those of a drift among them; fields that are None left out."""
-        found: dict[str, Numbers] = {}
+        values: dict[str, Numbers] = {}
         for name in self._fields:
             value = getattr(self, name)
-            found |= dict(value.theta) if isinstance(value, Drift) else {name: value}
-        return {name: value for name, value in found.items() if value is not None}
+            values |= dict(value.theta) if isinstance(value, Drift) else {name: value}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def leading(self) -> tuple[int, ...]:
@@ -87,16 +87,18 @@ class ParameterDraws(Displayed):
             if "robot" in axes
         }
         for name, value in self.places.items():
-            own = slice(robot, robot + 1) if value.shape[-len(self.AXES[name])] > 1 else slice(None)
-            picked[name] = np.moveaxis(np.moveaxis(value, -len(self.AXES[name]), 0)[own], 0,
+            index = (
+                slice(robot, robot + 1) if value.shape[-len(self.AXES[name])] > 1 else slice(None)
+            )
+            picked[name] = np.moveaxis(np.moveaxis(value, -len(self.AXES[name]), 0)[index], 0,
                                        -len(self.AXES[name]))  # fmt: skip
         return self._replace(**picked)  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def places(self) -> dict[str, np.ndarray]:
         """Effects of places in the model, place and place_bound, by name."""
-        found = {name: getattr(self, name, None) for name in PLACES}
-        return {name: np.asarray(value) for name, value in found.items() if value is not None}
+        effects = {name: getattr(self, name, None) for name in PLACES}
+        return {name: np.asarray(value) for name, value in effects.items() if value is not None}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
         """Effect of each bound, that of the cell entered included; shape (..., bound, effect).

@@ -159,12 +159,14 @@ class DriftParams(_Apart, _OwnDrift):
         u = self.drift.values(awareness.reshape(-1, *awareness.shape[2:]), many=True)
         u = u.reshape(n_draws, *awareness.shape[:3])
         b = np.asarray(self.b)
-        known = {
+        fields = {
             name: getattr(self, name)
             for name in ("beta0", "delta_w", "delta_v", "x0_mean", "x0_sd")
         }
         zero = np.zeros((n_draws, n_features))
-        return TrustParams(beta=zero, b=u + (b if b.ndim == 4 else b[:, None, None, None]), **known)
+        return TrustParams(
+            beta=zero, b=u + (b if b.ndim == 4 else b[:, None, None, None]), **fields
+        )
 
 
 Params = TrustParams | RobotParams | CoupledParams | DriftParams

@@ -61,10 +61,10 @@ class PlaceEffect:
             )
         for name in ("tau_s", "tau_e", "length_scale", "length_scale_sd"):
             value = require_positive(f"PlaceEffect.{name}", getattr(self, name))
-            most, of = _MOST.get(name, (100.0, "trust, which is between 0 and 1"))
+            most, scale = _MOST.get(name, (100.0, "trust, which is between 0 and 1"))
             if value > most:
                 raise TrustboError(
-                    f"PlaceEffect.{name} = {value:g} exceeds {most:g}: it is of {of}."
+                    f"PlaceEffect.{name} = {value:g} exceeds {most:g}: it is of {scale}."
                 )
 
     @property
@@ -129,17 +129,17 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
     """
     if shape is None:
         shape = len(missions), max(len(mission.bounds) for mission in missions)
-    found = np.full((*shape, 3), -1)
+    bounds = np.full((*shape, 3), -1)
     for j, mission in enumerate(missions):
         path = mission.path[: len(mission.bounds) + 1]  # a failed mission did not run the rest
         try:
-            found[j, : len(mission.bounds)] = bounds_along(path)
+            bounds[j, : len(mission.bounds)] = bounds_along(path)
         except TrustboError as error:
             raise TrustboError(
                 f"mission {j}: {error} A model with place effects needs whole paths; give "
                 "place=None, or split the mission there."
             ) from None
-    return found
+    return bounds
 
 
 def visited(
@@ -172,7 +172,7 @@ def visited(
     n_effects = 1 if place.shared else n_robots
     robot = np.broadcast_to(np.arange(n_effects), (*there.shape, n_effects))
     move = bounds[..., 0] if place.bounds else np.where(there, -1, -2)
-    four = np.stack(np.broadcast_arrays(robot, *(each[..., None] for each in (
+    four = np.stack(np.broadcast_arrays(robot, *(column[..., None] for column in (
         move, bounds[..., 1], bounds[..., 2]))), axis=-1)  # fmt: skip
     units, index = np.unique(four[there].reshape(-1, 4), axis=0, return_inverse=True)
     if len(units) > MAX_VISITED:

@@ -35,8 +35,8 @@ class PooledTrust(TrustModel):
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of beta0, beta, b, delta_w and delta_v."""
-        own = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
-        return own | self.place_dims
+        axes = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
+        return axes | self.place_dims
 
     @property
     def robot_sets(self) -> str:

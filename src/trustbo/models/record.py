@@ -17,14 +17,14 @@ _MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, C
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
     """Record of class, options, priors as text, and whether these depend on the features' names."""
-    own = {
+    custom = {
         "class": type(model).__name__,
         **model.options(),
         "place": None if model.place is None else model.place.to_record(),
         "priors": model.priors.describe(),
     }
     by_feature = model.priors is Priors.default(model.observation)
-    return own | ({"by_feature": True} if by_feature else {})
+    return custom | ({"by_feature": True} if by_feature else {})
 
 
 def model_from_record(

@@ -53,17 +53,17 @@ def weigh_ticks(batch: MissionBatch, weight: np.ndarray | None = None) -> TickWe
         weight: Weight of each mission, shape (mission,); 1 by default.
     """
     seen = ~np.isnan(batch.contact_rate)
-    each = np.ones(len(seen)) if weight is None else weight
+    weights = np.ones(len(seen)) if weight is None else weight
     ticks = np.nan_to_num(np.broadcast_to(batch.n_ticks, seen.shape)[seen])
     values, index = np.unique(ticks, return_inverse=True)
-    total = np.bincount(index, (seen * each[:, None, None])[seen], len(values))
+    total = np.bincount(index, (seen * weights[:, None, None])[seen], len(values))
     return dict(zip(values.tolist(), total.tolist(), strict=True))
 
 
-def add_ticks(each: Sequence[Mapping[float, float]], factor: float = 1.0) -> TickWeights:
+def add_ticks(terms: Sequence[Mapping[float, float]], factor: float = 1.0) -> TickWeights:
     """Sum of tick weights, times a factor."""
     total: TickWeights = {}
-    for one in each:
+    for one in terms:
         for ticks, weight in one.items():
             total[ticks] = total.get(ticks, 0.0) + factor * weight
     return total
@@ -71,10 +71,12 @@ def add_ticks(each: Sequence[Mapping[float, float]], factor: float = 1.0) -> Tic
 
 def resolution(ticks: Mapping[float, float]) -> float:
     """Weighted median of 1/n_ticks over the measured rates, at most `COARSEST_RESOLUTION`."""
-    each = sorted((1.0 / n if n else UNKNOWN_RESOLUTION, w) for n, w in ticks.items() if w > 0.0)
-    if not each:
+    resolutions = sorted(
+        (1.0 / n if n else UNKNOWN_RESOLUTION, w) for n, w in ticks.items() if w > 0.0
+    )
+    if not resolutions:
         return UNKNOWN_RESOLUTION
-    values, weights = np.array(each).T
+    values, weights = np.array(resolutions).T
     below = np.cumsum(weights) / weights.sum()
     # Where exactly half lie below, the mean of both neighbours, as a plain median does.
     middle = values[np.minimum(np.searchsorted(below, [0.5 - 1e-9, 0.5 + 1e-9]), len(values) - 1)]

@@ -109,10 +109,10 @@ class _Animation(FuncAnimation):
         if writer is None:
             suffix = require_choice("suffix", path.suffix.lower(), SUFFIXES)
             writer = PillowWriter(fps) if suffix == ".gif" else FFMpegWriter(fps, extra_args=_EVEN)
-        known: dict[Any, Any] = (
+        settings: dict[Any, Any] = (
             {"animation.ffmpeg_path": _ffmpeg()} if isinstance(writer, FFMpegWriter) else {}
         )
-        with mpl.rc_context(known):
+        with mpl.rc_context(settings):
             write_file(path, lambda file: FuncAnimation.save(self, file, writer, *args, **options))
 
 
@@ -202,7 +202,7 @@ class _Team:
         ]
         lead = style | {"color": "black", "markeredgecolor": "white", "zorder": 6}
         (self.lead,) = ax.plot([], [], marker="*", markersize=15, label="lead", **lead)
-        own, _ = ax.get_legend_handles_labels()
+        handles, _ = ax.get_legend_handles_labels()
         lines = [
             Line2D([], [], color=SEEN, label="in contact"),
             Line2D([], [], color=UNSEEN, linestyle=_DASHED, label="no contact"),
@@ -211,7 +211,7 @@ class _Team:
             ),
             Patch(facecolor=VEGETATION, label="vegetation"),
         ]
-        ax.legend(handles=[*own, *lines], loc="upper left", fontsize=SMALL, framealpha=0.85)
+        ax.legend(handles=[*handles, *lines], loc="upper left", fontsize=SMALL, framealpha=0.85)
 
     def place(self, poses: np.ndarray, contact: np.ndarray) -> None:
         """Move the markers to the poses of a tick, the lead first."""

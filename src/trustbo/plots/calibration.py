@@ -38,11 +38,11 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
         Axes, shape (2,).
     """
     require_kind("plots.calibration", ranks, xr.Dataset, "give the Dataset of models.sbc")
-    look, colours = Style.of(style), theme()
-    made = small_multiples(2, (3.6, 2.9), look, least=2.4)
+    options, colours = Style.of(style), theme()
+    made = small_multiples(2, (3.6, 2.9), options, least=2.4)
     curves, cover = made.panels
     n, names = ranks.sizes["dataset"], [str(name) for name in ranks["parameter"].values]
-    shades = curve_colours(len(names), look)
+    shades = curve_colours(len(names), options)
     widths, keys = ranks["interval"].values, []
     dodge = 0.025 * (np.linspace(-1.0, 1.0, len(names)) if len(names) > 1 else np.zeros(1))
     far = float(stats.kstwo.ppf(_PROBABILITY, n))
@@ -75,7 +75,7 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
     cover.set_ylabel("share of truths in it", fontsize=SMALL)
     for ax in made.panels:
         plain(ax)
-    set_titles(made, ["", ""], look)
-    said = f"{n} data sets, {ranks.attrs.get('sampler', 'unknown')} sampler"
-    legend(made, keys, look, title=said, title_fontsize=SMALL, ncols=min(len(keys), 5))
+    set_titles(made, ["", ""], options)
+    subtitle = f"{n} data sets, {ranks.attrs.get('sampler', 'unknown')} sampler"
+    legend(made, keys, options, title=subtitle, title_fontsize=SMALL, ncols=min(len(keys), 5))
     return made.panels

@@ -44,22 +44,24 @@ def parameter_history(
     """
     such = "give a list of posteriors, such as Result.posteriors"
     require_kind("plots.parameter_history", posteriors, Sequence, such)
-    look, colours = Style.of(style), theme()
+    options, colours = Style.of(style), theme()
     if not posteriors:
         raise TrustboError("there are no posteriors; give one for each mission.")
-    known = [str(name) for name in posteriors[-1]["posterior"].data_vars]
-    chosen = known if names is None else [require_choice("parameter", n, known) for n in names]
+    available = [str(name) for name in posteriors[-1]["posterior"].data_vars]
+    chosen = (
+        available if names is None else [require_choice("parameter", n, available) for n in names]
+    )
     last = _scalars(posteriors[-1], "posterior", chosen)
     if len(last) > MOST_PANELS:
         raise TrustboError(
             f"{len(last)} parameters need as many panels; choose at most {MOST_PANELS} by names=, "
-            f"of {', '.join(known)}."
+            f"of {', '.join(available)}."
         )
     for label in truth or {}:
         require_choice("label in truth", label, last)
     prior = _scalars(posteriors[-1], "prior", chosen)
     after = [_scalars(posterior, "posterior", chosen) for posterior in posteriors]
-    made = small_multiples(len(last), (2.5, 1.6), look, sharex=True, least=1.4)
+    made = small_multiples(len(last), (2.5, 1.6), options, sharex=True, least=1.4)
     for ax, label in zip(made.panels, last, strict=True):
         _draw_parameter(ax, prior.get(label), [draws[label] for draws in after])
         if truth is not None and label in truth:
@@ -68,9 +70,9 @@ def parameter_history(
         ax.xaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
         ax.yaxis.set_major_locator(MaxNLocator(nbins=4))
         plain(ax)
-    set_titles(made, list(last), look)
+    set_titles(made, list(last), options)
     label_lower(made, "missions")
-    legend(made, _keys(truth is not None), look, ncols=4)
+    legend(made, _keys(truth is not None), options, ncols=4)
     return made.panels
 
 
@@ -107,10 +109,10 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
     require_kind(
         "plots.campaign_history", history, xr.Dataset, "give a history, such as Result.history"
     )
-    look, colours = Style.of(style), theme()
+    options, colours = Style.of(style), theme()
     if not history.sizes.get("iteration"):
         raise TrustboError("the history has no mission yet; tell the campaign one first.")
-    made = small_multiples(2, (4.6, 1.6), look, columns=1, sharex=True)
+    made = small_multiples(2, (4.6, 1.6), options, columns=1, sharex=True)
     panels = made.panels
     mission, changed = history["iteration"].values, history["path_changed"].values.astype(bool)
     changed[0] |= mission[0] == 1  # the first path is new
@@ -143,8 +145,8 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
         )
     label_lower(made, "mission")
     panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    set_titles(made, ["", ""], look)
-    legend(made, panels[1].get_legend_handles_labels()[0], look)
+    set_titles(made, ["", ""], options)
+    legend(made, panels[1].get_legend_handles_labels()[0], options)
     return panels
 
 
@@ -152,8 +154,8 @@ def _draw_parameter(ax: Axes, prior: np.ndarray | None, after: Sequence[np.ndarr
     ends = np.stack([np.quantile(draws, (*QUANTILES, 0.5)) for draws in after], axis=1)
     bars, colours = [(1.0 + np.arange(len(after)), ends, theme().line)], theme()
     if prior is not None:
-        own = np.quantile(prior, (*QUANTILES, 0.5))[:, None]
-        bars.append((np.zeros(1), own, colours.quiet))
+        quantiles = np.quantile(prior, (*QUANTILES, 0.5))[:, None]
+        bars.append((np.zeros(1), quantiles, colours.quiet))
     for x, (low, lower, upper, high, middle), colour in bars:
         ax.vlines(x, low, high, color=colour, linewidth=1.0)
         ax.vlines(x, lower, upper, color=colour, linewidth=3.0)

@@ -47,18 +47,18 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
         Axes, shape (9,).
     """
     require_kind("plots.criticism", found, Criticism, "give a Criticism, from tb.criticise")
-    look = Style.of(style)
-    made = small_multiples(9, (2.5, 2.2), look, least=1.8)
+    options = Style.of(style)
+    made = small_multiples(9, (2.5, 2.2), options, least=1.8)
     tests, pit, cover, correlation, *groups, cells = made.panels
     _draw_tests(tests, found)
     _draw_curves(pit, cover, correlation, found.curves)
     for ax, kind in zip(groups, _KINDS, strict=True):
         _draw_groups(ax, found, kind)
-    _draw_cells(cells, found, made, look)
+    _draw_cells(cells, found, made, options)
     for ax in made.panels:
         plain(ax)
-    set_titles(made, [""] * 9, look)
-    legend(made, _keys(), look, ncols=4)
+    set_titles(made, [""] * 9, options)
+    legend(made, _keys(), options, ncols=4)
     return made.panels
 
 
@@ -74,8 +74,8 @@ def _keys() -> list[Line2D | Patch]:
     ]
 
 
-def _draw_tests(ax: Axes, found: Criticism) -> None:
-    table = found.table.loc[np.isfinite(found.table["p_adjusted"].to_numpy(dtype=float)), :]
+def _draw_tests(ax: Axes, criticism: Criticism) -> None:
+    table = criticism.table.loc[np.isfinite(criticism.table["p_adjusted"].to_numpy(dtype=float)), :]
     p, after = (
         np.maximum(table[name].to_numpy(dtype=float), _LEAST_P)
         for name in ("p_adjusted", "p_after")
@@ -87,7 +87,7 @@ def _draw_tests(ax: Axes, found: Criticism) -> None:
     ax.scatter(after, y, s=18, facecolor=theme().paper, edgecolor=theme().ink, zorder=3)
     ax.scatter(p, y, s=22, color=np.where(p <= _LEVEL, theme().odd, theme().ink), zorder=4)
     ax.set(xscale="log", xlim=(_LEAST_P / 2.0, 1.6), ylim=(-0.7, len(table) - 0.3))
-    bold = ["bold" if name == found.fault else "normal" for name in names]
+    bold = ["bold" if name == criticism.fault else "normal" for name in names]
     ax.set_yticks(y, names)
     for label, weight in zip(ax.get_yticklabels(), bold, strict=True):
         label.set_fontweight(weight)
@@ -137,8 +137,8 @@ def _mark(ax: Axes, x: np.ndarray, curves: xr.Dataset, name: str) -> None:
     ax.plot(x[outside], y[outside], "o", color=theme().odd, markersize=4, zorder=4)
 
 
-def _draw_groups(ax: Axes, found: Criticism, kind: str) -> None:
-    groups = _groups_of(found, kind)
+def _draw_groups(ax: Axes, criticism: Criticism, kind: str) -> None:
+    groups = _groups_of(criticism, kind)
     mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
     odd, labels = groups["stands_out"].to_numpy(dtype=bool), list(groups["group"])
     x = np.arange(len(mean)) if kind in ("robot", "contact") else np.array(labels, dtype=float)
@@ -154,14 +154,14 @@ def _draw_groups(ax: Axes, found: Criticism, kind: str) -> None:
     ax.set_ylabel("mean residual (sd)", fontsize=SMALL)
 
 
-def _draw_cells(ax: Axes, found: Criticism, made: Panels, look: Style) -> None:
-    groups = _groups_of(found, "cell")
+def _draw_cells(ax: Axes, criticism: Criticism, made: Panels, options: Style) -> None:
+    groups = _groups_of(criticism, "cell")
     cells = np.array(list(groups["group"]))
     values = np.full(tuple(cells.max(0) + 1), np.nan)
     mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
     values[*cells.T] = mean / band
     far = max(float(np.nanmax(np.abs(values))), 1.0)
-    image = ax.imshow(values, cmap=look.colours(BETTER_WORSE), vmin=-far, vmax=far)
+    image = ax.imshow(values, cmap=options.colours(BETTER_WORSE), vmin=-far, vmax=far)
     for row, col in cells[groups["stands_out"].to_numpy(dtype=bool)]:
         corner = col - 0.5, row - 0.5
         ax.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, edgecolor="black", linewidth=1.6))
@@ -169,8 +169,8 @@ def _draw_cells(ax: Axes, found: Criticism, made: Panels, look: Style) -> None:
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("column of the cell entered", fontsize=SMALL)
     ax.set_ylabel("row", fontsize=SMALL)
-    colour_bar(made, image, "mean residual / band", look, axes=[ax])
+    colour_bar(made, image, "mean residual / band", options, axes=[ax])
 
 
-def _groups_of(found: Criticism, kind: str) -> pd.DataFrame:
-    return found.groups.loc[found.groups["kind"].to_numpy() == kind, :]
+def _groups_of(criticism: Criticism, kind: str) -> pd.DataFrame:
+    return criticism.groups.loc[criticism.groups["kind"].to_numpy() == kind, :]

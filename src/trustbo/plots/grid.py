@@ -18,13 +18,13 @@ _LETTER = SMALL / 72.0
 """Height of a letter of a cell's name, inches; its width is some 0.6 of that."""
 
 
-def grid_map(found: Survey) -> Axes:
+def grid_map(survey: Survey) -> Axes:
     """Draw the mean heights of the cells of a terrain, with the cells' names, row,col.
 
     Cells too small for a name are named at the edges alone. Impassable cells are hatched; a
     suggested start is a circle, a goal a star.
     """
-    grid, cells = found.grid, found.cells
+    grid, cells = survey.grid, survey.cells
     (rows, cols), (left, bottom, right, top) = grid.shape, grid.bounds
     scale = min(_WIDTH / (right - left), _HEIGHT / (top - bottom))
     wide, tall = (max(scale * side, _LEAST) for side in (right - left, top - bottom))
@@ -35,7 +35,7 @@ def grid_map(found: Survey) -> Axes:
     image = ax.imshow(heights, cmap=light, extent=(-0.5, cols - 0.5, rows - 0.5, -0.5))
     ax.set_aspect(grid.cell_height / grid.cell_width)
     figure.colorbar(image, ax=ax, label="mean height (m)", shrink=0.8)
-    closed = np.ma.masked_array(np.ones(grid.shape), found.passable)
+    closed = np.ma.masked_array(np.ones(grid.shape), survey.passable)
     edges = np.arange(cols + 1) - 0.5, np.arange(rows + 1) - 0.5
     grey = ListedColormap(["0.8"])
     ax.pcolor(*edges, closed, cmap=grey, hatch="///", edgecolor="0.6", linewidth=0.0)
@@ -48,8 +48,8 @@ def grid_map(found: Survey) -> Axes:
             ax.text(
                 col, row, f"{row},{col}", ha="center", va="center", fontsize=SMALL, color="black"
             )
-    if found.passable.sum() > 1:
-        start, goal = found.ends
+    if survey.passable.sum() > 1:
+        start, goal = survey.ends
         cell_is_wide, size = cell[0] > 2.0 * cell[1], min(10.0, max(4.0, 43.0 * min(cell)))
         for end, marker, name in ((start, "o", "start"), (goal, "*", "goal")):
             label = f"e.g. --{name} {end[0]},{end[1]}"

@@ -80,7 +80,7 @@ def trust_maps(
         TrustboError: There is no such mission.
     """
     require_kind("plots.trust_maps", history, xr.Dataset, "give a history, such as Result.history")
-    look, number = Style.of(style), history["iteration"].values.tolist()
+    options, number = Style.of(style), history["iteration"].values.tolist()
     chosen = _chosen(missions, number)
     maps = [history["trust_map"].sel(iteration=i) for i in chosen]
     paths: list[Sequence[Cell]] = [_cells(history["path"].sel(iteration=i).values) for i in chosen]
@@ -91,30 +91,37 @@ def trust_maps(
     everything[:, *paths[0][0]] = np.nan
     low, high = robust_limits(everything[learned.index(0) + 1 :] if 0 in learned else everything)
     high = min(high, 1.0) if low < 1.0 else high
-    made = map_panels(workspace.grid, len(maps), look)
-    colours = look.colours(COLOURS)
-    for ax, trust, own in zip(made.panels, maps, paths, strict=True):
-        _draw_map(ax, trust, workspace, Normalize(low, high), colours, relief=look.relief)
-        draw_path(ax, own, workspace.grid)
-    set_titles(made, titles, look)
+    made = map_panels(workspace.grid, len(maps), options)
+    colours = options.colours(COLOURS)
+    for ax, trust, cells in zip(made.panels, maps, paths, strict=True):
+        _draw_map(ax, trust, workspace, Normalize(low, high), colours, relief=options.relief)
+        draw_path(ax, cells, workspace.grid)
+    set_titles(made, titles, options)
     extend = _extend(np.nanmin(everything) < low, np.nanmax(everything) > high)
     label = "expected trust (1: contact kept)"
     _finish(
-        made, workspace, label, ScalarMappable(Normalize(low, high), colours), look, extend=extend
+        made,
+        workspace,
+        label,
+        ScalarMappable(Normalize(low, high), colours),
+        options,
+        extend=extend,
     )
     return made.panels
 
 
-def _chosen(missions: Sequence[int] | str, known: list[int]) -> list[int]:
+def _chosen(missions: Sequence[int] | str, available: list[int]) -> list[int]:
     """Numbers of the missions to draw."""
     if isinstance(missions, str):
         if missions not in ("moments", "all"):
             raise TrustboError(
                 f"missions must be 'moments', 'all' or numbers of missions; got {missions!r}."
             )
-        return known if missions == "all" else [i for i in known if i in MOMENTS]
-    if not set(missions) <= set(known):
-        raise TrustboError(f"missions must be some of {known[0]}..{known[-1]}; got {missions!r}.")
+        return available if missions == "all" else [i for i in available if i in MOMENTS]
+    if not set(missions) <= set(available):
+        raise TrustboError(
+            f"missions must be some of {available[0]}..{available[-1]}; got {missions!r}."
+        )
     return list(missions)
 
 
@@ -154,20 +161,20 @@ def robot_maps(
     """
     such = "give maps (robot, row, col), such as planner.cost_map(params, per_robot=True)"
     require_kind("plots.robot_maps", maps, xr.DataArray, such)
-    look, maps = Style.of(style), maps.transpose("robot", "row", "col")
+    options, maps = Style.of(style), maps.transpose("robot", "row", "col")
     values = np.where(workspace.passable.values, maps.values, np.nan)
     if path is not None:
         values[:, *path[0]] = np.nan
-    limits, colours = robust_limits(values), look.colours(COLOURS)
-    made = map_panels(workspace.grid, maps.sizes["robot"], look)
-    for ax, own in zip(made.panels, maps, strict=True):
-        _draw_map(ax, own, workspace, Normalize(*limits), colours, relief=look.relief)
+    limits, colours = robust_limits(values), options.colours(COLOURS)
+    made = map_panels(workspace.grid, maps.sizes["robot"], options)
+    for ax, robot_map in zip(made.panels, maps, strict=True):
+        _draw_map(ax, robot_map, workspace, Normalize(*limits), colours, relief=options.relief)
         if path is not None:
             draw_path(ax, path, workspace.grid)
-    set_titles(made, [str(name) for name in maps["robot"].values], look)
+    set_titles(made, [str(name) for name in maps["robot"].values], options)
     extend = _extend(np.nanmin(values) < limits[0], np.nanmax(values) > limits[1])
     mappable = ScalarMappable(Normalize(*limits), colours)
-    _finish(made, workspace, label, mappable, look, extend=extend)
+    _finish(made, workspace, label, mappable, options, extend=extend)
     return made.panels
 
 
@@ -228,20 +235,20 @@ def _one_map(
     path: Sequence[Cell] | None,
     label: str,
     norm: Normalize,
-    look: Style,
+    options: Style,
     extend: str = "neither",
 ) -> Axes:
     """Draw a single map."""
-    made = map_panels(workspace.grid, 1, look, width=3.6)
+    made = map_panels(workspace.grid, 1, options, width=3.6)
     (ax,) = made.panels
-    colours = look.colours(COLOURS)
-    _draw_map(ax, values, workspace, norm, colours, relief=look.relief)
+    colours = options.colours(COLOURS)
+    _draw_map(ax, values, workspace, norm, colours, relief=options.relief)
     if path is not None:
         draw_path(ax, path, workspace.grid)
-    if look.title:
-        set_titles(made, [""], look)
+    if options.title:
+        set_titles(made, [""], options)
     of_bar = {"extend": extend} | ({"format": "%g"} if isinstance(norm, LogNorm) else {})
-    _finish(made, workspace, label, ScalarMappable(norm, colours), look, **of_bar)
+    _finish(made, workspace, label, ScalarMappable(norm, colours), options, **of_bar)
     return ax
 
 
@@ -323,22 +330,22 @@ def contours(workspace: Workspace, heights: str = "dem") -> list[np.ndarray]:
         return []
     step = -(-max(terrain[heights].shape) // _MOST_PIXELS)  # more would not be visible
     height = terrain[heights].values[::step, ::step]
-    known = np.isfinite(height)
-    if min(height.shape) < 3 or not known.any():
+    valid = np.isfinite(height)
+    if min(height.shape) < 3 or not valid.any():
         return []
     # Smoothed where it is known only: a normalised convolution.
     width = max(1.0, _SMOOTH * max(height.shape))
-    weight = gaussian_filter(known.astype(float), width)
-    smooth = gaussian_filter(np.where(known, height, 0.0), width) / np.maximum(weight, 1e-9)
-    interval = contour_interval(float(np.ptp(smooth[known])))
+    weight = gaussian_filter(valid.astype(float), width)
+    smooth = gaussian_filter(np.where(valid, height, 0.0), width) / np.maximum(weight, 1e-9)
+    interval = contour_interval(float(np.ptp(smooth[valid])))
     if interval is None:
         return []
-    low, high = (float(f(smooth[known])) for f in (np.min, np.max))
+    low, high = (float(f(smooth[valid])) for f in (np.min, np.max))
     dy, dx = (float(size) for size in pixel_size(terrain))
     _, _, _, top = extent_of(workspace.grid)
     x = (np.arange(height.shape[1]) * step + 0.5) * dx
     y = top - (np.arange(height.shape[0]) * step + 0.5) * dy
-    traced = contour_generator(x, y, np.ma.masked_where(~known, smooth), line_type="Separate")
+    traced = contour_generator(x, y, np.ma.masked_where(~valid, smooth), line_type="Separate")
     levels = np.arange(np.ceil(low / interval), np.floor(high / interval) + 1) * interval
     return [np.asarray(line) for level in levels for line in traced.lines(level)]
 
@@ -422,7 +429,7 @@ def _finish(
     workspace: Workspace,
     label: str,
     mappable: ScalarMappable,
-    look: Style,
+    style: Style,
     **options: Any,
 ) -> None:
     """Add the scale, labels in metres, and one colour bar for all panels."""
@@ -431,5 +438,5 @@ def _finish(
     if not workspace.passable.all():
         label = f"{label[:-1]}; " if label.endswith(")") else f"{label} ("
         label += "grey: impassable)"
-    colour_bar(made, mappable, label, look, **options)
-    fit_height(made, look)
+    colour_bar(made, mappable, label, style, **options)
+    fit_height(made, style)

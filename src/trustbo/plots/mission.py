@@ -37,7 +37,7 @@ def mission_trust(
     require_kind(
         "plots.mission_trust", posterior, xr.DataTree, "give a posterior, such as Result.posterior"
     )
-    look, latent = Style.of(style), posterior["latent"].to_dataset()
+    options, latent = Style.of(style), posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
     if not isinstance(mission, int | np.integer) or not -n_missions <= mission < n_missions:
         raise TrustboError(
@@ -51,7 +51,7 @@ def mission_trust(
     middle, bands = np.median(trust.values, 0), np.quantile(trust.values, QUANTILES, axis=0)
     robots = [str(name) for name in trust["robot"].values]
     named = "trust", "median"
-    return _panels(robots, trust["bound"].values, middle, bands, rates, named, look)
+    return _panels(robots, trust["bound"].values, middle, bands, rates, named, options)
 
 
 def plan_trust(
@@ -77,7 +77,7 @@ def plan_trust(
     require_kind(
         "plots.plan_trust", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()"
     )
-    look, (n_bounds, n_robots) = Style.of(style), plan.trust.shape
+    options, (n_bounds, n_robots) = Style.of(style), plan.trust.shape
     if len(robots) != n_robots:
         raise ShapeError(f"the plan has {n_robots} robots; got the names {tuple(robots)}.")
     rates = np.full(plan.trust.shape, np.nan)
@@ -91,7 +91,7 @@ def plan_trust(
         rates[: len(measured)] = measured
     bounds = np.arange(1, n_bounds + 1)
     names, named = [str(robot) for robot in robots], ("expected trust", "mean")
-    return _panels(names, bounds, plan.trust, plan.bands, rates, named, look)
+    return _panels(names, bounds, plan.trust, plan.bands, rates, named, options)
 
 
 def _panels(
@@ -101,10 +101,10 @@ def _panels(
     bands: np.ndarray,
     rates: np.ndarray,
     named: tuple[str, str],
-    look: Style,
+    options: Style,
 ) -> np.ndarray:
     (what, centre), colours = named, theme()
-    made = small_multiples(len(robots), _SIZE, look, sharex=True, sharey=True)
+    made = small_multiples(len(robots), _SIZE, options, sharex=True, sharey=True)
     for i, ax in enumerate(made.panels):
         x, m, (low, lower, upper, high) = bounds, middle[:, i], bands[:, :, i]
         if len(x) == 1:  # a band of one bound would not be seen
@@ -120,9 +120,9 @@ def _panels(
         dots.set(markeredgecolor=colours.paper, markeredgewidth=0.5)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         plain(ax)
-    set_titles(made, robots, look)
+    set_titles(made, robots, options)
     label_lower(made, "bound")
     for ax in made.left:
         ax.set_ylabel("trust, contact rate", fontsize=SMALL)
-    legend(made, made.panels[0].get_legend_handles_labels()[0], look, ncols=4)
+    legend(made, made.panels[0].get_legend_handles_labels()[0], options, ncols=4)
     return made.panels

@@ -61,7 +61,7 @@ def place_map(
     such = "give a posterior with places, such as Result.posterior, and a Workspace"
     require_kind("plots.place_map", posterior, xr.DataTree, such)
     require_kind("plots.place_map", workspace, Workspace, such)
-    look, maps = Style.of(style), place_maps(posterior)
+    options, maps = Style.of(style), place_maps(posterior)
     have, grid = (maps.sizes["row"], maps.sizes["col"]), workspace.grid
     if have[0] > grid.shape[0] or have[1] > grid.shape[1]:
         raise ShapeError(
@@ -74,23 +74,23 @@ def place_map(
     _, top = _ends(abs(maps), "mean", units)
     colours = {
         "mean": (Normalize(-top, top), colormaps[BETTER_WORSE]),
-        "sd": (Normalize(*_ends(maps, "sd", units)), look.colours(COLOURS)),
+        "sd": (Normalize(*_ends(maps, "sd", units)), options.colours(COLOURS)),
     }
-    said = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
-    made = map_panels(grid, 2 * len(names), look, columns=2, width=3.4, margin=0.0, least=2.0)
+    wording = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
+    made = map_panels(grid, 2 * len(names), options, columns=2, width=3.4, margin=0.0, least=2.0)
     titles = []
     for i, name in enumerate(names):
-        own = maps.isel(robot=i)
+        maps_of_robot = maps.isel(robot=i)
         for ax, (kind, drawn) in zip(made.panels[2 * i : 2 * i + 2], colours.items(), strict=True):
-            _draw(ax, own, kind, units, i, workspace, *drawn)
-            if look.relief:
+            _draw(ax, maps_of_robot, kind, units, i, workspace, *drawn)
+            if options.relief:
                 draw_relief(ax, workspace)
-            titles.append(f"{name}: {said[kind]}" if name else said[kind])
-        if "place_mean" in own:
-            _signs(made.panels[2 * i], own, workspace, top)
+            titles.append(f"{name}: {wording[kind]}" if name else wording[kind])
+        if "place_mean" in maps_of_robot:
+            _signs(made.panels[2 * i], maps_of_robot, workspace, top)
     draw_scale(made.panels[0], grid)
     label_maps(made)
-    set_titles(made, titles, look)
+    set_titles(made, titles, options)
     labels = {"mean": "effect on trust, mean", "sd": "effect on trust, sd"}
     for k, kind in enumerate(colours):
         of_kind = {
@@ -98,8 +98,8 @@ def place_map(
             "extend": "both" if kind == "mean" else "neither",
         }
         under = {"location": "bottom", "aspect": 24, "pad": 0.02}
-        colour_bar(made, ScalarMappable(*colours[kind]), labels[kind], look, **of_kind, **under)
-    fit_height(made, look)
+        colour_bar(made, ScalarMappable(*colours[kind]), labels[kind], options, **of_kind, **under)
+    fit_height(made, options)
     return made.panels
 
 

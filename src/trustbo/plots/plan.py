@@ -49,7 +49,7 @@ def plan_map(
         TrustboError: The workspace has no terrain in memory, or there is no such bound.
     """
     require_kind("plots.plan_map", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()")
-    look = Style.of(style)
+    options = Style.of(style)
     if plan.waypoints is None:
         raise TrustboError(
             "plan_map needs a plan on a workspace made with Workspace.from_terrain of a terrain in "
@@ -59,24 +59,24 @@ def plan_map(
     shown = list(range(1, n_bounds + 1)) if bounds is None else list(bounds)
     if not set(shown) <= set(range(1, n_bounds + 1)):
         raise TrustboError(f"bounds must be some of 1..{n_bounds}; got {bounds!r}.")
-    made = small_multiples(1 + len(shown), (2.5, 2.5), look)
+    made = small_multiples(1 + len(shown), (2.5, 2.5), options)
     whole, *others = made.panels
     titles = [f"path of {n_bounds} bounds"]
-    _stage(whole, plan, look)
+    _stage(whole, plan, options)
     draw_path(whole, plan.path, plan.workspace.grid)
     draw_scale(whole, plan.workspace.grid)
     for ax, k in zip(others, shown, strict=True):
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
         titles.append(f"bound {k}: {a},{b} to {c},{d}")
-        _stage(ax, plan, look)
+        _stage(ax, plan, options)
         _draw_bound(ax, plan, k - 1)
-    set_titles(made, titles, look)
-    legend(made, _keys(plan.workspace.team.names), look)
+    set_titles(made, titles, options)
+    legend(made, _keys(plan.workspace.team.names), options)
     return made.panels
 
 
-def _stage(ax: Axes, plan: Plan, look: Style) -> None:
-    draw_ground(ax, plan.workspace, "dem", relief=look.relief)
+def _stage(ax: Axes, plan: Plan, options: Style) -> None:
+    draw_ground(ax, plan.workspace, "dem", relief=options.relief)
     left, right, bottom, top = extent_of(plan.workspace.grid)
     ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 

@@ -59,7 +59,7 @@ def regret_curves(
     such = "give a study's dataset, from study.load_study"
     require_kind("plots.regret_curves", dataset, xr.Dataset, such)
     require_choice("variable", variable, _MEANING)
-    look = Style.of(style)
+    options = Style.of(style)
     for name in (by, panels or by):
         require_choice(
             "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]
@@ -73,14 +73,14 @@ def regret_curves(
     values = [None] if panels is None else list(dict.fromkeys(dataset[panels].values.tolist()))
     width = min(1.0 + 0.16 * len(names) * regret.sizes["mission"], 6.5)
     size, n, titles = (max(width, 2.5), 3.2), len(values), []
-    made = small_multiples(n, size, look, columns=n, least=2.2, sharey=True)
+    made = small_multiples(n, size, options, columns=n, least=2.2, sharey=True)
     for ax, value in zip(made.panels, values, strict=True):
         chosen = regret if value is None else regret[dataset[panels].values == value]
-        _draw(ax, chosen, names, by, look)
+        _draw(ax, chosen, names, by, options)
         n_runs = [int(np.sum(chosen[by].values == name)) for name in names]
         counted = "-".join(str(n) for n in sorted({min(n_runs), max(n_runs)}))
         titles.append(f"{'' if value is None else f'{panels} {value}, '}{counted} runs each")
-    set_titles(made, titles, look)
+    set_titles(made, titles, options)
     label_lower(made, "mission")
     first = made.panels[0]
     for ax in made.left:
@@ -92,22 +92,22 @@ def regret_curves(
         ax.set_ylim(-0.03 * top, top)  # shows markers at 0 whole
     # Below the panels, so that it covers no curve.
     keys = first.get_legend_handles_labels()[0]
-    said = f"{by}: median, 50 % and 90 % of runs"
-    legend(made, keys, look, title=said, title_fontsize=SMALL, ncols=min(len(keys), 4))
+    label = f"{by}: median, 50 % and 90 % of runs"
+    legend(made, keys, options, title=label, title_fontsize=SMALL, ncols=min(len(keys), 4))
     return made.panels
 
 
-def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str, look: Style) -> None:
-    mission, shades, colours = regret["mission"].values, curve_colours(len(names), look), theme()
+def _draw(ax: Axes, regret: xr.DataArray, names: Sequence[object], by: str, options: Style) -> None:
+    mission, shades, colours = regret["mission"].values, curve_colours(len(names), options), theme()
     # Side by side; shaded bands would cover each other.
     dodge = np.linspace(-0.5, 0.5, len(names)) * _SPREAD if len(names) > 1 else [0.0]
     for i, name in enumerate(names):
-        own = regret.values[regret[by].values == name]
-        known = np.isfinite(own).any(0)
-        if not known.any():
+        runs = regret.values[regret[by].values == name]
+        defined = np.isfinite(runs).any(0)
+        if not defined.any():
             continue
-        ends = np.nanquantile(own[:, known], QUANTILES, axis=0)
-        place, own_style = mission[known] + dodge[i], {"color": shades[i], "zorder": 3}
+        ends = np.nanquantile(runs[:, defined], QUANTILES, axis=0)
+        place, own_style = mission[defined] + dodge[i], {"color": shades[i], "zorder": 3}
         ax.vlines(place, ends[0], ends[4], linewidth=0.9, **own_style)
         ax.vlines(place, ends[1], ends[3], linewidth=3.2, **own_style)
         (curve,) = ax.plot(place, ends[2], linewidth=1.1, label=str(name), **own_style)

@@ -129,10 +129,10 @@ class Style:
     @classmethod
     def of(cls, options: StyleOptions) -> Self:
         """Check the keyword arguments of a figure."""
-        known = [f.name for f in fields(cls)]
+        names = [f.name for f in fields(cls)]
         for name in options:
-            if name not in known:
-                raise unknown("option", name, known)
+            if name not in names:
+                raise unknown("option", name, names)
         return cls(**options)
 
     def colours(self, default: str | Colormap) -> Colormap:

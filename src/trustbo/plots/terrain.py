@@ -47,15 +47,15 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
         TrustboError: The workspace has no terrain, or one that is read lazily.
     """
     require_kind("plots.terrain_maps", workspace, Workspace, "give a Workspace")
-    look, terrain, pixels = Style.of(style), workspace.terrain, workspace.pixels
+    options, terrain, pixels = Style.of(style), workspace.terrain, workspace.pixels
     if terrain is None or pixels is None:
         raise TrustboError(
             "terrain_maps needs a workspace made with Workspace.from_terrain of a terrain in "
             "memory; coarsen a lazily read one first."
         )
     grid, names = workspace.grid, workspace.features
-    made = map_panels(grid, 1 + len(names), look)
-    extent, colours = extent_of(grid), look.colours(COLOURS)
+    made = map_panels(grid, 1 + len(names), options)
+    extent, colours = extent_of(grid), options.colours(COLOURS)
     dsm = terrain["dsm"].values
     surface, *indices = made.panels
     heights = Normalize(float(np.nanmin(dsm)), float(np.nanmax(dsm)))
@@ -68,17 +68,17 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
         ax.set_facecolor(theme().closed)
         ax.imshow(index, cmap=colours, vmin=0, vmax=1, extent=extent, interpolation="nearest")
     for ax in made.panels:
-        if look.relief:
+        if options.relief:
             draw_relief(ax, workspace)
         grid_lines(ax, grid)
     draw_scale(surface, grid)
-    set_titles(made, ["surface (DSM)", *(name.replace("_", " ") for name in names)], look)
+    set_titles(made, ["surface (DSM)", *(name.replace("_", " ") for name in names)], options)
     label_maps(made)
     label = "index (0 worst, 1 best; grey: too steep)"
-    colour_bar(made, ScalarMappable(Normalize(0, 1), colours), label, look)
-    if look.legend:
+    colour_bar(made, ScalarMappable(Normalize(0, 1), colours), label, options)
+    if options.legend:
         _draw_heights(surface, heights, float(np.nanmin(dsm)), float(np.nanmax(dsm)))
-    fit_height(made, look)
+    fit_height(made, options)
     return made.panels
 
 
@@ -114,25 +114,25 @@ def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOpti
     require_kind(
         "plots.loadings", composites, Mapping, "give composites by name, `Workspace.composites`"
     )
-    look = Style.of(style)
+    options = Style.of(style)
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")
     most = max(len(index.signs) for index in composites.values())
     made = small_multiples(
         len(composites),
         (3.6, 1.0 + 0.3 * most),
-        look,
+        options,
         columns=len(composites),
         least=2.2,
         sharex=True,
     )
     for ax, index in zip(made.panels, composites.values(), strict=True):
-        _bars(ax, index, legend=look.legend)
+        _bars(ax, index, legend=options.legend)
     shares = [float(index.explained_variance_ratio_[0]) for index in composites.values()]
     set_titles(
         made,
         [f"{n}:\n{share:.0%} of the variance" for n, share in zip(composites, shares, strict=True)],
-        look,
+        options,
     )
     return made.panels
 

@@ -84,12 +84,12 @@ def places(result: Result) -> Picture:
     effects = place_maps(result.posterior)
     name = "place_mean" if "place_mean" in effects else "place_bound_mean"
     low, high = _ends(effects[name])
-    of = "cells" if name == "place_mean" else "bounds"
+    kind = "cells" if name == "place_mean" else "bounds"
     n_visited = result.posterior["places"].sizes["bound"]
     return picture(
         lambda: plots.place_map(result.posterior, result.workspace),
-        f"Maps of the effects of places on trust: the mean of {of} goes from {low} to {high}; and "
-        f"their standard deviation. Arrows are the {counted(n_visited, 'place')} visited.",
+        f"Maps of the effects of places on trust: the mean of {kind} goes from {low} to {high}; "
+        f"and their standard deviation. Arrows are the {counted(n_visited, 'place')} visited.",
         "Left, the mean effect on trust of entering a cell, its sign large where it has a "
         "probability of 95 %; right, its standard deviation. Arrows are bounds that were made, "
         "their colour the further effect of the bound.",
@@ -162,11 +162,14 @@ def parameters(result: Result) -> Picture | None:
 def criticism(found: Criticism) -> Picture:
     """Draw the tests and residuals of the model's criticism."""
     odd = found.groups.loc[found.groups["stands_out"].to_numpy(), :]
-    said = f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
+    sentence = (
+        f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
+    )
     return picture(
         lambda: plots.criticism(found),
         "Nine panels: adjusted p of each test, PIT, coverage, autocorrelation, and mean residuals "
-        f"by mission, bound, robot, expected contact and cell; {said}. The table has the tests.",
+        f"by mission, bound, robot, expected contact and cell; {sentence}. "
+        "The table has the tests.",
         "Tests (hollow: once the named fault is accounted for), predictions and mean residuals. "
         "Grey bands hold a whole panel with 95 % where the model is right; red is outside.",
     )

@@ -65,11 +65,11 @@ class LivePage:
             facts = facts_of(result, campaign.recommend())[:-1]  # but the reason of the end
             sections = _sections(result)
         now = time.strftime("%H:%M on %d %B %Y")
-        said = f"{state}: as of mission {n} of {self.total}, at {now}."
+        status = f"{state}: as of mission {n} of {self.total}, at {now}."
         if refresh:
-            said += f" {_if_long_ago(campaign)}"
+            status += f" {_if_long_ago(campaign)}"
         title = f"A campaign after {counted(n, 'mission')} of {self.total}"
-        page = render(title, [Fact("State", said), *facts], sections, refresh=refresh)
+        page = render(title, [Fact("State", status), *facts], sections, refresh=refresh)
         write_text(self.path, page)
 
 

@@ -37,8 +37,10 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     target = require_file(path, ".html", ".htm")
     if not result.missions:
         raise TrustboError("the result has no mission; run one first.")
-    own = "explore.html" if target.name == "report.html" else f"{target.stem}-explore.html"
-    explorer = require_file(target.with_name(own))
+    explorer_name = (
+        "explore.html" if target.name == "report.html" else f"{target.stem}-explore.html"
+    )
+    explorer = require_file(target.with_name(explorer_name))
     result.explore().save(explorer)
     name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
     page = render(
@@ -136,12 +138,12 @@ def _sections(result: Result) -> Iterator[Section]:
 def _criticism(result: Result) -> Section:
     """Section of the model's criticism, or of the reason why there is none."""
     try:
-        found = criticise(result.posterior, result.missions, compare=False)
+        outcome = criticise(result.posterior, result.missions, compare=False)
     except TrustboError as error:
         return Section("criticism", "Criticism of the model", f"Not made: {error}", [])
-    said = found.verdict[0].upper() + found.verdict[1:]
-    blocks = [figures.criticism(found), tables.criticism_table(found)]
-    return Section("criticism", "Criticism of the model", said, blocks)
+    sentence = outcome.verdict[0].upper() + outcome.verdict[1:]
+    blocks = [figures.criticism(outcome), tables.criticism_table(outcome)]
+    return Section("criticism", "Criticism of the model", sentence, blocks)
 
 
 def _meaning_of_parameters(result: Result) -> str:

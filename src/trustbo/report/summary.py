@@ -86,26 +86,26 @@ def _exactness(plan: Plan) -> str:
 
 def _arrival(risk: PathRisk) -> str:
     worst = int(np.argmax(risk.p_fail))
-    said = (
+    sentence = (
         f"It reaches the goal with probability {arrival(risk.p_arrive, risk.p_arrive_band)}; its "
         f"bound {worst + 1} is the likeliest to fail, with {number(risk.p_fail[worst])}."
     )
     causes = {cause: float(p.sum()) for cause, p in risk.by_cause.items()}
     likeliest = [c for c, p in causes.items() if p >= (1.0 - 1e-6) * max(causes.values())]
     if len(likeliest) == 1:
-        said += f" The likeliest cause is {likeliest[0].replace('_', ' ')}."
-    return said
+        sentence += f" The likeliest cause is {likeliest[0].replace('_', ' ')}."
+    return sentence
 
 
 def _soundness(result: Result) -> Fact:
     """Judge the worst diagnostics over the posteriors of all missions."""
-    history, said, good = result.history, [], True
+    history, sentences, good = result.history, [], True
     if "r_hat" in history:
         rhat = float(np.nanmax(history["r_hat"]))
         ess = float(np.nanmin(history["ess_bulk"]))
         divergences = int(np.nansum(history["divergences"]))
         good = rhat <= MAX_RHAT and ess >= MIN_ESS and divergences == 0
-        said.append(
+        sentences.append(
             f"R-hat is {number(rhat, 3)} at worst (good: at most {MAX_RHAT}), bulk ESS "
             f"{number(ess, 0)} at least (good: {MIN_ESS:.0f} or more), with "
             f"{counted(divergences, 'divergence')} (good: 0)"
@@ -113,15 +113,15 @@ def _soundness(result: Result) -> Fact:
     if "k_hat" in history:
         khat, kish = (float(f(history[n])) for f, n in ((np.nanmax, "k_hat"), (np.nanmin, "kish")))
         good = good and khat <= MAX_KHAT
-        said.append(
+        sentences.append(
             f"the exact sampler's k-hat is {number(khat, 2)} at worst (good: below {GOOD_KHAT}; "
             f"usable: up to {MAX_KHAT}), its Kish size {number(kish, 0)} effective points at "
             "least; these are the evidence, as R-hat and ESS of resampled draws are always good"
         )
-    if not said:
+    if not sentences:
         return Fact("Posteriors", "Nothing could be learned yet.")
     verdict = "They are well sampled" if good else "Do not rely on them"
-    return Fact("Posteriors", f"{verdict}: {'; '.join(said)}.", good)
+    return Fact("Posteriors", f"{verdict}: {'; '.join(sentences)}.", good)
 
 
 def _end(result: Result) -> str:
@@ -134,8 +134,8 @@ def _end(result: Result) -> str:
             return "It was interrupted, or is still under way: trustbo resume goes on."
         return "It is under way, or was interrupted: Campaign.load(folder) goes on."
     name, _, rest = text.partition(":")
-    known = {
+    reasons = {
         "regret_bound": "The recommended path is good enough:",
         "seconds": "The time was up, in seconds:",
     }
-    return f"{known[name]}{rest}." if name in known else f"A rule to stop said: {text}."
+    return f"{reasons[name]}{rest}." if name in reasons else f"A rule to stop said: {text}."

@@ -118,15 +118,15 @@ def history_table(result: Result) -> Table:
 def _outcome(row: dict[Hashable, Any]) -> str:
     """Text of how a mission ended, and where it failed."""
     status = str(row["status"]).replace("_", " ")
-    at = f" at {row['where']}" if row["where"] else ""
-    return f"given up: {row['reason']}{at}" if row["state"] == GIVEN_UP else f"{status}{at}"
+    where = f" at {row['where']}" if row["where"] else ""
+    return f"given up: {row['reason']}{where}" if row["state"] == GIVEN_UP else f"{status}{where}"
 
 
-def criticism_table(found: Criticism) -> Table:
+def criticism_table(criticism: Criticism) -> Table:
     """Tabulate the tests of a criticism."""
-    table = found.table
+    table = criticism.table
     p, after = (map(_p, table[name].to_numpy(dtype=float)) for name in ("p_adjusted", "p_after"))
-    words = (map(str, each) for each in (table.index, table["label"], table["finding"]))
+    words = (map(str, column) for column in (table.index, table["label"], table["finding"]))
     names, labels, findings = words
     rows = list(zip(names, labels, p, after, findings, strict=True))
     return Table(

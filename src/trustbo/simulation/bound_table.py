@@ -185,8 +185,8 @@ class _Tally:
 
 def _root_mean_square(values: np.ndarray) -> float:
     """Root mean square of finite values; NaN if there are none."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else np.nan
 
 
 def _along(path: Sequence[Cell]) -> tuple[np.ndarray, ...]:

@@ -62,8 +62,8 @@ class Measure:
         for m, name in enumerate(self._names):
             index = self._realtime.get(name)
             if index is not None and states:
-                known = np.concatenate(states)
-                columns = {n: known[..., i].ravel() for i, n in enumerate(STATES)}
+                recorded = np.concatenate(states)
+                columns = {n: recorded[..., i].ravel() for i, n in enumerate(STATES)}
                 columns["offline"] = values[..., m].ravel()
                 fused = index.of_columns({n: columns[n] for n in index.signs})
                 values[..., m] = fused.reshape(values.shape[:-1])
@@ -72,10 +72,12 @@ class Measure:
         moved[starts] = True
         weight = moved[..., None] & np.isfinite(values)
         total = np.add.reduceat(np.where(weight, values, 0.0), starts, axis=0)
-        found = np.full((*total.shape[:-1], self._n_features), np.nan)
+        awareness = np.full((*total.shape[:-1], self._n_features), np.nan)
         with np.errstate(invalid="ignore"):
-            found[..., self._columns] = total / np.add.reduceat(weight, starts, 0, dtype=np.int64)
-        return found
+            awareness[..., self._columns] = total / np.add.reduceat(
+                weight, starts, 0, dtype=np.int64
+            )
+        return awareness
 
     def states(self, poses: np.ndarray) -> np.ndarray:
         """Values of `STATES` of each robot at each tick, shape (tick, robot, state)."""

@@ -54,8 +54,8 @@ class ModelContact:
         if isinstance(params, CoupledParams):
             process, observed = np.asarray(params.Delta_w), np.diagonal(params.Delta_v)
         else:
-            each = [np.broadcast_to(sd, n_robots) for sd in (params.delta_w, params.delta_v)]
-            process, observed = np.diag(each[0] ** 2), each[1] ** 2
+            noises = [np.broadcast_to(sd, n_robots) for sd in (params.delta_w, params.delta_v)]
+            process, observed = np.diag(noises[0] ** 2), noises[1] ** 2
         self._noise = np.asarray(process, float), np.asarray(observed, float)
 
     def contact(self, path: Sequence[Cell]) -> np.ndarray:

@@ -163,7 +163,7 @@ class KinematicSimulator(DescribedSimulator):
             if not under_way:
                 break
         names = self.workspace.features, self.workspace.team.names
-        return [Mission(tuple(cells), tuple(of), of[-1].status, *names) for of in bounds]
+        return [Mission(tuple(cells), tuple(run), run[-1].status, *names) for run in bounds]
 
     def reset(
         self, start: Cell, seed: int, *, next_cell: Cell | None = None, mission: int = 0
@@ -229,12 +229,12 @@ class KinematicSimulator(DescribedSimulator):
         lidars = self.team.lead, *self.team.robots
         independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
         outcomes = []
-        for closing, found in zip(drives[1:], others, strict=True):
+        for closing, detected in zip(drives[1:], others, strict=True):
             after = dataclasses.replace(
                 state, cells=closing.cells, poses=closing.poses[-1], stops=closing.stops
             )
             after.tracks, status = state.tracks.copy(), closing.status
-            probability = np.concatenate([seen, found])
+            probability = np.concatenate([seen, detected])
             if not independent or self.lost_contact_after is not None:
                 moves = np.concatenate([drives[0].lead_moves, closing.lead_moves])
                 both = closing._replace(lead_moves=moves)
@@ -295,14 +295,16 @@ class KinematicSimulator(DescribedSimulator):
             self._drive(state, k, cell, next_cell, rng)
             for state, rng in zip(states, rngs, strict=True)
         ]
-        found = detections(self._now, self.sight, self.team, drives)
-        contacts = [self._contact(*own) for own in zip(states, drives, found, rngs, strict=True)]
+        probabilities = detections(self._now, self.sight, self.team, drives)
+        contacts = [
+            self._contact(*one) for one in zip(states, drives, probabilities, rngs, strict=True)
+        ]
         poses = [drive.poses[: len(c)] for drive, (c, _) in zip(drives, contacts, strict=True)]
         closing = [drive.closing(len(p)) for drive, p in zip(drives, poses, strict=True)]
         moved = [self._measure.states(p[:, 1:]) if self._wants_states else None for p in poses]
         awareness = self._measure(
-            [p[own, 1:] for p, own in zip(poses, closing, strict=True)],
-            [x[own] for x, own in zip(moved, closing, strict=True) if x is not None],
+            [p[one, 1:] for p, one in zip(poses, closing, strict=True)],
+            [x[one] for x, one in zip(moved, closing, strict=True) if x is not None],
         )
         bounds = []
         for state, drive, track, (contact, status), x, z in zip(
@@ -402,11 +404,11 @@ class KinematicSimulator(DescribedSimulator):
         self, state: State, drive: Drive, probabilities: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, str]:
         """Contact at each tick, (tick, robot), until the bound ends, and its status."""
-        found = rng.random(probabilities.shape) < probabilities
-        contact = np.empty(found.shape, bool)
+        detected = rng.random(probabilities.shape) < probabilities
+        contact = np.empty(detected.shape, bool)
         for phase, watchers in enumerate(self._watchers):
-            own = drive.lead_moves == (phase == 0)
-            contact[own] = contact_of(found[own], watchers, state.tracks[phase])
+            mask = drive.lead_moves == (phase == 0)
+            contact[mask] = contact_of(detected[mask], watchers, state.tracks[phase])
         n_ticks, status = len(contact), drive.status
         if self.lost_contact_after is not None:
             patience = max(1, round(self.lost_contact_after / self.tick))

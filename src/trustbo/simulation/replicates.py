@@ -127,8 +127,8 @@ class PlainReplicates:
                 entropy = [self._seed, number, edge.move, *edge.cell, i]
                 seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
                 run.reset(edge.left, seed, **at_start, **self._numbered)
-                known = {"next_cell": next_cell} if sees_next else {}
-                bound = run.run_bound(1, edge.cell, **known)
+                options = {"next_cell": next_cell} if sees_next else {}
+                bound = run.run_bound(1, edge.cell, **options)
                 outcomes.append((np.asarray(bound.contact_rate), bound.status))
             getattr(run, "close", lambda: None)()
             yield outcomes if sees_next else outcomes * len(edge.ahead)

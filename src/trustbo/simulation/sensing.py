@@ -17,22 +17,22 @@ from trustbo.workspace.sight import Sight, detection_probability, optics
 def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) -> list[np.ndarray]:
     """Probability that a scan detects its target, shape (tick, robot) for each bound."""
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
-    t2_looks = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
+    t2_scans = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
     lead, t2 = np.repeat(poses[:, :1], len(team.robots), axis=1), poses[:, 1:]
     by_t2 = np.stack([optics(robot, team.lead) for robot in team.robots])
     by_lead = np.stack([optics(team.lead, robot) for robot in team.robots])
-    sensor, target, of_look = (
-        np.where(t2_looks[..., None], a, b).reshape(-1, a.shape[-1])  # (tick * robot, ...)
+    sensor, target, scanners = (
+        np.where(t2_scans[..., None], a, b).reshape(-1, a.shape[-1])  # (tick * robot, ...)
         for a, b in ((t2, lead), (lead, t2), (by_t2, by_lead))
     )
-    found = detection_probability(world.surface, sight, sensor, target, of_look)
+    probability = detection_probability(world.surface, sight, sensor, target, scanners)
     for mask, strength in world.jams:
         inside = mask[world.surface.nearest(sensor[:, 0], sensor[:, 1])]
         inside |= mask[world.surface.nearest(target[:, 0], target[:, 1])]
-        found[inside] *= 1.0 - strength
-    found = found.reshape(-1, len(team.robots))
-    found *= np.where(t2_looks, world.detection, team.lead.detection)
-    return np.split(found, np.cumsum([len(drive.poses) for drive in drives])[:-1])
+        probability[inside] *= 1.0 - strength
+    probability = probability.reshape(-1, len(team.robots))
+    probability *= np.where(t2_scans, world.detection, team.lead.detection)
+    return np.split(probability, np.cumsum([len(drive.poses) for drive in drives])[:-1])
 
 
 def new_tracks(n_robots: int) -> np.ndarray:
@@ -40,7 +40,7 @@ def new_tracks(n_robots: int) -> np.ndarray:
     return np.zeros((2, n_robots, 2), np.int64)
 
 
-def contact_of(found: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
+def contact_of(detected: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray) -> np.ndarray:
     """Contact from scans: a track begins after some detections in a row, and ends after misses.
 
     `detected`, shape (tick, robot), has the outcome of each scan; the watchers' lidars, one per
@@ -48,17 +48,17 @@ def contact_of(found: np.ndarray, watchers: Sequence[Robot], tracks: np.ndarray)
     Returns shape (tick, robot), bool.
     """
     limits = np.array([[robot.acquire, robot.drop] for robot in watchers])
-    contact = np.empty(found.shape, bool)
-    _track(found, limits, tracks, contact)
+    contact = np.empty(detected.shape, bool)
+    _track(detected, limits, tracks, contact)
     return contact
 
 
 @njit(cache=True)
-def _track(found, limits, tracks, contact):
-    for k in range(found.shape[0]):
-        for i in range(found.shape[1]):
+def _track(detected, limits, tracks, contact):
+    for k in range(detected.shape[0]):
+        for i in range(detected.shape[1]):
             tracked = tracks[i, 0]
-            if found[k, i] != (tracked == 1):
+            if detected[k, i] != (tracked == 1):
                 tracks[i, 1] += 1
                 if tracks[i, 1] >= limits[i, tracked]:
                     tracks[i, 0], tracks[i, 1] = 1 - tracked, 0

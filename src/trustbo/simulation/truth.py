@@ -83,10 +83,13 @@ class Truth(Displayed):
     """
 
     def __init__(
-        self, workspace: Workspace, bounds: Contact, at: "Callable[[int], Truth] | None" = None
+        self,
+        workspace: Workspace,
+        bounds: Contact,
+        at_mission: "Callable[[int], Truth] | None" = None,
     ) -> None:
         """Store the contact of bounds; `at(mission)` is the truth of another mission's world."""
-        self.workspace, self.bounds, self._at = workspace, bounds, at
+        self.workspace, self.bounds, self._at = workspace, bounds, at_mission
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
 
     def _card(self) -> Card:
@@ -138,14 +141,14 @@ class Truth(Displayed):
             bounds = ModelContact(simulator.model, *true)
             return cls(workspace, bounds)
         numbers = require_whole("seed", seed, 0), require_positive("standard_error", standard_error)
-        known: dict[object, Self] = {}
+        cached: dict[object, Self] = {}
 
         def at(number: int) -> Self:
             world = _world(simulator, require_whole("mission", number, 0))
-            if world not in known:
+            if world not in cached:
                 table = _table(simulator, number, world, *numbers, folder, progress)
-                known[world] = cls(workspace, table, at)
-            return known[world]
+                cached[world] = cls(workspace, table, at)
+            return cached[world]
 
         return at(mission)
 
@@ -218,10 +221,10 @@ class Truth(Displayed):
         """
         cells = self._cells(path)
         best_path = self.best(cells[0], cells[-1], objective, max_bounds, connectivity=connectivity)
-        best, own = self.value(best_path), self.value(cells)
+        best, value = self.value(best_path), self.value(cells)
         if objective == "mean":
-            return _percent(best.mean - own.mean, best.mean)
-        return _percent(own.lost - best.lost, len(best_path) - 1 - best.lost)
+            return _percent(best.mean - value.mean, best.mean)
+        return _percent(value.lost - best.lost, len(best_path) - 1 - best.lost)
 
     def require_workspace(self, workspace: Workspace) -> None:
         """Refuse another workspace than that of the truth; its features may differ.
@@ -229,9 +232,9 @@ class Truth(Displayed):
         Raises:
             TrustboError: The grid, passable cells or terrain differ.
         """
-        for name, own, other in _differences(self.workspace, workspace):
+        for name, mine, other in _differences(self.workspace, workspace):
             raise TrustboError(
-                f"the truth is of another workspace: its {name} is {own}, the campaign's {other}; "
+                f"the truth is of another workspace: its {name} is {mine}, the campaign's {other}; "
                 "make it with Truth.of(simulator) of this workspace's simulator."
             )
 
@@ -243,8 +246,8 @@ class Truth(Displayed):
         return cells
 
 
-def _percent(lacking: float, of: float) -> float:
-    return 100.0 * lacking / of if of > 0.0 else np.nan
+def _percent(lacking: float, whole: float) -> float:
+    return 100.0 * lacking / whole if whole > 0.0 else np.nan
 
 
 def _world(simulator: Any, mission: int) -> object:
@@ -291,8 +294,8 @@ def _table(
 def _content(simulator: Any) -> list[bytes]:
     """Contents of the workspace on which contact depends."""
     workspace: Workspace = simulator.workspace
-    own = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
-    parts = [to_json(own).encode(), _bytes(workspace.passable)]
+    settings = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
+    parts = [to_json(settings).encode(), _bytes(workspace.passable)]
     if workspace.terrain is None or workspace.pixels is None:
         return [*parts, _bytes(workspace.awareness)]
     pixels = [_bytes(workspace.pixels[name]) for name in ("traversability", "passable")]
@@ -316,21 +319,21 @@ def _code() -> str:
 def _differences(a: Workspace, b: Workspace) -> list[tuple[str, str, str]]:
     """Names of what differs, with both values in words."""
     if a.grid != b.grid:
-        own, theirs = (
+        mine, theirs = (
             f"{g.shape[0]} x {g.shape[1]} cells of {g.cell_height:g} m x {g.cell_width:g} m at "
             f"{g.left:g}, {g.top:g}"
             for g in (a.grid, b.grid)
         )
-        return [("grid", own, theirs)]
+        return [("grid", mine, theirs)]
     if not np.array_equal(a.passable.values, b.passable.values):
         n, other = (f"{int(w.passable.sum())} passable cells" for w in (a, b))
         return [("passability", n, other)]
     if a.terrain is None or b.terrain is None:
         return []
-    found = []
+    differences = []
     for name in ("dem", "dsm"):
-        own, theirs = a.terrain[name].values, b.terrain[name].values
-        if own.shape != theirs.shape or not np.array_equal(own, theirs, equal_nan=True):
-            mean, other = (f"of mean height {np.nanmean(h):.2f} m" for h in (own, theirs))
-            found.append((name, mean, other))
-    return found
+        mine, theirs = a.terrain[name].values, b.terrain[name].values
+        if mine.shape != theirs.shape or not np.array_equal(mine, theirs, equal_nan=True):
+            mean, other = (f"of mean height {np.nanmean(h):.2f} m" for h in (mine, theirs))
+            differences.append((name, mean, other))
+    return differences

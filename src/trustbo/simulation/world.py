@@ -123,8 +123,13 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
             f"the true terrain has CRS {terrain.rio.crs}, the workspace's another; reproject it."
         )
     surface = surface_of(terrain, np.isfinite(terrain["dem"].values))
-    own, needed, pixel = surface.extent, planned.extent, max(*surface.pixel, *planned.pixel)
-    short = [(own[0] - needed[0]), (own[1] - needed[1]), needed[2] - own[2], needed[3] - own[3]]
+    extent, needed, pixel = surface.extent, planned.extent, max(*surface.pixel, *planned.pixel)
+    short = [
+        (extent[0] - needed[0]),
+        (extent[1] - needed[1]),
+        needed[2] - extent[2],
+        needed[3] - extent[3],
+    ]
     if max(short) > pixel:
         raise TerrainError(
             f"the true terrain ends {max(short):.3g} m inside the planning grid; give one that "

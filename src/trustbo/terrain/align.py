@@ -138,7 +138,7 @@ def _scale(
 ) -> tuple[float, float]:
     """Pixels of the new grid per pixel of the raster, along columns and along rows."""
     middle = transform * (shape[1] / 2, shape[0] / 2)
-    u, v = (at[0] for at in transform_points(crs, raster.crs, [middle[0]], [middle[1]])[:2])
+    u, v = (points[0] for points in transform_points(crs, raster.crs, [middle[0]], [middle[1]])[:2])
     t = raster.transform
     x, y = transform_points(raster.crs, crs, [u, u + t.a, u], [v, v, v + t.e])[:2]
     steps = [[(x[1] - x[0]) / transform.a, (x[2] - x[0]) / transform.a]]

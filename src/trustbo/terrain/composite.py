@@ -105,9 +105,9 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
         x = np.stack(self._columns(features), axis=1).astype(float)
         x = x[np.isfinite(x).all(1)]
         if len(x) < self.min_samples:
-            found = f"only {len(x)} samples have" if len(x) else "no pixel has"
+            problem = f"only {len(x)} samples have" if len(x) else "no pixel has"
             raise TerrainError(
-                f"{found} all of the features {', '.join(self.signs)}; "
+                f"{problem} all of the features {', '.join(self.signs)}; "
                 f"{self.min_samples} are needed."
             )
         x = x[:: -(-len(x) // MAX_PIXELS)]

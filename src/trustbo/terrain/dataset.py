@@ -79,7 +79,7 @@ def read_terrain(
             open_raster(source, role, closing, crs=crs, resolution=resolution, nodata=nodata)
             for role, source in sources.items()
         ]
-        _say(rasters)
+        _warn_of(rasters)
         rasters = _averaged(rasters, resolution, max_pixels, progress)
         ground, surface = on_one_grid(rasters[0], rasters[-1])
         surface = ground if dsm is None else surface
@@ -95,7 +95,7 @@ def read_terrain(
     return _noted(assemble_terrain(heights[0], heights[-1]), rasters, ground.crs)
 
 
-def _say(rasters: list[Raster]) -> None:
+def _warn_of(rasters: list[Raster]) -> None:
     """Warn of heights that are converted, and of a surface that is not known."""
     for raster in rasters:
         if raster.unit != METRE:
@@ -164,8 +164,8 @@ def _averaged(
             f"one of {_side(r) * k:.3g} m"
             for r, k in zip(rasters, factors, strict=True)
         )
-        said = "; ".join(averaged)
-        warnings.warn(f"{said}. For another size, give resolution=.", stacklevel=3)
+        sentence = "; ".join(averaged)
+        warnings.warn(f"{sentence}. For another size, give resolution=.", stacklevel=3)
     return [
         raster if factor == 1 else raster.coarsened(factor, progress)
         for raster, factor in zip(rasters, factors, strict=True)
@@ -178,7 +178,7 @@ def _side(raster: Raster) -> float:
 
 
 def _noted(terrain: xr.Dataset, rasters: list[Raster], crs: CRS) -> xr.Dataset:
-    """Record in a terrain's attributes the warnings of `_say`, and the CRSs warped from."""
+    """Record in a terrain's attributes the warnings of `_warn_of`, and the CRSs warped from."""
     for name, raster in zip(("dem", "dsm"), (rasters[0], rasters[-1]), strict=True):
         if raster.unit != METRE:
             terrain[name].attrs["stored_units"] = raster.unit.name
@@ -276,11 +276,11 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
         for axis in ("y", "x"):
             require_regular(terrain[axis].values, axis, "the raster")
         return _with_crs(_north_up(terrain.transpose("y", "x")), crs)
-    known = terrain.attrs.get("clipped_share", 0.0)
+    clipped = terrain.attrs.get("clipped_share", 0.0)
     if _is_in_order(terrain):
         return _with_crs(terrain.copy(), crs)
     result = assemble_terrain(terrain["dem"].rio.write_crs(crs), terrain["dsm"])
-    result.attrs["clipped_share"] = max(known, result.attrs["clipped_share"])
+    result.attrs["clipped_share"] = max(clipped, result.attrs["clipped_share"])
     return result
 
 
@@ -304,14 +304,14 @@ def _is_in_order(terrain: xr.Dataset) -> bool:
         require_regular(terrain[axis].values, axis, "the raster")
     if terrain["y"][0] < terrain["y"][-1] or terrain["x"][0] > terrain["x"][-1]:
         return False
-    known = False
+    has_data = False
     for first in range(0, len(dem), _ROWS):
         g, s = (a.values[first : first + _ROWS] for a in (dem, dsm))
         valid = np.isfinite(g)
         if (valid != np.isfinite(s)).any() or (s < g).any() or np.isinf(g).any():
             return False
-        known |= bool(valid.any())
-    return known
+        has_data |= bool(valid.any())
+    return has_data
 
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:

@@ -238,11 +238,11 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:
     """Mean over squares of half-width `radius` (m), of the pixels that have a value."""
     size: Any = [2 * max(1, round(radius / step)) + 1 for step in pixel_size(terrain)]
-    known, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
+    has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
     total = ndimage.uniform_filter(np.where(valid, values, 0.0), size, mode="nearest")
     weight = ndimage.uniform_filter(valid.astype(total.dtype), size, mode="nearest")
     with np.errstate(invalid="ignore", divide="ignore"):
-        return terrain["dem"].copy(deep=False, data=np.where(known, total / weight, np.nan))
+        return terrain["dem"].copy(deep=False, data=np.where(has_ground, total / weight, np.nan))
 
 
 def _named(array: xr.DataArray, name: str, units: str) -> xr.DataArray:

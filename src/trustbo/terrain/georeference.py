@@ -42,14 +42,14 @@ def _georeference(raster: Raster, crs: object, resolution: float | None) -> Rast
         raise TerrainError(
             f"{raster.name} carries no georeference; pass both crs= and resolution= (metres)."
         )
-    known = _given_crs(raster.name, crs)
-    if known.is_geographic:
+    given = _given_crs(raster.name, crs)
+    if given.is_geographic:
         raise TerrainError(
             f"crs {crs!r} is in degrees, but resolution= is in metres; give a metric one."
         )
     step = require_positive("resolution", resolution)
     transform = from_origin(0.0, raster.shape[0] * step, step, step)
-    return dataclasses.replace(raster, crs=raster.crs or known, transform=transform)
+    return dataclasses.replace(raster, crs=raster.crs or given, transform=transform)
 
 
 def _given_crs(name: str, crs: object) -> CRS:

@@ -216,11 +216,11 @@ def _pixels_of(like: xr.DataArray | xr.Dataset, crs: CRS) -> _Pixels:
     """Pixels of a raster in the same CRS."""
     if like.rio.crs is None:
         raise TerrainError("like has no CRS; set it, e.g. like.rio.write_crs('EPSG:32633').")
-    own = _horizontal(pyproj.CRS.from_wkt(like.rio.crs.to_wkt()), "like")
-    if own != crs:
+    raster_crs = _horizontal(pyproj.CRS.from_wkt(like.rio.crs.to_wkt()), "like")
+    if raster_crs != crs:
         raise TerrainError(
-            f"like is in {own.to_string()}, but the points in {crs.to_string()}; reproject it, "
-            "e.g. with like.rio.reproject."
+            f"like is in {raster_crs.to_string()}, but the points in {crs.to_string()}; reproject "
+            "it, e.g. with like.rio.reproject."
         )
     try:
         dims = like.rio.x_dim, like.rio.y_dim

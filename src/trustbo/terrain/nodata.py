@@ -23,9 +23,9 @@ def tagged(array: xr.DataArray, name: str) -> list[float]:
     try:
         return [float(tag) for tag in tags if tag is not None]
     except (TypeError, ValueError):
-        said = ", ".join(map(str, tags))
+        listed = ", ".join(map(str, tags))
         raise TerrainError(
-            f"{name} has a nodata attribute that is no number: {said}; correct it."
+            f"{name} has a nodata attribute that is no number: {listed}; correct it."
         ) from None
 
 

@@ -154,8 +154,8 @@ def _from_array(
         for axis in (y, x):
             require_regular(array[axis].values, axis, name)
         (top, height), (left, width) = (
-            (float(at[0]), float(at[-1] - at[0]) / (len(at) - 1))
-            for at in (array[y].values, array[x].values)
+            (float(coordinate[0]), float(coordinate[-1] - coordinate[0]) / (len(coordinate) - 1))
+            for coordinate in (array[y].values, array[x].values)
         )
         transform = Affine(width, 0.0, left - width / 2, 0.0, height, top - height / 2)
         # A bare image has pixel numbers of this form too, but no CRS.

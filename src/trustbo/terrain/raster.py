@@ -57,9 +57,9 @@ class Raster:
         def strip(above: slice, columns: slice) -> np.ndarray:
             fine = self.read(*(slice(s.start * factor, s.stop * factor) for s in (above, columns)))
             blocks = fine.reshape(above.stop - above.start, factor, -1, factor)
-            known = np.isfinite(blocks)
-            n = known.sum((1, 3))
-            total = np.add.reduce(np.where(known, blocks, 0.0), (1, 3))
+            valid = np.isfinite(blocks)
+            n = valid.sum((1, 3))
+            total = np.add.reduce(np.where(valid, blocks, 0.0), (1, 3))
             return np.where(2 * n >= factor**2, total / np.maximum(n, 1), np.nan)
 
         def read(above: slice, columns: slice) -> np.ndarray:

@@ -85,18 +85,18 @@ def cell_maps(
     parts = [p for f in features.values() for p in _parts(f)]
     halo = max(part.halo for part in parts)
     whole = list(strips(terrain, halo)) if terrain["dem"].size <= MAX_PIXELS else None
-    known = _StripFeatures(whole)
+    strip_features = _StripFeatures(whole)
     to_fit = {n: f for n, f in features.items() if isinstance(f, Mapping)}
-    fitted = _fit(terrain, to_fit, scaling, known, whole)
+    fitted = _fit(terrain, to_fit, scaling, strip_features, whole)
     like = terrain["dem"]
     cells = {name: CellMeans(grid, like) for name in (*features, "passable")}
     maps: dict[str, list[np.ndarray]] = {name: [] for name in cells}
 
     def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
-        index = {"passable": known.passable(strip, max_slope)}
+        index = {"passable": strip_features.passable(strip, max_slope)}
         for name, f in features.items():
-            index[name] = known.index(strip, name, f, fitted)
-        sums = {name: of.sums(index[name], strip.rows.start) for name, of in cells.items()}
+            index[name] = strip_features.index(strip, name, f, fitted)
+        sums = {name: means.sums(index[name], strip.rows.start) for name, means in cells.items()}
         wanted = index if keep_pixels else ()
         return strip, {name: index[name].copy() for name in wanted}, sums
 
@@ -106,8 +106,8 @@ def cell_maps(
             cells[name].merge(of_strip)
         for name, values in index.items():
             maps[name].append(values)
-        own = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
-        n_clipped, n_valid = n_clipped + own * strip.n_clipped, n_valid + own * strip.n_valid
+        share = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
+        n_clipped, n_valid = n_clipped + share * strip.n_clipped, n_valid + share * strip.n_valid
     if is_lazy(terrain):
         warn_if_clipped(round(n_clipped), round(n_valid), stacklevel=4)
     return CellMaps(
@@ -207,7 +207,7 @@ def _fit(
     terrain: xr.Dataset,
     features: Mapping[str, Mapping[str, PixelFeature]],
     scaling: str,
-    known: _StripFeatures,
+    strip_features: _StripFeatures,
     whole: Sequence[Strip] | None,
 ) -> dict[str, CompositeIndex]:
     """Composites fitted on a sample of pixels, with the halo that the features of each need."""
@@ -215,7 +215,7 @@ def _fit(
     for name, parts in features.items():
         halo = max(part.halo for part in parts.values())
         chosen = whole or sample_strips(terrain, halo, SAMPLE)
-        drawn = [known.features(strip, name, parts) for strip in chosen]
+        drawn = [strip_features.features(strip, name, parts) for strip in chosen]
         sample = xr.Dataset(
             {p: ("pixel", np.concatenate([d[p].ravel() for d in drawn])) for p in parts}
         )

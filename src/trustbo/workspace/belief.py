@@ -100,9 +100,9 @@ class AwarenessBelief:
         for k, bound in enumerate(mission.bounds):
             error = bound.awareness - mapped[:, k]
             for m in range(error.shape[1]):
-                known = error[~np.isnan(error[:, m]), m]
-                if len(known):
-                    self._seen[m].append((*bound.cell, float(known.mean())))
+                measured = error[~np.isnan(error[:, m]), m]
+                if len(measured):
+                    self._seen[m].append((*bound.cell, float(measured.mean())))
 
     def mean(self) -> np.ndarray:
         """Expected awareness, shape (robot, row, col, feature), in [0, 1]."""

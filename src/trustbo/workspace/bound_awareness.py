@@ -96,25 +96,31 @@ def of_bounds(
         ways.posts.require_room(cell)
 
     def work(block: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        own = np.array(block)
-        pairs = list(zip(_cells(own[:, 1:] - steps[own[:, 0]]), _cells(own[:, 1:]), strict=True))
+        block_index = np.array(block)
+        pairs = list(
+            zip(
+                _cells(block_index[:, 1:] - steps[block_index[:, 0]]),
+                _cells(block_index[:, 1:]),
+                strict=True,
+            )
+        )
         given = geometry(ways, pairs, passable)
-        found = partial(bound_features, surface, team=ways.posts.team, given=given)
-        both = [found(sight=sight, index=easy_pixels) for sight in sights]
-        return own, [los for los, _ in both], both[0][1]
+        features_of = partial(bound_features, surface, team=ways.posts.team, given=given)
+        both = [features_of(sight=sight, index=easy_pixels) for sight in sights]
+        return block_index, [los for los, _ in both], both[0][1]
 
-    for own, seen, easy in in_order(work, batched(index, _BLOCK)):
+    for block_index, seen, easy in in_order(work, batched(index, _BLOCK)):
         for n, los in enumerate(seen):
-            maps[:, *own.T, n_features + n] = los.T
+            maps[:, *block_index.T, n_features + n] = los.T
         if TRAVERSABLE in features:
             m = list(features).index(TRAVERSABLE)
-            known = np.where(np.isfinite(easy.T), easy.T, maps[:, *own.T, m])
-            maps[:, *own.T, m] = known
+            filled = np.where(np.isfinite(easy.T), easy.T, maps[:, *block_index.T, m])
+            maps[:, *block_index.T, m] = filled
     maps = np.clip(maps, 0.0, 1.0)
     into = np.maximum(exists.sum(0), 1)[..., None]
     seen = np.nansum(maps[..., n_features:], axis=1) / into
-    own = np.concatenate([cells, np.where(passable[..., None], seen, np.nan)], axis=-1)
-    return BoundMaps(maps, own)
+    block_index = np.concatenate([cells, np.where(passable[..., None], seen, np.nan)], axis=-1)
+    return BoundMaps(maps, block_index)
 
 
 def _cells(index: np.ndarray) -> list[Cell]:

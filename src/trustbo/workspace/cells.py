@@ -32,8 +32,8 @@ def of_cells(
     if (bad := (z < 0.0) | (z > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")
-    known = np.isfinite(z).all((0, -1))  # ([move], row, col)
-    reached = known if z.ndim == 4 else known.any(0)
+    finite = np.isfinite(z).all((0, -1))  # ([move], row, col)
+    reached = finite if z.ndim == 4 else finite.any(0)
     free = reached if passable is None else np.asarray(passable, dtype=bool)
     if free.shape != z.shape[-3:-1]:
         raise ShapeError(f"passable must be (row, col) = {z.shape[-3:-1]}; got {free.shape}.")
@@ -45,7 +45,7 @@ def of_cells(
     if z.ndim == 4:
         return z, free, None
     exists = existing_bounds(free)
-    if (missing := exists & ~known).any():
+    if (missing := exists & ~finite).any():
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
         down, right = MOVES[8][m]
         raise TrustboError(

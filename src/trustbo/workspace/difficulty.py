@@ -69,8 +69,8 @@ def _of_bound(ways: Ways, maps: _Pixels, a: Cell, c: Cell, onward: Cell | None) 
     for robot, way in zip(robots, (ways.lead(a, c), *ways.closing(a, c, onward)), strict=True):
         if way is None:
             continue  # two posts may be in one pixel, with a route of length 0
-        at = surface.nearest(*way.T)
-        easy, room = (values[at] for values in maps)
+        pixels = surface.nearest(*way.T)
+        easy, room = (values[pixels] for values in maps)
         easy = easy[np.isfinite(easy)]
         tight = (room <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
         measures = (

@@ -95,20 +95,25 @@ def bound_features(
 
 
 def _seen(
-    surface: Surface, sight: Sight, watcher: Robot, watched: Robot, eye: np.ndarray, at: np.ndarray
+    surface: Surface,
+    sight: Sight,
+    watcher: Robot,
+    watched: Robot,
+    eye: np.ndarray,
+    targets: np.ndarray,
 ) -> np.ndarray:
     """Mean probability of detection over the samples of bounds, shape (bound,)."""
-    eye = np.broadcast_to(eye, at.shape).reshape(-1, 2)
+    eye = np.broadcast_to(eye, targets.shape).reshape(-1, 2)
     lidar = optics(watcher, watched)
-    found = detection_probability(surface, sight, eye, at.reshape(-1, 2), lidar)
-    return watcher.detection * found.reshape(at.shape[:2]).mean(1)
+    detected = detection_probability(surface, sight, eye, targets.reshape(-1, 2), lidar)
+    return watcher.detection * detected.reshape(targets.shape[:2]).mean(1)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
     """Mean of the known values, shape (bound,); NaN where none is."""
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
-        return np.where(known, values, 0.0).sum(1) / known.sum(1)
+        return np.where(finite, values, 0.0).sum(1) / finite.sum(1)
 
 
 def _at_times(

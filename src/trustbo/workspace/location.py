@@ -65,12 +65,14 @@ def named(what: str, location: object) -> Named:
                 f"{location!r}. {_SPELLINGS}"
             ) from None
         return Named(CELL, pair, repr(location if isinstance(location, str) else pair))
-    own = {str(name).strip().lower(): value for name, value in given.items()}
+    values = {str(name).strip().lower(): value for name, value in given.items()}
     for names in (CELL, METRES, DEGREES):
-        if own.keys() == set(names) and len(own) == len(given):
-            first, second = (_number(what, name, own[name], names == CELL) for name in names)
-            found = Named(names, (first, second), "")
-            return found._replace(typed=repr(location if isinstance(location, str) else found.text))
+        if values.keys() == set(names) and len(values) == len(given):
+            first, second = (_number(what, name, values[name], names == CELL) for name in names)
+            parsed = Named(names, (first, second), "")
+            return parsed._replace(
+                typed=repr(location if isinstance(location, str) else parsed.text)
+            )
     raise TrustboError(
         f"{what} must have the names row and col, x and y, or lon and lat; got {location!r}. "
         f"{_SPELLINGS}"
@@ -97,19 +99,19 @@ def cell_of(
         TrustboError: The location is none, off the grid, or impassable; degrees on a grid without a
             CRS. The message has the location as typed and parsed, the extent, and the nearest cell.
     """
-    found = _named_on(grid, what, location)
-    cell = _cell(grid, found.names, found.values)
-    shown = _understood(found, grid)
+    parsed = _named_on(grid, what, location)
+    cell = _cell(grid, parsed.names, parsed.values)
+    shown = _understood(parsed, grid)
     if cell is None:
         rows, cols = grid.shape
         raise TrustboError(
             f"{what} {shown} is outside the grid of {rows} rows and {cols} columns; rows are "
             f"0..{rows - 1} from the top, columns 0..{cols - 1}{extent(grid, ', ')}."
-            f"{_otherwise(found, grid)}{_nearest(found, grid, passable)}"
+            f"{_otherwise(parsed, grid)}{_nearest(parsed, grid, passable)}"
         )
     if passable is not None and not passable[cell]:
-        within = "" if found.names == CELL else f", in cell {cell},"
-        near = _nearest(found, grid, passable).removesuffix(".")
+        within = "" if parsed.names == CELL else f", in cell {cell},"
+        near = _nearest(parsed, grid, passable).removesuffix(".")
         near = near.replace(" The", " the", 1).replace(" No", " no", 1)
         raise TrustboError(
             f"{what} {shown}{within} is impassable{why(*cell)};{near}"
@@ -123,8 +125,8 @@ def position_near(what: str, location: object, grid: "Grid", reach: float) -> tu
 
     TrustboError: it is none, or farther; the message has the same parts as that of `cell_of`.
     """
-    found = _named_on(grid, what, location)
-    position = position_of(grid, found.names, found.values)
+    parsed = _named_on(grid, what, location)
+    position = position_of(grid, parsed.names, parsed.values)
     far, (left, bottom, right, top) = math.inf, grid.bounds
     if position is not None:
         x, y = position
@@ -132,8 +134,8 @@ def position_near(what: str, location: object, grid: "Grid", reach: float) -> tu
     if position is None or far > reach:
         away = "not near the grid" if position is None else f"{far / 1e3:.0f} km from the grid"
         raise TrustboError(
-            f"{what} {_understood(found, grid)} is {away}{extent(grid, ', ')}."
-            f"{_otherwise(found, grid)}{_nearest(found, grid, None)}"
+            f"{what} {_understood(parsed, grid)} is {away}{extent(grid, ', ')}."
+            f"{_otherwise(parsed, grid)}{_nearest(parsed, grid, None)}"
         )
     return float(position[0]), float(position[1])
 
@@ -254,24 +256,26 @@ def _cell(grid: "Grid", names: tuple[str, str], values: Iterable[float]) -> Cell
     return (int(row), int(col)) if 0 <= row < rows and 0 <= col < cols else None
 
 
-def _understood(found: Named, grid: "Grid") -> str:
+def _understood(parsed: Named, grid: "Grid") -> str:
     """Text of a location in the user's spelling and as parsed."""
-    (a, b), names = found.values, found.names
+    (a, b), names = parsed.values, parsed.names
     if names == CELL:
         return (
-            found.typed if found.typed.startswith("(") else f"{found.typed} (row {a}, column {b})"
+            parsed.typed
+            if parsed.typed.startswith("(")
+            else f"{parsed.typed} (row {a}, column {b})"
         )
     if names == METRES:
-        return f"{found.typed} (x {a:.1f}, y {b:.1f} m in {crs_name(grid)})"
+        return f"{parsed.typed} (x {a:.1f}, y {b:.1f} m in {crs_name(grid)})"
     position = position_of(grid, names, (a, b))
     there = "no place of the CRS" if position is None else "x {:.1f}, y {:.1f} m".format(*position)
-    return f"{found.typed} (longitude {a:g}, latitude {b:g}, {there})"
+    return f"{parsed.typed} (longitude {a:g}, latitude {b:g}, {there})"
 
 
-def _otherwise(found: Named, grid: "Grid") -> str:
+def _otherwise(parsed: Named, grid: "Grid") -> str:
     """Sentence that names the spelling under which the same two numbers are on the grid."""
-    a, b = found.values
-    for names in dict.fromkeys((found.names, CELL, METRES, DEGREES)):
+    a, b = parsed.values
+    for names in dict.fromkeys((parsed.names, CELL, METRES, DEGREES)):
         if names == DEGREES and grid.crs is None:
             continue
         for values in ((a, b), (b, a)):
@@ -293,11 +297,11 @@ def _names_for(location: object, grid: "Grid") -> str:
     return _otherwise(Named(CELL, (a, b), ""), grid) if math.isfinite(a + b) else ""
 
 
-def _nearest(found: Named, grid: "Grid", passable: np.ndarray | None) -> str:
+def _nearest(parsed: Named, grid: "Grid", passable: np.ndarray | None) -> str:
     """Sentence that names the nearest (passable) cell, and its distance if that is long."""
-    position, turned = position_of(grid, found.names, found.values), ""
+    position, turned = position_of(grid, parsed.names, parsed.values), ""
     if position is None:
-        position = position_of(grid, found.names, found.values[::-1])
+        position = position_of(grid, parsed.names, parsed.values[::-1])
         turned = " of lon and lat swapped"
     if position is None:
         return ""
@@ -309,7 +313,7 @@ def _nearest(found: Named, grid: "Grid", passable: np.ndarray | None) -> str:
     k = int(np.argmin(distance))
     row, col = cells[k].tolist()
     km = distance[k] / 1e3
-    far = f", {km:.0f} km away" if km > 1.0 and found.names != CELL else ""
-    at = "" if grid.crs is None else f" at x={x[k]:.1f},y={y[k]:.1f}"
+    far = f", {km:.0f} km away" if km > 1.0 and parsed.names != CELL else ""
+    text = "" if grid.crs is None else f" at x={x[k]:.1f},y={y[k]:.1f}"
     kind = f"{'cell' if passable is None else 'passable cell'}{turned}"
-    return f" The nearest {kind} is {(row, col)}{at}{far}."
+    return f" The nearest {kind} is {(row, col)}{text}{far}."

@@ -136,15 +136,15 @@ class Posts:
         """Detection of the lead at each goal from each position, (goal, position) per robot."""
         sensor = np.tile(position, (len(goals), 1))
         target = np.repeat(goals, len(position), axis=0)
-        known: dict[bytes, np.ndarray] = {}
-        found = []
+        cached: dict[bytes, np.ndarray] = {}
+        rows = []
         for robot in self.team.robots:
             lidar = optics(robot, self.team.lead)
-            if (key := lidar.tobytes()) not in known:
+            if (key := lidar.tobytes()) not in cached:
                 seen = detection_probability(self.surface, self._sight, sensor, target, lidar)
-                known[key] = seen.reshape(len(goals), len(position))
-            found.append(known[key])
-        return found
+                cached[key] = seen.reshape(len(goals), len(position))
+            rows.append(cached[key])
+        return rows
 
     def require_room(self, cell: Cell) -> None:
         """Refuse a cell without a pixel for each robot: TerrainError that names cell and robot."""

@@ -40,12 +40,12 @@ class Routes:
         key = (*ends, window, robot.max_slope)
         if key not in self._known:
             self._known[key] = self._search(ends[0], ends[1], window, robot.max_slope)
-        found = self._known[key]
-        if not len(found):
+        cached = self._known[key]
+        if not len(cached):
             return None
-        if len(found) == 1:  # a single-pixel route still needs two ends
+        if len(cached) == 1:  # a single-pixel route still needs two ends
             return np.stack([start, goal])
-        route = found.copy()
+        route = cached.copy()
         route[0], route[-1] = start, goal
         return route
 
@@ -83,20 +83,20 @@ def speed_share(tilt, max_slope):
 def _a_star(pace, pixel, start, goal):
     """Pixels of the cheapest route over paces (s/m, inf where impassable); empty if none."""
     rows, cols = pace.shape
-    known = np.full((rows, cols), np.inf)
+    best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
     least = pace.min()
     for r, c in (start, goal):
         if not (0 <= r < rows and 0 <= c < cols):
             return np.empty((0, 2), np.int64)
-    known[start] = 0.0
+    best[start] = 0.0
     queue = [(0.0, start[0], start[1])]
     while queue:
         estimate, r, c = heapq.heappop(queue)
         if (r, c) == goal:
             break
         ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
-        if estimate > known[r, c] + ahead + 1e-9:
+        if estimate > best[r, c] + ahead + 1e-9:
             continue  # a stale entry: the pixel was improved since
         for dr in range(-1, 2):
             for dc in range(-1, 2):
@@ -107,13 +107,13 @@ def _a_star(pace, pixel, start, goal):
                 if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
                     continue
                 length = math.hypot(dr * pixel[0], dc * pixel[1])
-                cost = known[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
-                if cost < known[i, j]:
-                    known[i, j] = cost
+                cost = best[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
+                if cost < best[i, j]:
+                    best[i, j] = cost
                     came[i, j] = r * cols + c
                     rest = math.hypot((goal[0] - i) * pixel[0], (goal[1] - j) * pixel[1])
                     heapq.heappush(queue, (cost + rest * least, i, j))
-    if not np.isfinite(known[goal]):
+    if not np.isfinite(best[goal]):
         return np.empty((0, 2), np.int64)
     n, cell = 1, goal[0] * cols + goal[1]
     while came[cell // cols, cell % cols] >= 0:

@@ -104,8 +104,8 @@ class Survey(Displayed):
         if free.sum() > 1:
             for name, (row, col) in zip(("start", "goal"), self.ends, strict=True):
                 (east, north), (lon, lat) = grid.center((row, col)), grid.lonlat((row, col))
-                said = f"{row},{col} or x={east:.1f},y={north:.1f} or lon={lon:.6f},lat={lat:.6f}"
-                rows_of.append((f"e.g. {name}", said))
+                text = f"{row},{col} or x={east:.1f},y={north:.1f} or lon={lon:.6f},lat={lat:.6f}"
+                rows_of.append((f"e.g. {name}", text))
 
         def picture() -> str:
             values = self.cells["height"].where(self.cells["passable"]).values
@@ -139,16 +139,16 @@ def survey(
         dem = strip.window.variables["dem"].values[strip.core]
         slope = FEATURES["slope"].of_rows(strip.window, strip.core)
         values = {"known": np.isfinite(dem), "even": slope <= team.max_slope, "height": dem}
-        for name, of in cells.items():
-            of.merge(of.sums(values[name], strip.rows.start))
+        for name, means in cells.items():
+            means.merge(means.sums(values[name], strip.rows.start))
         low, high = np.nanmin(dem, initial=low), np.nanmax(dem, initial=high)
-    known, even, height = (cells[name].cells for name in ("known", "even", "height"))
+    valid, even, height = (cells[name].cells for name in ("known", "even", "height"))
     with np.errstate(invalid="ignore"):
-        steep = 1.0 - even / known
+        steep = 1.0 - even / valid
     dims = ("row", "col")
-    found = xr.Dataset(
+    dataset = xr.Dataset(
         {
-            "missing": (dims, 1.0 - known, {"units": "1"}),
+            "missing": (dims, 1.0 - valid, {"units": "1"}),
             "steep": (dims, steep, {"units": "1"}),
             "height": (dims, height, {"units": "m"}),
             "passable": (dims, even >= 1.0 - MAX_MISSING),
@@ -157,9 +157,11 @@ def survey(
     )
     pixels = terrain.sizes["y"], terrain.sizes["x"]
     heights = float(low), float(high)
-    sources = {str(name): of.attrs.get("warped_from") for name, of in terrain.data_vars.items()}
+    sources = {
+        str(name): means.attrs.get("warped_from") for name, means in terrain.data_vars.items()
+    }
     warped = tuple(f"{name} from {name_of_crs(crs)}" for name, crs in sources.items() if crs)
-    return Survey(grid, team, found, heights, pixel_size(terrain), pixels, warped)
+    return Survey(grid, team, dataset, heights, pixel_size(terrain), pixels, warped)
 
 
 def reason_impassable(missing: float, team: Team) -> str:

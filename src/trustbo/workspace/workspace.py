@@ -267,13 +267,13 @@ class Workspace(Displayed):
         ways, pixels = self.ground, self.pixels
         assert ways is not None and pixels is not None  # noqa: S101, PT018  # `require_sight`
         easy = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
-        found = of_bounds(
+        maps = of_bounds(
             ways, self.sights, self.awareness.values, self.passable.values, self.features, easy
         )
         names = [*self.features, *sight_features(len(self.sights))]
         like = self.awareness.isel(feature=[0] * len(names)).assign_coords(feature=names)
-        made = dataclasses.replace(self, awareness=like.copy(data=found.cells))
-        made = made.with_bounds(found.bounds)
+        made = dataclasses.replace(self, awareness=like.copy(data=maps.cells))
+        made = made.with_bounds(maps.bounds)
         made.__dict__["ground"] = ways  # with the posts and routes cached so far
         return made
 
@@ -320,8 +320,8 @@ class Workspace(Displayed):
         if (ground := self.ground) is not None:
             assert self.pixels is not None  # noqa: S101  # there are ways
             names, shape = MEASURES, ground.posts.surface.ground.shape
-            known = self.pixels.get(TRAVERSABLE)
-            easy = np.full(shape, np.nan) if known is None else known.values
+            traversability = self.pixels.get(TRAVERSABLE)
+            easy = np.full(shape, np.nan) if traversability is None else traversability.values
             values = bound_difficulty(ground, easy, exists.values)
         coords = {**exists.coords, "measure": list(names)}
         return xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
@@ -395,8 +395,8 @@ class Workspace(Displayed):
         unnamed = default_features(len(mission.features))
         if mission.features == unnamed and len(unnamed) == len(self.features):
             named = tuple(
-                own if name not in FEATURES else name
-                for name, own in zip(unnamed, self.features, strict=True)
+                feature if name not in FEATURES else name
+                for name, feature in zip(unnamed, self.features, strict=True)
             )
             mission = dataclasses.replace(mission, features=named)
         predicted = [name for name in self.features if is_line_of_sight(name)]
@@ -410,10 +410,10 @@ class Workspace(Displayed):
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
         """
-        own = self.in_order(mission)
-        if not np.isnan(own.awareness).any():
-            return own
-        return fill_awareness(own, self.along(own.path))
+        ordered = self.in_order(mission)
+        if not np.isnan(ordered.awareness).any():
+            return ordered
+        return fill_awareness(ordered, self.along(ordered.path))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""

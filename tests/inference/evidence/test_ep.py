@@ -26,7 +26,9 @@ def given_coefficients(family, p, z, y):
     """Chains of rates (chain, bound) whose drift is known, and their sites."""
     batch = MissionBatch(z[:, :, None], y[:, :, None], np.full((*y.shape, 1), N_TICKS))
     chains, sites = gather_chains(FAMILIES[family], batch)
-    return chains._replace(u=chains.u[..., :0], of=chains.of[:, :0], drift=z @ p.beta + p.b), sites
+    return chains._replace(
+        u=chains.u[..., :0], gamma_index=chains.gamma_index[:, :0], drift=z @ p.beta + p.b
+    ), sites
 
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial"])

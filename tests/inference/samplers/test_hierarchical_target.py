@@ -44,7 +44,7 @@ def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
         stationary=stationary,
     )
     target = target_of(missions, HierarchicalTrust(priors))
-    target.look(np.zeros(9))
+    target.recentre(np.zeros(9))
     z = 0.7 * rng.standard_normal((4, 9))
     found = target.log_density(z)
     theta, log_prior = target.constrain(z)
@@ -77,7 +77,7 @@ def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
 def test_coordinates_leave_the_priors_as_they_are():
     """With the Jacobian, the density of (mean, beta0_i, noises, tau) is that of their priors."""
     target = target_of(small(), HierarchicalTrust())
-    target.look(np.zeros(9))
+    target.recentre(np.zeros(9))
     z = 0.5 * np.random.default_rng(0).standard_normal(9)
 
     def natural(z):

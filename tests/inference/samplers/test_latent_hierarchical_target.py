@@ -43,7 +43,7 @@ def test_rates_within_the_limits_have_the_closed_form_s_density():
     latent = target_of(missions, HierarchicalTrust(observation="censored"))
     model = HierarchicalTrust(latent.priors)
     exact = HierarchicalTarget(gather(model, stack_missions(missions)), model.priors)
-    exact.look(np.zeros(10))
+    exact.recentre(np.zeros(10))
     z = 0.7 * rng.standard_normal((5, 10))
     theta, _ = exact.constrain(z)
     found, expected = latent.log_likelihood(theta), exact.log_likelihood(theta)

@@ -69,7 +69,7 @@ def gather_sequences(
     kept = np.flatnonzero((weight > 0.0) & (length > 0))
     # Longest first within the same gaps: a short mission has the leading covariances of a long one.
     gaps = [~seen[j, : length[j]] for j in range(len(seen))]
-    where = [np.argwhere(each).tobytes() for each in gaps]
+    where = [np.argwhere(gap).tobytes() for gap in gaps]
     order = sorted(kept, key=lambda j: (where[j], -length[j]))
     kind = np.cumsum([where[j] != where[order[max(i - 1, 0)]] for i, j in enumerate(order)])
     flat = np.nan_to_num(awareness[order]).reshape(len(order), seen.shape[1], -1)
@@ -87,20 +87,20 @@ def gather_sequences(
     )
 
 
-def integrate(sequences: Sequences, at: Dynamics) -> tuple[np.ndarray, np.ndarray]:
+def integrate(sequences: Sequences, dynamics: Dynamics) -> tuple[np.ndarray, np.ndarray]:
     """Log density of the rates (point,), and the bordered factors (point, c + 1, c + 1).
 
     The density is NaN where a covariance is not positive definite.
     """
-    n, q = len(at.B0), at.mean.shape[1] + 1
+    n, q = len(dynamics.B0), dynamics.mean.shape[1] + 1
     value, factor = np.empty(n), np.zeros((n, q, q))
-    at = Dynamics(*(plain(a) for a in at))
-    over_rows(lambda i, j: _integrate(sequences, at, i, j, value, factor), n)
+    dynamics = Dynamics(*(plain(a) for a in dynamics))
+    over_rows(lambda i, j: _integrate(sequences, dynamics, i, j, value, factor), n)
     return value, factor
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _integrate(data, at, first, last, value, factor):
+def _integrate(data, dynamics, first, last, value, factor):
     n_missions, n_bounds, n = data.y.shape
     p = len(data.robot)
     rows = np.zeros((n_missions * n_bounds * n, p + 1))
@@ -110,22 +110,22 @@ def _integrate(data, at, first, last, value, factor):
     for t in range(first, last):
         for c in range(p):
             for i in range(n):
-                spread[i, c] = at.G[t, i, data.robot[c]]
+                spread[i, c] = dynamics.G[t, i, data.robot[c]]
         total, n_rows = 0.0, np.int64(0)  # an int64 throughout
         for s in range(n_missions):
             if s == 0 or data.kind[s] != data.kind[s - 1]:
-                _filter(data.seen[s], data.length[s], at.B0[t], at.Q[t], at.R[t], data.x0[1],
-                        data.lag, gain, scale, of_bound)  # fmt: skip
+                _filter(data.seen[s], data.length[s], dynamics.B0[t], dynamics.Q[t],
+                        dynamics.R[t], data.x0[1], data.lag, gain, scale, of_bound)  # fmt: skip
             total += data.weight[s] * of_bound[: data.length[s]].sum()
-            n_rows = _whiten(data, s, at.B0[t], spread, gain, scale, m, J, rows, n_rows)
+            n_rows = _whiten(data, s, dynamics.B0[t], spread, gain, scale, m, J, rows, n_rows)
         A = factor[t]
         copy(rows[:n_rows].T @ rows[:n_rows], A)
         for c in range(p):
-            of_prior = at.precision[t, c]
+            of_prior = dynamics.precision[t, c]
             A[c, c] += of_prior
             # The recursion gives columns of -X: drifts enter the innovations with a minus.
-            A[p, c] = of_prior * at.mean[t, c] - A[p, c]
-            A[p, p] += of_prior * at.mean[t, c] ** 2
+            A[p, c] = of_prior * dynamics.mean[t, c] - A[p, c]
+            A[p, p] += of_prior * dynamics.mean[t, c] ** 2
             total -= np.log(of_prior)
         _cholesky(A)
         for c in range(p):

@@ -234,15 +234,15 @@ def sufficient_statistics(
     """
     z, y = batch.awareness, batch.contact_rate
     u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
-    each = np.repeat(np.ones(len(y)) if weight is None else weight, y.shape[2])
+    row_weight = np.repeat(np.ones(len(y)) if weight is None else weight, y.shape[2])
     # One row per robot and mission: (sequence, bound[, coefficient]).
     y = np.swapaxes(y, 1, 2).reshape(-1, y.shape[1])
     u = np.swapaxes(u, 1, 2).reshape(len(y), y.shape[1], -1)
     seen = ~np.isnan(y)
     length, complete = lengths(seen)
-    counted = (length > 0) & (each > 0.0)
+    counted = (length > 0) & (row_weight > 0.0)
     grams = {
-        int(n): _length_gram(y[rows, :n], u[rows, :n], each[rows], x0_mean, lag)
+        int(n): _length_gram(y[rows, :n], u[rows, :n], row_weight[rows], x0_mean, lag)
         for n in np.unique(length[counted & complete])
         for rows in [counted & complete & (length == n)]
     }
@@ -250,8 +250,8 @@ def sufficient_statistics(
     gaps = ()
     if gappy.any():
         n = length[gappy].max()
-        gaps = (GapSequences(y[gappy, :n], u[gappy, :n], each[gappy], x0_mean),)
-    weights, rates = (seen * each[:, None])[seen], y[seen]
+        gaps = (GapSequences(y[gappy, :n], u[gappy, :n], row_weight[gappy], x0_mean),)
+    weights, rates = (seen * row_weight[:, None])[seen], y[seen]
     sums = (float(weights @ rates), float(weights @ rates**2))
     ticks, n_features = weigh_ticks(batch, weight), z.shape[-1]
     total = float(weights.sum())

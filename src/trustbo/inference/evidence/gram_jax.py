@@ -83,9 +83,9 @@ def coefficients(
     M = jnp.einsum("gk,gkpq->pq", inverse, s.spectral)
     outer = shrink[:, None, None] * inverse[:, :, None] * inverse[:, None, :]
     M = M - jnp.einsum("gkl,gklpq->pq", outer, s.corner)
-    known = jnp.stack([jnp.ones_like(params.beta0), -params.beta0, lag - params.beta0])
+    loadings = jnp.stack([jnp.ones_like(params.beta0), -params.beta0, lag - params.beta0])
     L = jnp.linalg.cholesky(M[3:, 3:] + jnp.diag(precision))
-    rhs = 0.5 * (M[3:, :3] + M[:3, 3:].T) @ known + precision * mean
+    rhs = 0.5 * (M[3:, :3] + M[:3, 3:].T) @ loadings + precision * mean
     return Conditional(cho_solve((L, True), rhs), L)
 
 
@@ -106,8 +106,8 @@ def log_likelihood(params: TrustParams, s: Spectrum, lag: float) -> Array:
     """Log density of all rates, latent trust integrated out."""
     p, h = params, params.beta0 - lag
     inverse, shrink, log_det = _scales(params, s, lag)
-    known = jnp.stack([jnp.ones_like(p.beta0), -p.beta0, -h])
-    v = jnp.concatenate([known, -p.beta, -jnp.reshape(p.b, (1,))])
+    loadings = jnp.stack([jnp.ones_like(p.beta0), -p.beta0, -h])
+    v = jnp.concatenate([loadings, -p.beta, -jnp.reshape(p.b, (1,))])
     pairs = jnp.reshape(v[:, None] * v[None, :], -1)
     # The two products with the data; all else is a handful of numbers.
     on_diagonal = jnp.reshape(s.spectral, (-1, pairs.size)) @ pairs

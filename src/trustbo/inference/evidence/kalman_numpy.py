@@ -144,8 +144,8 @@ def _groups(
     b, n_draws = np.asarray(params.b), len(params.b)
     of_bounds = b.ndim == 4  # (draw, mission, bound, robot), see `Params.on`
     for members in params.alike(n_robots):
-        of = params._replace(b=np.zeros((n_draws, n_robots))) if of_bounds else params
-        draws = _draws_last(of.of_robot(members[0]))
+        shared = params._replace(b=np.zeros((n_draws, n_robots))) if of_bounds else params
+        draws = _draws_last(shared.of_robot(members[0]))
         mission, robot = (a.ravel() for a in np.meshgrid(range(n_missions), members, indexing="ij"))
         y = batch.contact_rate[mission, :, robot].T
         seen = ~np.isnan(y)
@@ -156,8 +156,8 @@ def _groups(
             rows = np.flatnonzero((kinds == [[n], [measured]]).all(0))
             here = seen[:n, rows, None]
             if of_bounds:
-                own = np.minimum(robot[rows], b.shape[3] - 1)
-                draws = draws._replace(b=b[:, mission[rows], :n, own].transpose(2, 0, 1).copy())
+                effect = np.minimum(robot[rows], b.shape[3] - 1)
+                draws = draws._replace(b=b[:, mission[rows], :n, effect].transpose(2, 0, 1).copy())
             yield _Group(
                 draws,
                 mission[rows],

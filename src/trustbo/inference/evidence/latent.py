@@ -84,8 +84,8 @@ def _in_batches(compiled: Callable[[Any], Array], inputs: Any) -> np.ndarray:
         inputs: Arrays with a leading axis (draw,).
     """
     n_draws = len(jax.tree.leaves(inputs)[0])
-    found = []
+    results = []
     for first in range(0, n_draws, _BATCH):
         rows = np.minimum(np.arange(first, first + _BATCH), n_draws - 1)
-        found.append(np.asarray(compiled(jax.tree.map(lambda a, rows=rows: a[rows], inputs))))
-    return np.concatenate(found)[:n_draws]
+        results.append(np.asarray(compiled(jax.tree.map(lambda a, rows=rows: a[rows], inputs))))
+    return np.concatenate(results)[:n_draws]

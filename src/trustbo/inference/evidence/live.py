@@ -71,10 +71,10 @@ class ApartFilter:
         else:
             e, left, log_density = (np.zeros(mean.shape) for _ in range(3))
             predicted, sd = h * mean + drift, np.broadcast_to(np.sqrt(self._R), mean.shape)
-            at, left[:, seen], log_density[:, seen] = family.observe(
+            moments, left[:, seen], log_density[:, seen] = family.observe(
                 predicted[:, seen], S[:, seen], y[seen], n_ticks[seen], sd[:, seen]
             )
-            e[:, seen] = at - predicted[:, seen]
+            e[:, seen] = moments - predicted[:, seen]
         gain = np.where(seen, C / S, 0.0)
         mean = self._beta0 * mean + drift + gain * e
         ahead = kalman.update(self._beta0, self._Q, var, gain, S - left)
@@ -106,8 +106,8 @@ class DriftFilter(ApartFilter):
     """Robots with a custom drift."""
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
-        own = z[:, None] if z.ndim == 3 else z[None]
-        return self._p.drift.values(own, many=True)[:, 0] + self._b
+        inputs = z[:, None] if z.ndim == 3 else z[None]
+        return self._p.drift.values(inputs, many=True)[:, 0] + self._b
 
 
 class CoupledFilter:
@@ -154,10 +154,10 @@ class CoupledFilter:
         for i in np.flatnonzero(~np.isnan(y)):
             k = i if family.observes_trust else n + i
             S, row = J[:, k, k].copy(), J[:, k].copy()
-            at, left, increment = family.observe(
+            moments, left, increment = family.observe(
                 joint[:, k], S, y[i], n_ticks[i], np.sqrt(self._p.Delta_v[:, i, i])
             )
-            gain, e = row / S[:, None], at - joint[:, k]
+            gain, e = row / S[:, None], moments - joint[:, k]
             log_density += increment
             joint += gain * e[:, None]
             J -= gain[:, :, None] * (row * (1.0 - left / S)[:, None])[:, None, :]

@@ -49,8 +49,8 @@ class PlaceIndex(NamedTuple):
         cell_of = np.concatenate([places.cell_of, np.zeros(-len(places.units) % _BUCKET, int)])
         seen = np.swapaxes(~np.isnan(contact_rate), 1, 2)  # (mission, robot, bound)
         over = ~np.logical_or.accumulate(seen[..., ::-1], axis=2)[..., ::-1]
-        each = (seen | over).reshape(-1, seen.shape[2])
-        patterns, pattern_of = np.unique(each, axis=0, return_inverse=True)
+        masks = (seen | over).reshape(-1, seen.shape[2])
+        patterns, pattern_of = np.unique(masks, axis=0, return_inverse=True)
         n = 4 ** int(np.ceil(np.log2(len(patterns)) / 2.0))
         padding = np.ones((n - len(patterns), seen.shape[2]), dtype=bool)
         return cls(
@@ -76,9 +76,9 @@ def _prior_covariance(hyper: PlaceHyper, places: PlaceIndex) -> Array:
     gap = places.cells[:, None] - places.cells[None]
     h = jnp.sqrt(3.0) * jnp.hypot(*jnp.moveaxis(gap[..., 1:] * 1.0, -1, 0)) / hyper.length_scale
     K = hyper.tau_s**2 * (1.0 + h) * jnp.exp(-h) * (gap[..., 0] == 0)
-    own = hyper.tau_e**2 + _JITTER * hyper.tau_s**2 + 1e-14
+    nugget = hyper.tau_e**2 + _JITTER * hyper.tau_s**2 + 1e-14
     same = places.cell_of
-    return K[same][:, same] + own * jnp.eye(len(same))
+    return K[same][:, same] + nugget * jnp.eye(len(same))
 
 
 def log_likelihood(
@@ -123,9 +123,9 @@ def _with_posterior(K: Array, W: Array, h: Array) -> tuple[Array, tuple[Array, .
     return value, (W, m, C, h - W @ m)
 
 
-def _gradient(known: tuple[Array, ...], ahead: Array) -> tuple[Array, Array, Array]:
+def _gradient(saved: tuple[Array, ...], ahead: Array) -> tuple[Array, Array, Array]:
     """Gradients in K, W and h: (K + W^-1)^-1 = W - W C W."""
-    W, m, C, left = known
+    W, m, C, left = saved
     of_K = jnp.outer(left, left) - W + W @ C @ W
     return 0.5 * ahead * of_K, -0.5 * ahead * (C + jnp.outer(m, m)), ahead * m
 
@@ -145,9 +145,9 @@ def _statistics(
     n_bounds, n_robots = y.shape[1:]
     seen = jnp.swapaxes(~jnp.isnan(y), 1, 2)  # (mission, robot, bound)
     # Robots that share their parameters share the whitening too.
-    alike = max(jnp.ndim(each) for each in (ssm.beta0, ssm.delta_w, ssm.delta_v)) == 0
+    alike = max(jnp.ndim(parameter) for parameter in (ssm.beta0, ssm.delta_w, ssm.delta_v)) == 0
     sets = [jnp.broadcast_to(v, 1 if alike else n_robots) for v in ssm[:1] + ssm[2:4]]
-    whiten = jax.vmap(lambda *of: _whitening(ssm, jnp.asarray(places.patterns), *of))
+    whiten = jax.vmap(lambda *arguments: _whitening(ssm, jnp.asarray(places.patterns), *arguments))
     carried, start, inverse, log_scale, T = whiten(*sets)
     robot = jnp.arange(n_robots)[None] * (not alike)
     H = jnp.eye(n_bounds, n_bounds + 1, 1) - ssm.lag * jnp.eye(n_bounds, n_bounds + 1)
@@ -189,8 +189,8 @@ def _whitening(
     V = ssm.x0_sd**2 * jnp.outer(first, first) + delta_w**2 * T @ T.T
 
     def one(seen: Array) -> tuple[Array, Array, Array]:
-        own = jnp.diag(jnp.where(seen, delta_v**2, 1.0))
-        L = jnp.linalg.cholesky(jnp.where(seen[:, None] & seen[None], V, 0.0) + own)
+        noise = jnp.diag(jnp.where(seen, delta_v**2, 1.0))
+        L = jnp.linalg.cholesky(jnp.where(seen[:, None] & seen[None], V, 0.0) + noise)
         inverse = solve_triangular(L, jnp.eye(n), lower=True)
         return inverse, jnp.log(jnp.diagonal(L)), inverse @ jnp.where(seen[:, None], T, 0.0)
 

@@ -52,8 +52,8 @@ def gather_rows(
         groups: dict[bytes, list[int]] = {}
         for i in range(n_robots):
             if seen[:, i].any() and w > 0.0:
-                own = b"" if shared else bytes([i])
-                groups.setdefault(seen[:, i].tobytes() + own, []).append(i)
+                robot_key = b"" if shared else bytes([i])
+                groups.setdefault(seen[:, i].tobytes() + robot_key, []).append(i)
         for members in groups.values():
             mask, n = seen[:, members[0]], len(members)
             rotation = helmert(n, full=True)
@@ -67,7 +67,7 @@ def gather_rows(
                 X[:, :n_features], X[:, n_features], X[0, -1] = z[k], a, a * x0_mean
                 rows.append((y[k], mask, X, a, w, unit, length))
     rows.sort(key=lambda row: (row[-1], row[1].tobytes()))  # like rows share one factor
-    y, seen, X, a, weights, unit, length = (np.array(each) for each in zip(*rows, strict=True))
+    y, seen, X, a, weights, unit, length = (np.array(column) for column in zip(*rows, strict=True))
     change = (np.diff(length) != 0) | (seen[1:] != seen[:-1]).any(1)
     kind = np.concatenate([[0], np.cumsum(change)])
     return Rows(y, seen, X, a, weights, unit, length, kind, float((weights @ seen).sum()))

@@ -38,17 +38,17 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     if sampler != "auto":
         return sampler, "asked for"
     pooling = model.partial_pooling is not None
-    own, coupled = isinstance(model, DriftTrust), is_coupled(model)
-    by_scores = model.place or pooling or own or coupled or not model.family.integrates_out
+    custom_drift, coupled = isinstance(model, DriftTrust), is_coupled(model)
+    by_scores = model.place or pooling or custom_drift or coupled or not model.family.integrates_out
     reason = model.why_not_exact or (
-        None if own else why_not_conjugate(model.priors, coupled=coupled)
+        None if custom_drift else why_not_conjugate(model.priors, coupled=coupled)
     )
     reason = reason or (
         why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
     )
     if reason is None:
         by = "" if model.family.integrates_out else " by expectation propagation, and weights"
-        what = "trust integrates out" if own else "trust and coefficients integrate out"
+        what = "trust integrates out" if custom_drift else "trust and coefficients integrate out"
         return "exact", f"{what}{by}"
     return ("nuts" if model.family.integrates_out else "joint"), reason
 

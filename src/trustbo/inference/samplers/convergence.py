@@ -38,11 +38,11 @@ def convergence(sites: xr.Dataset) -> dict[str, tuple[float, float]]:
     """The worst R-hat and the least bulk ESS of each parameter."""
     with np.errstate(invalid="ignore"):
         rhat, ess = sampling_diagnostics.rhat(sites), sampling_diagnostics.ess(sites, method="bulk")
-    found = {}
+    diagnostics_of = {}
     for name, draws in sites.data_vars.items():
         # A value that never moves is a constant of the model, such as an absent correlation.
         free = np.ptp(draws.values, axis=(0, 1)) > 0.0
         if free.any():
             worst = float(rhat[name].values[free].max())
-            found[str(name)] = (worst, float(ess[name].values[free].min()))
-    return found
+            diagnostics_of[str(name)] = (worst, float(ess[name].values[free].min()))
+    return diagnostics_of

@@ -50,15 +50,17 @@ class CoupledTarget:
         self.priors, self.n, self.n_features, self.ordered = priors, n, n_features, ordered
         n_inputs = n * n_features + 1
         robot, source = np.divmod(np.arange(n * n_inputs), n_inputs)
-        own = source // n_features == robot
+        diagonal = source // n_features == robot
         free = source == n_inputs - 1
         if ordered:
-            robot, source, own, free = (a[own | free] for a in (robot, source, own, free))
+            robot, source, diagonal, free = (
+                a[diagonal | free] for a in (robot, source, diagonal, free)
+            )
         self.data: Sequences = gather_sequences(
             batch.awareness, batch.contact_rate, weight, robot, source,
             (float(priors.x0_mean), float(priors.x0_sd)), model.lag,
         )  # fmt: skip
-        self._own, self._feature = own | free, np.where(free, n_features, source % n_features)
+        self._own, self._feature = diagonal | free, np.where(free, n_features, source % n_features)
         pairs = n * (n - 1) // 2
         sizes = (n, n - 1, n, n) if ordered else (n, 2 * pairs, n, n, pairs, pairs)
         self._ends = np.cumsum(sizes)
@@ -92,7 +94,7 @@ class CoupledTarget:
         mode = optimize.minimize(cost, start, jac=True, method="BFGS", options={"maxiter": 60}).x
         return Student(mode, laplace(self.log_density, mode[None], 0)[2][0])
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """No-op: the density is exact everywhere."""
 
     def defensive(self, proposal: Student) -> Student:
@@ -104,8 +106,8 @@ class CoupledTarget:
     ) -> tuple[dict[str, np.ndarray], None]:
         """Parameters at the points of sorted indices; these draws need no weights."""
         unique, where = np.unique(chosen, return_inverse=True)
-        at, sites = self.constrain(z[unique])
-        factor = integrate(self.data, at)[1]
+        dynamics, sites = self.constrain(z[unique])
+        factor = integrate(self.data, dynamics)[1]
         F, half = factor[where, :-1, :-1], factor[where, -1, :-1]
         right = (half + rng.standard_normal(half.shape))[..., None]
         c = np.linalg.solve(np.swapaxes(F, 1, 2), right)[..., 0]
@@ -115,15 +117,19 @@ class CoupledTarget:
             of_robots = c.reshape(shape)
             return sites | {"beta": of_robots[..., :-1], "b": of_robots[..., -1]}, None
         B = c.reshape(shape)[..., :-1].reshape(len(c), self.n, self.n, -1)
-        named = {"B0": at.B0[where], "B": np.moveaxis(B, -1, 1), "b": c.reshape(shape)[..., -1]}
-        return named | {"Delta_w": at.Q[where], "Delta_v": at.R[where]}, None
+        named = {
+            "B0": dynamics.B0[where],
+            "B": np.moveaxis(B, -1, 1),
+            "b": c.reshape(shape)[..., -1],
+        }
+        return named | {"Delta_w": dynamics.Q[where], "Delta_v": dynamics.R[where]}, None
 
     def constrain(self, z: np.ndarray) -> tuple[Dynamics, dict[str, np.ndarray]]:
         """Dynamics at scores (point, score); for robots in order, their parameters too."""
         n, eye = self.n, np.eye(self.n)
         beta0, coupling, size, angle, *partial = np.split(z, self._ends[:-1], axis=1)
-        each = np.stack([beta0, size, angle], axis=2).reshape(-1, 3)
-        of_robots = scores.beta0_and_noises(self.priors, each).reshape(-1, n, 3)
+        triples = np.stack([beta0, size, angle], axis=2).reshape(-1, 3)
+        of_robots = scores.beta0_and_noises(self.priors, triples).reshape(-1, n, 3)
         beta0, sd_w, sd_v = np.moveaxis(of_robots, 2, 0)
         coupling = scores.quantile(self.priors.coupling, coupling)
         prior = self._prior(beta0)
@@ -137,7 +143,7 @@ class CoupledTarget:
             return Dynamics(G * beta0[:, None], G, Q, R, *prior), sites
         B0 = np.where(eye, beta0[:, :, None], 0.0)
         B0[:, ~np.eye(n, dtype=bool)] = coupling
-        w, v = (self._correlations(of) for of in partial)
+        w, v = (self._correlations(partials) for partials in partial)
         w, v = w * sd_w[:, :, None], v * sd_v[:, :, None]
         Q, R = w @ np.swapaxes(w, 1, 2), v @ np.swapaxes(v, 1, 2)
         return Dynamics(B0, np.broadcast_to(eye, B0.shape), Q, R, *prior), {}
@@ -147,12 +153,12 @@ class CoupledTarget:
         priors, robot = self.priors, self.data.robot
         rest = 1.0 - beta0[:, robot] if priors.stationary else np.ones((len(beta0), len(robot)))
 
-        def each(name: str) -> np.ndarray:
+        def moment_of(name: str) -> np.ndarray:
             of_features = np.broadcast_to(numbers(priors.beta, name), self.n_features)
-            own = np.append(of_features, numbers(priors.b, name))[self._feature]
-            return np.where(self._own, own * rest, numbers(priors.coupling, name))
+            diagonal = np.append(of_features, numbers(priors.b, name))[self._feature]
+            return np.where(self._own, diagonal * rest, numbers(priors.coupling, name))
 
-        return each("loc"), each("scale") ** -2.0
+        return moment_of("loc"), moment_of("scale") ** -2.0
 
     def _correlations(self, z: np.ndarray) -> np.ndarray:
         """Factors of correlations (point, robot, robot') of scores (point, pair)."""

@@ -65,12 +65,14 @@ class DriftTarget:
         """Log posterior density of scores (point, score), shape (point,)."""
         rows = np.minimum(np.arange(-(-len(z) // _CHUNK) * _CHUNK), len(z) - 1)
         with np.errstate(all="ignore"), own_settings():  # far out there is no density
-            theta, own = self._theta(z), z[:, self._n_given :]
-            each = [
-                np.asarray(_log_likelihood(self.model, *self._data, theta[part], own[part]))
+            theta, drift_scores = self._theta(z), z[:, self._n_given :]
+            batches = [
+                np.asarray(
+                    _log_likelihood(self.model, *self._data, theta[part], drift_scores[part])
+                )
                 for part in rows.reshape(-1, _CHUNK)
             ]
-            value = np.concatenate(each)[: len(z)] + scores.log_prior(z)
+            value = np.concatenate(batches)[: len(z)] + scores.log_prior(z)
         ok = np.isfinite(value) & (theta[:, 1:3] > 1e-6).all(1)
         return np.where(ok, value, -np.inf)
 
@@ -89,7 +91,7 @@ class DriftTarget:
         self.has_modes = bool((far & (value > value[top] - _CLOSE)).any())
         return Student(modes[top], scale[top])
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """No-op: the density is exact everywhere."""
 
     def defensive(self, proposal: Student) -> Spanning:
@@ -100,9 +102,9 @@ class DriftTarget:
         self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
     ) -> tuple[dict[str, np.ndarray], None]:
         """Parameters at the points of indices; these draws need no weights."""
-        theta, own = self._theta(z[chosen]), z[chosen, self._n_given :]
+        theta, scores = self._theta(z[chosen]), z[chosen, self._n_given :]
         shared = dict(zip(("beta0", "delta_w", "delta_v"), theta.T[:3], strict=True))
-        params = shared | self.model.parameters_at(own, self._shape)
+        params = shared | self.model.parameters_at(scores, self._shape)
         if self._visited is None:
             return params, None
         place = cast(PlaceEffect, self.model.place)
@@ -112,7 +114,7 @@ class DriftTarget:
             keys = jax.random.split(jax.random.key(int(rng.integers(1 << 31))), len(theta))
             rows = np.minimum(np.arange(-(-len(theta) // _CHUNK) * _CHUNK), len(theta) - 1)
             units = [
-                np.asarray(_draw_effects(self.model, *self._data, theta[i], own[i], keys[i]))
+                np.asarray(_draw_effects(self.model, *self._data, theta[i], scores[i], keys[i]))
                 for i in rows.reshape(-1, _CHUNK)
             ]
         flat = np.concatenate(units)[: len(theta), : len(self._visited.units)]
@@ -133,18 +135,18 @@ def _log_likelihood(
     weight: Array,
     places: PlaceIndex | None,
     theta: Array,
-    own: Array,
+    scores: Array,
 ) -> Array:
     """Log likelihood (point,) at theta, see `_theta`, and scores (point, score) of the drift."""
 
-    def one(theta: Array, own: Array) -> Array:
-        ssm = _ssm(model, awareness, theta, own)
+    def one(theta: Array, scores: Array) -> Array:
+        ssm = _ssm(model, awareness, theta, scores)
         if places is None:
             return ssm.log_likelihood(jnp.swapaxes(contact_rate, 0, 1)).sum(1) @ weight
         hyper = PlaceHyper(*theta[3:])
         return place_marginal.log_likelihood(ssm, contact_rate, weight, hyper, places)
 
-    return jax.vmap(one)(theta, own)
+    return jax.vmap(one)(theta, scores)
 
 
 @jax.jit
@@ -155,20 +157,20 @@ def _draw_effects(
     weight: Array,
     places: PlaceIndex,
     theta: Array,
-    own: Array,
+    scores: Array,
     keys: Array,
 ) -> Array:
     """Effects (point, unit) of visited places, one exact draw at each point."""
 
-    def one(theta: Array, own: Array, key: Array) -> Array:
-        ssm, hyper = _ssm(model, awareness, theta, own), PlaceHyper(*theta[3:])
+    def one(theta: Array, scores: Array, key: Array) -> Array:
+        ssm, hyper = _ssm(model, awareness, theta, scores), PlaceHyper(*theta[3:])
         return place_marginal.draw_effects(ssm, contact_rate, weight, hyper, places, key)
 
-    return jax.vmap(one)(theta, own, keys)
+    return jax.vmap(one)(theta, scores, keys)
 
 
-def _ssm(model: DriftTrust, awareness: Array, theta: Array, own: Array) -> ScalarSSM:
+def _ssm(model: DriftTrust, awareness: Array, theta: Array, scores: Array) -> ScalarSSM:
     """State space of one point."""
-    drift = Drift(model.form, model.at_scores(own, *awareness.shape[2:])[0], awareness.shape[3])
+    drift = Drift(model.form, model.at_scores(scores, *awareness.shape[2:])[0], awareness.shape[3])
     x0 = model.priors.x0_mean, model.priors.x0_sd
     return DriftParams(theta[0], drift, theta[1], theta[2], *x0).ssm(awareness, model.lag)

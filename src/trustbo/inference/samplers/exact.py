@@ -81,7 +81,9 @@ class _Target(NamedTuple):
         # Far out the noises underflow: such a point has no density, and is no reason to warn.
         with np.errstate(all="ignore"):
             done = [self._evaluate(part) for part in parts]
-        log_density, mean, factor = (np.concatenate(of, axis=-1) for of in zip(*done, strict=True))
+        log_density, mean, factor = (
+            np.concatenate(pieces, axis=-1) for pieces in zip(*done, strict=True)
+        )
         return np.where(np.isfinite(log_density), log_density, -np.inf), mean, factor
 
     def _evaluate(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -162,7 +164,7 @@ def sample_exact(
             if points.khat < GOOD_KHAT:
                 break
             last = _weigh(target, _adapted(last, first, seed + k), seed)
-            points = min(points, last, key=lambda each: each.khat)
+            points = min(points, last, key=lambda candidate: candidate.khat)
     rng = np.random.default_rng(seed)
     weights = np.exp(points.log_w)
     chosen = rng.permutation(systematic(weights, n_draws, rng))

@@ -77,11 +77,11 @@ class HierarchicalScores(ABC):
         grid = np.stack(axes, axis=-1).reshape(-1, 2)
         z = np.zeros((len(grid), 4 + self.n_coefficients + self.n_robots))
         z[:, 1:3] = grid
-        self.look(z[len(z) // 2])
+        self.recentre(z[len(z) // 2])
         z = z[[self.log_density(z).argmax()]]
         scale = np.eye(z.shape[1])[None]
         for n_steps in self.steps:  # the coordinates depend on the noises
-            self.look(z[0])
+            self.recentre(z[0])
             z[:, 0], z[:, -self.n_robots :] = 0.0, 0.0
             z, _, scale = laplace(self.log_density, z, n_steps)
         return Student(z[0], scale[0])
@@ -96,10 +96,13 @@ class HierarchicalScores(ABC):
         _, delta_w, delta_v = scores.beta0_and_noises(priors, np.insert(z[:, 1:3], 0, 0.0, 1)).T
         tau = np.maximum(scores.quantile(priors.tau, z[:, 3 : 4 + p]), _LEAST_TAU)
         spread = tau[:, :1] ** 2
-        known = 1.0 / (self._var + spread)
+        information = 1.0 / (self._var + spread)
         middle, precision = self._prior
-        var = 1.0 / (known.sum(1) + precision)
-        mean = var * ((known * self._center).sum(1) + precision * middle) + np.sqrt(var) * z[:, 0]
+        var = 1.0 / (information.sum(1) + precision)
+        mean = (
+            var * ((information * self._center).sum(1) + precision * middle)
+            + np.sqrt(var) * z[:, 0]
+        )
         v = 1.0 / (1.0 / self._var + 1.0 / spread)
         center = v * (self._center / self._var + mean[:, None] / spread)
         beta0 = center + np.sqrt(v) * z[:, 4 + p :]
@@ -142,7 +145,7 @@ class HierarchicalScores(ABC):
             rest = 1.0 - self.from_line(theta["mean"])[:, None]
         return self.mean * rest, self.precision / rest**2
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """Refit the normal approximation of each robot's beta0 at the noises of one point."""
         theta, _ = self.constrain(z[None])
         grid = np.linspace(-3.5, 4.5, 49) if self._unit else np.linspace(-1.5, 1.5, 49)
@@ -208,7 +211,7 @@ class HierarchicalTarget(HierarchicalScores):
         the precision of mu; and for each robot that of e_i and its dependence on mu.
         """
         beta0, tau = theta["beta0"], theta["tau"].T  # (coefficient, point)
-        mean, precision = (each.T for each in self.of_means(theta))
+        mean, precision = (moment.T for moment in self.of_means(theta))
         eye = np.eye(self.n_coefficients)[..., None]
         P, h, robots = precision * eye, precision * mean, []
         total = 0.5 * np.log(precision).sum(0) - 0.5 * (precision * mean**2).sum(0)

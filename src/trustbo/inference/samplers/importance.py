@@ -71,7 +71,7 @@ class ScoreTarget(Protocol):
         """Gaussian fit at the best mode."""
         ...
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """Re-expand the approximate density around a point (score,)."""
         ...
 
@@ -127,16 +127,16 @@ def sample_scores(
         points, proposal = _weigh(target, seed, start)
         rng = np.random.default_rng(seed)
         n = min(n_draws, target.n_corrected or n_draws)
-        chosen, params, found = _draw(target, points, n, rng)
+        chosen, params, smoothing = _draw(target, points, n, rng)
     khat, kish, log_evidence = points.khat, points.kish, points.log_evidence
-    at = np.arange(n)
-    if found is not None:
-        smoothed, worst, log_mean = found
+    kept = np.arange(n)
+    if smoothing is not None:
+        smoothed, worst, log_mean = smoothing
         inner, log_evidence = _kish(smoothed), log_evidence + log_mean
         khat = max(khat, worst) if inner < _EVEN * len(chosen) else khat
         kish = 1.0 / (1.0 / kish + 1.0 / inner)
-        at = systematic(np.exp(smoothed), n_draws, rng)
-    order = at[rng.permutation(n_draws)]
+        kept = systematic(np.exp(smoothed), n_draws, rng)
+    order = kept[rng.permutation(n_draws)]
     return ScoreDraws(
         ExactDraws(
             {name: values[order] for name, values in params.items()},
@@ -161,17 +161,17 @@ def _draw(
     params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
     if log_weight is None:
         return chosen, params, None
-    found = smoothed_weights(log_weight)
+    smoothing = smoothed_weights(log_weight)
     for k in range(_MORE_LAST):
-        enough = found[1] < (GOOD_KHAT if k < _MORE else MAX_KHAT)
-        if enough or _kish(found[0]) > _EVEN * len(chosen):
+        enough = smoothing[1] < (GOOD_KHAT if k < _MORE else MAX_KHAT)
+        if enough or _kish(smoothing[0]) > _EVEN * len(chosen):
             break
         more = np.sort(systematic(np.exp(points.log_w), n, rng))
         others, added = target.draw(points.z, points.log_p, more, rng)
         chosen, log_weight = np.append(chosen, more), np.append(log_weight, added)  # pyright: ignore
-        params = {name: np.concatenate([of, others[name]]) for name, of in params.items()}
-        found = smoothed_weights(log_weight)
-    return chosen, params, found
+        params = {name: np.concatenate([values, others[name]]) for name, values in params.items()}
+        smoothing = smoothed_weights(log_weight)
+    return chosen, params, smoothing
 
 
 def _kish(log_w: np.ndarray) -> float:
@@ -186,7 +186,7 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
     if proposal is None:
         proposal = target.first()
     else:
-        target.look(proposal.center)
+        target.recentre(proposal.center)
     for k in range(1, _MAX_ROUNDS + 1):
         cloud.add(proposal.widened(target.widths[0]), target.n_pilot // 2, seed + k)
         cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)
@@ -240,7 +240,7 @@ class _Cloud:
 
     def points(self) -> _Points:
         z, log_p = np.concatenate(self._z), np.concatenate(self._log_p)
-        raw = log_p - log_mixture(self._proposals, [len(each) for each in self._z], z)
+        raw = log_p - log_mixture(self._proposals, [len(drawn) for drawn in self._z], z)
         if not np.isfinite(raw).any():
             return _Points(z, log_p, np.full(len(z), -np.log(len(z))), np.inf, -np.inf)
         return _Points(z, log_p, *smoothed_weights(raw))

@@ -103,17 +103,17 @@ def newton(
         return value, gradient, hessian
 
     def step(carry):
-        k, z, at, proposal, ridge, _ = carry
+        k, z, derivatives, proposal, ridge, _ = carry
         new = everything(proposal)
         # The Hessian may overflow where the value does not: such a step is rejected.
         finite = jnp.isfinite(new[1]).all() & jnp.isfinite(new[2]).all()
-        better = finite & (new[0] < at[0])
+        better = finite & (new[0] < derivatives[0])
         z = jnp.where(better, proposal, z)
-        at = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, at)
+        derivatives = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, derivatives)
         ridge = jnp.where(better, ridge / 4.0, ridge * 8.0 + 1e-6)
-        direction = newton_direction(jnp, at[1], at[2], 1e-6, ridge)
+        direction = newton_direction(jnp, derivatives[1], derivatives[2], 1e-6, ridge)
         direction = direction * jnp.minimum(1.0, (longest / jnp.abs(direction)).min())
-        return k + 1, z, at, z - direction, ridge, at[1] @ direction
+        return k + 1, z, derivatives, z - direction, ridge, derivatives[1] @ direction
 
     def unfinished(carry):
         return (carry[0] < n_steps) & ~(carry[-1] < 1e-12)

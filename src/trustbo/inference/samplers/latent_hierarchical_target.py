@@ -35,18 +35,18 @@ class LatentHierarchicalTarget(HierarchicalScores):
         self._x0 = np.array([priors.x0_mean, priors.x0_sd], dtype=float)
         self._nu = max(8.0, 3.0 * n_robots * self.n_coefficients)
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """Recentre the sites, and the normal approximation of each robot's beta0, at one point."""
         theta, _ = self.constrain(z[None])
         (beta0, delta_w, delta_v, x0, P, g), _ = self._given(theta)
-        known = x0, P[0], g[0], self.chains, self._sites
-        self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *known, _SETTLED)
-        super().look(z)
+        fixed = x0, P[0], g[0], self.chains, self._sites
+        self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *fixed, _SETTLED)
+        super().recentre(z)
 
     def log_likelihood(self, theta: dict[str, np.ndarray]) -> np.ndarray:
         """See `HierarchicalScores.log_likelihood`; by EP."""
         noises = theta["delta_w"], theta["delta_v"]
-        ok = np.all([np.isfinite(each) & (each > _LEAST_NOISE) for each in noises], axis=0)
+        ok = np.all([np.isfinite(noise) & (noise > _LEAST_NOISE) for noise in noises], axis=0)
         ok &= np.isfinite(theta["beta0"]).all(1)
         out = np.full(len(ok), -np.inf)
         given, log_det = self._given({name: values[ok] for name, values in theta.items()})
@@ -75,9 +75,9 @@ class LatentHierarchicalTarget(HierarchicalScores):
         c = c.reshape(len(c), self.n_robots, self.n_coefficients)
         tau = self._tau(theta)
         mean, precision = self.of_means(theta)
-        known = precision + self.n_robots / tau**2
-        mu = (precision * mean + c.sum(1) / tau**2) / known
-        mu += rng.standard_normal(mu.shape) / np.sqrt(known)
+        information = precision + self.n_robots / tau**2
+        mu = (precision * mean + c.sum(1) / tau**2) / information
+        mu += rng.standard_normal(mu.shape) / np.sqrt(information)
         return self.name_draws(theta, mu, c), log_weight
 
     def _tau(self, theta: dict[str, np.ndarray]) -> np.ndarray:
@@ -87,15 +87,15 @@ class LatentHierarchicalTarget(HierarchicalScores):
         """Arguments of the kernels at theta, and log |P| of the prior precision."""
         n_robots, p = self.n_robots, self.n_coefficients
         mean, precision = self.of_means(theta)  # (point, coefficient)
-        own = self._tau(theta) ** -2.0
-        total = precision + n_robots * own
+        information = self._tau(theta) ** -2.0
+        total = precision + n_robots * information
         # Of tau^2 I + s^2 11' the inverse is I / tau^2 - 11' / tau^4 / (1 / s^2 + n / tau^2).
-        P = np.zeros((len(own), n_robots, p, n_robots, p))
+        P = np.zeros((len(information), n_robots, p, n_robots, p))
         for k in range(p):
-            P[:, :, k, :, k] = -(own[:, k] ** 2 / total[:, k])[:, None, None]
-            P[:, np.arange(n_robots), k, np.arange(n_robots), k] += own[:, k, None]
-        P = P.reshape(len(own), n_robots * p, n_robots * p)
-        log_det = (np.log(precision) - np.log(total) + n_robots * np.log(own)).sum(1)
+            P[:, :, k, :, k] = -(information[:, k] ** 2 / total[:, k])[:, None, None]
+            P[:, np.arange(n_robots), k, np.arange(n_robots), k] += information[:, k, None]
+        P = P.reshape(len(information), n_robots * p, n_robots * p)
+        log_det = (np.log(precision) - np.log(total) + n_robots * np.log(information)).sum(1)
         beta0 = self.from_line(theta["beta0"])
         return (
             beta0, theta["delta_w"], theta["delta_v"], self._x0, P, np.tile(mean, n_robots),

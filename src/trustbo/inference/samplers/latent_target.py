@@ -70,18 +70,18 @@ class LatentTarget:
         z = grid[[self.log_density(grid, _ROUGH).argmax()]]
         scale = np.eye(self.n_scores)[None]
         for _ in range(_ROUNDS):
-            self.look(z[0])
+            self.recentre(z[0])
             last, (z, _, scale) = z, laplace(self.log_density, z, n_steps=2)
             if np.abs(np.linalg.solve(scale[0], (z - last)[0])).max() < _STILL:
                 break
-        self.look(z[0])
+        self.recentre(z[0])
         return Student(z[0], scale[0])
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """Recentre the sites at one point, for sweeps to start from."""
         (beta0, delta_w, delta_v, x0, P, g), _ = self._given(self._theta(z[None]))
-        known = x0, P[0], g[0], self.chains, self._sites
-        self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *known, _SETTLED)
+        fixed = x0, P[0], g[0], self.chains, self._sites
+        self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *fixed, _SETTLED)
 
     def defensive(self, proposal: Student) -> Spanning:
         """Proposal that spans all angles between the noises; the prior for scores of places."""
@@ -169,10 +169,10 @@ def draw_weighted(
         rng: Random number generator.
     """
     gammas, log_weights = [], []
-    for of, n in zip(given, count, strict=True):
-        gamma = rng.standard_normal((n, len(of[-1])))
+    for point, n in zip(given, count, strict=True):
+        gamma = rng.standard_normal((n, len(point[-1])))
         gamma /= np.sqrt(rng.chisquare(nu, (n, 1)) / nu)
-        beta0, delta_w, delta_v, x0, P, g = of
+        beta0, delta_w, delta_v, x0, P, g = point
         weights = draws.draw_coefficients(
             beta0, delta_w, delta_v, x0, P, g, chains, sites, SWEEPS, nu, gamma, rng
         )

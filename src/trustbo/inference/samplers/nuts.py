@@ -91,13 +91,13 @@ def run_nuts(
     with watch.running(settings) as seen:
         length_free = settings._replace(draws=0)  # its programs serve any number of draws
         start = _begin(length_free, key, model, data, complete=complete)
-        each, advance = [], partial(_advance, length_free._replace(n_chains=0), model, data)
+        runs, advance = [], partial(_advance, length_free._replace(n_chains=0), model, data)
         # One chain after the other: vectorised chains would all wait for the longest trajectory.
         for i in range(settings.n_chains):
             chain, state = jax.tree.map(lambda a, i=i: a[i], (start.chains, start.states))
             go_on = partial(advance, start.frame, chain, complete=complete)
-            each.append(_run_chain(settings, go_on, state, seen))
-        z, stats = jax.tree.map(lambda *a: np.stack(a), *each)
+            runs.append(_run_chain(settings, go_on, state, seen))
+        z, stats = jax.tree.map(lambda *a: np.stack(a), *runs)
         finish = partial(_finish, length_free, model, data, complete=complete)
         theta, params, at_modes = finish(start, z["theta"])
     kept = z.get("innovations"), start.frame.linearisation
@@ -164,8 +164,8 @@ def _advance(
 ) -> tuple[HMCState, tuple[dict[str, Array], dict[str, Array]]]:
     """State after n more draws; and these, with their statistics, as the first of `_MOST` rows."""
     target = _target(settings, model, data, frame, complete=complete)
-    at = ParamInfo(state.z, state.potential_energy, state.z_grad)  # costs no gradient
-    _, step = _kernel(settings, target, chain, at, state.rng_key)
+    info = ParamInfo(state.z, state.potential_energy, state.z_grad)  # costs no gradient
+    _, step = _kernel(settings, target, chain, info, state.rng_key)
 
     def row(state: HMCState) -> tuple[dict[str, Array], dict[str, Array]]:
         stats = {
@@ -207,7 +207,9 @@ def _finish(
         params = jax.vmap(target.constrain)(theta)
         if data.places is not None and model.family.integrates_out:
             keys = random.split(key, len(theta))
-            params["place_unit"] = lax.map(lambda of: target.draw_effects(*of), (theta, keys))
+            params["place_unit"] = lax.map(
+                lambda arguments: target.draw_effects(*arguments), (theta, keys)
+            )
         return theta, params
 
     theta, params = lax.map(finish, (start.chains, jnp.asarray(x), start.effect_keys))

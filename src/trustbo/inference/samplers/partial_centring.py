@@ -31,8 +31,8 @@ def fit_robots(target: Target, pooling: HierarchicalTrust, site: Sites) -> Robot
 
     def log_likelihood(c: Array) -> Array:
         deviations = pooling.robot_sites((c - mu[None]) / tau[None])
-        each = target.log_likelihood(pooling.assemble(values | deviations))
-        return (each * target.data.weight[:, None]).sum(0)
+        log_p = target.log_likelihood(pooling.assemble(values | deviations))
+        return (log_p * target.data.weight[:, None]).sum(0)
 
     index = jnp.arange(len(c))
     gradient = jax.jacfwd(log_likelihood)(c)[index, index]
@@ -54,10 +54,10 @@ def centre(
     log_jacobian = -len(innovations) * jnp.log(tau).sum()
     if pooling.means_are_real:
         spread = jnp.linalg.inv(fit.precision) + jnp.diag(tau**2)[None]
-        known = jnp.linalg.inv(spread)
+        information = jnp.linalg.inv(spread)
         # Unit precision stands for the priors, which are about so wide.
-        L = jnp.linalg.cholesky(known.sum(0) + jnp.eye(len(mu)))
-        center = cho_solve((L, True), jnp.einsum("icd,id->c", known, fit.center))
+        L = jnp.linalg.cholesky(information.sum(0) + jnp.eye(len(mu)))
+        center = cho_solve((L, True), jnp.einsum("icd,id->c", information, fit.center))
         mu = center + solve_triangular(L, mu, trans=1, lower=True)
         log_jacobian = log_jacobian - jnp.log(jnp.diagonal(L)).sum()
         site = site | pooling.mean_sites(mu)

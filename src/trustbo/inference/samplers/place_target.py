@@ -108,7 +108,7 @@ class PlaceTarget:
         """See `prior_of_places`."""
         return prior_of_places(proposal)
 
-    def look(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> None:
         """No-op: the density is exact everywhere."""
 
     def draw(
@@ -118,15 +118,15 @@ class PlaceTarget:
         n, places, place = len(chosen), self.places, self.place
         n_units, n_coefficients = len(places.units), len(self.mean)
         c, g = rng.standard_normal((n, n_coefficients)), rng.standard_normal((n, n_units))
-        theta, at = np.empty((n, 6)), 0
+        theta, start = np.empty((n, 6)), 0
         unique, count = np.unique(chosen, return_counts=True)
         step = max(1, int(_NUMBERS / (8 * n_units**2)))
         for i in range(0, len(unique), step):
-            law = self.conditional(z[unique[i : i + step]])
-            for k, of in enumerate(count[i : i + step]):
-                rows = slice(at, at := at + int(of))
-                theta[rows] = law.theta[k]
-                c[rows], g[rows] = _given_theta(law, k, c[rows], g[rows])
+            conditional = self.conditional(z[unique[i : i + step]])
+            for k, repeats in enumerate(count[i : i + step]):
+                rows = slice(start, start := start + int(repeats))
+                theta[rows] = conditional.theta[k]
+                c[rows], g[rows] = _given_theta(conditional, k, c[rows], g[rows])
         return name_draws(theta, c, g, places, place, rng), None
 
     def _evaluate(self, z: np.ndarray, *, keep: bool = False) -> Conditional:
@@ -138,9 +138,11 @@ class PlaceTarget:
             total = np.hypot(theta[:, 1], theta[:, 2])
             floor = place_prior.JITTER * np.maximum(theta[:, 3], total)
             theta[:, 5] = np.maximum(theta[:, 5], floor)
-            found = self._integrate(theta, keep=keep)
-            log_p = np.where(ok & np.isfinite(found.log_p), found.log_p + log_prior, -np.inf)
-            return found._replace(log_p=log_p)
+            integrated = self._integrate(theta, keep=keep)
+            log_p = np.where(
+                ok & np.isfinite(integrated.log_p), integrated.log_p + log_prior, -np.inf
+            )
+            return integrated._replace(log_p=log_p)
 
     def _integrate(self, theta: np.ndarray, *, keep: bool) -> Conditional:
         rows, n = self.rows, len(theta)
@@ -211,9 +213,9 @@ def name_draws(
 
 
 def _given_theta(
-    law: Conditional, k: int, c: np.ndarray, g: np.ndarray
+    conditional: Conditional, k: int, c: np.ndarray, g: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients and effects of standard normal numbers (draw, ...), at the k-th point."""
-    c = np.linalg.solve(law.factor[k].T, law.half[k][:, None] + c.T).T
-    right = law.of_units[k, -1] - c @ law.of_units[k, :-1]
-    return c, place_prior.solve(law.L[k], right + g, transposed=True)
+    c = np.linalg.solve(conditional.factor[k].T, conditional.half[k][:, None] + c.T).T
+    right = conditional.of_units[k, -1] - c @ conditional.of_units[k, :-1]
+    return c, place_prior.solve(conditional.L[k], right + g, transposed=True)

@@ -121,8 +121,8 @@ def reparametrise(
     def draw_effects(theta: Array, key: Array) -> Array:
         return target.draw_effects(target.values(space.to_sites(theta, robots)[0]), key)
 
-    known = constrain, potential, profile, Frame(target.linearisation, robots), draw_effects
-    return Reparametrisation(starts, longest, *known)
+    functions = constrain, potential, profile, Frame(target.linearisation, robots), draw_effects
+    return Reparametrisation(starts, longest, *functions)
 
 
 def _starts(model: TrustModel, target: Target, scatter: Array) -> tuple[Array, Array]:
@@ -187,14 +187,18 @@ class Coordinates:
         x0 = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
         params = TrustParams(**others, beta=site["beta"], b=site["b"], **x0)
 
-        weights, intercept = (of(others["beta0"]) for of in (priors.weights, priors.intercept))
+        weights, intercept = (
+            prior(others["beta0"]) for prior in (priors.weights, priors.intercept)
+        )
 
-        def each(name: str) -> Array:
+        def moment_of(name: str) -> Array:
             of_beta = jnp.broadcast_to(getattr(weights, name), site["beta"].shape)
             return jnp.append(of_beta, getattr(intercept, name))
 
         sums: Spectrum = self.target.data.spectrum  # pyright: ignore[reportAssignmentType]
-        mean, L = coefficients(params, sums, self.model.lag, each("loc"), each("scale") ** -2.0)
+        mean, L = coefficients(
+            params, sums, self.model.lag, moment_of("loc"), moment_of("scale") ** -2.0
+        )
         c = mean + solve_triangular(L, e, trans=1, lower=True)
         return site | {"beta": c[:-1], "b": c[-1]}, -jnp.log(jnp.diagonal(L)).sum()
 
@@ -213,7 +217,7 @@ class _Means(NamedTuple):
 
 def _average(model: TrustModel, data: NutsData) -> _Means:
     if data.means is not None:
-        y, z, scatter = (jnp.asarray(each) for each in data.means)
+        y, z, scatter = (jnp.asarray(mean) for mean in data.means)
         return _Means(y, z, jnp.zeros(()), jnp.maximum(scatter, 0.005))
     measured = ~jnp.isnan(data.contact_rate)
     n = jnp.maximum(measured.sum(), 1)

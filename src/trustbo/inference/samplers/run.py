@@ -145,13 +145,13 @@ def _sample_exact(
 ) -> Draws:
     """Draws by importance sampling; UnevenWeightsError: its weights are too uneven."""
     shape = (settings.n_chains, settings.draws)
-    each = [
+    posteriors = [
         sample_exact(statistics, model.priors, shape[0] * shape[1], seed + i)
         for i, statistics in enumerate(gather(model, batch, weight))
     ]
-    _require_even(each)
-    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
-    return Draws(params, stats, _summarize(each), "exact")
+    _require_even(posteriors)
+    params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
+    return Draws(params, stats, _summarize(posteriors), "exact")
 
 
 def _sample_scores(
@@ -169,18 +169,20 @@ def _sample_scores(
     coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
     if start is not None and coupled and len(start.center) != coupled.n_scores:
         start = None  # of another team
-    found = [sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)]
-    each = [one.draws for one in found]
-    _require_even(each)
+    sampled = [
+        sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)
+    ]
+    posteriors = [one.draws for one in sampled]
+    _require_even(posteriors)
     if any(getattr(target, "has_modes", False) for target in targets):
         raise UnevenWeightsError(
             "weights do not tell the shares of modes, of which the posterior has more than one"
         )
-    params, stats = _join(each, shape, per_robot=model.robot_sets == "each")
+    params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
     effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
-    summary = _summarize(each)
+    summary = _summarize(posteriors)
     if places is not None or coupled is not None:
-        proposal = found[0].proposal
+        proposal = sampled[0].proposal
         summary["proposal_center"] = proposal.center.tolist()
         summary["proposal_scale"] = proposal.scale.ravel().tolist()
     return Draws(params, stats, summary, "exact", places=effects)
@@ -211,33 +213,33 @@ def _targets(
     return [LatentTarget(*gather_chains(family, one), priors) for one in split_robots(model, batch)]
 
 
-def _summarize(each: list[ExactDraws]) -> dict[str, Any]:
+def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:
     """Diagnostics of independent posteriors together."""
     return {
-        "k_hat": max(exact.khat for exact in each),
-        "kish": min(exact.kish for exact in each),
-        "log_evidence": sum(exact.log_evidence for exact in each),
+        "k_hat": max(exact.khat for exact in posteriors),
+        "kish": min(exact.kish for exact in posteriors),
+        "log_evidence": sum(exact.log_evidence for exact in posteriors),
     }
 
 
-def _require_even(each: list[ExactDraws]) -> None:
+def _require_even(posteriors: list[ExactDraws]) -> None:
     """Refuse importance weights that are too uneven: UnevenWeightsError."""
-    khat = max(exact.khat for exact in each)
+    khat = max(exact.khat for exact in posteriors)
     if not khat <= MAX_KHAT:
         raise UnevenWeightsError(f"weights are too uneven (k-hat {khat:.2f}, limit {MAX_KHAT})")
 
 
-def _join(each: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
+def _join(posteriors: list[ExactDraws], shape: tuple[int, int], *, per_robot: bool):
     """Draws of all robots side by side; their weights multiply."""
 
     def join(columns: list[np.ndarray]) -> np.ndarray:
         joined = np.stack(columns, axis=1) if per_robot else columns[0]
         return joined.reshape(*shape, *joined.shape[1:])
 
-    params = {name: join([e.params[name] for e in each]) for name in each[0].params}
+    params = {name: join([e.params[name] for e in posteriors]) for name in posteriors[0].params}
     stats = {
-        "lp": np.sum([e.lp for e in each], axis=0).reshape(shape),
-        "log_weight": np.sum([e.log_weight for e in each], axis=0).reshape(shape),
+        "lp": np.sum([e.lp for e in posteriors], axis=0).reshape(shape),
+        "log_weight": np.sum([e.log_weight for e in posteriors], axis=0).reshape(shape),
     }
     return params, stats
 
@@ -256,8 +258,8 @@ def _sample_nuts(
     name = "nuts" if model.family.integrates_out else "joint"
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
-        own = random.fold_in(key, retries)
-        raw = run_nuts(tried, own, model, data, complete=complete, watch=watch)
+        subkey = random.fold_in(key, retries)
+        raw = run_nuts(tried, subkey, model, data, complete=complete, watch=watch)
         params, stats = ({k: np.asarray(v) for k, v in g.items()} for g in (raw.params, raw.stats))
         stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
         innovations = None if raw.innovations is None else np.asarray(raw.innovations)
@@ -281,7 +283,7 @@ def _with_effects(model: TrustModel, draws: Draws, places: Visited, seed: int) -
     hyper = {name: params[name].ravel() for name in model.place_dims}
     rng = np.random.default_rng([seed, 3])
     effects = split_units(flat, hyper, places, cast(PlaceEffect, model.place), rng)
-    shaped = {n: of.reshape(*units.shape[:2], -1) for n, of in effects.items()}
+    shaped = {n: values.reshape(*units.shape[:2], -1) for n, values in effects.items()}
     return draws._replace(params=params, places=shaped)
 
 

@@ -66,11 +66,12 @@ class NutsSettings(NamedTuple):
         Raises:
             TrustboError: A setting of NUTS alone, and another sampler.
         """
-        own = [n for n in SETTINGS if n not in _OF_ALL and getattr(self, n) != _DEFAULTS[n]]
-        if sampler == "exact" and own:
+        changed = [n for n in SETTINGS if n not in _OF_ALL and getattr(self, n) != _DEFAULTS[n]]
+        if sampler == "exact" and changed:
             raise TrustboError(
-                f"{', '.join(own)} {'is' if len(own) == 1 else 'are'} for NUTS, and the sampler "
-                f'is "exact": give sampler "nuts", or leave {"it" if len(own) == 1 else "them"}.'
+                f"{', '.join(changed)} {'is' if len(changed) == 1 else 'are'} for NUTS, and the "
+                'sampler is "exact": give sampler "nuts", or leave '
+                f"{'it' if len(changed) == 1 else 'them'}."
             )
 
     @property

@@ -102,12 +102,12 @@ class Spanning(NamedTuple):
         """See `Student.log_density`."""
         score = z[:, self.axis]
         others = np.delete(z, self.axis, axis=1) - special.ndtr(score)[:, None] * self.slope
-        own = -0.5 * (score / self.sd) ** 2 - np.log(self.sd * np.sqrt(2.0 * np.pi))
-        return own + self.others.log_density(others)
+        marginal = -0.5 * (score / self.sd) ** 2 - np.log(self.sd * np.sqrt(2.0 * np.pi))
+        return marginal + self.others.log_density(others)
 
 
 def log_mixture(components: Sequence[Proposal], sizes: Sequence[int], z: np.ndarray) -> np.ndarray:
     """Log density of the mixture that `sizes` points of each component are drawn from."""
     shares = np.log(np.asarray(sizes, dtype=float) / sum(sizes))
-    terms = [s + each.log_density(z) for s, each in zip(shares, components, strict=True)]
+    terms = [s + component.log_density(z) for s, component in zip(shares, components, strict=True)]
     return np.logaddexp.reduce(terms, axis=0)

@@ -86,8 +86,8 @@ class Target:
     def constrain(self, site: Sites) -> Sites:
         """The model's parameters, by name."""
         values = constrain_fn(self._sample, (), {}, site, return_deterministic=True)
-        own = ("place_unit",) if self._samples_effects else ()
-        return {name: values[name] for name in (*self.model.dims, *own)}
+        extra = ("place_unit",) if self._samples_effects else ()
+        return {name: values[name] for name in (*self.model.dims, *extra)}
 
     @property
     def _samples_effects(self) -> bool:
@@ -111,8 +111,8 @@ class Target:
         """One exact draw of the effects of units, given parameters of Gaussian rates."""
         params, hyper = handlers.substitute(self._sample, values)()  # pyright: ignore
         ssm = params.ssm(self.data.awareness, self.model.lag)
-        known = self.data.contact_rate, self.data.weight, hyper, self.data.places
-        return place_marginal.draw_effects(ssm, *known, key)  # pyright: ignore
+        fixed = self.data.contact_rate, self.data.weight, hyper, self.data.places
+        return place_marginal.draw_effects(ssm, *fixed, key)  # pyright: ignore
 
     def log_likelihood(
         self, params: Params, innovations: Array | None = None, *, complete: bool = False
@@ -133,8 +133,8 @@ class Target:
         params, hyper = self._sample()
         if hyper is not None and not self._samples_effects:
             ssm = params.ssm(self.data.awareness, self.model.lag)  # pyright: ignore
-            known = self.data.contact_rate, self.data.weight, hyper, self.data.places
-            numpyro.factor("contact_rate", place_marginal.log_likelihood(ssm, *known))  # pyright: ignore
+            fixed = self.data.contact_rate, self.data.weight, hyper, self.data.places
+            numpyro.factor("contact_rate", place_marginal.log_likelihood(ssm, *fixed))  # pyright: ignore
             return
         if self.data.spectrum is not None:
             sums = gram_jax.log_likelihood(params, self.data.spectrum, self.model.lag)  # pyright: ignore
@@ -159,8 +159,8 @@ class _WeightedRates(ContactRate):
 
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         complete = self.target.complete
-        each = self.target.log_likelihood(self.params, self.innovations, complete=complete)
-        return each.sum(1) * self.target.data.weight
+        log_p = self.target.log_likelihood(self.params, self.innovations, complete=complete)
+        return log_p.sum(1) * self.target.data.weight
 
 
 def sample_hyper(place: PlaceEffect) -> PlaceHyper:

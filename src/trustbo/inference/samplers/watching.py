@@ -59,11 +59,11 @@ class Watch:
             stats: Statistics of each, `n_steps` and `diverging` among them.
         """
         n = len(stats["n_steps"])
-        chain, at = divmod(self._draws, self._of_chain)
-        phase = "warm-up" if at < self._settings.warmup else "draws"
+        chain, draw = divmod(self._draws, self._of_chain)
+        phase = "warm-up" if draw < self._settings.warmup else "draws"
         label = f"{self._name}, chain {chain + 1} of {self._settings.n_chains}, {phase}"
         self._bar.set_description_str(label, refresh=False)
-        kept = np.arange(at, at + n) % self._of_chain >= self._settings.warmup
+        kept = np.arange(draw, draw + n) % self._of_chain >= self._settings.warmup
         self._n_divergences += int((kept & stats["diverging"]).sum())
         if self._n_divergences:
             self._bar.set_postfix_str(f"{self._n_divergences} divergences", refresh=False)
@@ -79,7 +79,7 @@ class Watch:
     def retry(self, settings: NutsSettings, complaints: Sequence[str]) -> None:
         """Print that NUTS runs again, and why."""
         more = f" and {len(complaints) - 1} more" if len(complaints) > 1 else ""
-        self._say(
+        self._print(
             f"{self._name} again, for longer ({settings}, target_accept "
             f"{settings.target_accept:g}): {complaints[0]}{more}."
         )
@@ -90,9 +90,9 @@ class Watch:
         self._estimated, seconds = True, self._seconds / self._n_steps.sum() * usual * self._total
         if seconds > LONG:
             faster = f" Faster: {self._faster}." if self._faster else ""
-            self._say(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
+            self._print(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
 
-    def _say(self, line: str) -> None:
+    def _print(self, line: str) -> None:
         say(self._place, line)
 
 

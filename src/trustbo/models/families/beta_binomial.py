@@ -138,8 +138,8 @@ class BetaBinomial(Linearised):
         args = np.broadcast_arrays(mean, var, y, n_ticks, noise_sd)
         shape = args[0].shape
         flat = (np.array(a, dtype=float).ravel() for a in args)  # a broadcast one cannot be written
-        found = count_moments(*flat)
-        return found[0].reshape(shape), found[1].reshape(shape), found[2].reshape(shape)
+        moments = count_moments(*flat)
+        return moments[0].reshape(shape), moments[1].reshape(shape), moments[2].reshape(shape)
 
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:
         """See `Family.terms`; each distinct count is a case."""

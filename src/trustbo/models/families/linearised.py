@@ -70,8 +70,8 @@ class Linearised(Family):
             approximate, filtered = self._approximate(ssm, observed._replace(linearisation=trust))
             return approximate.smooth(filtered).mean
 
-        found = lax.fori_loop(0, _N_STEPS, step, self.start(observed))
-        return observed._replace(linearisation=found)
+        point = lax.fori_loop(0, _N_STEPS, step, self.start(observed))
+        return observed._replace(linearisation=point)
 
     def _approximate(self, ssm: SSM, observed: Observed) -> tuple[SSM, Filtered]:
         """The state space with Gaussian rates in place of the family's, and their filter."""

@@ -87,9 +87,9 @@ class StudentT(Linearised):
         mean, var, y, sd = np.broadcast_arrays(mean, var, y, noise_sd)
         S = var[..., None] + sd[..., None] ** 2 / weight
         e = (y - mean)[..., None]
-        each = log_p - 0.5 * (e**2 / S + np.log(2.0 * np.pi * S))
-        total = np.logaddexp.reduce(each, axis=-1)
-        share, gain = np.exp(each - total[..., None]), var[..., None] / S
+        log_terms = log_p - 0.5 * (e**2 / S + np.log(2.0 * np.pi * S))
+        total = np.logaddexp.reduce(log_terms, axis=-1)
+        share, gain = np.exp(log_terms - total[..., None]), var[..., None] / S
         center = mean + (share * gain * e).sum(-1)
         spread = (1.0 - gain) * var[..., None] + (
             mean[..., None] + gain * e - center[..., None]

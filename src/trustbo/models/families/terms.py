@@ -132,10 +132,12 @@ def new_table(tables):
 @njit(**OPTIONS)
 def table_at(tables, delta_v, out):
     """Tables at one concentration, into out (case, x)."""
-    at = (math.log(concentration(delta_v)) - _PHI_LOW) / _PHI_STEP
-    at = min(at, _N_PHI - 2.001) if at >= 1.0 else 1.0  # of NaN too, which is no index
-    i = int(at)
-    a, b, c, d = _lagrange(at - i)
+    position = (math.log(concentration(delta_v)) - _PHI_LOW) / _PHI_STEP
+    position = (
+        min(position, _N_PHI - 2.001) if position >= 1.0 else 1.0
+    )  # of NaN too, which is no index
+    i = int(position)
+    a, b, c, d = _lagrange(position - i)
     for j in range(tables.shape[1]):
         for g in range(N_X):
             out[j, g] = (
@@ -149,13 +151,13 @@ def table_at(tables, delta_v, out):
 @njit(**OPTIONS)
 def _read(row, x):
     """Log probability of a count at trust x, from its row of the table."""
-    at = (x - _X_LOW) / _X_STEP
-    if at < 1.0:
-        return row[1] + (at - 1.0) * (row[1] - row[0])
-    if not at <= N_X - 2.001:  # NaN too, which is no index
-        return row[N_X - 2] + (at - (N_X - 2.0)) * (row[N_X - 1] - row[N_X - 2])
-    i = int(at)
-    a, b, c, d = _lagrange(at - i)
+    position = (x - _X_LOW) / _X_STEP
+    if position < 1.0:
+        return row[1] + (position - 1.0) * (row[1] - row[0])
+    if not position <= N_X - 2.001:  # NaN too, which is no index
+        return row[N_X - 2] + (position - (N_X - 2.0)) * (row[N_X - 1] - row[N_X - 2])
+    i = int(position)
+    a, b, c, d = _lagrange(position - i)
     return a * row[i - 1] + b * row[i] + c * row[i + 1] + d * row[i + 2]
 
 
@@ -185,10 +187,10 @@ def match(kind, delta_v, row, m, v, lam, eta):
         h = side * (m - limit) / S
         log_p, rho = log_phi(h)
         g = rho * (h + rho)
-        new, at = 1e-12, m
+        new, centre = 1e-12, m
         if g > 1e-12:
-            new, at = g / max(S * S - v * g, 1e-12), m + side * S / (h + rho)
-        return log_p - log_overlap(m, v, lam, eta), new, new * at
+            new, centre = g / max(S * S - v * g, 1e-12), m + side * S / (h + rho)
+        return log_p - log_overlap(m, v, lam, eta), new, new * centre
     D = 1.0 + lam * v
     center, sd = (m + eta * v) / D, math.sqrt(v / D)
     # Relative to the centre: unnormalised, terms of many ticks overflow.
@@ -213,7 +215,7 @@ def count_moments(mean, var, y, n_ticks, delta_v):
     Newton's search for the mode takes the beta-binomial's slope and curvature by differences; its
     Gaussian fit carries the nodes. All arguments are (value,).
     """
-    found = np.empty((3, len(mean)))
+    moments = np.empty((3, len(mean)))
     for t in range(len(mean)):
         N, m, v, phi = n_ticks[t], mean[t], var[t], concentration(delta_v[t])
         n, d = np.round(y[t] * n_ticks[t]), 0.05
@@ -232,16 +234,16 @@ def count_moments(mean, var, y, n_ticks, delta_v):
         off = log_count(n, N, phi, x) - 0.5 * (x - m) ** 2 / v
         f0 = f1 = f2 = 0.0
         for j in range(len(_NODES)):
-            at = x + sd * _NODES[j]
-            value = log_count(n, N, phi, at) - 0.5 * (at - m) ** 2 / v + 0.5 * _NODES[j] ** 2
+            node = x + sd * _NODES[j]
+            value = log_count(n, N, phi, node) - 0.5 * (node - m) ** 2 / v + 0.5 * _NODES[j] ** 2
             f = _WEIGHTS[j] * math.exp(min(value - off, 300.0))
             f0, f1, f2 = f0 + f, f1 + f * _NODES[j], f2 + f * _NODES[j] ** 2
         a = f1 / f0
-        found[0, t], found[1, t] = x + sd * a, sd * sd * max(f2 / f0 - a * a, 0.05)
+        moments[0, t], moments[1, t] = x + sd * a, sd * sd * max(f2 / f0 - a * a, 0.05)
         constant = math.lgamma(N + 1.0) - math.lgamma(n + 1.0) - math.lgamma(N - n + 1.0)
         constant -= math.lgamma(N + phi) - math.lgamma(phi)
-        found[2, t] = off + math.log(f0) + math.log(sd / np.sqrt(v)) + constant
-    return found
+        moments[2, t] = off + math.log(f0) + math.log(sd / np.sqrt(v)) + constant
+    return moments
 
 
 @njit(**PART_OPTIONS)
@@ -300,9 +302,9 @@ def draw_count(count, phi, row, mean, sd, lam, eta, choice, rng):
     candidates, weights = choice
     J, shift, best = len(candidates), rng.random(), -1e300
     for j in range(J):
-        at = (j + shift) / J * _BINS
-        i = min(int(at), _BINS - 1)
-        e = _WIDE * (_KNOTS[i] + (at - i) * (_KNOTS[i + 1] - _KNOTS[i]))
+        position = (j + shift) / J * _BINS
+        i = min(int(position), _BINS - 1)
+        e = _WIDE * (_KNOTS[i] + (position - i) * (_KNOTS[i + 1] - _KNOTS[i]))
         x = mean + sd * e
         candidates[j] = x
         value = _read(row, x) - x * (eta - 0.5 * lam * x)

@@ -46,20 +46,20 @@ def draw_missions(
     trust, rates = np.empty((2, len(params.b), *shape))
     coupled = isinstance(params, CoupledParams)
     for robots in [list(range(n_robots))] if coupled else params.alike(n_robots):
-        law = _Law.coupled(params) if coupled else _Law.apart(params, robots)
+        dynamics = _Dynamics.coupled(params) if coupled else _Dynamics.apart(params, robots)
         w, v = rng.standard_normal((2, n_bounds, n_missions, len(robots), len(params.b)))
-        x = law.x0_mean + law.x0_sd * rng.standard_normal(w.shape[1:])
+        x = dynamics.x0_mean + dynamics.x0_sd * rng.standard_normal(w.shape[1:])
         for k in range(n_bounds):
-            before, drift = x, law.drift(awareness[:, k, robots], k)
-            x = _times(law.B0, x) + drift + _times(law.w, w[k])
-            y = x - lag * before + _times(law.v, v[k])
-            y = family.draw_rates(rng, x, y, law.delta_v, n_ticks[:, k, robots, None])
+            before, drift = x, dynamics.drift(awareness[:, k, robots], k)
+            x = _times(dynamics.B0, x) + drift + _times(dynamics.w, w[k])
+            y = x - lag * before + _times(dynamics.v, v[k])
+            y = family.draw_rates(rng, x, y, dynamics.delta_v, n_ticks[:, k, robots, None])
             trust[:, :, k, robots] = np.moveaxis(x, -1, 0)
             rates[:, :, k, robots] = np.moveaxis(y, -1, 0)
     return TrustSample(trust, rates)
 
 
-class _Law(NamedTuple):
+class _Dynamics(NamedTuple):
     """Parameters of robots that share them, or that influence each other, draws last."""
 
     B0: np.ndarray  # (draw,), or (robot, robot', draw)

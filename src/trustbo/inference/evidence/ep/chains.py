@@ -44,8 +44,8 @@ def gather_chains(
     column = plain(u.shape[-1] * robot[:, None] + np.arange(u.shape[-1]))
     drift = u[kept]
     if places is not None:  # each bound has the effect of its unit, one column for each bound
-        own = np.minimum(kept % n_robots, places.unit.shape[2] - 1)
-        unit = places.unit[kept // n_robots, :, own]
+        effect = np.minimum(kept % n_robots, places.unit.shape[2] - 1)
+        unit = places.unit[kept // n_robots, :, effect]
         drift = np.concatenate([drift, np.eye(y.shape[1]) * (unit >= 0)[..., None]], axis=-1)
         column = np.concatenate([column, u.shape[-1] + np.maximum(unit, 0)], axis=1)
     length = y.shape[1] - np.argmax(seen[kept][:, ::-1], axis=1)

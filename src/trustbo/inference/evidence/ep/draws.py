@@ -106,7 +106,7 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
     evidence, but for |P|^(1/2).
     """
     n, D = gamma.shape
-    K, last = chains.y.shape[1], chains.of.shape[1]
+    K, last = chains.y.shape[1], chains.gamma_index.shape[1]
     table, sites = new_table(chains.tables), np.empty(kept.shape)
     table_at(chains.tables, delta_v, table)
     start_sites(chains, delta_v, kept, sites[0], sites[1])
@@ -142,7 +142,7 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
             for k in range(K):
                 u[k] = chains.drift[c, k]
                 for j in range(last):
-                    u[k] += chains.u[c, k, j] * z[chains.of[c, j]]
+                    u[k] += chains.u[c, k, j] * z[chains.gamma_index[c, j]]
             total += draw_chain(
                 b0[chains.robot[c]], delta_w, delta_v, x0, chains, c, u, table, constant, sites[0],
                 sites[1], ahead, x, choice, rng,

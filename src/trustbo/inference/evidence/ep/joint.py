@@ -43,7 +43,7 @@ class Chains(NamedTuple):
     kind: np.ndarray  # (chain, bound), of each term, see `terms`
     case: np.ndarray  # (chain, bound), of each count
     u: np.ndarray  # (chain, bound, column), drift that each of its coefficients gives
-    of: np.ndarray  # (chain, column), their indices in gamma
+    gamma_index: np.ndarray  # (chain, column), their indices in gamma
     robot: np.ndarray  # (chain,), index of its beta0
     length: np.ndarray  # (chain,), bounds up to the last rate
     first: np.ndarray  # (chain,), the first bound whose term is not Gaussian; else the length
@@ -176,16 +176,16 @@ def _solve(Q, h, L, mean, covariance):
 def _match_chain(b0, chain, chains, delta_v, table, predicted, filtered, var, mean, cov,
                  lam, eta, damp, gamma, Sigma, s):  # fmt: skip
     """Smooth a chain, match its sites, in place if `damp` > 0; log of the masses' ratios."""
-    kind, case, of = chains.kind, chains.case, chains.of
-    precision, n, last = 1.0 / (delta_v * delta_v), chains.length[chain], of.shape[1]
+    kind, case, columns = chains.kind, chains.case, chains.gamma_index
+    precision, n, last = 1.0 / (delta_v * delta_v), chains.length[chain], columns.shape[1]
     total = 0.5 * chains.squares[chain, 0] * (np.log(precision) - LOG_2PI)
     total -= 0.5 * precision * chains.squares[chain, 1]
     if chains.first[chain] >= n:
         return total
     for a in range(last):
-        gamma[a] = mean[of[chain, a]]
+        gamma[a] = mean[columns[chain, a]]
         for b in range(last):
-            Sigma[a, b] = cov[of[chain, a], of[chain, b]]
+            Sigma[a, b] = cov[columns[chain, a], columns[chain, b]]
     v = 0.0
     for k in range(n - 1, chains.first[chain] - 1, -1):
         if k == n - 1:
@@ -236,7 +236,7 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
     Sites are updated in place by all sweeps but the last; mean and L are those of gamma and of the
     factor of its precision at the last. Without `evaluate` only these are computed.
     """
-    (n_chains, K), D, last = chains.y.shape, len(g), chains.of.shape[1]
+    (n_chains, K), D, last = chains.y.shape, len(g), chains.gamma_index.shape[1]
     predicted, filtered = np.empty((2, n_chains, K, last + 1))
     var, cov = np.empty((n_chains, K, 2)), np.empty((D, D))
     Q, h, own_Q, own_h = np.empty((D, D)), np.empty(D), np.empty((last, last)), np.empty(last)
@@ -258,10 +258,10 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
                 chains.length[c], lam, eta, predicted[c], filtered[c], var[c], own_Q, own_h,
             )  # fmt: skip
             for a in range(last):
-                i = chains.of[c, a]
+                i = chains.gamma_index[c, a]
                 h[i] += own_h[a]
                 for b in range(a + 1):
-                    j = chains.of[c, b]
+                    j = chains.gamma_index[c, b]
                     # A bound made twice: both columns have one index in gamma.
                     twice = 2.0 if i == j and a != b else 1.0
                     Q[max(i, j), min(i, j)] += twice * own_Q[a, b]

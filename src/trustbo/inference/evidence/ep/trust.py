@@ -49,13 +49,13 @@ def summarize(
             group.numbers, axis=0, return_index=True, return_inverse=True, return_counts=True
         )  # resampled draws repeat: each is evaluated once
         n_each = int(np.clip(_N_TRAJECTORIES // len(first), 2, 64))
-        at = group.mission, slice(None), group.robot
+        where = group.mission, slice(None), group.robot
         for rows in _chunks(group, len(first)):
             x, log_weight = group.trajectories(first[rows], n_each, rng)
             weight = np.exp(log_weight - log_weight.max(1, keepdims=True))
             weight /= weight.sum(1, keepdims=True) * (n / count[rows, None, None])
-            mean[at] += np.einsum("dtc,dtck->ck", weight, x)
-            square[at] += np.einsum("dtc,dtck->ck", weight, x**2)
+            mean[where] += np.einsum("dtc,dtck->ck", weight, x)
+            square[where] += np.einsum("dtc,dtck->ck", weight, x**2)
             log_mean = np.logaddexp.reduce(log_weight, axis=1) - np.log(n_each)
             here = np.flatnonzero((index.ravel() >= rows.start) & (index.ravel() < rows.stop))
             of_draws = log_mean[index.ravel()[here] - rows.start]
@@ -109,7 +109,7 @@ class _Group(NamedTuple):
         drift = np.einsum("ckf,df->dck", u, self.coefficients[draws], optimize=True)
         if self.effects is not None:
             drift += self.effects[draws]
-        chains = self.chains._replace(u=u[..., :0], of=self.chains.of[:, :0])
+        chains = self.chains._replace(u=u[..., :0], gamma_index=self.chains.gamma_index[:, :0])
         x = np.zeros((len(draws), n, *u.shape[:2]))
         log_weight = np.empty(x.shape[:3])
         _trajectories(self.theta[draws], drift, chains, self.sites, x, log_weight, rng)
@@ -123,8 +123,8 @@ def _groups(
     n_robots, b = batch.contact_rate.shape[2], np.asarray(params.b)
     of_bounds = b.ndim == 4  # (draw, mission, bound, robot), see `Params.on`
     for members in params.alike(n_robots):
-        of = params._replace(b=np.zeros((len(b), n_robots))) if of_bounds else params
-        one = of.of_robot(members[0])
+        shared = params._replace(b=np.zeros((len(b), n_robots))) if of_bounds else params
+        one = shared.of_robot(members[0])
         n = len(b)
 
         def column(name: str, one: Params = one, n: int = n) -> np.ndarray:
