@@ -1,7 +1,8 @@
-"""Docstrings, arguments and help texts begin with a noun or a verb (docs/architecture.md)."""
+"""Plain English in docstrings (docs/architecture.md): their openings, and words of the field."""
 
 import ast
 import re
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,26 @@ INTERROGATIVES = {
 }  # fmt: skip
 SECTIONS = {"Args:", "Attributes:", "Raises:", "Returns:", "Yields:"}
 UNNAMED = {"Returns:", "Yields:"}  # no name stands before the text of their entries
+
+PLAIN = {  # a word of ours, and the field's words for it
+    r"whoever|whomever": "the caller, users",
+    r"whatever": "any, for any",
+    r"told": "recorded, passed, measured",
+    r"tells?|telling": "identifies, distinguishes, states, prints",
+    r"worth": "equivalent, value; of a component of a model: ablation",
+    r"besides?": "next to, in the same folder; in addition to",
+    r"(?:one's|its|their|your|user's|users') own": "separate, custom, default",
+    r"laws?(?! of total)": "distribution, conditional, prior; of a kernel: loss",
+    r"looks?|looked|looking": "inspect, expand around, recentre; of a lidar: scan",
+    r"says?|said": "states, gives, records, shows",
+    r"knows?": "has, records, identifies",
+    r"contenders?|entrants?|outsiders?": "method, baseline",
+    r"cards?": "summary, repr",
+    r"set aside": "excluded",
+    r"as (?:it|they) (?:is|are|was|were)(?! not)": "unchanged",
+    r"beyond what": "that ... does not explain",
+}
+LEFT = {"campaign": 102, "cli": 9, "planning": 18, "study": 25}  # to be reworded: only ever fewer
 
 
 def openings_of(file: Path) -> Iterator[tuple[int, str]]:
@@ -46,6 +67,27 @@ def _parts(node: ast.expr) -> Iterator[tuple[int, str]]:
 def _text(node: ast.expr) -> Iterator[tuple[int, str]]:
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         yield node.lineno, node.value
+
+
+def private_words(file: Path) -> Iterator[tuple[int, str, str]]:
+    """Line and word of each word of `PLAIN` in a docstring, and plain words for it."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            for statement in node.body:
+                if isinstance(statement, ast.Expr):
+                    for line, text in _text(statement.value):
+                        yield from _private(line, text)
+
+
+def _private(first: int, text: str) -> Iterator[tuple[int, str, str]]:
+    # Of the same length: code in backticks and names of entries are no words.
+    text = re.sub(r"`[^`]*`", lambda code: re.sub(r"[^\n]", "x", code[0]), text)
+    text = re.sub(r"(?m)^( +)([\w*, ]+):(?= )", lambda entry: " " * len(entry[0]), text)
+    for words, plain in PLAIN.items():
+        pattern = words.replace(" ", r"\s+")
+        for match in re.finditer(rf"\b(?:{pattern})\b", text, re.IGNORECASE):
+            word = " ".join(match[0].split())
+            yield first + text.count("\n", 0, match.start()), word, plain
 
 
 def is_interrogative(text: str) -> bool:
@@ -82,3 +124,34 @@ def test_each_kind_of_opening_is_found(tmp_path, text, lines):
     file = tmp_path / "module.py"
     file.write_text(text)
     assert [line for line, said in openings_of(file) if is_interrogative(said)] == lines
+
+
+def test_docstrings_have_the_words_of_the_field():
+    found = [
+        (room_of(file), f"{file.relative_to(SOURCE)}:{line}: {word} ({plain})")
+        for file in sorted(SOURCE.rglob("*.py"))
+        for line, word, plain in private_words(file)
+    ]
+    number = Counter(room for room, _ in found)
+    grown = {room for room, n in number.items() if n > LEFT.get(room, 0)}
+    assert not grown, "\n" + "\n".join(line for room, line in found if room in grown)
+
+
+def room_of(file: Path) -> str:
+    return file.relative_to(SOURCE / "trustbo").parts[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('"""Draws; whoever takes them judges k-hat."""', [(1, "whoever")]),
+        ('def f():\n    """F.\n\n    Value as it\n    is.\n    """', [(4, "as it is")]),
+        ('class A:\n    x: int\n    """Robots with effects of their own."""', [(3, "their own")]),
+        ('def f(a):\n    """F.\n\n    Args:\n        worth: Its worth.\n    """', [(5, "worth")]),
+        ('"""Data given to `Campaign.tell`, and the law of total variance."""', []),
+    ],
+)
+def test_each_private_word_is_found(tmp_path, text, words):
+    file = tmp_path / "module.py"
+    file.write_text(text)
+    assert [(line, word) for line, word, _ in private_words(file)] == words

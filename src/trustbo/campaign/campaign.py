@@ -293,7 +293,7 @@ class Campaign(LearnedMissions, Displayed):
         """Give up the mission that was asked for; the next plan knows.
 
         Args:
-            reason: Reason, for the record. One of `models.CAUSES`, such as "stuck", says that a
+            reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", says that a
                 bound of the plan failed, and is learned from as a hazard.
             mission: Bounds that were run, to learn from; None if there are none.
             where: Cell that it failed to enter, where it did not report but that is known.

@@ -59,7 +59,7 @@ class CampaignOptions:
             environment is followed; for `"refit"` with Gaussian observations.
         awareness: Trust in the awareness map: map (blind) or belief (missions correct it). Under
             `"belief"`, or an `AwarenessBelief` of your own, policies draw from it too.
-        hazard: Priors of the chance that a bound fails. A `models.Hazard`, or some of its fields
+        hazard: Priors of the chance that a bound fails. A `hazard.Hazard`, or some of its fields
             by name.
         n_chains: Number of chains of NUTS; draws of other samplers are divided among them.
         warmup: Warm-up draws of each chain of NUTS, 300 by default.
@@ -234,7 +234,7 @@ def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
     if isinstance(given, Hazard):
         return given
     if not isinstance(given, Mapping):
-        raise TrustboError(f"hazard must be a models.Hazard, or some of its fields; got {given!r}.")
+        raise TrustboError(f"hazard must be a hazard.Hazard, or some of its fields; got {given!r}.")
     names = [prior.name for prior in fields(Hazard)]
     for name in given:
         if name not in names:

@@ -79,7 +79,7 @@ class Result(Displayed):
             differs from the plan before (`path_changed`), the `trust_map` it was planned on, the
             mission's mean `contact_rate`, its `status`, and its `state` with the `reason` ("told":
             to be learned from with a later mission; "learned"; "set aside": never), the posterior's
-            diagnostics (see `models.diagnostics`), and the seconds of planning, running and
+            diagnostics (see `inference.diagnostics`), and the seconds of planning, running and
             fitting.
         settings: Options of the campaign, and the settings of its model and simulator.
         stop_reason: Reason of the end.
@@ -201,7 +201,7 @@ class Result(Displayed):
             mean over robots, by its name, or as `awareness_<name>` where another map or a dim has
             that name. NaN where no robot can go. Where places have effects, also `place_mean` and
             `place_sd` of the cell's, and `place_bounds_mean`, the mean of those of the bounds into
-            it (see `models.place_maps`); of robots' own effects, the mean over robots.
+            it (see `inference.place_maps`); of robots' own effects, the mean over robots.
         """
         if n_draws is None and seed == 0:
             return self._maps.copy(deep=True)  # the caller may write into it

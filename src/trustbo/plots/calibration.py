@@ -31,13 +31,13 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
     95 % of such shares if the parameter is calibrated (binomial).
 
     Args:
-        ranks: Dataset of `models.sbc`.
+        ranks: Dataset of `inference.sbc`.
         **style: Options of `Style`; `cmap` is that of the curves.
 
     Returns:
         Axes, shape (2,).
     """
-    require_kind("plots.calibration", ranks, xr.Dataset, "give the Dataset of models.sbc")
+    require_kind("plots.calibration", ranks, xr.Dataset, "give the Dataset of inference.sbc")
     options, colours = Style.of(style), theme()
     made = small_multiples(2, (3.6, 2.9), options, least=2.4)
     curves, cover = made.panels
