@@ -293,7 +293,7 @@ class Mission(Displayed):
         Args:
             robots: Names of the robots.
             features: Names of the features.
-            unmeasured: Those of the features that the mission may lack; they are NaN then.
+            unmeasured: Features that the mission may lack; their values are then NaN.
 
         Raises:
             ShapeError: It has other robots or features.

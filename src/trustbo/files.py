@@ -77,13 +77,13 @@ def temporary_name(path: Path) -> Path:
 
 
 def _to_disk(file: Path) -> None:
-    """Let a file's bytes outlast a power cut before its name does."""
+    """Flush a file's bytes to disk before it is renamed."""
     with file.open("rb+") as stream:
         os.fsync(stream.fileno())
 
 
 def folder_to_disk(folder: Path) -> None:
-    """Let the names in a folder outlast a power cut, where the system can."""
+    """Flush a folder's entries to disk, where the system supports it."""
     with suppress(OSError):  # folders cannot be opened everywhere
         opened = os.open(folder, os.O_RDONLY)
         try:
@@ -311,7 +311,7 @@ def cache_folder(name: str) -> Path:
 
 
 def require_folder(directory: FilePath) -> Path:
-    """Return a folder, which need not exist; TrustboError if it, or one above it, is a file."""
+    """Return a folder, which need not exist; TrustboError if it or a parent is a file."""
     folder = as_path(directory)
     for part in (folder, *folder.parents):
         if part.exists():

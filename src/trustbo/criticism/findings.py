@@ -49,7 +49,7 @@ def finding(
     tests: Sequence[Departure],
     coefficients: Coefficients,
 ) -> str:
-    """Finding of a test in a sentence."""
+    """Sentence on the finding of a test."""
     mission, _, robot = data.slots.T
     label, one = outcome.label, np.ones(len(data.slots))
     if name == "place":

@@ -9,11 +9,11 @@ with warnings.catch_warnings():  # without ipywidgets its bars are of text, whic
     from tqdm.auto import tqdm
 
 NOWHERE, TERMINAL, NOTEBOOK, FILE = "", "terminal", "notebook", "file"
-"""Places of progress; a file gets lines alone, as carriage returns are for a terminal."""
+"""Places to show progress; a file gets lines only, as carriage returns need a terminal."""
 
 
 def place_of(progress: bool) -> str:
-    """Place that progress is shown in, if it is at all."""
+    """Place to show progress, or None if it is off."""
     if not progress:
         return NOWHERE
     if in_notebook():

@@ -36,7 +36,7 @@ class _Content:
 
     @cached_property
     def maps(self) -> xr.Dataset:
-        """Maps of the result, made once and only if a format needs them, as they can take long."""
+        """Maps of the result, computed once and only if a format needs them, as they are slow."""
         return self.result.maps()
 
 
@@ -50,7 +50,7 @@ class _Format(NamedTuple):
     require: Callable[[Result], None] | None = None
     """Check that refuses a result the format cannot hold."""
     on_terrain: tuple[str, ...] = ()
-    """More files, of posts and ways, that are written with a terrain in memory only."""
+    """Further files, of posts and ways, which need a terrain in memory."""
 
     def files_in(self, folder: Path, result: Result) -> list[Path]:
         more = () if result.workspace.ground is None else self.on_terrain

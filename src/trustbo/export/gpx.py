@@ -40,7 +40,7 @@ def gpx_routes(plan: Plan, name: str) -> str:
 def _route(
     plan: Plan, robot: str, ways: list[np.ndarray], near: float
 ) -> tuple[str, np.ndarray, list[tuple[str, str]]]:
-    """Return the description of a robot's route, its points (point, 2), and what each is."""
+    """Return the description of a robot's route, its points (point, 2), and their labels."""
     n_bounds, names = len(plan.path) - 1, (LEAD, *plan.workspace.team.names)
     cells = [f"cell {row}, {col}" for row, col in plan.path]
     ends = ["start", *(f"bound {k}" for k in range(1, n_bounds)), "goal"]

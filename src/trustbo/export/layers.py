@@ -104,9 +104,9 @@ def way_points(plan: Plan) -> pd.DataFrame:
 
 
 def routes_of(plan: Plan) -> dict[str, list[np.ndarray]]:
-    """Return the ways of each robot, bound by bound, the lead first; the first one missing ends it.
+    """Return the ways of each robot, bound by bound, the lead first, up to the first missing one.
 
-    Beyond it a robot must not drive: it has no way there.
+    After it the robot has no route, and must not drive.
     """
     names = (LEAD, *plan.workspace.team.names)
     ways = zip(*_required(plan, plan.ways), strict=True)

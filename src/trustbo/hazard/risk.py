@@ -12,7 +12,7 @@ from trustbo.hazard.sampler import LIMIT_NAMES, TILT, add_lost, prior_betas, ste
 from trustbo.workspace import Workspace
 
 _ENTRIES = 1 << 20  # of (draw, bound) at a time
-_SOME = 256  # bounds by which draws are put in order
+_SOME = 256  # number of bounds whose mean chance orders the draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class BoundRisk:
             hazard["place"].values,
             dict(zip(names, (count / count.sum()).tolist(), strict=True)),
         )
-        if "p_fail" in hazard:  # known already
+        if "p_fail" in hazard:  # located failures
             risk.__dict__["_moments"] = hazard["p_fail"].values, hazard["p_fail_sd"].values
         return risk
 
@@ -93,7 +93,7 @@ class BoundRisk:
 
     @cached_property
     def stopped(self) -> np.ndarray:
-        """Expected number of failures so far, shape (move, row, col)."""
+        """Posterior expected number of past failures, shape (move, row, col)."""
         counts = self.failures.copy()
         for j, (path, weight) in enumerate(zip(self.lost, self.lost_weights, strict=True)):
             for k, bound in enumerate(path, start=1):
@@ -154,7 +154,7 @@ class BoundRisk:
 
 
 def _places_in(bounds: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Indices of wanted bounds in ascending `bounds`; -1 for one that is not there."""
+    """Indices of wanted bounds in ascending `bounds`; -1 for one that is absent."""
     nearest = np.minimum(np.searchsorted(bounds, wanted), len(bounds) - 1)
     return np.where(bounds[nearest] == wanted, nearest, -1)
 

@@ -41,10 +41,10 @@ def to_datatree(
     missions: Sequence[Mission],
     site_dims: dict[str, tuple[str, ...]],
 ) -> xr.DataTree:
-    """Name the axes, cut the padding off, and mark what lies beyond a mission's end as NaN.
+    """Name the axes, remove the padding, and set values after a mission's end to NaN.
 
     Args:
-        groups: Arrays by group and name, with leading axes (chain, draw) unless they are moments.
+        groups: Arrays by group and name, with leading axes (chain, draw) except moments.
         missions: Missions of the posterior.
         site_dims: Axes of the model's parameters.
     """
@@ -113,7 +113,7 @@ def _data_groups(
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
-    """Missions that a posterior holds the data of."""
+    """Missions rebuilt from the data in a posterior."""
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
     robots, features = ([str(n) for n in data[dim].values] for dim in ("robot", "feature"))

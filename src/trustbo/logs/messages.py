@@ -87,7 +87,7 @@ class Messages:
         return self._types[TEXT](data=text)
 
     def flag(self, value: bool) -> Any:
-        """Make a truth value."""
+        """Make a boolean."""
         return self._types[FLAG](data=bool(value))
 
     def numbers(self, values: np.ndarray, names: Sequence[str]) -> Any:

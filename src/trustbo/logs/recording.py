@@ -33,7 +33,7 @@ class Marker(NamedTuple):
     bound: int
     cell: Cell
     path: tuple[Cell, ...] = ()
-    """Planned path, start first, if bound 0 has it."""
+    """Planned path, start first, if recorded in bound 0."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""numpyro, whole; and the JAX settings that results are computed under.
+"""Import of numpyro with its submodules, and the JAX settings of all computations.
 
 Without ipywidgets, a kernel of Jupyter is warned of it when numpyro is imported ("IProgress not
 found"); the warning is silenced, as text bars suffice.
@@ -28,7 +28,7 @@ VERSIONS: dict[str, str] = {
     "numpyro": numpyro.__version__,
     "jax": jax.__version__,
 }
-"""Versions that posteriors record, read once: each takes 4 ms."""
+"""Versions recorded in posteriors; cached, as each lookup takes 4 ms."""
 
 for _name, _module in list(sys.modules.items()):
     _package, _, _child = _name.rpartition(".")

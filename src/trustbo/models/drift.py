@@ -91,7 +91,7 @@ class DriftTrust(TrustModel):
 
     @classmethod
     def tree_unflatten(cls, static: tuple[Any, ...], data: tuple[Any, ...]) -> Self:
-        """Put the model together again; nothing is checked, as values may be tracers."""
+        """Rebuild the model without checks, as values may be tracers."""
         model = object.__new__(cls)
         (priors, listed), (*options, drift, how) = data, static
         if not callable(how):
@@ -221,7 +221,7 @@ class DriftTrust(TrustModel):
         return {name: draw(getattr(self.priors, name), (n,), rng) for name in names} | draws
 
     def for_features(self, features: Any) -> Self:
-        """The model itself: no prior goes by the name of a feature."""
+        """The model itself: no prior depends on names of features."""
         return self
 
     def options(self) -> dict[str, str]:
@@ -240,7 +240,7 @@ class DriftTrust(TrustModel):
         }
 
     def check(self, sites: Mapping[str, np.ndarray], shape: tuple[int, int]) -> None:
-        """See `TrustModel.check`: the drift has to be finite wherever awareness can be."""
+        """See `TrustModel.check`: the drift has to be finite for any awareness in [0, 1]."""
         drift = self.params(sites, shape[1]).drift
         rng = np.random.default_rng(0)
         z = np.stack([np.zeros(shape), np.ones(shape), *rng.uniform(size=(6, *shape))])

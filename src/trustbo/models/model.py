@@ -35,7 +35,7 @@ _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 @dataclass(frozen=True, repr=False)
 class TrustModel(Displayed, ABC):
-    """A trust model; itself a numpyro model, so that `MCMC(NUTS(model))` works.
+    """Trust model; callable as a numpyro model, so that `MCMC(NUTS(model))` works.
 
     Attributes:
         priors: Prior of each parameter; by default those of the family of observations and of the
@@ -111,7 +111,7 @@ class TrustModel(Displayed, ABC):
 
     @property
     def priors_are_independent(self) -> bool:
-        """Whether each field of the parameters is drawn from the prior of its name, alone."""
+        """Whether each field of the parameters has an independent prior of that name."""
         return False
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
@@ -350,10 +350,10 @@ class TrustModel(Displayed, ABC):
 
     @property
     def why_no_statistics(self) -> str | None:
-        """Reason why missions have no sufficient statistics of fixed size; None if they have.
+        """Reason why no sufficient statistics of fixed size exist; None if they do.
 
-        Observations are not Gaussian; robots share some parameters only, or influence each other;
-        or places have effects, which no sum over missions determines.
+        They exist for Gaussian observations, common or separate parameters of robots, and no
+        effects of places.
         """
         if not self.family.integrates_out:
             return "its observations are not Gaussian"
@@ -406,7 +406,7 @@ class TrustModel(Displayed, ABC):
         return ", ".join([type(self).__name__, *places, self.observation, *others])
 
     def describe(self) -> str:
-        """The model's name and options."""
+        """Text of the model's name and options."""
         listed = ", ".join(f'{name}="{value}"' for name, value in self.options().items())
         listed += "" if self.place is None else f", place={self.place}"
         return f"{type(self).__name__}({listed})"

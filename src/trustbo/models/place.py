@@ -152,7 +152,7 @@ def visited(
 
     Args:
         bounds: Move, row and column, -1 in the padding.
-        place: Effects there are.
+        place: Effects in the model.
         n_robots: Number of robots.
         shape: Rows and columns of the grid; by default the fewest that hold all cells.
 

@@ -113,7 +113,7 @@ class Priors(Displayed):
 
     @classmethod
     def default(cls, observation: str = "gaussian") -> Self:
-        """Default priors of a family of observations, always the same object.
+        """Default priors of a family of observations, one cached object.
 
         Counts (`"beta_binomial"`) have wider ones, as trust is a logit: beta_m ~ N(0, 2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5), x_0 ~ N(0, 1.5^2).
@@ -162,7 +162,7 @@ class Priors(Displayed):
         Args:
             name: Name of a field.
             values: Shape (...), or (..., feature) for `beta`.
-            beta0: Autoregression (...), which priors of stationary trust go by.
+            beta0: Autoregression (...), on which priors of stationary trust depend.
         """
         prior = getattr(self, name)
         if not self.stationary or name not in ("beta", "b"):
@@ -238,7 +238,7 @@ def as_text(prior: Distribution | float) -> str:
         return "yes" if prior else "no"
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
-    if isinstance(prior, Floored):  # the floor is no prior of the user's, but the data's
+    if isinstance(prior, Floored):  # the floor belongs to the data, not to the prior
         return as_text(prior.base)
     numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
     return f"{type(prior).__name__}({numbers})"

@@ -104,7 +104,7 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
         Axes, shape (2,): objective of the plans, mean contact rate of the missions.
 
     Raises:
-        TrustboError: The history has no mission.
+        TrustboError: The history is empty.
     """
     require_kind(
         "plots.campaign_history", history, xr.Dataset, "give a history, such as Result.history"

@@ -32,7 +32,7 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 
 
 
 class Panels(NamedTuple):
-    """Axes of a figure, and those of them that carry the labels."""
+    """Axes of a figure, and the subsets that carry labels."""
 
     figure: Figure | SubFigure
     panels: np.ndarray
@@ -139,7 +139,7 @@ def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
 def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: Any) -> None:
     """Add a colour bar, unless left out; a label longer than its bar is broken.
 
-    `axes=` are those it belongs to, by default all panels.
+    The option `axes=` has the Axes of the bar, by default all panels.
     """
     if not style.legend:
         return
@@ -168,7 +168,7 @@ def _heights(axes: Sequence[Axes]) -> list[float]:
 
 
 def _whole(ax: Axes) -> Figure:
-    """Figure of Axes, with all its parts."""
+    """Top-level figure of Axes, also if they are in a subfigure."""
     figure = ax.get_figure(root=True)
     assert isinstance(figure, Figure)  # noqa: S101
     return figure

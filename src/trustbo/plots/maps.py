@@ -60,8 +60,8 @@ def trust_maps(
 
     The last panel shows the map and the recommended path after the last mission. All are on one
     scale, from the 2 % to the 98 % quantile of the learned maps, the start cell left out, whose
-    trust is assumed: a draw of the prior may be far off. A trust of 1 is that of unbroken contact;
-    above it there is no other colour.
+    trust is assumed: a draw of the prior may be far off. A trust of 1 corresponds to unbroken
+    contact; larger values share its colour.
 
     Args:
         history: Map and path of each iteration, such as `Result.history`.
@@ -69,8 +69,7 @@ def trust_maps(
         path: Path recommended then, such as `Result.path`.
         workspace: Workspace of the cells.
         missions: Missions to draw, numbers of the history's `iteration`; `"moments"` for the first,
-            second and fourth, as far as there are, planned with what 0, 1 and 3 missions taught;
-            or `"all"`.
+            second and fourth, as far as they exist, planned after 0, 1 and 3 missions; or `"all"`.
         **style: Options of `Style`.
 
     Returns:
@@ -111,7 +110,7 @@ def trust_maps(
 
 
 def _chosen(missions: Sequence[int] | str, available: list[int]) -> list[int]:
-    """Numbers of the missions to draw."""
+    """Numbers of the missions to draw; TrustboError for one that does not exist."""
     if isinstance(missions, str):
         if missions not in ("moments", "all"):
             raise TrustboError(
@@ -126,7 +125,7 @@ def _chosen(missions: Sequence[int] | str, available: list[int]) -> list[int]:
 
 
 def _moment(n: int) -> str:
-    """Title of a map that n missions taught."""
+    """Title of a map learned from n missions."""
     return "prior" if n == 0 else f"after {n} mission{'s' if n > 1 else ''}"
 
 
@@ -152,7 +151,8 @@ def robot_maps(
         maps: Maps (robot, row, col), such as `planner.cost_map(params, per_robot=True)`, the cost
             f = 1 - sigma(trust) of the paper.
         workspace: Workspace of the cells.
-        path: Path to draw on each map; its start, where trust is assumed, has no part in the scale.
+        path: Path to draw on each map; its start, where trust is assumed, is excluded from the
+            scale.
         label: Label of the colour bar.
         **style: Options of `Style`.
 
@@ -333,7 +333,7 @@ def contours(workspace: Workspace, heights: str = "dem") -> list[np.ndarray]:
     valid = np.isfinite(height)
     if min(height.shape) < 3 or not valid.any():
         return []
-    # Smoothed where it is known only: a normalised convolution.
+    # A normalised convolution: only known heights are smoothed.
     width = max(1.0, _SMOOTH * max(height.shape))
     weight = gaussian_filter(valid.astype(float), width)
     smooth = gaussian_filter(np.where(valid, height, 0.0), width) / np.maximum(weight, 1e-9)

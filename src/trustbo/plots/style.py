@@ -16,10 +16,10 @@ SMALL, MEDIUM = 8.0, 9.0
 
 
 class Theme(NamedTuple):
-    """Colours of all that is no value: hexadecimal, each once, so that one can replace another."""
+    """Colours of all but data values: hexadecimal, and distinct so that themes can be swapped."""
 
     ink: str
-    """Text, frames, and what was measured."""
+    """Colour of text, frames and measurements."""
     paper: str
     """Background."""
     quiet: str
@@ -103,7 +103,7 @@ class Style:
         relief: Whether to draw contour lines of the terrain on maps.
 
     Raises:
-        TrustboError: An option is unknown, or its value cannot be.
+        TrustboError: An option is unknown, or its value invalid.
     """
 
     ax: Any = None

@@ -80,7 +80,7 @@ class Fact:
     Attributes:
         name: Subject, one or two words.
         text: Statement, one or two sentences.
-        good: Whether the fact is good; None if there is nothing to judge.
+        good: Whether the fact is good; None for a neutral one.
     """
 
     name: str

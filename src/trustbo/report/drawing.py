@@ -49,7 +49,7 @@ def picture(draw: Callable[[], Axes | np.ndarray], alt: str, caption: str) -> Pi
 
 
 def themed(svg: str) -> str:
-    """Replace the colours of the light theme by names, whose values follow the reader's setting."""
+    """Replace colours of the light theme by CSS variables, which follow the reader's setting."""
     light, dark = (
         "".join(f"--{name}:{colour};" for name, colour in theme._asdict().items())
         for theme in (LIGHT, DARK)

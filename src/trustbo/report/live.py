@@ -20,7 +20,7 @@ _REFRESH = 5
 
 
 class LivePage:
-    """Page of a campaign under way: a callback of campaigns, renewed after each mission.
+    """Page of a running campaign: a callback that rewrites it after each mission.
 
     The file is replaced as a whole, so that there is a page to be read at any time, after a crash
     too: it states its mission and time, and the meaning if that is long ago.
@@ -55,14 +55,14 @@ class LivePage:
             self._write("It was interrupted", refresh=0)
 
     def finish(self, result: Result) -> None:
-        """Write the usual report in its place."""
+        """Replace the page by the final report."""
         write_report(self.path, result)
 
     def _write(self, state: str, *, refresh: int = _REFRESH) -> None:
         campaign, n, facts, sections = self._campaign, 0, [], []
         if campaign is not None:
             result, n = campaign.result(), len(campaign.missions)
-            facts = facts_of(result, campaign.recommend())[:-1]  # but the reason of the end
+            facts = facts_of(result, campaign.recommend())[:-1]  # except for the reason of the end
             sections = _sections(result)
         now = time.strftime("%H:%M on %d %B %Y")
         status = f"{state}: as of mission {n} of {self.total}, at {now}."

@@ -24,7 +24,7 @@ _MEANS = {
 def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
     """Return the facts of the summary: campaign, recommendation, value, diagnostics.
 
-    The `plan` is the result's; a campaign under way has it at hand.
+    The `plan` is that of the result; a running campaign passes it.
     """
     plan = result.plan if plan is None else plan
     return [
@@ -125,7 +125,7 @@ def _soundness(result: Result) -> Fact:
 
 
 def _end(result: Result) -> str:
-    """Return the reason of the end, or the way to go on."""
+    """Return the reason of the end, or the command to resume."""
     text = result.stop_reason
     if text == "n_iterations":
         return "All missions asked for were run."

@@ -8,7 +8,7 @@ import numpy as np
 from trustbo.data import Cell
 
 BOUNDING = ("successive", "alternate")
-"""T2 closes up to the lead after each bound, or passes it in the next."""
+"""Modes of bounding: T2 closes up to the lead after each bound, or passes it in the next."""
 
 
 @dataclass(eq=False)

@@ -102,7 +102,7 @@ class Degradation:
 
 
 def acts_in(event: Threat | Degradation, mission: int) -> bool:
-    """Whether it acts in a mission."""
+    """Whether the event acts in a mission."""
     last = event.last_mission
     return event.first_mission <= mission and (last is None or mission <= last)
 

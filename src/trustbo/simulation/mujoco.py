@@ -26,7 +26,7 @@ PROGRESS = 0.25
 CLEARANCE, AVOIDANCE_RANGE = 1.3, 4.0
 """Distance that a robot keeps from another, centre to centre, and range of avoidance, m."""
 COLLISION_TIME = 3.0
-"""Longest time from a touch to a failure that counts as a collision, s."""
+"""Upper limit of the time from a touch to a failure that counts as a collision, s."""
 STILL = 0.05
 """Least displacement of a robot at its goal that counts as motion, m."""
 SLOW = 1.5

@@ -12,7 +12,7 @@ from trustbo.errors import TrustboError
 class Simulator(Protocol):
     """Simulator that runs a path: one of this package, a custom one, or real robots.
 
-    One more method is optional: `describe() -> dict` gives settings that a campaign records. A
+    One more method is optional: `describe() -> dict` returns settings that a campaign records. A
     simulator whose world changes takes the number of the mission as a keyword `mission` of `run`
     (and of `reset`).
     """

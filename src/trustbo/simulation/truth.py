@@ -35,7 +35,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
 OBJECTIVES = ("lost_contact", "mean")
-"""Objectives that a truth has a best path for."""
+"""Objectives for which a truth has a best path."""
 
 
 class PathContact(NamedTuple):
@@ -251,7 +251,7 @@ def _percent(lacking: float, whole: float) -> float:
 
 
 def _world(simulator: Any, mission: int) -> object:
-    """Identity of the world of a mission: which events act in it."""
+    """Identity of the world of a mission: the events that act in it."""
     if isinstance(simulator, KinematicSimulator):
         events = (*simulator.threats, *simulator.degradations)
         return tuple(i for i, event in enumerate(events) if acts_in(event, mission))
@@ -317,7 +317,7 @@ def _code() -> str:
 
 
 def _differences(a: Workspace, b: Workspace) -> list[tuple[str, str, str]]:
-    """Names of what differs, with both values in words."""
+    """Names of settings that differ, with both values as text."""
     if a.grid != b.grid:
         mine, theirs = (
             f"{g.shape[0]} x {g.shape[1]} cells of {g.cell_height:g} m x {g.cell_width:g} m at "

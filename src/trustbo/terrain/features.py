@@ -236,7 +236,7 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray, radius: float) -> xr.DataArray:
-    """Mean over squares of half-width `radius` (m), of the pixels that have a value."""
+    """Mean of the valid pixels in squares of half-width `radius` (m)."""
     size: Any = [2 * max(1, round(radius / step)) + 1 for step in pixel_size(terrain)]
     has_ground, valid = np.isfinite(terrain["dem"].values), np.isfinite(values)
     total = ndimage.uniform_filter(np.where(valid, values, 0.0), size, mode="nearest")

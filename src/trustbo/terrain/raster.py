@@ -1,4 +1,4 @@
-"""Raster that is read window by window, and its lazy array."""
+"""Rasters read window by window, and their lazy arrays."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -127,7 +127,7 @@ class Grid(Displayed):
         return cell_of("position", {"x": x, "y": y}, self)
 
     def place(self, maps: xr.Dataset) -> xr.Dataset:
-        """Maps of the cells (row, col) on their place: dims (y, x), with the transform and CRS."""
+        """Georeference maps of the cells (row, col): dims (y, x), with the transform and CRS."""
         placed = maps.drop_vars(["row", "col", "y", "x"], errors="ignore").rename(row="y", col="x")
         placed = placed.assign_coords(y=self.y, x=self.x)
         for axis in ("y", "x"):
@@ -188,7 +188,7 @@ class Grid(Displayed):
 
 
 def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
-    """Maps with the dims row and col, also of those with (y, x), as `Result.maps` has them."""
+    """Maps with dims row and col, converted from (y, x), those of `Result.maps`."""
     if not {"y", "x"} <= set(maps.dims):
         return maps
     return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")

@@ -50,7 +50,7 @@ class Named(NamedTuple):
 
 
 def named(what: str, location: object) -> Named:
-    """Give the numbers of a location their names.
+    """Parse a location into named numbers.
 
     A bare pair is a cell: positions need names, so that nothing is guessed. TrustboError: neither a
     pair of whole numbers nor two numbers with the names of one spelling.
@@ -141,7 +141,7 @@ def position_near(what: str, location: object, grid: "Grid", reach: float) -> tu
 
 
 def _named_on(grid: "Grid", what: str, location: object) -> Named:
-    """Numbers of a location with their names; the error has the spelling that is on the grid."""
+    """Parse a location; the error suggests the spelling that is on the grid."""
     try:
         return named(what, location)
     except TrustboError as error:

@@ -157,7 +157,7 @@ class Posts:
             )
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of a cell's passable pixels, those of the largest region if any.
+        """Rows and columns of a cell's passable pixels, in the largest region where possible.
 
         All of its pixels if none is passable; no route leads there.
         """

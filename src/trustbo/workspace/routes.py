@@ -11,7 +11,7 @@ from trustbo.team import Robot
 from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
-"""Share of its speed that a robot keeps at its slope limit."""
+"""Speed at the slope limit as a share of that on level ground."""
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -75,7 +75,7 @@ class Routes:
 
 @_compiled
 def speed_share(tilt, max_slope):
-    """Share of its speed on level ground that a robot keeps at a tilt, rad."""
+    """Speed at a tilt (rad) as a share of that on level ground."""
     return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
 
 

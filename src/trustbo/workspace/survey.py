@@ -118,7 +118,7 @@ class Survey(Displayed):
 def survey(
     terrain: xr.Dataset, shape: tuple[int, int] = (10, 10), team: Team | None = None
 ) -> Survey:
-    """Survey a terrain, which takes a moment: no awareness is computed.
+    """Survey a terrain; fast, as no awareness is computed.
 
     Of a lazily read terrain of over 4 million pixels, bands of rows are read, whose shares stand
     for those of their cells.

@@ -207,7 +207,7 @@ class SufficientStatistics(NamedTuple):
 
 
 Statistics = tuple[SufficientStatistics, ...]
-"""Statistics of all robots together, or of each, if they have nothing in common."""
+"""Statistics of all robots together, or of each robot if these share nothing."""
 
 
 def require_forgetting(forgetting: float) -> float:

@@ -77,7 +77,7 @@ def _trust_draws(
 
 
 def _in_batches(compiled: Callable[[Any], Array], inputs: Any) -> np.ndarray:
-    """Results of a compiled function of draws, in batches of one size: one program for all.
+    """Results of a compiled function of draws, in batches of one size, for one compiled program.
 
     Args:
         compiled: Function of inputs with a leading axis (draw,).

@@ -1,4 +1,4 @@
-"""Distinct modes of a posterior: where chains of NUTS start, and whether they were there.
+"""Distinct modes of a posterior: starts of NUTS chains, and checks that these visited them.
 
 Chains that start at different modes and do not meet have a large R-hat. It does not detect a mode
 that all chains left in their warm-up: so the mass that a Gaussian fit at each mode holds (Laplace)
@@ -27,10 +27,10 @@ class Modes(NamedTuple):
 
     mode: Array  # (mode, unknown)
     scale: Array  # (mode, unknown, unknown), Cholesky factors of the covariances
-    share: Array  # (mode,), of all mass; 0 where a mode is there already, or holds too little
+    share: Array  # (mode,), sum 1; 0 for duplicates and modes below the mass limit
 
     def spread(self, n_chains: int) -> tuple[Array, Array]:
-        """Mode and scale to start each chain from: those that have a share, in turn."""
+        """Mode and scale for the start of each chain, cycling over modes with positive mass."""
         kept = self.share > 0.0
         places = jnp.argsort(~kept, stable=True)[jnp.arange(n_chains) % kept.sum()]
         return self.mode[places], self.scale[places]
@@ -68,16 +68,16 @@ def find_modes(
     gaps = mode[:, None] - mode[None]  # (other, start, unknown)
     white = jax.vmap(lambda L, gap: solve_triangular(L, gap.T, lower=True))(scale, gaps)
     near = jnp.abs(white).max(1) < _SAME_MODE
-    again = jnp.triu(near, 1).any(0)  # as one of more mass
+    again = jnp.triu(near, 1).any(0)  # as a heavier one
     light = log_mass < log_mass[0] - _LEAST_LOG_MASS
     mass = jnp.where(again | light, 0.0, jnp.exp(log_mass - log_mass[0])).at[0].set(1.0)
     return Modes(mode, scale, mass / mass.sum())
 
 
 def visits(modes: Modes, draws: np.ndarray) -> dict[int, np.ndarray]:
-    """Whether each draw lies around a mode, by the mode's index, for those of noteworthy mass.
+    """Mask of the draws around each mode above the mass limit, by the mode's index.
 
-    A draw lies around the mode whose Gaussian fit, times its share, is densest there.
+    A draw belongs to the mode with the largest mass times Gaussian density there.
 
     Args:
         modes: Modes.

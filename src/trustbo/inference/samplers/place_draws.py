@@ -21,7 +21,7 @@ def split_units(
         g: Effects of units, (draw, unit).
         hyper: Hyperparameters by name, each (draw,).
         places: Visited places.
-        place: Effects there are.
+        place: Effects in the model.
         rng: Random number generator.
     """
     if not place.bounds:

@@ -9,9 +9,9 @@ from trustbo.errors import TrustboError, require_whole, unknown
 _OTHERS = (
     "workspace", "earlier", "weights", "seed", "progress", "n_trajectories", "check", "whole",
 )  # fmt: skip
-"""Other keyword arguments of `fit`, for the advice on a misspelt one."""
+"""Other keyword arguments of `fit`, to suggest for misspelt ones."""
 _FORMER = {"n_warmup": "warmup", "n_draws": "draws"}
-"""Names until version 0.2, which are still taken."""
+"""Names until version 0.2, still accepted."""
 _OF_ALL = ("n_chains", "draws")
 """Settings that the exact sampler takes too: the number and the shape of its draws."""
 

@@ -1,4 +1,4 @@
-"""Censored rates (Tobit): y = x + v cut to [0, 1], so rates of 0 and 1 are known as limits only.
+"""Censored rates (Tobit): y = x + v clipped to [0, 1], so rates of 0 and 1 are only limits.
 
 Trust is Gaussian given the censored rates, which are drawn beyond their limits bound by bound from
 the filter's predictions (GHK), as functions of the innovations.
@@ -21,7 +21,7 @@ from trustbo.models.state_space.scalar import Censoring, Filtered
 
 @dataclass(frozen=True)
 class Censored(Gaussian):
-    """Gaussian rates that pile up at 0 and 1."""
+    """Gaussian rates censored at 0 and 1."""
 
     name: ClassVar[str] = "censored"
     integrates_out: ClassVar[bool] = False
@@ -38,13 +38,13 @@ class Censored(Gaussian):
         return ssm.filter(observed.y, complete=complete, censoring=Censoring(side, e))
 
     def measure(self, key: Array, ssm: SSM, trust: Array, y: Array, n_ticks: Array) -> Array:
-        """See `Family.measure`: `y` cut to [0, 1]."""
+        """See `Family.measure`: `y` clipped to [0, 1]."""
         return jnp.clip(y, 0.0, 1.0)
 
     def rate_moments(
         self, trust: np.ndarray, noise_sd: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `Family.rate_moments`: of a normal variable cut to [0, 1] (Tobin 1958)."""
+        """See `Family.rate_moments`: of a normal variable clipped to [0, 1] (Tobin 1958)."""
         low, high = -trust / noise_sd, (1.0 - trust) / noise_sd
         inside = norm.cdf(high) - norm.cdf(low)
         first = norm.pdf(low) - norm.pdf(high)
@@ -73,7 +73,7 @@ class Censored(Gaussian):
         n_ticks: np.ndarray,
         noise_sd: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `Family.observe`: of a normal cut at a limit (Tobin 1958)."""
+        """See `Family.observe`: of a normal censored at a limit (Tobin 1958)."""
         value, zero, density = super().observe(mean, var, y, n_ticks, noise_sd)
         at_one, cut, S = y >= 1.0, (y >= 1.0) | (y <= 0.0), np.sqrt(var)
         side, limit = np.where(at_one, 1.0, -1.0), np.where(at_one, 1.0, 0.0)

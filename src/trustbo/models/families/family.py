@@ -23,7 +23,7 @@ from trustbo.models.state_space.vector import VectorSSM
 
 SSM = ScalarSSM | VectorSSM
 N_IMPORTANCE = 32
-"""Trajectories over which the likelihood is averaged where trust does not integrate out."""
+"""Trajectories to average the likelihood over where trust does not integrate out."""
 
 
 class Observed(NamedTuple):
@@ -52,17 +52,17 @@ class Family(ABC):
     integrates_out: ClassVar[bool] = False
     """Whether latent trust integrates out in closed form: rates are linear in it, and Gaussian."""
     needs_ticks: ClassVar[bool] = False
-    """Each measured rate needs its number of ticks."""
+    """Whether each measured rate needs its number of ticks."""
     linearises: ClassVar[bool] = False
-    """The density is weighted around a linearisation point, found by `refine`."""
+    """Whether the density is weighted around a linearisation point, found by `refine`."""
     allows_change: ClassVar[bool] = True
-    """Rates may measure the change of trust (`response="change"`)."""
+    """Whether rates may measure the change of trust (`response="change"`)."""
     rounds: ClassVar[bool] = True
-    """delta_v is the sd of a rate, which is known to the resolution of its ticks."""
+    """Whether delta_v is the sd of a rate, recorded to the resolution of its ticks."""
     observes_trust: ClassVar[bool] = False
-    """`observe` takes and gives moments of trust, not of the rate before it is cut."""
+    """Whether `observe` maps moments of trust, not of the rate before clipping."""
     correlates: ClassVar[bool] = True
-    """Observation noise may be correlated between robots."""
+    """Whether observation noise may be correlated between robots."""
 
     propagates: ClassVar[bool] = True
     """Whether expectation propagation has its `terms`, hence the exact sampler applies."""
@@ -122,8 +122,8 @@ class Family(ABC):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Moments given a rate that was predicted N(mean, var), and its log probability or density.
 
-        They are those of the rate before it is cut, noise included, or of trust where
-        `observes_trust`. Arrays broadcast; `y` is not NaN.
+        Moments are of the rate before clipping, noise included, or of trust where `observes_trust`.
+        Arrays broadcast; `y` is not NaN.
         """
 
     def terms(self, y: np.ndarray, n_ticks: np.ndarray) -> Terms:

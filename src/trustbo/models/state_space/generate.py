@@ -60,7 +60,7 @@ def draw_missions(
 
 
 class _Dynamics(NamedTuple):
-    """Parameters of robots that share them, or that influence each other, draws last."""
+    """Parameters of one group of robots: with common parameters, or coupled; draws last."""
 
     B0: np.ndarray  # (draw,), or (robot, robot', draw)
     B: np.ndarray  # (feature, draw), or (feature, robot, robot', draw)

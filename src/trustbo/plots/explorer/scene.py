@@ -1,4 +1,4 @@
-"""Content of the interactive page: layers of the map, and paths that its slider goes through."""
+"""Content of the interactive page: layers of the map, and the paths of its slider."""
 
 import json
 import math
@@ -42,7 +42,7 @@ class Layer:
     sd: str | None = None
 
     def record(self, passable: np.ndarray) -> dict[str, Any]:
-        """Layer as JSON can hold it, without values where cells are impassable."""
+        """JSON-serialisable layer, without values where cells are impassable."""
         values = np.where(passable, self.values, np.nan)
         maps = [to_list(one.ravel()) for one in values.reshape(-1, *passable.shape)]
         return {
@@ -80,7 +80,7 @@ class Step:
     numbers: dict[str, list[str]] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
-        """Step as JSON can hold it."""
+        """JSON-serialisable step."""
         return {
             "title": self.title,
             "note": self.note,
@@ -111,7 +111,7 @@ class Scene:
     steps: Sequence[Step]
 
     def record(self) -> dict[str, Any]:
-        """Content as JSON can hold it, with the layers that there is room for."""
+        """JSON-serialisable content, with as many layers as the size limit allows."""
         grid, passable = self.workspace.grid, self.workspace.passable.values
         steps = [step.record() for step in self.steps]
         room, shown = MOST_BYTES - len(json.dumps(steps)), []
