@@ -372,7 +372,7 @@ def default_features(n_features: int) -> tuple[str, ...]:
 
 
 def _failure(failed_at: int | None, reason: str, status: str, n_bounds: int) -> tuple[int, str]:
-    """Bound, from 1, in which a mission failed, and its outcome."""
+    """Bound in which a mission failed, from 1, and its status."""
     if failed_at is None:
         raise TrustboError(
             f"reason={reason!r} needs failed_at=, the number of the bound, from 1, that ended the "

@@ -76,9 +76,9 @@ def require_same_team(missions: Sequence[Mission]) -> None:
 
 
 def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
-    """Fill awareness that a mission did not measure (NaN) with what is known of its bounds.
+    """Fill awareness that a mission did not measure (NaN) with given awareness of its bounds.
 
-    `known` has shape (bound, robot, feature).
+    `awareness` has shape (bound, robot, feature).
     """
     if not np.isnan(mission.awareness).any():
         return mission

@@ -46,7 +46,7 @@ def match_moments(draws: np.ndarray, prior: "Distribution") -> "Distribution":
 
 
 def robust_scale(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Infinite cuts, median and interquartile range of each column of x, (row, column)."""
+    """Scale of each column of x (row, column): no clipping, median, interquartile range."""
     low, high = (np.full(x.shape[1], end) for end in (-np.inf, np.inf))
     quartiles = np.percentile(x, [25, 50, 75], axis=0)
     return low, high, quartiles[1], quartiles[2] - quartiles[0]

@@ -13,7 +13,7 @@ NOWHERE, TERMINAL, NOTEBOOK, FILE = "", "terminal", "notebook", "file"
 
 
 def place_of(progress: bool) -> str:
-    """Place to show progress, or None if it is off."""
+    """Place to show progress; `NOWHERE` without progress."""
     if not progress:
         return NOWHERE
     if in_notebook():

@@ -36,7 +36,7 @@ class Exposures(NamedTuple):
     """
 
     bounds: Bounds
-    """Bounds that were met, without repetition, in lexicographic order."""
+    """Distinct bounds with an exposure, in lexicographic order."""
     n: np.ndarray
     """Exposures whose outcome is known, shape (bound,): bounds completed, and those that failed."""
     failed: np.ndarray

@@ -45,5 +45,5 @@ class PooledTrust(TrustModel):
 
     @property
     def priors_are_independent(self) -> bool:
-        """Whether priors are independent: yes."""
+        """True: each parameter has an independent prior."""
         return True

@@ -20,7 +20,7 @@ PAGE = 7.6
 _KEY, _LETTER = 0.45, 0.068
 """Widths of a legend's key with its margins, and of a letter of its text, inches."""
 _LINE = 0.18
-"""Height of a line of a legend, inches; a figure is higher by them, for panels to keep theirs."""
+"""Height of a line of a legend, inches; added to the figure's height to keep that of panels."""
 _PAD = 0.04
 """Margin around a figure, inches."""
 _LETTERS = 11

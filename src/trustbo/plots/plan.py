@@ -119,7 +119,7 @@ def _free_corner(points: np.ndarray) -> tuple[int, int]:
 
 
 def _window(middle: float, half: float, low: float, high: float) -> tuple[float, float]:
-    """Left end and width of a window around a point, moved to be inside the map."""
+    """Left end and width of a window around a point, shifted into the map."""
     width = min(2.0 * half, high - low)
     return float(np.clip(middle - width / 2.0, low, high - width)), width
 

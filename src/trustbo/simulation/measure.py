@@ -17,7 +17,7 @@ from trustbo.workspace.surface import Surface
 
 _PARTS, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
 _OPAQUE = 1e6
-"""Extinction of a canopy that lets nothing through, 1/m."""
+"""Extinction of an opaque canopy, 1/m."""
 
 
 class Measure:

@@ -136,7 +136,7 @@ class ReplaySimulator(DescribedSimulator):
 
         Raises:
             TrustboError: `reset` was not called, a bound is out of order, no mission has that path,
-                or the mission that is replayed had ended, or went another way.
+                or the replayed mission had ended or took another path.
         """
         if self._start is None:
             raise TrustboError("call reset(start, seed) before run_bound.")

@@ -68,7 +68,7 @@ def _track(detected, limits, tracks, contact):
 
 
 def cut_at_lost_contact(contact: np.ndarray, patience: int, status: str) -> tuple[int, str]:
-    """Length in ticks and status of a bound that ends after `patience` ticks without contact."""
+    """Length in ticks and status of a bound, cut after `patience` ticks without contact."""
     alone = 0
     for k, any_contact in enumerate(contact.any(1)):
         alone = 0 if any_contact else alone + 1

@@ -39,7 +39,7 @@ OBJECTIVES = ("lost_contact", "mean")
 
 
 class PathContact(NamedTuple):
-    """Contact lost and kept on a path, and the chance to arrive."""
+    """Expected contact lost and kept on a path, and the probability to arrive."""
 
     lost: float
     """Expected contact lost, in bounds: the sum over bounds of 1 - contact, mean over robots."""

@@ -59,8 +59,8 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             robust: Loadings from rank correlations (Spearman), robust to outliers and to monotone
                 transforms of the features.
             method: `"zheng2023"` is for comparison with the later code of the paper's authors:
-                features scaled by median and interquartile range, uncut, the component's sign left
-                to the solver, the score squashed by the logistic function.
+                features scaled by median and interquartile range, uncut, the component's sign as
+                returned by the solver, the score mapped by the logistic function.
             min_samples: Least number of samples to fit on.
 
         Raises:
@@ -76,8 +76,8 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
     def realtime(cls, feature: str, **options: object) -> Self:
         """Make the index of a driven bound: the map's value fused with the robot's state.
 
-        Fit it once, on the bounds of a set of calibration missions, and keep it: fitted again on
-        few bounds, its signs may flip.
+        Fit it once on the bounds of a set of calibration missions: refitted on few bounds, its
+        signs may flip.
 
         Args:
             feature: `"traversability"`: the map's (`offline`) at the robot's true position, its
@@ -244,7 +244,7 @@ class CompositeIndex(TransformerMixin, BaseEstimator):
             self._low, self._high = np.percentile(x, [1, 99], axis=0)
             x = np.clip(x, self._low, self._high)
             self._mean, self._sd = x.mean(0), x.std(0)
-        # A feature that (nearly) never changes carries no information, and has no z-score.
+        # A (nearly) constant feature carries no information, and has no z-score.
         self._varies = self._sd > 1e-9 * np.maximum(1.0, np.abs(self._mean))
 
     def _scale(self, score: np.ndarray) -> None:

@@ -62,7 +62,7 @@ def _halo_rows(terrain: xr.Dataset, halo: float) -> int:
 
 
 def strip_of(terrain: xr.Dataset, first: int, last: int, around: int) -> Strip:
-    """Read the rows from `first` up to `last`, and `around` more on both sides, as a strip."""
+    """Read rows `first` to `last`, with `around` more on both sides, as a strip."""
     top, bottom = max(0, first - around), min(terrain["dem"].shape[0], last + around)
     window, n_clipped, n_valid = terrain.isel(y=slice(top, bottom)), 0, 0
     if is_lazy(terrain):

@@ -24,7 +24,7 @@ _BLOCK = 256  # bounds computed at a time: they share calls, and bound the memor
 
 
 class BoundMaps(NamedTuple):
-    """Awareness of bounds and of cells, each with the line of sight under each sight last."""
+    """Awareness of bounds and of cells; the last features are the lines of sight, by sight."""
 
     bounds: np.ndarray  # (robot, move, row, col, feature), NaN where there is none
     cells: np.ndarray  # (robot, row, col, feature)

@@ -329,7 +329,7 @@ class Workspace(Displayed):
     def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
         """Posts and ways over another surface of the same terrain, such as one with closed areas.
 
-        Posts go by the workspace's sight, or by another where it has none.
+        Posts are chosen by the workspace's sight, or by `sight` where it has none.
         """
         assumed = (*self.sights, sight or Sight())[0]
         assert self.pixels is not None  # noqa: S101  # there is a surface

@@ -180,7 +180,7 @@ class SufficientStatistics(NamedTuple):
         )
 
     def scaled(self, factor: float) -> Self:
-        """The statistics of the same missions with other weight."""
+        """Multiply the weight of the missions by a factor."""
         return self._replace(
             grams={length: gram.scaled(factor) for length, gram in self.grams.items()},
             gaps=tuple(gap.scaled(factor) for gap in self.gaps),

@@ -1,7 +1,7 @@
 """The identity of `gram` in JAX, for NUTS: the pooled Gaussian likelihood from sums over missions.
 
-A density costs the same for 600 rates as for 100 000. Lengths and frequencies are padded, so that
-compiled code is reused.
+The cost of a density does not depend on the number of rates. Lengths and frequencies are padded, so
+that compiled code is reused.
 """
 
 from typing import NamedTuple
@@ -61,7 +61,7 @@ def spectrum(statistics: SufficientStatistics) -> Spectrum:
 
 
 class Conditional(NamedTuple):
-    """Weights and intercept given all else, under normal priors."""
+    """Conditional distribution of weights and intercept under normal priors."""
 
     mean: Array  # (coefficient,)
     cholesky: Array  # (coefficient, coefficient), lower factor of their precision

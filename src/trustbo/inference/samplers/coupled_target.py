@@ -1,13 +1,14 @@
 """The posterior of coupled robots with Gaussian rates, their linear coefficients integrated out.
 
 Given B0, the noises and, of robots in order, gamma, all weights and intercepts integrate out
-(`coupled_marginal`), with the couplings among them. Left are scores of the priors: three robots
-have 9 numbers of B0 and 6 of each covariance, 21 in all (in order 3 + 2 + 6 = 11), for any number
-of features. beta0 and the noises are scored as in `scores`, size and angle robot by robot;
-couplings are normal; correlations are the partial ones of the LKJ prior. With b = concentration +
-(n - 2 - k) / 2, the correlation of robots i and k < i given those before k is 2 Beta(b, b) - 1, and
-row i of the factor of the correlations is p_0, p_1 (1 - p_0^2)^1/2, p_2 (1 - p_0^2)^1/2 (1 -
-p_1^2)^1/2, ..., and what is left of 1 last (Lewandowski, Kurowicka and Joe 2009).
+(`coupled_marginal`), with the couplings among them. The remaining unknowns are scores of the
+priors: three robots have 9 numbers of B0 and 6 of each covariance, 21 in all (in order 3 + 2 + 6 =
+11), for any number of features. beta0 and the noises are scored as in `scores`, size and angle
+robot by robot; couplings are normal; correlations are the partial ones of the LKJ prior. With b =
+concentration + (n - 2 - k) / 2, the correlation of robots i and k < i given those before k is 2
+Beta(b, b) - 1, and row i of the factor of the correlations is p_0, p_1 (1 - p_0^2)^1/2, p_2 (1 -
+p_0^2)^1/2 (1 - p_1^2)^1/2, ..., and last the root of 1 less the squares before (Lewandowski,
+Kurowicka and Joe 2009).
 """
 
 import numpy as np

@@ -1,11 +1,11 @@
 """The posterior of a model with a custom drift, Gaussian rates and few parameters.
 
-Trust and effects of places integrate out. All else is a score of its prior (`scores`), the user's
-parameters in the order of their statements: each is the quantile of its prior, given those before
-it, at Phi(score). So where data carry no information the posterior is a sphere, and a hierarchy is
-non-centred. The density is compiled for 256 points at a time. The first proposal is Laplace's at
-the best of the modes found from the best prior points; where a second mode matters, weights would
-not reveal it, and NUTS takes over.
+Trust and effects of places integrate out. The other parameters are scores of their priors
+(`scores`), the user's in the order of their statements: each is the quantile of its prior, given
+those before it, at Phi(score). So where data carry no information the posterior is a sphere, and a
+hierarchy is non-centred. The density is compiled for 256 points at a time. The first proposal is
+Laplace's at the best of the modes found from the best prior points; where a second mode matters,
+weights would not reveal it, and NUTS takes over.
 """
 
 from typing import cast

@@ -264,14 +264,15 @@ def _starts(target: _Target) -> np.ndarray:
 def _adapted(points: _Weighted, first: Mixture, seed: int) -> Mixture:
     """Mixture around resampled points, each component as wide as the mass nearby.
 
-    It follows any shape of the posterior. One component over all, for tails, has a share, and so
-    has the first proposal: no mode is lost, no weight exceeds its first value over that share.
+    It follows any shape of the posterior. A component over all points, for tails, and the first
+    proposal keep fixed shares: no mode is lost, and no weight exceeds its first value divided by
+    that share.
     """
     z, weights = points.z, np.exp(points.log_w)
     mean = weights @ z
     off = z - mean
     covariance = (off * weights[:, None]).T @ off
-    covariance += 1e-6 * np.trace(covariance) * np.eye(3)  # where one point has all weight
+    covariance += 1e-6 * np.trace(covariance) * np.eye(3)  # in case one point has all the weight
     whole = np.linalg.cholesky(covariance)
     white = np.linalg.solve(whole, z.T).T
     order = np.argsort(z[:, 2])

@@ -2,9 +2,9 @@
 
 Given beta0_i of each robot and the noises, each robot's rates are a quadratic form in its weights
 and intercept c_i (`gram`). With c_i = mu + D e_i, D = diag(tau), e_i ~ N(0, 1) and a normal prior
-of mu, first e_i and then mu integrate out in closed form. Left are, for I robots and p of these
-coefficients, 4 + p + I scores: of mean_beta0, of the two noises, of the spreads tau_beta0 and tau,
-and of each beta0_i; three robots and two features make ten.
+of mu, first e_i and then mu integrate out in closed form. The remaining unknowns are, for I robots
+and p of these coefficients, 4 + p + I scores: of mean_beta0, of the two noises, of the spreads
+tau_beta0 and tau, and of each beta0_i; three robots and two features make ten.
 
 mean_beta0 and beta0_i are not scores of their priors, as a small tau would make these a funnel. On
 the real line, the likelihood of robot i's beta0 is approximated by a normal, fitted on a grid at

@@ -203,7 +203,7 @@ def name_draws(
     place: PlaceEffect,
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """Parameters by name of theta (draw, 6), coefficients c and effects of units g."""
+    """Posterior draws by name from theta (draw, 6), coefficients c and effects g of units."""
     params = dict(zip(("beta0", "delta_w", "delta_v"), theta.T, strict=False))
     names = ("tau_s", "length_scale", "tau_e")
     hyper: dict[str, np.ndarray] = dict(zip(names, theta[:, 3:].T, strict=True))

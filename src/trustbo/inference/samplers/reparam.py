@@ -8,7 +8,8 @@ scaling (`nuts`). Each step gives one badly determined direction a separate axis
   where delta_v has a floor (`floored`);
 - level: the data fix the average level of trust, y = beta0 y + beta . z + b, better than its parts.
   b + beta0 mean(y) + beta . mean(z) stands in the place of b. Both steps have Jacobian 1;
-- collapse: the pooled model's (beta, b) are normal given all else (generalised least squares,
+- collapse: the pooled model's (beta, b) are normal given the other parameters (generalised least
+squares,
   `gram_jax.coefficients`). If asked for, their innovations stand in their places (Gelfand, Sahu and
   Carlin 1995), and few data round a perfect fit make no funnel;
 - robots: coefficients that vary by robot are partially non-centred, see `partial_centring`.
@@ -57,7 +58,7 @@ class Reparametrisation(NamedTuple):
     longest: Array
     """Longest step of the search in each unknown, (unknown,): finite where the starts differ."""
     constrain: Callable[[Array], Sites]
-    """Parameters by name, from such a vector."""
+    """Function from a flat vector to parameters by name."""
     potential: Callable[[Sites], Array]
     """Minus the log density of {"theta", "innovations"}."""
     profile: Callable[[Array], Array]
@@ -180,7 +181,7 @@ class Coordinates:
         return self.target.potential(full) - log_jacobian
 
     def _collapse(self, site: Sites) -> tuple[Sites, Array]:
-        """Weights and intercept as functions of all else and of standard normal innovations."""
+        """Weights and intercept as functions of the other parameters and normal innovations."""
         priors, inverse = self.model.priors, self.target.inverse
         e = jnp.append(site["beta"], site["b"])
         others = {name: inverse[name](site[name]) for name in ("beta0", "delta_w", "delta_v")}

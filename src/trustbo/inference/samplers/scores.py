@@ -1,4 +1,4 @@
-"""Hyperparameters as normal scores of their priors: tails are Gaussian where data are silent.
+"""Hyperparameters as normal scores of their priors: without data, the density is Gaussian.
 
 A parameter is the quantile of its prior at Phi(score), so a score is N(0, 1) a priori. The two
 noises are a size and an angle of their half-normal scores, as the data determine the size best:

@@ -29,7 +29,7 @@ def load_bokeh() -> tuple[Any, Any]:
 
 
 def palette(colours: str | Colormap) -> list[str]:
-    """Return colours of matplotlib, or of those with a name, as hexadecimal text."""
+    """Return the colours of a colour map, or of the one with that name, as hexadecimal text."""
     shades = colormaps.get_cmap(colours)(np.linspace(0.0, 1.0, SHADES))
     return [to_hex(colour) for colour in shades]
 

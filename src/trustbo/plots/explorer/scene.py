@@ -13,7 +13,7 @@ from trustbo.plots.maps import COLOURS
 from trustbo.workspace import Workspace
 
 MOST_BYTES = 3_200_000
-"""Size of steps and layers, so that a page stays below 5 MB; layers beyond it are left out."""
+"""Upper limit in bytes of steps and layers, for a page below 5 MB; further layers are dropped."""
 _PER_VALUE = 11  # bytes, at most, of a cell's value
 _DIGITS = 6
 
