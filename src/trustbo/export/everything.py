@@ -36,7 +36,7 @@ class _Content:
 
     @cached_property
     def maps(self) -> xr.Dataset:
-        """Maps of the result, computed once and only if a format needs them, as they are slow."""
+        """Maps of the result, computed once and only if a format needs them: they are slow."""
         return self.result.maps()
 
 
