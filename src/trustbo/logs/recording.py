@@ -119,10 +119,10 @@ class Recording:
         contacts = [series.between(marker.time, end) for series in self.contact]
         if not len(statuses.time):
             end = max((int(c.time[-1]) for c in contacts if len(c.time)), default=marker.time)
-        looks = [~np.isnan(c.value) for c in contacts]  # an unmeasured contact is no tick
+        recorded = [~np.isnan(c.value) for c in contacts]  # an unmeasured contact is no tick
         contacts = [
             Series(c.time[mask], c.value[mask] > 0.5)
-            for c, mask in zip(contacts, looks, strict=True)
+            for c, mask in zip(contacts, recorded, strict=True)
         ]
         n_ticks = np.array([len(c.time) for c in contacts])
         ticks = contacts[int(np.argmax(n_ticks))].time

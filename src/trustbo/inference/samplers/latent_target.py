@@ -97,9 +97,11 @@ class LatentTarget:
 
         def given():
             for i in range(0, len(unique), step):
-                (beta0, delta_w, delta_v, x0, P, g), found = self._given(theta[i : i + step])
-                log_det[i : i + step] = found
-                for t in range(len(found)):
+                (beta0, delta_w, delta_v, x0, P, g), block_log_det = self._given(
+                    theta[i : i + step]
+                )
+                log_det[i : i + step] = block_log_det
+                for t in range(len(block_log_det)):
                     yield beta0[t], delta_w[t], delta_v[t], x0, P[t], g[t]
 
         gamma, log_weight = draw_weighted(given(), count, self._nu, self.chains, self._sites, rng)
