@@ -316,7 +316,8 @@ def damage(rng, folder):
         try:
             opened = opens(copy)
             if isinstance(opened, tb.Campaign):
-                opened.close()
+                with opened:
+                    pass
         except tb.TrustboError as error:
             if file.name not in str(error) and how:
                 raise AssertionError(f"the error does not name {file.name}: {error}") from None

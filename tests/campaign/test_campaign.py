@@ -207,7 +207,7 @@ def test_every_model_can_be_planned_with(model, initial):
 
 def test_plans_carry_bands_over_the_draws_they_are_made_from(workspace):
     campaign = Campaign(workspace, *ENDS, model=HierarchicalTrust())
-    campaign.belief = sample_prior(campaign.model, 2, 50, seed=0, n_robots=3)
+    campaign.learner.belief = sample_prior(campaign.model, 2, 50, seed=0, n_robots=3)
     plan = campaign.ask()
     assert plan.bands.shape == (4, *plan.trust.shape)
     assert (plan.bands[-1] > plan.bands[0]).all()

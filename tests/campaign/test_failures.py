@@ -9,7 +9,7 @@ import pytest
 from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
-from trustbo.campaign.failures import to_avoid
+from trustbo.campaign.planners import to_avoid
 from trustbo.errors import PosteriorError
 from trustbo.hazard import BoundRisk, Hazard, LostMission, fit_hazard
 from trustbo.planning.plan import plan_from_record, plan_to_record
@@ -222,7 +222,8 @@ def test_a_campaign_resumes_with_the_same_hazard(workspace, tmp_path):
     campaign.ask()
     campaign.fail("stuck")
     campaign.fail("lost_contact", where=campaign.ask().path[1])
-    campaign.close()
+    with campaign:
+        pass
     with tb.Campaign.load(tmp_path) as again:
         assert again.log.failures == campaign.log.failures
         assert again.hazard.drop_attrs().identical(campaign.hazard.drop_attrs())
@@ -240,7 +241,7 @@ def test_a_refused_hazard_leaves_the_one_before(workspace, monkeypatch):
     def refuse(*args, **kwargs):
         raise PosteriorError("hazard refused: k-hat = 0.90 > 0.7.")
 
-    monkeypatch.setattr("trustbo.campaign.failures.fit_hazard", refuse)
+    monkeypatch.setattr("trustbo.campaign.learning.fit_hazard", refuse)
     with pytest.warns(UserWarning, match="goes on with the hazard before"):
         campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=1))
     assert campaign.hazard.identical(before)
@@ -269,7 +270,8 @@ def test_priors_of_the_hazard_are_an_option_that_is_kept(workspace, tmp_path):
     assert campaign.hazard.drop_attrs().identical(expected.drop_attrs())
     assert campaign.options == begin(workspace, hazard={"intercept": [-3, 1], "cause": 0.5}).options
     campaign.ask()
-    campaign.close()
+    with campaign:
+        pass
     with tb.Campaign.load(tmp_path) as again:
         assert again.options.hazard == prior
         assert again.risk.mean[4, 0, 1] == campaign.risk.mean[4, 0, 1]

@@ -81,7 +81,7 @@ def replacements(workspace):
 
     def keep(folder, other):
         with tb.Campaign.load(other) as campaign:
-            campaign.keep(folder)
+            campaign.save(folder, keep=True)
 
     def save(folder, other):
         with tb.Campaign.load(other) as campaign:
@@ -117,7 +117,8 @@ def test_files_of_others_are_kept(how, workspace, folder, other, tmp_path):
     if how == "resume":
         tb.resume(folder, simulator=ModelSimulator(workspace), n_iterations=3, progress=False)
     elif how == "load":
-        tb.Campaign.load(folder).close()
+        with tb.Campaign.load(folder):
+            pass
     else:
         replacements(workspace)[how](folder, other)
     assert contents(before) == before
@@ -134,7 +135,8 @@ def test_a_folder_of_other_files_is_used_with_a_warning(workspace, tmp_path):
     with pytest.warns(UserWarning, match=r"folder' holds other files too .linked, notes.txt, pos"):
         run(workspace, folder, n=1)
     assert contents(before) == before
-    tb.Campaign.load(folder).close()  # and silently later, as warnings are errors here
+    with tb.Campaign.load(folder):  # and silently later, as warnings are errors here
+        pass
 
 
 @pytest.mark.parametrize(
@@ -249,7 +251,7 @@ def test_wherever_it_dies_there_is_the_old_campaign_or_the_new(
         if how == "save_result":
             tb.load_result(other).save(folder)
         elif how == "begin":  # what comes after is no replacement
-            tb.Campaign(tb.load_result(folder).workspace, *ENDS, seed=1).keep(folder)
+            tb.Campaign(tb.load_result(folder).workspace, *ENDS, seed=1).save(folder, keep=True)
         else:
             replace(folder, other)
     assert len(copies) > 30
@@ -265,7 +267,7 @@ def test_wherever_it_dies_there_is_the_old_campaign_or_the_new(
 def test_a_replacement_that_fails_leaves_everything(workspace, folder, monkeypatch):
     before = contents(own_files(folder))
     with tb.Campaign.load(folder) as campaign, monkeypatch.context() as patch:
-        patch.setattr("trustbo.campaign.result.write_missions", None)
+        patch.setattr("trustbo.campaign.result_files.write_missions", None)
         with pytest.raises(TypeError):
             campaign.save(folder)
         patch.undo()
@@ -288,7 +290,7 @@ def test_a_folder_of_version_0_1_is_replaced_and_what_has_gone_is_gone(workspace
     shutil.copytree(Path(__file__).parents[1] / "data" / "campaign_0.1", folder)
     (folder / "posteriors" / "mine.nc").write_text("mine")
     with tb.Campaign(workspace, *ENDS) as campaign:
-        campaign.keep(folder)
+        campaign.save(folder, keep=True)
     names = {f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.is_file()}
     shown = {name for name in names if not Path(name).name.startswith(".")}
     assert shown == {"campaign.json", "workspace.nc", "posteriors/mine.nc"}
@@ -323,14 +325,16 @@ def test_a_replacement_cut_off_in_a_process_that_goes_on_loses_no_mission(tmp_pa
     drive()
     drive()
     states = [str(state) for state in campaign.history["state"].values]
-    campaign.close()
+    with campaign:
+        pass
     again = tb.Campaign.load(folder)
     assert [str(state) for state in again.history["state"].values] == states
     assert states == ["learned", "set aside", "learned", "learned"]
     for mine, kept in zip(campaign.posteriors, again.posteriors, strict=True):
         np.testing.assert_array_equal(mine["posterior"]["beta0"], kept["posterior"]["beta0"])
         np.testing.assert_array_equal(*(np.ravel(p.attrs["missions"]) for p in (mine, kept)))
-    again.close()
+    with again:
+        pass
 
 
 def test_saving_to_its_own_folder_keeps_hold_of_it_when_it_fails(tmp_path, monkeypatch):
@@ -341,9 +345,35 @@ def test_saving_to_its_own_folder_keeps_hold_of_it_when_it_fails(tmp_path, monke
         raise tb.TrustboError("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("trustbo.campaign.folder.write_checked", refuse)
+        patch.setattr("trustbo.campaign.storage.write_checked", refuse)
         with pytest.raises(tb.TrustboError, match="the disk is full"):
             campaign.save(tmp_path / "kept")
     with pytest.raises(tb.TrustboError, match="another campaign is at work"):
         tb.Campaign.load(tmp_path / "kept")
-    campaign.close()
+    with campaign:
+        pass
+
+
+def test_keep_and_close_of_version_0_2_are_found_and_name_what_replaced_them(tmp_path):
+    campaign = tb.Campaign(random_cells(3, 3), (2, 0), (0, 2))
+    with pytest.warns(FutureWarning, match=r"save\(folder, keep=True\)"):
+        campaign.keep(tmp_path / "kept")
+    with pytest.raises(tb.TrustboError, match="another campaign is at work"):
+        tb.Campaign.load(tmp_path / "kept")
+    with pytest.warns(FutureWarning, match="with campaign:"):
+        campaign.close()
+    with tb.Campaign.load(tmp_path / "kept") as again:
+        assert again.missions == []
+
+
+def test_a_copy_that_is_saved_is_not_held_and_one_that_is_kept_follows(tmp_path):
+    with tb.Campaign(random_cells(3, 3), (2, 0), (0, 2), directory=tmp_path / "first") as campaign:
+        campaign.save(tmp_path / "copy")
+        with tb.Campaign.load(tmp_path / "copy") as copy:
+            assert copy.settings == campaign.settings
+        campaign.save(tmp_path / "second", keep=True)
+        path = campaign.ask().path
+    with tb.Campaign.load(tmp_path / "first") as first:
+        assert first.state.suggested is None
+    with tb.Campaign.load(tmp_path / "second") as second:
+        assert second.state.suggested.path == path

@@ -150,7 +150,8 @@ def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, tmp_path, mo
         patch.setattr("trustbo.campaign.learning.fit", die)
         with pytest.raises(KeyboardInterrupt):
             campaign.tell(mission)
-    campaign.close()
+    with campaign:
+        pass
     again = tb.Campaign.load(tmp_path / "half")
     assert len(again.missions) == 2
     assert again.waiting == []
@@ -165,7 +166,8 @@ def test_a_folder_is_for_one_campaign_at_a_time(workspace, tmp_path):
             tb.Campaign.load(tmp_path)
     with pytest.raises(tb.TrustboError, match="holds a campaign already: go on with it by"):
         tb.Campaign(workspace, *ENDS, directory=tmp_path)
-    tb.Campaign.load(tmp_path).close()
+    with tb.Campaign.load(tmp_path):
+        pass
     with pytest.raises(tb.TrustboError, match="holds no campaign"):
         tb.Campaign.load(tmp_path / "nothing")
     assert not (tmp_path / "nothing").exists()
@@ -212,7 +214,8 @@ def test_what_is_your_own_is_asked_for_again(workspace, tmp_path):
         return planner.evaluate([(3, 0), (2, 1), (1, 2), (0, 3)], draws.mean())
 
     model = PooledTrust(priors=Priors(x0_mean=0.4))
-    tb.Campaign(workspace, *ENDS, model=model, policy=straight, directory=tmp_path).close()
+    with tb.Campaign(workspace, *ENDS, model=model, policy=straight, directory=tmp_path):
+        pass
     with pytest.raises(tb.TrustboError, match=r"policy was your own .'straight'.; give it again"):
         tb.Campaign.load(tmp_path, model=model)
     with pytest.raises(tb.TrustboError, match="has priors of its own, or is your own; give it"):
@@ -297,7 +300,8 @@ def test_options_are_checked_recorded_and_given_as_one_object(workspace, tmp_pat
         tb.Campaign(workspace, *ENDS, options=options, replan="bound")
     with pytest.raises(tb.TrustboError, match="callbacks must be callables; got 3"):
         tb.CampaignOptions(callbacks=[3])
-    tb.Campaign(workspace, *ENDS, sampler="exact", options=options, directory=tmp_path).close()
+    with tb.Campaign(workspace, *ENDS, sampler="exact", options=options, directory=tmp_path):
+        pass
     with pytest.raises(tb.TrustboError, match="unknown option of one's own 'team'"):
         tb.Campaign.load(tmp_path, team="mean")
     with tb.Campaign.load(tmp_path, callbacks=[print]) as again:

@@ -100,7 +100,8 @@ def test_a_campaign(kept, tmp_path):
             assert state(again) == state_of_first
             same_missions(first.log.measured, again.log.measured)
             same_workspace(first.workspace, again.workspace)
-            again.close()
+            with again:
+                pass
     same_results(tb.load_result(kept), tb.load_result(tmp_path / "1"))
 
 

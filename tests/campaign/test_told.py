@@ -68,7 +68,8 @@ def test_a_mission_that_is_refused_stays_told_and_is_learned_with_the_next(
     assert campaign.posterior is None
     assert campaign.history["state"].values.tolist() == ["told"]
     assert "R-hat" in str(campaign.history["reason"].values[0])
-    campaign.close()
+    with campaign:
+        pass
 
     again = tb.Campaign.load(tmp_path)  # it opens, and fits nothing
     assert len(again.waiting) == 1
@@ -77,7 +78,8 @@ def test_a_mission_that_is_refused_stays_told_and_is_learned_with_the_next(
     assert again.history["state"].values.tolist() == ["learned", "learned"]
     assert again.posteriors[0] is None
     assert again.posterior["constant_data"].sizes["mission"] == 2
-    again.close()
+    with again:
+        pass
     kept = tb.load_result(tmp_path)
     assert kept.posteriors[0] is None
     np.testing.assert_array_equal(
@@ -130,7 +132,8 @@ def test_a_mission_that_measured_nothing_is_set_aside_and_the_folder_opens(works
     with pytest.warns(UserWarning, match="mission 1 is set aside: no contact rate was measured"):
         assert campaign.tell(nothing) is None
     campaign.tell(rates(workspace, campaign.ask().path))
-    campaign.close()
+    with campaign:
+        pass
     with tb.Campaign.load(tmp_path) as again:
         assert again.history["state"].values.tolist() == ["set aside", "learned"]
         assert again.posterior["constant_data"]["mission"].values.tolist() == [1]
@@ -147,8 +150,10 @@ def test_a_cell_without_awareness_sets_its_mission_aside(tmp_path):
         UserWarning, match=r"awareness of bound 1, robot r1, .* cell \(2, 1\) has no"
     ):
         campaign.tell(blind, other_path=True)
-    campaign.close()
-    tb.Campaign.load(tmp_path).close()
+    with campaign:
+        pass
+    with tb.Campaign.load(tmp_path):
+        pass
 
 
 def test_one_s_own_word_sets_aside_and_telling_again_takes_back(workspace):
@@ -322,7 +327,8 @@ def test_the_error_of_a_model_of_one_s_own_is_none_of_the_file(workspace, tmp_pa
                 raise ValueError("my own mistake")
             return super().options()
 
-    tb.Campaign(workspace, *ENDS, model=Broken(), sampler="nuts", directory=tmp_path).close()
+    with tb.Campaign(workspace, *ENDS, model=Broken(), sampler="nuts", directory=tmp_path):
+        pass
     Broken.fails = True
     with pytest.raises(ValueError, match="my own mistake") as error:
         tb.Campaign.load(tmp_path, model=Broken())
@@ -336,7 +342,8 @@ def test_a_number_that_is_not_known_is_missing_in_the_history_also_after_loading
     for seed, regret in enumerate([np.nan, 2.5]):
         told = rates(workspace, campaign.ask().path, seed=seed)
         campaign.tell(told, regret=regret, fuel=np.nan)
-    campaign.close()
+    with campaign:
+        pass
     history = tb.Campaign.load(tmp_path).result().history
     np.testing.assert_array_equal(history["regret"], [np.nan, 2.5])
     np.testing.assert_array_equal(history["fuel"], [np.nan, np.nan])
@@ -465,7 +472,8 @@ def test_leftovers_of_dead_runs_are_removed_and_sums_kept(folder, tmp_path):
     for file in dead:
         file.write_text("half")
     sums = sorted(copy.rglob(".*.sha256"))
-    tb.Campaign.load(copy).close()
+    with tb.Campaign.load(copy):
+        pass
     assert not any(file.exists() for file in dead)
     assert sorted(copy.rglob(".*.sha256")) == sums
 

@@ -95,7 +95,8 @@ def test_resume_says_what_it_cannot_do(invoke, tmp_path):
     assert done.exit_code == 2
     assert "holds no campaign; give the --out of trustbo run" in done.stderr
     workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 2), 0.5))
-    tb.Campaign(workspace, (2, 0), (0, 2), directory=tmp_path).close()
+    with tb.Campaign(workspace, (2, 0), (0, 2), directory=tmp_path):
+        pass
     done = invoke("resume", tmp_path)
     assert done.exit_code == 2
     assert "was run by robots of your own, not by trustbo run" in done.stderr

@@ -55,7 +55,8 @@ def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
     again = tb.Campaign.load(tmp_path / "campaign")
     assert again.ask().path == asked.path
     assert_is_of_its_path(again.ask(), workspace)
-    again.close()
+    with again:
+        pass
 
 
 def test_without_a_terrain_there_are_none():

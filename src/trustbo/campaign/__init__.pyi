@@ -1,7 +1,8 @@
 from .campaign import Campaign
 from .loop import iterate, missions, resume
 from .options import CampaignOptions
-from .result import Result, load_result
+from .result import Result
+from .result_files import load_result
 from .stopping import RegretBound, Seconds
 
 __all__ = [

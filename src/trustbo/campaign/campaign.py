@@ -4,46 +4,49 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Self
 
 import jax
 import numpy as np
+import pandas as pd
 import xarray as xr
 from jax import random
 
 from trustbo.campaign.card import campaign_card
-from trustbo.campaign.failures import Failure, require_another, require_reason, to_avoid, under_risk
-from trustbo.campaign.folder import CampaignFolder
-from trustbo.campaign.history import SET_ASIDE, TOLD, Entry, History
-from trustbo.campaign.learned import LearnedMissions
-from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, again
+from trustbo.campaign.failures import Failure, require_another, require_reason
+from trustbo.campaign.history import history_of, table_of
+from trustbo.campaign.learning import Learner
+from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
+from trustbo.campaign.planners import planner_of, to_avoid, under_risk
+from trustbo.campaign.posteriors import Posterior, whole_posterior
 from trustbo.campaign.replacing import STATE
 from trustbo.campaign.result import Result
-from trustbo.campaign.told import never_to_be_learned, require_extra, require_mission, require_new
+from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState
+from trustbo.campaign.storage import Storage
+from trustbo.campaign.told import require_extra, require_mission, require_new
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
-from trustbo.errors import TrustboError, require_whole
-from trustbo.files import FilePath, as_path, interpreting
-from trustbo.hazard import CAUSES
-from trustbo.inference import params_of
+from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.files import FilePath, interpreting
+from trustbo.hazard import CAUSES, BoundRisk
 from trustbo.models import TrustModel
 from trustbo.models.backend import VERSIONS
+from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
-from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.planning.policies import resolve_policy
 from trustbo.stacking import fill_awareness
-from trustbo.workspace import Workspace
+from trustbo.workspace import AwarenessBelief, Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 _N_MAPS = 500
 """Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
 _N_KEPT = 200
+_RENAMED = "Campaign.{} is {} since version 0.3; the old name will go."
 
 
-class Campaign(LearnedMissions, Displayed):
+class Campaign(Displayed):
     """Learns from missions and proposes the next path.
 
     A mission is planned by `ask`, then told, then learned from. One that cannot be learned from yet
@@ -54,12 +57,12 @@ class Campaign(LearnedMissions, Displayed):
     Attributes:
         workspace: Workspace of the paths.
         options: Options of the campaign.
-        policy: Policy that chooses the paths.
+        state: Missions as measured, their states, plans and posteriors, failures and notes.
+        learner: Model, fit and hazard, and what is believed now.
         planner: Planner on the workspace's awareness map; see `planner_now`.
-        log: Missions as measured, their states, plans, posteriors and failures (a `History`).
-        belief: Parameter draws that the next plan is made from: the posterior's, or, before the
-            first mission, one from the prior.
-        awareness: Belief about the awareness; None where the map is trusted.
+        policy: Policy that chooses the paths.
+        storage: Files of the campaign; None where it is in memory only.
+        settings: Options and model, for `Result.settings`.
     """
 
     def __init__(
@@ -88,7 +91,7 @@ class Campaign(LearnedMissions, Displayed):
             sampler: Sampler of the posterior; see `trustbo.fit`.
             seed: Seed of everything random.
             directory: Folder that the campaign is kept in as it goes. No other process may use it
-                until `close`, or the end of this one.
+                until the end of `with campaign:`, or of this one.
             **options: Fields of `CampaignOptions`, or a whole one as `options`.
 
         Raises:
@@ -96,14 +99,19 @@ class Campaign(LearnedMissions, Displayed):
                 the model; or a model that cannot be updated so.
             NoPathError: The goal cannot be reached.
         """
-        chosen = CampaignOptions.of(options, Campaign.__init__)
+        self.options = CampaignOptions.of(options, Campaign.__init__)
         self.policy = resolve_policy(policy)
-        super().__init__(workspace, chosen, model, sampler, seed)
-        law = self.observation, self.model.response
-        self.planner = chosen.planner(workspace, start, goal, objective, *law)
-        self.awareness = chosen.belief(workspace)
-        self._plan: Plan | None = None
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+        self.workspace = workspace
+        self.state = CampaignState(require_whole("seed", seed, 0))
+        prior = self.state.seed_of("prior")
+        self.learner = Learner(workspace, self.options, model, sampler, prior)
+        model = self.learner.model
+        law = model.family.name, model.response
+        self.planner = planner_of(self.options, workspace, start, goal, objective, law)
+        self.storage: Storage | None = None
         self._believed: Planner | None = None
+        self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
         own_policy = not isinstance(policy, str)
         named = {
@@ -112,29 +120,28 @@ class Campaign(LearnedMissions, Displayed):
             "policy": getattr(policy, "__name__", type(policy).__name__) if own_policy else policy,
             "objective": objective,
             "sampler": sampler,
-            "seed": self.seed,
+            "seed": self.state.seed,
         }
         record = named | self.options.to_record()
         self.settings = record | {
-            "model": type(self.model).__name__ + " with places" * (self.model.place is not None),
-            "observation": self.model.observation,
-            "response": self.model.response,
+            "model": type(model).__name__ + " with places" * (model.place is not None),
+            "observation": model.observation,
+            "response": model.response,
             "max_bounds": self.planner.max_bounds,
         }
-        self._record = record | {
-            "model": model_to_record(self.model),
+        self.state.options = record | {
+            "model": model_to_record(model),
             "own_policy": own_policy,
             "own_awareness": self.options.own_awareness,
         }
-        self._folder: CampaignFolder | None = None
         if directory is not None:
-            self._open(CampaignFolder(directory), overwrite=False)
+            self._save_to(Storage(directory, begun=False), keep=True)
 
     def _card(self) -> Card:
         told, settings = len(self.missions), self.settings
         others = {
-            "set aside": len(self.log.numbers(SET_ASIDE)),
-            "given up": len(self.log.failures),
+            "set aside": len(self.state.numbers(SET_ASIDE)),
+            "given up": len(self.state.failures),
         }
         also = "".join(f", {n} {what}" for what, n in others.items() if n)
         rows = [
@@ -156,7 +163,7 @@ class Campaign(LearnedMissions, Displayed):
         Raises:
             TrustboError: The policy returned a path that is broken, or no plan.
         """
-        if self._plan is None:
+        if self.state.suggested is None:
             started = time.perf_counter()
             planner = self.planner_now()
             with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
@@ -169,9 +176,8 @@ class Campaign(LearnedMissions, Displayed):
                 planner.require_path(plan.path)
             except TrustboError as error:
                 raise TrustboError(f"the policy {name!r}: {error}") from None
-            self._plan = self._accept(plan, started)
-            self._write_state()
-        return self._plan
+            return self._accept(plan, started)
+        return self.state.suggested
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
         """Let the operator choose the next path; `ask` then returns it.
@@ -184,9 +190,7 @@ class Campaign(LearnedMissions, Displayed):
         """
         started = time.perf_counter()
         plan = self.planner_now().evaluate(path, self.belief.mean())
-        self._plan = self._accept(plan, started)
-        self._write_state()
-        return self._plan
+        return self._accept(plan, started)
 
     def tell(
         self, mission: Mission, *, other_path: bool = False, again: bool = False, **extra: float
@@ -214,10 +218,10 @@ class Campaign(LearnedMissions, Displayed):
         plan = self.ask()
         mission = require_mission(self.workspace, mission, plan.path, other_path=other_path)
         if not again:
-            told = (e.measured for e in self.log.entries if e.state != SET_ASIDE)
-            require_new(mission, list(told))
+            earlier = (e.measured for e in self.state.entries if e.state != SET_ASIDE)
+            require_new(mission, list(earlier))
         self._take(mission, require_extra(extra))
-        return self.log.last_tree
+        return self.state.last_tree
 
     def set_aside(self, reason: str, mission: int | None = None) -> xr.DataTree | None:
         """Leave a mission out of what is learned from, for good; telling it again takes it back.
@@ -232,54 +236,33 @@ class Campaign(LearnedMissions, Displayed):
         Raises:
             TrustboError: There is no such mission, or it is set aside already.
         """
-        n = len(self.log.entries)
+        n = len(self.state.entries)
         number = n if mission is None else require_whole("mission", mission, 1)
         if not 1 <= number <= n:
             raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
-        if (entry := self.log.entries[number - 1]).state == SET_ASIDE:
+        if (entry := self.state.entries[number - 1]).state == SET_ASIDE:
             raise TrustboError(f"mission {number} is set aside already: {entry.row['reason']}")
         if self.options.update == "moment_matched":
             raise TrustboError('update="moment_matched" cannot forget a mission; use "refit".')
-        self.log.entries[number - 1].become(SET_ASIDE, str(reason))
-        self._learn(self.seed_of("fit"))
-        self._plan = self._believed = None
-        if self._folder is not None:
-            self._replace(self._folder)  # the last posterior is another now
-        return self.log.last_tree
+        entry.become(SET_ASIDE, str(reason))
+        self.learner.learn(self.state, self.seed_of("fit"))
+        self.state.suggested = self._believed = None
+        if self.storage is not None:  # the last posterior is another now
+            self.storage.replace(self.workspace, self.state, self.result())
+        return self.state.last_tree
 
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
         """Keep a mission on disk, then learn from it."""
         plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
         filled = fill_awareness(mission, self.known_along(mission.path))
-        told, entries = time.perf_counter(), self.log.entries
-        if self._folder is not None:
-            extras = [*(entry.extra for entry in entries), extra]
-            self._folder.write_measured([*self.log.measured, mission], extras)
-        before = entries[-1].plan if entries else plan
-        rates = mission.contact_rate
-        row: dict[str, Any] = {
-            "objective": plan.value,
-            "path_changed": plan.path != before.path,
-            "contact_rate": float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan,
-            "status": mission.status,
-            "state": TOLD,
-            "reason": "",
-            **extra,
-            "seconds_plan": self._asked[0],
-            "seconds_run": told - self._asked[1],
-        }
-        entries.append(Entry(filled, mission, plan, trust_map, row, self.log.last, extra))
-        if reason := never_to_be_learned(filled):
-            entries[-1].become(SET_ASIDE, reason)
-            self._forget_risk()
-            warnings.warn(f"mission {len(entries)} is set aside: {reason}", stacklevel=3)
-        else:
-            self._learn(seed)
-        row["seconds_fit"] = time.perf_counter() - told
-        if self.awareness is not None:
-            self.awareness.update(mission)
-        self._plan = self._believed = None
-        self._write()
+        told = time.perf_counter()
+        if self.storage is not None:
+            self.storage.write_told(self.state, mission, extra)
+        seconds = {"seconds_plan": self._asked[0], "seconds_run": told - self._asked[1]}
+        entry = self.state.add(mission, filled, plan, trust_map, extra, **seconds)
+        self.learner.take(self.state, seed)
+        entry.row["seconds_fit"] = time.perf_counter() - told
+        self._go_on()
 
     def fail(
         self,
@@ -290,7 +273,7 @@ class Campaign(LearnedMissions, Displayed):
         other_path: bool = False,
         again: bool = False,
     ) -> xr.DataTree | None:
-        """Give up the mission that was asked for; the next plan knows.
+        """Give up the mission that was asked for; the next plan takes it into account.
 
         Args:
             reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", says that a
@@ -317,17 +300,12 @@ class Campaign(LearnedMissions, Displayed):
         if mission is not None:
             posterior = self.tell(mission, other_path=other_path, again=again)
         else:
-            if not again and self._plan is None:
-                require_another(self.log.failures, len(self.missions))
+            if not again and self.state.suggested is None:
+                require_another(self.state.failures, len(self.missions))
             path = self.ask().path if where is not None or reason in CAUSES else ()
         failure = Failure.of(len(self.missions), reason, path, where)
-        self.log.failures.append(failure._replace(told=mission is not None))
-        self._plan = self._believed = None
-        self._forget_risk()
-        if self.log.entries:
-            self._write()
-        else:  # there is no result yet
-            self._write_state()
+        self.state.failures.append(failure._replace(told=mission is not None))
+        self._go_on()
         return posterior
 
     def recommend(self) -> Plan:
@@ -346,58 +324,65 @@ class Campaign(LearnedMissions, Displayed):
         Raises:
             TrustboError: Nothing was learned yet.
         """
-        if not self.log.entries:
+        if not self.state.entries:
             raise TrustboError("the campaign has no mission yet; tell it one first.")
         best = self.recommend()
         return Result(
             self.workspace,
-            self.missions,
-            self.posteriors,
+            self.state.missions,
+            self.state.posteriors,
             list(best.path),
             best.trust,
             best.value,
             self.trust_map(),
             self.history,
-            {**self.settings, **self.log.notes, "trustbo_version": VERSIONS["trustbo"]},
-            self.log.stop_reason,
+            {**self.settings, **self.state.notes, "trustbo_version": VERSIONS["trustbo"]},
+            self.state.stop_reason,
             self._believed_awareness(),
-            tuple(self.log.failures),
+            tuple(self.state.failures),
         )
+
+    def stop(self, reason: str) -> Result:
+        """End the campaign, which may still go on later, and return its result.
+
+        Args:
+            reason: Reason, for `Result.stop_reason`.
+        """
+        self.state.stop_reason = reason
+        result = self.result()
+        if self.storage is not None:
+            self.storage.write(self.state, result, ended=True)
+        return result
 
     # --- the folder ---
 
-    def keep(self, directory: FilePath) -> None:
-        """Write everything to a folder, replacing what is there, and keep it up to date from now.
-
-        Raises:
-            TrustboError: Another campaign holds the folder, or its name belongs to a file.
-        """
-        own, folder = self._folder, self._folder_for(directory)
-        self._open(folder, overwrite=True)
-        if own is not None and own is not folder:
-            own.close()
-
-    def _folder_for(self, directory: FilePath) -> CampaignFolder:
-        """Folder of a name, the campaign's own if it is kept there."""
-        own = self._folder
-        here = own is not None and own.path.resolve() == as_path(directory).resolve()
-        return own if own is not None and here else CampaignFolder(directory)
-
-    def save(self, directory: FilePath) -> None:
+    def save(self, directory: FilePath, *, keep: bool = False) -> None:
         """Write everything to a folder that `Campaign.load` reads.
 
-        Another campaign in it is replaced. To keep a campaign as it goes, make it with a
-        `directory`.
+        Another campaign in it is replaced.
+
+        Args:
+            directory: Folder to write to.
+            keep: Whether to keep the campaign there from now on, as with a `directory`, until the
+                end of `with campaign:`.
 
         Raises:
             TrustboError: Another campaign holds the folder, or its name belongs to a file.
         """
-        folder = self._folder_for(directory)
+        own = self.storage
+        here = own is not None and own.is_at(directory)
+        self._save_to(own if own is not None and here else Storage(directory), keep)
+
+    def _save_to(self, storage: Storage, keep: bool) -> None:
+        own = self.storage
         try:
-            self._replace(folder)
+            storage.replace(self.workspace, self.state, self._result_so_far())
+            if keep:
+                self.storage = storage
         finally:
-            if folder is not self._folder:
-                folder.close()
+            for held in (own, storage):
+                if held is not None and held is not self.storage:
+                    held.release()
 
     @classmethod
     def load(
@@ -423,114 +408,50 @@ class Campaign(LearnedMissions, Displayed):
             TrustboError: There is no campaign; another process is at work on it; or something of
                 your own is missing.
         """
-        folder = CampaignFolder(directory, begun=True)
+        storage = Storage(directory, begun=True)
         try:
-            state, measured, extras, kept = folder.read()
-            workspace = folder.read_workspace()
-            with interpreting(folder.path / STATE):
-                given, kind = _read_options(state, policy, **own)
-                learner = model_from_record(kind) if model is None else None
+            state, workspace, pending = storage.read()
+            with interpreting(storage.path / STATE):
+                given, kind = arguments_of(state.options, policy, **own)
+                learned = model_from_record(kind) if model is None else None
             # Not within: an error of the user's own model is none of the file.
-            learner = model_from_record(kind, model) if learner is None else learner
-            campaign = cls(workspace, model=learner, **given)
-            with interpreting(folder.path / STATE):
-                campaign.log = History.from_state(state, measured, extras, kept, workspace)
-                if (suggested := state.get("suggested")) is not None:
-                    campaign._plan = plan_from_record(suggested, workspace)
-            if campaign.awareness is not None:
-                for mission in campaign.log.measured:
-                    campaign.awareness.update(mission)
-            if (last := campaign.log.last) is not None:
-                tree = last()
-                with interpreting(last.file or folder.path):
-                    campaign.belief = params_of(tree)
-            campaign._folder = folder
-            for j in range(len(campaign.missions), len(measured)):
-                campaign._take(measured[j], extras[j])
+            learned = model_from_record(kind, model) if learned is None else learned
+            campaign = cls(workspace, model=learned, **given)
+            state.options = campaign.state.options  # as this version writes them
+            campaign.state, campaign.storage = state, storage
+            campaign.learner.restore(state)
+            for mission, extra in pending:
+                campaign._take(mission, extra)
         except BaseException:
-            folder.close()
+            storage.release()
             raise
         return campaign
 
-    def stop(self, reason: str) -> Result:
-        """End the campaign, which may still go on later, and return its result.
-
-        Args:
-            reason: Reason, for `Result.stop_reason`.
-        """
-        self.log.stop_reason = reason
-        result = self.result()
-        if self._folder is not None:
-            self._folder.write(self._state(), result, ended=True)
-        return result
-
-    def folder_of_page(self) -> Path:
-        """Folder that the campaign is kept in, for its page.
-
-        Raises:
-            TrustboError: There is none.
-        """
-        if self._folder is None:
-            raise TrustboError(
-                "a page is report.html in the campaign's folder; give directory=, or checkpoint= "
-                "to iterate."
-            )
-        return self._folder.path
+    def keep(self, directory: FilePath) -> None:
+        """Save with `keep=True`, by its name in version 0.2."""
+        warnings.warn(_RENAMED.format("keep(folder)", "save(folder, keep=True)"), FutureWarning, 2)
+        self.save(directory, keep=True)
 
     def close(self) -> None:
-        """Let go of the folder; the campaign is kept there no longer."""
-        if self._folder is not None:
-            self._folder.close()
-            self._folder = None
+        """Let go of the folder as `with campaign:` does, by its name in version 0.2."""
+        warnings.warn(_RENAMED.format("close()", "the end of `with campaign:`"), FutureWarning, 2)
+        self.__exit__()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
+        if self.storage is not None:
+            self.storage.release()
+            self.storage = None
 
-    def _open(self, folder: CampaignFolder, *, overwrite: bool) -> None:
-        """Write all of it to a folder, and keep it there from now on."""
-        if folder.is_used and not overwrite:
-            folder.close()
-            raise TrustboError(
-                f"{str(folder.path)!r} holds a campaign already: go on with it by "
-                "Campaign.load, or choose another folder."
-            )
-        try:
-            self._replace(folder)
-        except BaseException:
-            if folder is not self._folder:
-                folder.close()
-            raise
-        self._folder = folder
-
-    def _replace(self, folder: CampaignFolder) -> None:
-        """Write all of it in place of what the folder holds."""
-        result = self.result() if self.log.entries else None
-        with folder.replaced(self.workspace):
-            if self.log.entries:
-                folder.write_measured(self.log.measured, [e.extra for e in self.log.entries])
-            folder.write(self._state(), result, whole=True)
-        if result is not None:
-            result.kept_in(folder.path)
-
-    def _write(self) -> None:
-        """Write what the last mission added."""
-        if self._folder is not None:
-            self._folder.write(self._state(), self.result())
-
-    def _write_state(self) -> None:
-        if self._folder is not None:
-            self._folder.write(self._state(), None)
-
-    def _state(self) -> dict[str, Any]:
-        plan = None if self._plan is None else plan_to_record(self._plan)
-        return {"options": self._record, "suggested": plan, **self.log.to_state()}
+    def _result_so_far(self) -> Result | None:
+        return self.result() if self.state.entries else None
 
     # --- inside ---
 
     def _accept(self, plan: Plan, started: float) -> Plan:
+        """Keep a plan as the next to be run."""
         bands = self.planner_now().bands(plan.path, self.belief)
         now = time.perf_counter()
         self._asked = now - started, now
@@ -542,7 +463,16 @@ class Campaign(LearnedMissions, Displayed):
                 "it, or none was found.",
                 stacklevel=4,
             )
-        return replace(plan, bands=bands)
+        self.state.suggested = accepted = replace(plan, bands=bands)
+        if self.storage is not None:
+            self.storage.write(self.state, None)
+        return accepted
+
+    def _go_on(self) -> None:
+        """Forget the plan that was run or given up, and write what it added."""
+        self.state.suggested = self._believed = None
+        if self.storage is not None:
+            self.storage.write(self.state, self._result_so_far())
 
     def planner_now(self) -> Planner:
         """Planner with the awareness that is believed in now, away from bounds that stopped robots.
@@ -556,7 +486,7 @@ class Campaign(LearnedMissions, Displayed):
                 n_maps = min(_N_MAPS, self.belief.leading[0])
                 maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
                 planner = planner.with_awareness(maps, self.awareness.mean())
-            if self.log.entries or self.log.failures:
+            if self.state.entries or self.state.failures:
                 avoided = to_avoid(self.risk)
                 planner = planner.avoiding(avoided, self.risk.mean) if avoided.any() else planner
             self._believed = under_risk(planner, self.risk)
@@ -588,17 +518,93 @@ class Campaign(LearnedMissions, Displayed):
         draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
         return xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
 
+    # --- state and belief ---
 
-def _read_options(
-    state: dict[str, Any], policy: Policy | None, **own: Any
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arguments of `Campaign` that a state holds, see `load`, and the record of its model."""
-    record = dict(state["options"])
-    if "replan" in state["notes"]:  # of version 0.1
-        record.setdefault("replan", state["notes"]["replan"])
-    given: dict[str, Any] = {name: tuple(record.pop(name)) for name in ("start", "goal")}
-    given["policy"] = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
-    given |= {name: record.pop(name) for name in ("objective", "sampler", "seed")}
-    model = record.pop("model")
-    given["options"] = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
-    return given, model
+    @property
+    def log(self) -> CampaignState:
+        """The `state`, by its name in version 0.2."""
+        return self.state
+
+    @property
+    def seed(self) -> int:
+        """Seed of everything random."""
+        return self.state.seed
+
+    @property
+    def missions(self) -> list[Mission]:
+        """Missions told so far, their awareness filled in."""
+        return self.state.missions
+
+    @property
+    def waiting(self) -> list[Mission]:
+        """Missions that were told, and are to be learned from with a later one."""
+        return [self.state.entries[j].measured for j in self.state.numbers(TOLD)]
+
+    @property
+    def plans(self) -> list[Plan]:
+        """Plan of each mission."""
+        return [entry.plan for entry in self.state.entries]
+
+    @property
+    def posteriors(self) -> Sequence[xr.DataTree]:
+        """Posterior of the parameters after each mission; None where nothing was learned yet."""
+        return self.state.posteriors
+
+    @property
+    def posterior(self) -> xr.DataTree | None:
+        """Posterior after the last mission, with all groups; None before anything is learned."""
+        last = self.state.last
+        if last is None:
+            return None
+        if self._whole is None or self._whole[0] is not last:
+            self._whole = last, whole_posterior(last(), self.missions, self.model)
+        whole = self._whole[1]
+        whole["hazard"] = xr.DataTree(self.hazard)
+        return whole
+
+    @property
+    def history(self) -> xr.Dataset:
+        """Dataset as `Result.history`; empty before the first mission."""
+        return history_of(self.state.entries)
+
+    def table(self) -> pd.DataFrame:
+        """Table with a row for each mission, as `Result.table`."""
+        return table_of(self.history, self.missions, self.state.failures)
+
+    def summary(self) -> pd.DataFrame:
+        """Return `table`, by the name that it had in version 0.2."""
+        return self.table()
+
+    def seed_of(self, stream: str) -> int:
+        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
+        return self.state.seed_of(stream)
+
+    @property
+    def model(self) -> TrustModel:
+        """Trust model."""
+        return self.learner.model
+
+    @property
+    def belief(self) -> Params:
+        """Parameter draws of the next plan: the posterior's, or, at first, one from the prior."""
+        return self.learner.belief
+
+    @property
+    def awareness(self) -> AwarenessBelief | None:
+        """Belief about the awareness; None where the map is trusted."""
+        return self.learner.awareness
+
+    @property
+    def observation(self) -> str:
+        """Family of observations of the belief: the posterior's, or that of the prior at first."""
+        return self.learner.observation(self.state)
+
+    @property
+    def hazard(self) -> xr.Dataset:
+        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
+        return self.learner.hazard(self.state)
+
+    @property
+    def risk(self) -> BoundRisk:
+        """Chances of the bounds to fail, of all missions so far."""
+        return self.learner.risk(self.state)

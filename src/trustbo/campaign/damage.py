@@ -5,9 +5,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from trustbo.campaign.migrate import migrate_result, migrate_state
 from trustbo.campaign.replacing import MEASURED, MISSIONS, RESULT, STATE
 from trustbo.errors import DamagedFileError
-from trustbo.files import read_record
+from trustbo.files import interpreting, read_record
 
 _TELL = "tell them, in order, to a new campaign in another folder, with other_path=True"
 
@@ -31,7 +32,8 @@ _PLAN = {
         "p_arrive_band": [float, float], "by_cause": {str: [float]}, "p_reach": [float],
     }),
 }  # fmt: skip
-_FAILURES = [[int, str, _PATH, ([int, int], None), bool]]
+_FAILURE = [int, str, _PATH, ([int, int], None), bool]
+_FAILURES = [(_FAILURE, _FAILURE[:4], _FAILURE[:2])]  # the latter of older versions
 _COLUMNS = "objective", "path_changed", "contact_rate", "status"
 _ROW = {"status": str, "state": str, "reason": str, str: (float, bool)}
 _NEEDED = {
@@ -64,7 +66,7 @@ _FIELDS: dict[str, dict[Any, Any]] = {
 
 
 def read_fields(file: Path) -> dict[str, Any]:
-    """Read `campaign.json` or `result.json`.
+    """Read `campaign.json` or `result.json`, those of older versions as this one writes them.
 
     Raises:
         DamagedFileError: The file is missing or damaged, or a field is missing or no such value.
@@ -89,7 +91,8 @@ def read_fields(file: Path) -> dict[str, Any]:
                 f"{str(file)!r} is damaged: {name} has {len(record[name])} entries for "
                 f"{n} missions."
             )
-    return record
+    with interpreting(file):
+        return migrate_state(record) if file.name == STATE else migrate_result(record)
 
 
 def _fits(value: Any, kind: Any) -> bool:
@@ -102,7 +105,8 @@ def _fits(value: Any, kind: Any) -> bool:
         case [one]:
             return isinstance(value, list) and all(_fits(v, one) for v in value)
         case list():
-            return isinstance(value, list) and all(map(_fits, value, kind))
+            alike = isinstance(value, list) and len(value) == len(kind)
+            return alike and all(map(_fits, value, kind))
         case dict():
             return isinstance(value, dict) and all(
                 _fits(v, kind.get(name, kind.get(str, object))) for name, v in value.items()

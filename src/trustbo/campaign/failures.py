@@ -1,28 +1,12 @@
-"""Failures of a campaign: missions given up, the hazard of bounds, and bounds to keep away from."""
+"""Failures of a campaign: missions that were given up, with their reasons."""
 
 import difflib
-import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
-import numpy as np
-import xarray as xr
-
-from trustbo.campaign.told import never_to_be_learned
 from trustbo.data import Cell, Mission
-from trustbo.errors import PosteriorError, TrustboError, require_pair
-from trustbo.hazard import CAUSES, BoundRisk, Hazard, LostMission, fit_hazard
-from trustbo.planning import Planner
-from trustbo.workspace import Workspace
-
-if TYPE_CHECKING:
-    from trustbo.campaign.history import Entry
-
-_N_DRAWS = 200
-STOPPED = 2
-"""Failures of a bound from which on it is not entered again without need."""
-RECOVERED = 0.2
-"""Mean chance to fail below which such a bound may be entered again all the same."""
+from trustbo.errors import TrustboError, require_pair
+from trustbo.hazard import CAUSES
 
 
 def require_reason(reason: object, mission: Mission | None) -> None:
@@ -92,58 +76,10 @@ class Failure(NamedTuple):
 
     @classmethod
     def restore(cls, record: Sequence[Any]) -> Self:
-        """Failure of a record, one of version 0.1 without a path."""
-        after, reason, *rest = record
-        path, where, *told = rest or ((), None)
+        """Failure of a record."""
+        after, reason, path, where, told = record
         cells = tuple((row, col) for row, col in path)
         cell = None if where is None else (where[0], where[1])
         if cell is not None and cell not in cells[1:]:
             raise ValueError(f"no path enters {cell}")
-        return cls(after, reason, cells, cell, *told)
-
-
-def learn_hazard(
-    entries: "Sequence[Entry]",
-    failures: Sequence[Failure],
-    workspace: Workspace,
-    hazard: Hazard,
-    forgetting: float,
-    seed: int,
-) -> xr.Dataset | None:
-    """Fit the hazard of bounds to all missions that were not set aside by hand.
-
-    A mission set aside because it measured no contact rate tells all the same where it failed.
-    None, with a warning, where the posterior is refused.
-    """
-    told = [
-        (j, entry.measured)
-        for j, entry in enumerate(entries)
-        if entry.state != "set aside" or never_to_be_learned(entry.mission)
-    ]
-    lost = [failure for failure in failures if failure.path]
-    ages = [len(entries) - 1 - j for j, _ in told], [len(entries) - f.after for f in lost]
-    weights = [forgetting ** np.array(age, dtype=float) for age in ages]
-    try:
-        return fit_hazard(
-            [mission for _, mission in told],
-            workspace,
-            hazard,
-            lost=[LostMission(f.path, f.reason, f.where) for f in lost],
-            weights=weights[0],
-            lost_weights=weights[1],
-            seed=seed,
-        )
-    except PosteriorError as error:
-        warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=4)
-        return None
-
-
-def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
-    """Planner that knows the chances of bounds to fail."""
-    return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes)
-
-
-def to_avoid(risk: BoundRisk) -> np.ndarray:
-    """Bounds that stopped robots twice, and whose posterior has not recovered, (move, row, col)."""
-    with np.errstate(invalid="ignore"):
-        return (risk.stopped >= STOPPED - 1e-9) & ~(risk.mean < RECOVERED)
+        return cls(after, reason, cells, cell, told)

@@ -1,24 +1,30 @@
-"""Learning of a campaign: its model, its sampler, and the weight of a mission."""
+"""Learning of a campaign: from its missions to a posterior, a hazard and a belief."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.options import CampaignOptions
+from trustbo.campaign.posteriors import Posterior
+from trustbo.campaign.state import LEARNED, SET_ASIDE, TOLD, CampaignState
+from trustbo.campaign.told import never_to_be_learned
 from trustbo.data import Mission
 from trustbo.display.bars import place_of, say
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.inference import fit, moment_matched, params_of, sample_prior
+from trustbo.files import interpreting
+from trustbo.hazard import BoundRisk, LostMission, fit_hazard
+from trustbo.inference import diagnostics, fit, moment_matched, params_of, sample_prior
+from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.models import TrustModel, TrustParams
+from trustbo.models import PlaceEffect, PooledTrust, TrustModel, TrustParams
 from trustbo.models.families import AUTO
 from trustbo.models.model import require_model
 from trustbo.models.params import Params
-from trustbo.workspace import Workspace
+from trustbo.workspace import AwarenessBelief, Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING
 
 _N_DRAWS = 1000
@@ -28,47 +34,166 @@ class CannotLearnError(TrustboError):
     """Missions that no sampler gives a posterior of."""
 
 
-@dataclass(frozen=True)
-class Learning:
-    """Model, sampler and way of updating; see `CampaignOptions`, which checks each by itself.
+class Learner:
+    """Fit and hazard of a campaign, and the belief that its plans are made from.
 
-    Raises:
-        TrustboError: An unknown sampler; a sampler that does not suit the model; or a model that
-            cannot be updated so.
+    Attributes:
+        workspace: Workspace of the missions.
+        options: Options of the campaign.
+        model: Trust model, by default `PooledTrust` with effects of places.
+        sampler: Sampler of the posterior.
+        belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
+        awareness: Belief about the awareness; None where the map is trusted.
+        progress: Whether fits show their progress, see `tb.fit`.
     """
 
-    model: TrustModel
-    sampler: str
-    update: str
-    forgetting: float
-    sampling: Mapping[str, Any] = field(default_factory=dict)
+    progress: bool = True
 
-    def __post_init__(self) -> None:
-        require_model(self.model)
-        sampler, _ = resolve_sampler(self.model, self.sampler)
-        NutsSettings.of(self.sampling).require_sampler(sampler)
-        gaussian = self.model.family.integrates_out and self.model.observation != AUTO
-        if self.forgetting < 1.0 and not (self.update == "refit" and gaussian):
-            raise TrustboError(
-                f'forgetting = {self.forgetting:g} needs update "refit" and Gaussian observations; '
-                f'got "{self.update}" and "{self.model.observation}".'
-            )
-        if self.update == "moment_matched":
-            if self.model.robot_sets != "all" or not gaussian:
-                raise TrustboError(
-                    f'update="moment_matched" is for PooledTrust of Gaussian rates; got '
-                    f"{self.model.describe()}."
-                )
-            warnings.warn(MOMENT_MATCHED_WARNING, stacklevel=5)
-
-    def learn(
+    def __init__(
         self,
-        missions: list[Mission],
-        new: int,
-        last: xr.DataTree | None,
+        workspace: Workspace,
+        options: CampaignOptions,
+        model: TrustModel | None,
+        sampler: str,
         seed: int,
-        workspace: Workspace | None = None,
-        progress: bool = True,
+    ) -> None:
+        """Begin with the prior, drawn by a seed.
+
+        Raises:
+            TrustboError: An unknown sampler; a sampler that does not suit the model; or a model
+                that cannot be updated so.
+        """
+        if model is None:  # moments that are matched are those of the paper's parameters
+            model = PooledTrust(place=PlaceEffect() if options.update == "refit" else None)
+        _require_learnable(model, sampler, options)
+        self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
+        self.belief = self._prior = _prior_belief(model, options.initial, workspace, seed)
+        self.awareness: AwarenessBelief | None = None
+        if options.awareness != "map":
+            own = options.awareness
+            self.awareness = AwarenessBelief(workspace) if isinstance(own, str) else own
+        self._known: tuple[object, xr.Dataset, BoundRisk] | None = None
+
+    def take(self, state: CampaignState, seed: int) -> None:
+        """Learn from the last mission of a state, or set it aside where nothing ever can be.
+
+        Args:
+            state: State whose last mission is new.
+            seed: Seed of the sampler.
+        """
+        entry = state.entries[-1]
+        if reason := never_to_be_learned(entry.mission):
+            entry.become(SET_ASIDE, reason)
+            warnings.warn(f"mission {len(state.entries)} is set aside: {reason}", stacklevel=4)
+        else:
+            self.learn(state, seed)
+        if self.awareness is not None:
+            self.awareness.update(entry.measured)
+
+    def learn(self, state: CampaignState, seed: int) -> None:
+        """Fit the posterior of all missions that are not set aside; if it is refused, go on."""
+        entries, waiting = state.entries, state.numbers(TOLD)
+        numbers, last = state.numbers(TOLD, LEARNED), state.last
+        if not numbers:
+            entries[-1].posterior, self.belief = None, self._prior
+            return
+        missions = [entries[j].mission for j in numbers]
+        try:
+            tree = self._fit(missions, len(waiting), state.last_tree, seed)
+        except CannotLearnError as error:
+            for j in waiting:
+                entries[j].become(TOLD, str(error))
+            known = "the prior" if last is None else "the posterior before"
+            warnings.warn(
+                f"mission {len(entries)} is kept, but cannot be learned from yet: {error} "
+                f"The campaign goes on with {known}, and tries again with the next mission.",
+                stacklevel=5,
+            )
+            return
+        alone = self.options.update == "moment_matched"  # the prior stands for those before
+        tree.attrs["missions"] = waiting if alone else numbers
+        tree["hazard"] = xr.DataTree(self.hazard(state))
+        if "latent" not in tree.children:
+            tree = parameters_alone(tree)
+        if last is not None:
+            last.shrink()
+        for j in waiting:
+            entries[j].become(LEARNED)
+        entries[-1].row |= diagnostics(tree)
+        entries[-1].posterior = Posterior(len(entries), tree)
+        self.belief = params_of(tree)
+
+    def restore(self, state: CampaignState) -> None:
+        """Believe again what was learned from the missions of a state that was read.
+
+        Raises:
+            DamagedFileError: The last posterior cannot be read.
+        """
+        if self.awareness is not None:
+            for mission in state.measured:
+                self.awareness.update(mission)
+        if (last := state.last) is not None:
+            tree = last()
+            with interpreting(last.file or ""):
+                self.belief = params_of(tree)
+
+    def observation(self, state: CampaignState) -> str:
+        """Family of observations of the belief: the posterior's, or that of the prior at first."""
+        last = state.last_tree
+        return self.model.family.name if last is None else last.attrs["observation"]
+
+    def hazard(self, state: CampaignState) -> xr.Dataset:
+        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
+        return self._hazard_and_risk(state)[0]
+
+    def risk(self, state: CampaignState) -> BoundRisk:
+        """Chances of the bounds to fail, of all missions of a state."""
+        return self._hazard_and_risk(state)[1]
+
+    def _hazard_and_risk(self, state: CampaignState) -> tuple[xr.Dataset, BoundRisk]:
+        """Hazard of a state, fitted when it is first asked for."""
+        asides = tuple(state.numbers(SET_ASIDE))
+        key = len(state.entries), len(state.failures), asides
+        if self._known is None or self._known[0] != key:
+            hazard, last = self._fit_hazard(state), state.last_tree
+            if hazard is None and last is not None and "hazard" in last.children:
+                hazard = last["hazard"].to_dataset()
+            if hazard is None:
+                hazard = fit_hazard([], self.workspace, self.options.prior_hazard)
+            self._known = key, hazard, BoundRisk.of(hazard, self.workspace)
+        return self._known[1:]
+
+    def _fit_hazard(self, state: CampaignState) -> xr.Dataset | None:
+        """Fit the hazard of bounds to all missions that were not set aside by hand.
+
+        A mission set aside because it measured no contact rate tells all the same where it failed.
+        None, with a warning, where the posterior is refused.
+        """
+        entries = state.entries
+        told = [
+            (j, entry.measured)
+            for j, entry in enumerate(entries)
+            if entry.state != SET_ASIDE or never_to_be_learned(entry.mission)
+        ]
+        lost = [failure for failure in state.failures if failure.path]
+        ages = [len(entries) - 1 - j for j, _ in told], [len(entries) - f.after for f in lost]
+        weights = [self.options.forgetting ** np.array(age, dtype=float) for age in ages]
+        try:
+            return fit_hazard(
+                [mission for _, mission in told],
+                self.workspace,
+                self.options.prior_hazard,
+                lost=[LostMission(f.path, f.reason, f.where) for f in lost],
+                weights=weights[0],
+                lost_weights=weights[1],
+                seed=state.seed_of("hazard"),
+            )
+        except PosteriorError as error:
+            warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=5)
+            return None
+
+    def _fit(
+        self, missions: list[Mission], new: int, last: xr.DataTree | None, seed: int
     ) -> xr.DataTree:
         """Fit the posterior of missions; one that is refused is tried again in other ways.
 
@@ -77,32 +202,31 @@ class Learning:
             new: Number of the last of them that `last` does not know.
             last: Posterior of the others.
             seed: Seed of the sampler.
-            workspace: Workspace of the missions, where places have effects.
-            progress: Whether NUTS and further attempts are shown, see `tb.fit`.
-
-        Returns:
-            Posterior of the parameters, see `inference.complete`.
 
         Raises:
             CannotLearnError: Every attempt failed.
         """
-        model, weights = self.model, None
-        if self.update == "moment_matched":
+        model, weights, options = self.model, None, self.options
+        if options.update == "moment_matched":
             priors = model.for_features(missions[0].features).priors
             if last is not None:
                 priors = moment_matched(cast(TrustParams, params_of(last)), priors)
             model, missions = replace(model, priors=priors), missions[-new:]
-        if self.forgetting < 1.0:
-            weights = self.forgetting ** np.arange(len(missions) - 1, -1, -1)
+        if options.forgetting < 1.0:
+            weights = options.forgetting ** np.arange(len(missions) - 1, -1, -1)
         reason = ""
         for shift, (sampler, sampling) in enumerate(self._attempts()):
             if reason:
                 more = f'sampler "{sampler}" and {sampling["draws"]} draws a chain'
-                say(place_of(progress), f"another try, with {more}, as the last failed: {reason}.")
+                say(
+                    place_of(self.progress),
+                    f"another try, with {more}, as the last failed: {reason}.",
+                )
             try:
                 return fit(
-                    missions, model, sampler, workspace=workspace, earlier=last, weights=weights,
-                    seed=seed + shift, progress=progress, whole=False, **sampling,
+                    missions, model, sampler, workspace=self.workspace, earlier=last,
+                    weights=weights, seed=seed + shift, progress=self.progress, whole=False,
+                    **sampling,
                 )  # fmt: skip
             except PosteriorError as error:
                 reason = error.reason
@@ -119,7 +243,7 @@ class Learning:
         sampler, _ = resolve_sampler(self.model, self.sampler)
         # Draws of the exact sampler are nearly independent, and effects of places make them large.
         n = _N_DRAWS // 4 if sampler == "exact" and self.model.place else _N_DRAWS
-        asked = {"draws": n, **self.sampling}
+        asked = {"draws": n, **self.options.sampling}
         attempts = [(self.sampler, asked), (self.sampler, asked | {"draws": 2 * asked["draws"]})]
         other = "nuts" if sampler == "exact" else "exact"
         try:
@@ -129,18 +253,36 @@ class Learning:
         shared = NutsSettings.of(asked | {"draws": 2 * max(asked["draws"], _N_DRAWS)}).shared
         return [*attempts, (other, shared)]
 
-    def prior_belief(
-        self, initial: str, n_robots: int, features: Sequence[str], seed: int
-    ) -> Params:
-        """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
-        model = self.model.observing("gaussian").for_features(features)
-        n_features = len(features)
-        if initial == "prior_mean" and model.priors_are_independent:
-            values = model.priors.mean(n_features)
-            sizes = model.sizes(n_robots, n_features)
-            means = {name: np.broadcast_to(values[name], (1, *sizes[name])) for name in sizes}
-            return model.params(means, n_features).flat()
-        # The mean of parameters that robots are drawn around has no closed form.
-        n_draws = 1 if initial == "prior_draw" else 1000
-        mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
-        return mean.flat()
+
+def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions) -> None:
+    require_model(model)
+    resolved, _ = resolve_sampler(model, sampler)
+    NutsSettings.of(options.sampling).require_sampler(resolved)
+    gaussian = model.family.integrates_out and model.observation != AUTO
+    if options.forgetting < 1.0 and not (options.update == "refit" and gaussian):
+        raise TrustboError(
+            f'forgetting = {options.forgetting:g} needs update "refit" and Gaussian observations; '
+            f'got "{options.update}" and "{model.observation}".'
+        )
+    if options.update == "moment_matched":
+        if model.robot_sets != "all" or not gaussian:
+            raise TrustboError(
+                f'update="moment_matched" is for PooledTrust of Gaussian rates; got '
+                f"{model.describe()}."
+            )
+        warnings.warn(MOMENT_MATCHED_WARNING, stacklevel=4)
+
+
+def _prior_belief(model: TrustModel, initial: str, workspace: Workspace, seed: int) -> Params:
+    """Draw from the prior, or take its mean, with a leading axis (draw,) of length 1."""
+    n_robots, n_features = len(workspace.team.robots), len(workspace.features)
+    model = model.observing("gaussian").for_features(workspace.features)
+    if initial == "prior_mean" and model.priors_are_independent:
+        values = model.priors.mean(n_features)
+        sizes = model.sizes(n_robots, n_features)
+        means = {name: np.broadcast_to(values[name], (1, *sizes[name])) for name in sizes}
+        return model.params(means, n_features).flat()
+    # The mean of parameters that robots are drawn around has no closed form.
+    n_draws = 1 if initial == "prior_draw" else 1000
+    mean = sample_prior(model, n_features, n_draws, seed, n_robots=n_robots).mean()
+    return mean.flat()

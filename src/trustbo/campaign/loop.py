@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.migrate import migrate_notes
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.progress import PAGE, PAGE_ALONE, Progress, continued
 from trustbo.campaign.replanning import run_replanning
@@ -101,7 +102,7 @@ def iterate(
     )
     with campaign:
         if checkpoint is not None:
-            campaign.keep(checkpoint)
+            campaign.save(checkpoint, keep=True)
         for _ in steps:
             pass
         return campaign.result()
@@ -144,19 +145,19 @@ def resume(
         DamagedFileError: A file of the folder is missing or damaged.
     """
     with Campaign.load(directory, model=model, policy=policy, **own) as campaign:
-        log, done = campaign.log, len(campaign.missions)
-        total = log.notes.get("n_iterations", 8) if n_iterations is None else n_iterations
-        ended = log.stop_reason not in ("interrupted", "n_iterations")
-        if ended and stop is None and total <= max(done, log.notes.get("n_iterations", 8)):
+        state, done = campaign.state, len(campaign.missions)
+        total = state.notes.get("n_iterations", 8) if n_iterations is None else n_iterations
+        ended = state.stop_reason not in ("interrupted", "n_iterations")
+        if ended and stop is None and total <= max(done, state.notes.get("n_iterations", 8)):
             return campaign.result()
-        rules = rules_of(log.notes.get("stop", [])) if stop is None else require_stops(stop)
-        before = dict(log.notes)
+        rules = rules_of(state.notes.get("stop", [])) if stop is None else require_stops(stop)
+        before = dict(state.notes)
         shown = continued(progress, as_path(directory))
         steps = missions(
             campaign, simulator, n_iterations=total, truth=truth, stop=rules, progress=shown
         )
-        _require_same(before, log.notes)
-        log.stop_reason = "interrupted"
+        _require_same(before, state.notes)
+        state.stop_reason = "interrupted"
         for _ in steps:
             pass
         return campaign.result()
@@ -209,7 +210,8 @@ def missions(
     describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
     # As a file gives them back: tuples are lists there, and arrays too.
     simulated = json.loads(to_json(describe()))
-    campaign.log.notes = {**simulated, "n_iterations": n_iterations, "stop": rules_to_record(rules)}
+    asked = {"n_iterations": n_iterations, "stop": rules_to_record(rules)}
+    campaign.state.notes = {**simulated, **asked}
     return _missions(campaign, runner, n_iterations, truth, rules, progress)
 
 
@@ -270,19 +272,11 @@ def _run(campaign: Campaign, runner: Any, plan: Plan) -> Mission:
     return runner.run(plan.path, seed=seed, **numbered)
 
 
-_RENAMED = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulator"}
-"""Simulators by their names in version 0.1."""
-
-
 def _require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
     """Refuse to go on with another simulator than the one begun with."""
+    before = migrate_notes(before, now)
     for name in now.keys() - {"n_iterations", "stop"}:
-        if name not in before and "stop" not in before:  # version 0.1 did not record it
-            continue
-        old = _RENAMED.get(str(before.get(name)), before.get(name))
-        if isinstance(old, int) and isinstance(now[name], list):  # only counted in version 0.1
-            now = now | {name: len(now[name])}
-        if to_json(old) != to_json(now[name]):  # as text: NaN equals itself
+        if to_json(old := before.get(name)) != to_json(now[name]):  # as text: NaN equals itself
             raise TrustboError(
                 f"the campaign was begun with {name} = {old!r}, not {now[name]!r}; give the same "
                 "simulator again with simulator=."

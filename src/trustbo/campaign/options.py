@@ -1,4 +1,4 @@
-"""Options of a campaign: one frozen object that validates, plans, records and restores.
+"""Options of a campaign: one frozen object, checked when it is made.
 
 Importing it loads nothing heavy, for `trustbo --help` is made from its fields.
 """
@@ -11,13 +11,10 @@ from trustbo.errors import TrustboError, require_choice, unknown
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
-    from trustbo.campaign.learning import Learning
     from trustbo.data import Mission
     from trustbo.hazard import Hazard
-    from trustbo.models import TrustModel
-    from trustbo.planning import Planner
-    from trustbo.workspace import AwarenessBelief, Workspace
-    from trustbo.workspace.location import Location
+    from trustbo.planning import Policy
+    from trustbo.workspace import AwarenessBelief
 
     Callback = Callable[[Campaign, Mission], None]
 
@@ -160,40 +157,6 @@ class CampaignOptions:
 
         return isinstance(self.awareness, AwarenessBelief)
 
-    def planner(
-        self,
-        workspace: "Workspace",
-        start: "Location",
-        goal: "Location",
-        objective: str,
-        observation: str,
-        response: str,
-    ) -> "Planner":
-        """Planner with these options, for a model of such rates."""
-        from trustbo.planning import Planner
-
-        chosen: dict[str, Any] = {name: getattr(self, name) for name in options_of(PLANNING)}
-        law = {"observation": observation, "response": response}
-        chosen["infeasible"] = "safest"
-        return Planner(workspace, start, goal, objective, **law, **chosen)
-
-    def learning(self, model: "TrustModel | None", sampler: str) -> "Learning":
-        """Learning of a model, by default `PooledTrust` with effects of places."""
-        from trustbo.campaign.learning import Learning
-        from trustbo.models import PlaceEffect, PooledTrust
-
-        if model is None:  # moments that are matched are those of the paper's parameters
-            model = PooledTrust(place=PlaceEffect() if self.update == "refit" else None)
-        return Learning(model, sampler, self.update, self.forgetting, self.sampling)
-
-    def belief(self, workspace: "Workspace") -> "AwarenessBelief | None":
-        """Belief about the awareness; None where the map is trusted."""
-        from trustbo.workspace import AwarenessBelief
-
-        if isinstance(self.awareness, AwarenessBelief):
-            return self.awareness
-        return AwarenessBelief(workspace) if self.awareness == "belief" else None
-
     def to_record(self) -> dict[str, Any]:
         """Options as JSON can hold them, callbacks left out."""
         record = {o.name: getattr(self, o.name) for o in fields(self) if o.name != "callbacks"}
@@ -218,9 +181,7 @@ class CampaignOptions:
             if name not in _OWN:
                 raise unknown("option of one's own", name, _OWN)
         awareness = again("awareness", record["awareness"], own.get("awareness"), own_awareness)
-        # Version 0.2 had a weight of the tilt, where there is a margin of the limit now.
-        hazard = {n: v for n, v in record.get("hazard", {}).items() if n != "log_tilt"}
-        return cls.of({**record, **own, "awareness": awareness, "hazard": hazard})
+        return cls.of({**record, **own, "awareness": awareness})
 
 
 def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
@@ -260,3 +221,22 @@ def again(name: str, kept: Any, given: Any, was_own: bool) -> Any:
     if given is not None and not was_own:
         raise TrustboError(f"the campaign's {name} is {kept!r}, none of your own; leave {name}=.")
     return kept if given is None else given
+
+
+def arguments_of(
+    record: Mapping[str, Any], policy: "Policy | None", **own: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arguments of `Campaign` in the record of its state, and the record of its model.
+
+    Args:
+        record: Field `options` of `CampaignState`.
+        policy: The same policy, if it is the user's own.
+        **own: The user's own awareness and callbacks, given again.
+    """
+    record = dict(record)
+    given: dict[str, Any] = {name: tuple(record.pop(name)) for name in ("start", "goal")}
+    given["policy"] = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
+    given |= {name: record.pop(name) for name in ("objective", "sampler", "seed")}
+    model = record.pop("model")
+    given["options"] = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
+    return given, model

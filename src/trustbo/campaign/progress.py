@@ -6,9 +6,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from trustbo.campaign.history import LEARNED
+from trustbo.campaign.state import LEARNED
 from trustbo.display.bars import FILE, NOTEBOOK, bar_in, place_of, say
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -49,7 +49,7 @@ class Progress:
         self._page: Any = None
         if progress in (PAGE, PAGE_ALONE):
             live = import_module("trustbo.report.live")  # by name: it lies above
-            self._page = live.LivePage(page_in(campaign.folder_of_page()), total)
+            self._page = live.LivePage(_page_of(campaign), total)
         if self._place == NOTEBOOK and progress is True:
             from IPython.display import display
 
@@ -57,7 +57,8 @@ class Progress:
 
     def __enter__(self) -> Self:
         done = len(self._campaign.missions)
-        self._before, self._campaign.progress = self._campaign.progress, bool(self._place)
+        learner = self._campaign.learner
+        self._before, learner.progress = learner.progress, bool(self._place)
         if self._page is not None:
             if done:
                 self._page(self._campaign)
@@ -74,7 +75,7 @@ class Progress:
         at: TracebackType | None,
     ) -> None:
         self._bar.close()
-        self._campaign.progress = self._before
+        self._campaign.learner.progress = self._before
         if self._map is not None and kind is None:  # the result is what a cell shows afterwards
             self._map.update(_Nothing())
         if self._page is not None:
@@ -101,6 +102,16 @@ def page_in(folder: Path) -> Path:
     return folder / "report.html"
 
 
+def _page_of(campaign: "Campaign") -> Path:
+    """Page in the folder that a campaign is kept in; TrustboError if there is none."""
+    if campaign.storage is None:
+        raise TrustboError(
+            "a page is report.html in the campaign's folder; give directory=, or checkpoint= to "
+            "iterate."
+        )
+    return page_in(campaign.storage.path)
+
+
 def continued(progress: bool | str, folder: Path) -> bool | str:
     """Progress of a campaign that goes on, with its page, if the run before left one not ended."""
     page = page_in(folder)
@@ -114,7 +125,7 @@ def continued(progress: bool | str, folder: Path) -> bool | str:
 
 def report_of(campaign: "Campaign") -> str:
     """Describe the last mission in a line."""
-    row = campaign.log.entries[-1].row
+    row = campaign.state.entries[-1].row
     regret = f", regret {row['regret']:.1f} %" if "regret" in row else ""
     name, label = ("r_hat", "R-hat") if "r_hat" in row else ("k_hat", "k-hat")
     learned = f"{label} {row[name]:.3f}" if row["state"] == LEARNED else row["state"]

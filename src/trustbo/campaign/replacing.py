@@ -19,6 +19,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from trustbo.campaign.migrate import posterior_after
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
@@ -207,11 +208,8 @@ def _counted(folder: Path) -> set[int]:
     """Numbers of the posteriors that the records of a folder count."""
     found = set()
     for record in _records(folder):
-        n, after = record["n_missions"], record.get("posterior_after")
-        if after is None and isinstance(n, int):  # of version 0.1: one a mission
-            after = range(1, min(n, 10_000) + 1)
-        if isinstance(after, list | range):
-            found |= {number for number in after if isinstance(number, int)}
+        with suppress(TypeError):  # of a damaged record
+            found |= {number for number in posterior_after(record) if isinstance(number, int)}
     return found
 
 

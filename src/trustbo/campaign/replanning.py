@@ -66,7 +66,7 @@ def run_replanning(
 
 def _live(campaign: Campaign) -> TrustFilter | None:
     """Filter of the campaign's posterior; None before anything was learned."""
-    last, n_robots = campaign.log.last_tree, campaign.workspace.awareness.sizes["robot"]
+    last, n_robots = campaign.state.last_tree, campaign.workspace.awareness.sizes["robot"]
     if last is None:
         return None
     model = campaign.model

@@ -1,10 +1,8 @@
 """Result of a campaign, in memory and on disk."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,52 +11,23 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.card import campaign_card
-from trustbo.campaign.damage import naming_what_is_left, read_fields
-from trustbo.campaign.failures import Failure, under_risk
-from trustbo.campaign.history import Kept, Posterior, Posteriors, table_of, whole_posterior
+from trustbo.campaign.failures import Failure
+from trustbo.campaign.history import table_of
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
-from trustbo.campaign.replacing import (
-    BELIEVED,
-    HISTORY,
-    MISSIONS,
-    POSTERIOR,
-    POSTERIORS,
-    RESULT,
-    STATE,
-    TABLE,
-    WORKSPACE,
-    current,
-    held,
-    replacing,
-)
+from trustbo.campaign.planners import planner_of, under_risk
+from trustbo.campaign.posteriors import kept_of, whole_posterior
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
-from trustbo.errors import DamagedFileError, TrustboError
-from trustbo.files import (
-    FilePath,
-    as_path,
-    interpreting,
-    read_record,
-    require_folder,
-    to_json,
-    write_checked,
-    write_text,
-)
+from trustbo.errors import TrustboError
+from trustbo.files import FilePath
 from trustbo.hazard import BoundRisk
 from trustbo.hazard.model import measures_of
 from trustbo.inference import params_of, place_maps
-from trustbo.logs.netcdf import read_missions, read_tree, write_missions, write_tree
 from trustbo.planning import Plan, Planner
-from trustbo.spreadsheet import frame_as_csv
 from trustbo.workspace import Workspace
-from trustbo.workspace import netcdf as archive
-from trustbo.workspace.moves import require_on_grid
 
 if TYPE_CHECKING:
     from trustbo.plots.explorer import Explorer
-
-_NEW = ("max_failure", "failure_cost")
-"""Options of planning that results of version 0.1 lack."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,7 +86,7 @@ class Result(Displayed):
     @property
     def has_posterior(self) -> bool:
         """Whether anything could be learned yet."""
-        return len(self.posteriors) > 0 and self._kept[-1] is not None
+        return len(self.posteriors) > 0 and kept_of(self.posteriors)[-1] is not None
 
     @cached_property
     def posterior(self) -> xr.DataTree:
@@ -151,8 +120,7 @@ class Result(Displayed):
     @cached_property
     def planner(self) -> Planner:
         """Planner as the campaign's, with the awareness believed in at the end."""
-        # Version 0.1 knew of no failures.
-        names = [n for n in options_of(PLANNING) if n in self.settings or n not in _NEW]
+        names = options_of(PLANNING)
         missing = [n for n in ("start", "goal", "objective", *names) if n not in self.settings]
         if missing:
             raise TrustboError(
@@ -166,7 +134,7 @@ class Result(Displayed):
             self.settings.get("response", "level"),
         )
         objective = self.settings["objective"]
-        planner = options.planner(self.workspace, start, goal, objective, *law)
+        planner = planner_of(options, self.workspace, start, goal, objective, law)
         if "hazard" in self.posterior.children:
             hazard = self.posterior["hazard"].to_dataset()
             # The workspace has no measures where the terrain was taken away.
@@ -276,164 +244,11 @@ class Result(Displayed):
             TrustboError: The folder's name belongs to a file, a file in it that trustbo did not
                 write would be replaced, or it holds a campaign that this result is not of.
         """
-        folder = require_folder(directory)
-        held_there = current(folder)
-        if (held_there / STATE).exists():
-            if not self._is_in(held_there):
-                raise TrustboError(
-                    f"{str(folder)!r} holds a campaign, with missions as they were told, which a "
-                    "result does not have; give another folder."
-                )
-            whole = held_there / POSTERIOR
-            if self.has_posterior and not whole.exists():  # written when a campaign ends
-                write_tree(whole, self.posterior)
-            return
-        with held(folder), replacing(folder) as new:
-            write_tree(new / WORKSPACE, archive.workspace_to_tree(self.workspace))
-            self.write(new, whole=True, home=folder)
-            if self.has_posterior:
-                write_tree(new / POSTERIOR, self.posterior)
-        self.kept_in(folder)
+        from trustbo.campaign.result_files import save_result  # it reads results too
 
-    def kept_in(self, home: Path) -> None:
-        """Record that the posteriors are in a folder, all of them, from where they are read."""
-        for kept in self._kept:
-            if kept:
-                kept.file = home / _posterior_file(kept.after)
-
-    def write(self, folder: Path, *, whole: bool, home: Path) -> None:
-        """Write all but the workspace, for a campaign that is kept.
-
-        Args:
-            folder: Folder to write to.
-            whole: Whether to write all missions, or only the last to a folder that has all before
-                it: earlier posteriors never change.
-            home: Folder that the files will be in; another where they replace what is there, and
-                `kept_in` is to be called once they did.
-        """
-        files = list({kept.after: kept for kept in self._kept if kept}.values())
-        for kept in files if whole else files[-2:]:  # the last but one may have shrunk
-            name = _posterior_file(kept.after)
-            if whole or home / name != kept.file:
-                write_tree(folder / name, kept())
-                if folder == home:
-                    kept.file = home / name  # it is there from now on
-        since = 0 if whole else len(self.missions)  # whose ticks are there
-        write_missions(folder / MISSIONS, self.missions, since=since)
-        history = self.history.assign(final_trust_map=self.trust_map)
-        write_tree(folder / HISTORY, xr.DataTree(history))
-        if self.believed is not None:
-            write_tree(folder / BELIEVED, xr.DataTree(self.believed))
-        write_text(folder / TABLE, frame_as_csv(self.table()))
-        # Written last: its presence means that the rest is complete.
-        write_checked(folder / RESULT, self._record().encode())
-
-    def _record(self) -> str:
-        """Everything that no other file holds, as JSON."""
-        return to_json(
-            {
-                "n_missions": len(self.missions),
-                "path": self.path,
-                "trust": self.trust.tolist(),
-                "value": self.value,
-                "settings": self.settings,
-                "stop_reason": self.stop_reason,
-                "posterior_after": [kept and kept.after for kept in self._kept],
-                **({"failures": self.failures} if self.failures else {}),  # as version 0.2 had it
-            }
-        )
-
-    def _is_in(self, folder: Path) -> bool:
-        """Whether a folder holds this very result."""
-        try:
-            return to_json(read_record(folder / RESULT)) == to_json(json.loads(self._record()))
-        except DamagedFileError:
-            return False
-
-    @property
-    def _kept(self) -> list[Posterior | None]:
-        if isinstance(self.posteriors, Posteriors):
-            return self.posteriors.kept
-        return [Posterior(j + 1, tree) for j, tree in enumerate(self.posteriors)]
-
-
-def load_result(directory: FilePath) -> Result:
-    """Read a result that `Result.save` wrote.
-
-    Args:
-        directory: Folder that it was written to.
-
-    Raises:
-        TrustboError: The folder holds no result.
-        DamagedFileError: A file is missing or damaged; the message says what can be read.
-    """
-    folder = current(as_path(directory))
-    if not (folder / RESULT).exists():
-        raise TrustboError(f"{str(directory)!r} holds no result; give a folder written by save().")
-    with naming_what_is_left(folder):
-        record = read_fields(folder / RESULT)
-        # A run killed while it saved may have left one mission more than the record counts.
-        missions, posteriors, history = read_kept(folder, record)
-        workspace, believed = read_workspace(folder), None
-        if record["settings"].get("awareness") == "belief":
-            believed = read_tree(folder / BELIEVED).to_dataset()
-        with interpreting(folder / HISTORY):
-            trust_map = history["final_trust_map"].rename("trust")
-            history = history.drop_vars("final_trust_map")
-        with interpreting(folder / RESULT):
-            trust = np.array(record["trust"], dtype=float)
-            path = require_on_grid(record["path"], workspace.grid.shape)
-            if trust.shape != (len(path) - 1, workspace.awareness.sizes["robot"]):
-                raise ValueError(f"trust of shape {trust.shape} along {len(path)} cells")
-            failures = tuple(Failure.restore(one) for one in record.get("failures", ()))
-        return Result(
-            workspace,
-            missions,
-            posteriors,
-            list(path),
-            trust,
-            record["value"],
-            trust_map,
-            history,
-            record["settings"],
-            record["stop_reason"],
-            believed,
-            failures,
-        )
-
-
-def read_kept(folder: Path, record: dict[str, Any]) -> Kept:
-    """Read the missions that a record counts, their posteriors and the history."""
-    n = record["n_missions"]
-    order = record.get("posterior_after", range(1, n + 1))  # of version 0.1: one a mission
-    kept: dict[int, Posterior] = {}
-    for after in {*order} - {None}:
-        file = folder / _posterior_file(after)
-        if not file.exists():
-            raise DamagedFileError(f"{str(file)!r} is missing.")
-        kept[after] = Posterior(after, file=file)
-    history, missions = read_tree(folder / HISTORY).to_dataset(), folder / MISSIONS
-    with interpreting(folder / HISTORY):
-        history = history.isel(iteration=slice(n))
-        if (rows := history.sizes["iteration"]) != n:
-            raise ValueError(f"{rows} missions of {n}")
-    filled = read_missions(missions)[:n]
-    if len(filled) != n:
-        raise DamagedFileError(f"{str(missions)!r} holds {len(filled)} missions of {n}.")
-    return Kept(filled, Posteriors(kept.get(after) for after in order), history)
-
-
-def read_workspace(folder: Path) -> Workspace:
-    """Read the workspace of a campaign or result; DamagedFileError if it is missing or damaged."""
-    tree = read_tree(folder / WORKSPACE)
-    with interpreting(folder / WORKSPACE):
-        return archive.workspace_from_tree(tree)
+        save_result(self, directory)
 
 
 def _cell(pair: Any) -> Cell:
     row, col = pair
     return int(row), int(col)
-
-
-def _posterior_file(after: int) -> Path:
-    return Path(POSTERIORS) / f"{after:04d}.nc"

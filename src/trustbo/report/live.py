@@ -75,7 +75,7 @@ class LivePage:
 
 def _if_long_ago(campaign: Campaign | None) -> str:
     """Sentence for the page of a killed run, which no process renews any more."""
-    last = {} if campaign is None else campaign.log.entries[-1].row
+    last = {} if campaign is None else campaign.state.entries[-1].row
     seconds = sum(value for name, value in last.items() if name.startswith("seconds_"))
     took = f", of which the last took {max(seconds, 1.0):.0f} s" if last else ""
     return (

@@ -1,0 +1,85 @@
+"""Records of versions 0.1 and 0.2, converted to those of this version.
+
+A campaign's folder is read by `damage.read_fields`, which converts each record here, so that no
+other module of `campaign/` has a case for an older version.
+"""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import xarray as xr
+
+_PLANNING = {"max_failure": None, "failure_cost": None}
+"""Options of planning that version 0.1 had not, which knew of no failures."""
+_LEARNED = {"state": "learned", "reason": ""}
+"""State of every mission of version 0.1, which had no other."""
+_SIMULATORS = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulator"}
+"""Simulators by their names in version 0.1."""
+_MOST = 10_000
+"""Missions of a record of version 0.1 at most; a damaged one may count more."""
+
+
+def migrate_state(record: dict[str, Any]) -> dict[str, Any]:
+    """Convert the record of `campaign.json`."""
+    options, notes = dict(record["options"]), record["notes"]
+    if "replan" in notes:  # of version 0.1
+        options.setdefault("replan", notes["replan"])
+    # Version 0.2 had a weight of the tilt, where there is a margin of the limit now.
+    hazard = {n: v for n, v in options.get("hazard", {}).items() if n != "log_tilt"}
+    return {
+        **record,
+        "options": options | {"hazard": hazard},
+        "rows": [row if "state" in row else row | _LEARNED for row in record["rows"]],
+        "posterior_after": posterior_after(record),
+        "failures": _failures(record),
+    }
+
+
+def migrate_result(record: dict[str, Any]) -> dict[str, Any]:
+    """Convert the record of `result.json`."""
+    return {
+        **record,
+        "settings": {**record["settings"], **_PLANNING, **record["settings"]},
+        "posterior_after": posterior_after(record),
+        "failures": _failures(record),
+    }
+
+
+def posterior_after(record: Mapping[str, Any]) -> list[int | None]:
+    """Number of missions after which the posterior of each was fitted; one a mission in 0.1."""
+    if "posterior_after" in record:
+        return record["posterior_after"]
+    return list(range(1, min(record["n_missions"], _MOST) + 1))
+
+
+def extras_of(attributes: Mapping[Any, Any], n: int) -> list[dict[str, Any]]:
+    """Numbers that `n` missions were told with; version 0.1 kept none."""
+    text = attributes.get("extra")
+    return [{} for _ in range(n)] if text is None else json.loads(text)
+
+
+def migrate_notes(notes: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the notes of the simulator that a campaign was begun with.
+
+    Version 0.1 recorded less: only its name, and lists by their lengths; the rest is taken from the
+    notes of now, and cannot be compared.
+    """
+    before = {n: _SIMULATORS.get(v, v) if isinstance(v, str) else v for n, v in notes.items()}
+    if "stop" not in notes:
+        before = {**now, **before}
+    for name, value in now.items():
+        if isinstance(value, list) and before.get(name) == len(value):
+            before[name] = value
+    return before
+
+
+def is_whole(posterior: xr.DataTree) -> bool:
+    """Whether a posterior was written with all groups, as version 0.1 did."""
+    return "missions" not in posterior.attrs
+
+
+def _failures(record: Mapping[str, Any]) -> list[list[Any]]:
+    """Failures with a path, a cell and whether they were told; version 0.1 had the reason alone."""
+    rest = [], None, False
+    return [[*one, *rest[max(len(one) - 2, 0) :]] for one in record.get("failures", [])]
