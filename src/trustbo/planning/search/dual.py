@@ -42,6 +42,7 @@ from trustbo.planning.search.graph import Costs, Graph, Resources, filled
 from trustbo.planning.search.losses import LEAST, NONE, joined, loss_of
 
 _part = njit(nogil=True, error_model="numpy", **PART)
+_inlined = njit(nogil=True, error_model="numpy", inline="always")  # see README
 _PRICES = 12
 """Number of prices that are tried."""
 
@@ -78,7 +79,7 @@ def failure(F: float, total: float) -> float:
     return -F * math.expm1(-total) if F > 0.0 else 0.0
 
 
-@_part
+@_inlined
 def maximise_dual(
     graph: Graph, costs: Costs, resources: Resources, ahead: Ahead, below: float
 ) -> Dual:
@@ -96,20 +97,19 @@ def maximise_dual(
             if start >= 0 and costs.start_cost[length] + free.best[start] < known.cost:
                 known, _ = _try(graph, costs, resources, ahead, free, start, known, path)
         return Dual(known, free, free, 0.0, dual.root)
-    if F == 0.0:
-        return _raise_price(graph, costs, resources, ahead, dual, 0.0, 0.0, path)
-    known = _follow_tangents(graph, costs, resources, ahead, known, low, path)
-    dual = Dual(known, free, free, 0.0, dual.root)
+    if F > 0.0:
+        known = _follow_tangents(graph, costs, resources, ahead, known, low, path)
+        dual = Dual(known, free, free, 0.0, dual.root)
     high = resources.limits[0]
     # Two rounds: the paths of the first lower `high`, so that the chord of the second is closer.
-    for _ in range(2):
-        if dual.known.cost < np.inf:
+    for _ in range(2 if F > 0.0 else 1):
+        if F > 0.0 and dual.known.cost < np.inf:
             # least + F (1 - exp(-r_0)) <= known cost, for any path that is better.
             share = (dual.known.cost - least) / F
             if share < 1.0:
                 high = min(high, -math.log1p(-max(share, 0.0)))
-        mu, base = 0.0, failure(resources.failure_cost, low)
-        if low < high < np.inf:
+        mu, base = 0.0, failure(F, low)
+        if F > 0.0 and low < high < np.inf:
             mu = F * (math.exp(-low) - math.exp(-high)) / (high - low)
             base = -F * math.expm1(-low) - mu * low
         dual = _raise_price(graph, costs, resources, ahead, dual, mu, base, path)
@@ -118,13 +118,13 @@ def maximise_dual(
     return dual
 
 
-@_part
+@_inlined
 def _most_cells(graph):
     """Largest number of cells of a path that `_follow` may find."""
     return graph.rank[-1] + 1 if graph.layered else len(graph.rank)
 
 
-@_part
+@_inlined
 def _safest_of_all(graph, costs, resources):
     """Least sum of the first resource from the start."""
     low = np.inf
@@ -135,7 +135,7 @@ def _safest_of_all(graph, costs, resources):
     return low
 
 
-@_part
+@_inlined
 def _follow_tangents(graph, costs, resources, ahead, known, low, path):
     """Improve the best path known where the first resource is priced at the failure cost's slope.
 
@@ -155,7 +155,7 @@ def _follow_tangents(graph, costs, resources, ahead, known, low, path):
     return known
 
 
-@_part
+@_inlined
 def _raise_price(graph, costs, resources, ahead, dual, mu, base, path):
     """Maximise the dual function over lambda for one chord; see its paths.
 
@@ -193,7 +193,7 @@ def _raise_price(graph, costs, resources, ahead, dual, mu, base, path):
     return Dual(known, free, priced, offset, root)
 
 
-@_part
+@_inlined
 def _next_price(price, excess, within, within_used, beyond, beyond_used):
     """Price at which the last paths within and beyond the limit cost the same.
 
@@ -249,7 +249,7 @@ def _try(graph, costs, resources, ahead, to_go, start, known, path):
     return known, _Tried(cost, first, used, feasible)
 
 
-@_part
+@_inlined
 def _follow(graph, costs, resources, ahead, to_go, node, cost, total, path):
     """Follow the best edges to go; write the path and its sums, return its cost, use and cells.
 

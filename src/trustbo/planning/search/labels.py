@@ -45,6 +45,7 @@ from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
+_inlined = njit(nogil=True, error_model="numpy", inline="always")  # see README
 MAX_LABELS = 300_000
 """Limit on the labels of a draw."""
 _MAX_ENTRIES = 20_000_000  # of the resources of labels
@@ -63,6 +64,7 @@ def solve(problem: SearchProblem, below: np.ndarray | None = None) -> Best:
     below = np.full(n_draws, np.inf) if below is None else below
     found = np.full(n_draws, np.inf), np.empty(n_draws)  # cost, lower limit
     graph = problem.graph
+    options = _AIMS if problem.loss == LEAST else None, None if graph.layered else True
     most = graph.rank[-1] + 1 if graph.layered else len(graph.rank)  # cells of a path
     parts, step = [], max(1, _MAX_CELLS // most)
     for begin in range(0, n_draws, step):
@@ -70,7 +72,7 @@ def solve(problem: SearchProblem, below: np.ndarray | None = None) -> Best:
 
         def work(first: int, last: int, begin: int = begin, part: np.ndarray = part) -> None:
             draws = begin, begin + first, begin + last
-            _solve(problem, below, _most_labels(problem), *draws, part, *found)
+            _solve(problem, below, _most_labels(problem), *options, *draws, part, *found)
 
         over_rows(work, len(part)) if len(part) > 1 else work(0, len(part))
         parts.append(part[:, : max(1, (part >= 0).sum(1).max(initial=0))])
@@ -87,38 +89,45 @@ def _most_labels(problem: SearchProblem) -> int:
 
 
 @_compiled
-def _solve(problem, below, max_labels, offset, first, last, paths, cost, lower):
-    """Find the paths of some draws; row 0 of `paths` is that of draw `offset`."""
+def _solve(problem, below, max_labels, aims, any_order, offset, first, last, paths, cost, lower):
+    """Find the paths of some draws; row 0 of `paths` is that of draw `offset`.
+
+    `aims` is None unless the largest loss counts, and `any_order` unless nodes have no order: what
+    a None stands for is not compiled.
+    """
+    graph, resources = problem.graph, problem.resources
     for d in range(first, last):
         costs = costs_of(problem, d)
-        known, root = _best_of_draw(problem.graph, costs, problem.resources, below[d], max_labels)
+        cost[d] = lower[d] = np.inf
+        if not any_start(graph, costs, resources):
+            continue
+        ahead = look_ahead(graph, costs, len(resources.limits) > 0)
+        dual = maximise_dual(graph, costs, resources, ahead, below[d])
+        known, root = dual.known, dual.root
+        if root >= known.cost:
+            root = known.cost
+        elif aims is not None:
+            known, root = _best_bottleneck(graph, costs, resources, ahead, dual, max_labels, aims)
+        else:
+            need, best = np.empty(0), known.cost
+            if any_order is None:
+                found, least = _by_rank(
+                    graph, costs, resources, ahead, need, dual, best, max_labels
+                )
+            else:
+                found, least = _best_first(
+                    graph, costs, resources, ahead, need, dual, best, max_labels
+                )
+            if len(found.path) > 0:
+                known = found
+            root = min(max(root, least), known.cost)
         cost[d], lower[d] = known.cost, root
         for k in range(len(known.path)):
             paths[d - offset, k] = known.path[k]
 
 
-@_part
-def _best_of_draw(graph, costs, resources, below, max_labels):
-    """Find the best path below a cost, and a lower limit on the cost of all paths."""
-    none = Found(np.empty(0, np.int64), np.inf)
-    if not any_start(graph, costs, resources):
-        return none, np.inf
-    ahead = look_ahead(graph, costs, len(resources.limits) > 0)
-    dual = maximise_dual(graph, costs, resources, ahead, below)
-    known, root = dual.known, dual.root
-    if root >= known.cost:
-        return known, known.cost
-    if costs.loss == LEAST:
-        return _best_bottleneck(graph, costs, resources, ahead, dual, max_labels)
-    need = np.empty(0)
-    found, lower = _search(graph, costs, resources, ahead, need, dual, known.cost, max_labels)
-    if len(found.path) > 0:
-        known = found
-    return known, min(max(root, lower), known.cost)
-
-
-@_part
-def _best_bottleneck(graph, costs, resources, ahead, dual, max_labels):
+@_inlined
+def _best_bottleneck(graph, costs, resources, ahead, dual, max_labels, aims):
     """Find the path whose largest loss is least, and a lower limit on that of all paths.
 
     A path is sought whose every loss is below an aim: the cost so far does not matter then to what
@@ -134,10 +143,10 @@ def _best_bottleneck(graph, costs, resources, ahead, dual, max_labels):
     gap = known.cost - root if known.cost < np.inf else 1.0
     step = gap / 32.0  # the first aim is low, and cheap where it is in vain
     aim = root + step
-    for _ in range(_AIMS):
+    for _ in range(aims):
         need = least_trust(graph, costs, aim)
         narrowed = with_safest(graph, costs, resources, need)
-        found, lower = _search(graph, costs, narrowed, ahead, need, dual, aim, max_labels)
+        found, lower = _by_rank(graph, costs, narrowed, ahead, need, dual, aim, max_labels)
         complete = lower == np.inf
         if len(found.path) > 0:
             known = found
@@ -162,15 +171,9 @@ class _Labels(NamedTuple):
 
 
 @_part
-def _search(graph, costs, resources, ahead, need, dual, below, max_labels):
-    """Find the best path that costs less than `below`, no cells if none.
-
-    Also a lower limit on the cost of all paths where labels were left at the limit on their number,
-    inf where all was seen.
-    """
-    labels = _Labels(
-        np.empty((256, 4), np.int64), np.empty((256, 4)), np.empty((256, len(resources.limits)))
-    )
+def _first_labels(graph, costs, n_resources):
+    """Labels of the start, the first of them at each node, -1 where none, and their number."""
+    labels = _Labels(np.empty((256, 4), np.int64), np.empty((256, 4)), np.empty((256, n_resources)))
     heads = np.empty(len(graph.rank), np.int64)
     for node in range(len(heads)):
         heads[node] = -1
@@ -183,22 +186,22 @@ def _search(graph, costs, resources, ahead, need, dual, below, max_labels):
             link[n, 0], link[n, 1], link[n, 2], link[n, 3] = node, -1, -1, -1
             state[n, 0] = -np.inf if costs.loss == LEAST else costs.start_cost[length]
             state[n, 1], state[n, 2], state[n, 3] = costs.x0, 0.0, -np.inf
-            for k in range(len(resources.limits)):
+            for k in range(n_resources):
                 used[n, k] = 0.0
             heads[node] = n
             n += 1
-    if graph.layered:
-        return _by_rank(
-            graph, costs, resources, ahead, need, dual, below, max_labels, labels, heads, n
-        )
-    return _best_first(
-        graph, costs, resources, ahead, need, dual, below, max_labels, labels, heads, n
-    )
+    return labels, heads, n
 
 
-@_part
-def _by_rank(graph, costs, resources, ahead, need, dual, best, max_labels, labels, heads, n):
-    """Process nodes by rank: all labels of a node are then known when the first is expanded."""
+@_inlined
+def _by_rank(graph, costs, resources, ahead, need, dual, best, max_labels):
+    """Find the best path that costs less than `best`, no cells if none, in a layered graph.
+
+    Nodes are processed by rank: all labels of a node are then known when the first is expanded.
+    Also a lower limit on the cost of all paths where labels were left at the limit on their number,
+    inf where all was seen.
+    """
+    labels, heads, n = _first_labels(graph, costs, len(resources.limits))
     F, goal = resources.failure_cost, np.int64(-1)
     for node in range(len(heads) - 1, -1, -1):
         label = heads[node]
@@ -221,9 +224,13 @@ def _by_rank(graph, costs, resources, ahead, need, dual, best, max_labels, label
     return _found(graph, labels, goal, best), np.inf
 
 
-@_part
-def _best_first(graph, costs, resources, ahead, need, dual, best, max_labels, labels, heads, n):
-    """Process labels by the lower limit of their completions: the first at the goal is the best."""
+@_inlined
+def _best_first(graph, costs, resources, ahead, need, dual, best, max_labels):
+    """Find what `_by_rank` does in any graph.
+
+    Labels are processed by the lower limit of their completions: the first at the goal is the best.
+    """
+    labels, heads, n = _first_labels(graph, costs, len(resources.limits))
     queue = [(dual.root, np.int64(0))]
     while queue:
         estimate, label = heapq.heappop(queue)
