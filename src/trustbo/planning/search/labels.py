@@ -170,10 +170,12 @@ class _Labels(NamedTuple):
     used: np.ndarray  # (label, resource): sums of the resources
 
 
-@_part
+@_inlined
 def _first_labels(graph, costs, n_resources):
     """Labels of the start, the first of them at each node, -1 where none, and their number."""
     labels = _Labels(np.empty((256, 4), np.int64), np.empty((256, 4)), np.empty((256, n_resources)))
+    labels = _with_room(labels, len(graph.starts))
+    link, state, used = labels
     heads = np.empty(len(graph.rank), np.int64)
     for node in range(len(heads)):
         heads[node] = -1
@@ -181,8 +183,6 @@ def _first_labels(graph, costs, n_resources):
     for length in range(len(graph.starts)):
         node = graph.starts[length]
         if node >= 0 and costs.start_cost[length] < np.inf:
-            labels = _with_room(labels, n + 1)
-            link, state, used = labels
             link[n, 0], link[n, 1], link[n, 2], link[n, 3] = node, -1, -1, -1
             state[n, 0] = -np.inf if costs.loss == LEAST else costs.start_cost[length]
             state[n, 1], state[n, 2], state[n, 3] = costs.x0, 0.0, -np.inf
@@ -251,7 +251,7 @@ def _best_first(graph, costs, resources, ahead, need, dual, best, max_labels):
     return _found(graph, labels, np.int64(-1), best), np.inf
 
 
-@_part
+@_inlined
 def _with_room(labels, n):
     """Labels with room for `n` of them."""
     return _Labels(with_room(labels.link, n), with_room(labels.state, n), with_room(labels.used, n))

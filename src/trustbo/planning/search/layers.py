@@ -23,13 +23,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART, over_rows
+from trustbo.parallel import over_rows
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.search.graph import Graph
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
-_part = njit(nogil=True, error_model="numpy", **PART)
+_inlined = njit(nogil=True, error_model="numpy", inline="always")  # see README
 
 
 @_compiled
@@ -210,7 +210,7 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
             _trace(layers, gain, length_cost, by_edge, found, layers.starts[chosen], paths[d])
 
 
-@_part
+@_inlined
 def _pass_back(layers, gain, length_cost, costly, by_edge, found):
     """Compute the best and second-best sum of every node, in the order of the bounds left."""
     left, first, head, move = layers.rank, layers.first, layers.head, layers.move
@@ -235,7 +235,7 @@ def _pass_back(layers, gain, length_cost, costly, by_edge, found):
         best[n], second[n], edge[n], by[n] = high, next_high, at, m_high
 
 
-@_part
+@_inlined
 def _trace(layers, gain, length_cost, by_edge, found, node, path):
     """Write down the path from a start node; second-best edges are searched again."""
     cell, first, head, move = layers.cell, layers.first, layers.head, layers.move
