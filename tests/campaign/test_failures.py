@@ -285,5 +285,5 @@ def test_priors_of_the_hazard_are_an_option_that_is_kept(workspace, tmp_path):
         assert again.options.hazard == prior
     with pytest.raises(tb.TrustboError, match="unknown prior of the hazard 'intercpt'; did you"):
         begin(workspace, hazard={"intercpt": (0.0, 1.0)})
-    with pytest.raises(tb.TrustboError, match=r"hazard must be a models\.Hazard"):
+    with pytest.raises(tb.TrustboError, match=r"hazard must be a hazard\.Hazard"):
         begin(workspace, hazard=0.1)

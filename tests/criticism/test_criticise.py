@@ -206,7 +206,7 @@ def test_with_places_nothing_is_compared_that_needs_nuts(planted, monkeypatch):
 
 def test_what_cannot_be_criticised_says_why(with_places, planted):
     posterior, _ = with_places
-    with pytest.raises(TrustboError, match=r"takes a posterior of trustbo.inference.fit; got dict"):
+    with pytest.raises(TrustboError, match=r"takes a posterior of trustbo\.fit; got dict"):
         criticise({})
     bare = posterior.copy()
     bare.attrs = {}

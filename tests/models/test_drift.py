@@ -29,6 +29,7 @@ from trustbo.inference.samplers import drift_target
 from trustbo.inference.updating import update_statistics
 from trustbo.models import DriftTrust, PlaceEffect, PooledTrust
 from trustbo.models.drift_form import find_drift
+from trustbo.study.methods import model_of
 
 NOISES = {"delta_w": 0.05, "delta_v": 0.05}
 
@@ -351,10 +352,10 @@ def test_a_posterior_from_a_file_finds_its_function_or_says_that_it_is_gone(post
 
 
 def test_a_study_imports_a_model_of_its_own():
-    study = tb.study.Study(terrains=["random_workspace"], models={"mine": HERE})
-    assert study.models["mine"] is OWN
+    study = tb.study.Study(terrains=["random_workspace"], models={"mine": {"kind": HERE}})
+    assert model_of(study.models["mine"]) is OWN
     with pytest.raises(TrustboError, match="'nowhere:OWN' cannot be imported: No module named"):
-        tb.study.Study(terrains=["random_workspace"], models={"mine": "nowhere:OWN"})
+        tb.study.Study(terrains=["random_workspace"], models={"mine": {"kind": "nowhere:OWN"}})
 
 
 HERE = f"{__name__}:OWN"

@@ -6,9 +6,10 @@ other module of `campaign/` has a case for an older version.
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import xarray as xr
+if TYPE_CHECKING:
+    import xarray as xr
 
 _PLANNING = {"max_failure": None, "failure_cost": None}
 """Options of planning that version 0.1 had not, which knew of no failures."""
@@ -74,7 +75,7 @@ def migrate_notes(notes: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str,
     return before
 
 
-def is_whole(posterior: xr.DataTree) -> bool:
+def is_whole(posterior: "xr.DataTree") -> bool:
     """Whether a posterior was written with all groups, as version 0.1 did."""
     return "missions" not in posterior.attrs
 

@@ -97,6 +97,7 @@ def _best_of_lengths(case: Case, drift: np.ndarray, weights: Weights) -> Best:
 
 
 def _sums_within(case: Case) -> Best:
+    _ = case.admissible.layers  # refused here if too large, before weights of so many bounds are
     dynamics, longest = case.dynamics, case.admissible.longest
     weights = additive_weights(dynamics, dynamics.views[0], case.objective, longest)
     u = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
