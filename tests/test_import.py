@@ -33,6 +33,14 @@ def test_importing_loads_nothing_heavy():
     assert printed(program) == "[]"
 
 
+def test_fitting_loads_no_figures():
+    program = (
+        "import sys, trustbo.inference; "
+        "print(sorted({'arviz', 'arviz_plots', 'matplotlib'} & set(sys.modules)))"
+    )
+    assert printed(program) == "[]"
+
+
 def test_type_checkers_are_told_that_it_is_typed():
     assert resources.files("trustbo").joinpath("py.typed").is_file()
     build = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"]

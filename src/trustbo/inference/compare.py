@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 
-import arviz as az
 import numpy as np
 import pandas as pd
 import xarray as xr
+from arviz_stats.loo.compare import compare as ranked
 
 from trustbo.errors import TrustboError
 from trustbo.inference.loo import loo
@@ -39,7 +39,7 @@ def compare(posteriors: Mapping[str, xr.DataTree]) -> pd.DataFrame:
                 f"{name!r} and {first!r} are posteriors of different missions, with rates "
                 f"{rates.shape} and {reference.shape}; fit both to the same."
             )
-    return az.compare({name: loo(tree) for name, tree in trees.items()})
+    return ranked({name: loo(tree) for name, tree in trees.items()})
 
 
 def _rates(posterior: xr.DataTree) -> np.ndarray:
