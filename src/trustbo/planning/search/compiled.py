@@ -53,6 +53,16 @@ class Case(NamedTuple):
         """Cost of the length of each move, (move,)."""
         return self.objective.length_weight * self.admissible.lengths
 
+    @property
+    def weights(self) -> Weights:
+        """Weights of the bounds of a sum, by the bounds left.
+
+        TrustboError: so many bounds are admissible that their graph is too large to be held.
+        """
+        _ = self.admissible.layers  # which refuses that, before weights of so many bounds are
+        view, longest = self.dynamics.views[0], self.admissible.longest
+        return additive_weights(self.dynamics, view, self.objective, longest)
+
 
 def plan_compiled(
     admissible: AdmissiblePaths,
@@ -73,10 +83,8 @@ def plan_compiled(
 
 
 def _sums(case: Case) -> Best:
-    dynamics, longest = case.dynamics, case.admissible.longest
-    weights = additive_weights(dynamics, dynamics.views[0], case.objective, longest)
-    drift = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
-    return _best_of_lengths(case, drift, weights)
+    u = case.dynamics.drift
+    return _best_of_lengths(case, u.reshape(*u.shape[:3], -1), case.weights)
 
 
 def _best_of_lengths(case: Case, drift: np.ndarray, weights: Weights) -> Best:
@@ -97,10 +105,8 @@ def _best_of_lengths(case: Case, drift: np.ndarray, weights: Weights) -> Best:
 
 
 def _sums_within(case: Case) -> Best:
-    _ = case.admissible.layers  # refused here if too large, before weights of so many bounds are
-    dynamics, longest = case.dynamics, case.admissible.longest
-    weights = additive_weights(dynamics, dynamics.views[0], case.objective, longest)
-    u = dynamics.drift.reshape(*dynamics.drift.shape[:2], -1)
+    weights, u = case.weights, case.dynamics.drift
+    u = u.reshape(*u.shape[:2], -1)
     return _best_sums(
         case, [w @ of_draw for w, of_draw in zip(weights.per_bound, u, strict=True)], weights
     )
@@ -265,7 +271,7 @@ def expected_path(
         Flat indices of cells, filled with -1; None if no path is feasible under a risk.
     """
     case = Case(admissible, dynamics, objective, risk)
-    weights = additive_weights(dynamics, dynamics.views[0], objective, admissible.longest)
+    weights = case.weights
     u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
     # E[w_j . u] for every number of bounds left j, move and cell: one state for every j.
     gain = np.einsum("djs,dsmc->jmc", weights.per_bound, np.nan_to_num(u)) / len(u)
