@@ -22,7 +22,9 @@ from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.latent_target import LatentTarget
 from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.run import nuts_data
 from trustbo.inference.samplers.student import Student, log_mixture
+from trustbo.inference.samplers.target import Target
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
@@ -228,6 +230,66 @@ def test_what_nuts_sees_is_the_same_marginal(place):
             as64.ssm(batch.awareness), batch.contact_rate, weight, hyper, index
         )
     assert float(found) == pytest.approx(expected, rel=1e-9 if place.bounds else 1e-5)
+
+
+def test_nuts_integrates_weights_and_intercept_out_with_the_effects():
+    """The density is that of a dense joint normal, and draws have its conditional moments."""
+    missions, priors = random_missions(2), Priors(stationary=True)
+    place = PlaceEffect(shared=False)
+    theta = (0.4, 0.1, 0.2, 0.3, 1.7, 0.2)
+    dense = Dense(missions, place, theta, priors)
+    batch = tb.stacking.stack_missions(missions)
+    there = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
+    weight = np.ones(len(batch.awareness))
+    data = nuts_data(PooledTrust(priors=priors, place=place), batch, weight, there)
+    with own_settings():
+        target = Target(PooledTrust(priors=priors, place=place), data, complete=False)
+        names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
+        values = {name: jax.numpy.asarray(v) for name, v in zip(names, theta, strict=True)}
+        site = {name: target.inverse[name].inv(v) for name, v in values.items()}
+        base = {name: 1.1 * v for name, v in site.items()}
+        other = {name: float(v) for name, v in target.values(base).items()}
+        keys = jax.random.split(jax.random.key(0), 20_000)
+        drawn = jax.jit(jax.vmap(lambda key: target.draw_effects(values, key)))(keys)
+        jump = float(target.potential(base) - target.potential(site))
+    # Of two points the difference: the priors' densities on the real line, by SciPy.
+    again = Dense(missions, place, tuple(other[name] for name in names), priors)
+    expected = dense.log_likelihood() - again.log_likelihood()
+    for name in names:
+        expected += log_prior(priors, place, name, float(values[name]))
+        expected -= log_prior(priors, place, name, other[name])
+    assert jump == pytest.approx(expected, rel=1e-8)
+    mean, cov = dense.posterior(dense.c_cov @ dense.U.T, dense.c_cov, dense.c_mean)
+    c = np.column_stack([drawn["beta"], drawn["b"]])
+    error = np.sqrt(np.diag(cov) / len(c))
+    assert (np.abs(c.mean(0) - mean) < 4.5 * error).all()
+    np.testing.assert_allclose(np.cov(c.T), cov, atol=4.5 * cov.max() * np.sqrt(2 / len(c)))
+    K = dense.K_s + dense.K_e
+    mean, cov = dense.posterior(K, K, 0.0)
+    units, n_units = [tuple(u) for u in there.units.tolist()], len(there.units)
+    moves = {tuple(m): i for i, m in enumerate(tb.workspace.moves.MOVES[8])}
+    robots = [i * (not place.shared) for i, _, _ in dense.rows]
+    index = [
+        units.index((i, moves[tuple(np.subtract(c, a).tolist())], *c))
+        for i, (_, a, c) in zip(robots, dense.rows, strict=True)
+    ]
+    g = np.asarray(drawn["place_unit"])[:, :n_units][:, index]
+    assert (np.abs(g.mean(0) - mean) < 4.5 * np.sqrt(np.diag(cov) / len(g))).all()
+    np.testing.assert_allclose(g.var(0), np.diag(cov), rtol=4.5 * np.sqrt(2 / len(g)))
+
+
+def log_prior(priors, place, name, value):
+    """Log density of a parameter's prior on the real line: its logit, or its logarithm."""
+    if name == "beta0":
+        density = stats.beta(priors.beta0.concentration1, priors.beta0.concentration0)
+        return density.logpdf(value) + np.log(value * (1.0 - value))
+    of_places = {
+        "tau_s": stats.halfnorm(scale=place.tau_s),
+        "tau_e": stats.halfnorm(scale=place.tau_e),
+        "length_scale": stats.lognorm(place.length_scale_sd, scale=place.length_scale),
+    }
+    noise = stats.halfnorm(scale=float(getattr(priors, name).scale)) if name[0] == "d" else None
+    return (noise or of_places[name]).logpdf(value) + np.log(value)
 
 
 @pytest.mark.parametrize("place", PLACES[:1] + PLACES[3:], ids=str)

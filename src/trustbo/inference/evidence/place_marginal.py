@@ -4,7 +4,9 @@ Dense where `place_rows` filters, so that each is a check of the other: with x =
 one robot in one mission, rates are y = H x + v, H = (0 I) - lag (I 0), and the effects g of its
 bounds enter x by T, T_kj = beta0^(k - j). Whitened by the covariance of its rates, the T of all
 missions and robots add up to the precision W that the data lend to g, and then, with L_g L_g' the
-prior covariance of g, det(V + T K T') = det(V) det(I + L_g' W L_g).
+prior covariance of g, det(V + T K T') = det(V) det(I + L_g' W L_g). Weights and intercept of the
+pooled model are more unknowns of that kind, with columns X of features in the place of T: sampled,
+they would make a funnel with the scales of the effects, which widen them tenfold.
 
 NUTS takes tens of thousands of gradients, so that common factors are shared. V and T do not depend
 on awareness, and those of a short mission are leading blocks of those of a long one: there is one
@@ -12,13 +14,14 @@ whitening for each pattern of gaps, not for each mission and robot. The term of 
 gradient in closed form, without the derivative of a Cholesky factor.
 """
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.linalg import solve_triangular
+from jax.scipy.linalg import block_diag, solve_triangular
 
 from trustbo.models.place import Visited
 from trustbo.models.state_space.scalar import ScalarSSM
@@ -66,6 +69,12 @@ class PlaceHyper(NamedTuple):
     length_scale: Array
     tau_e: Array
 
+    @classmethod
+    def of(cls, values: Mapping[str, Array]) -> "PlaceHyper":
+        """Take the effects that are there from parameters by name."""
+        absent = {"tau_s": jnp.zeros(()), "length_scale": jnp.ones(()), "tau_e": jnp.zeros(())}
+        return cls(*(values.get(name, absent[name]) for name in cls._fields))
+
 
 def prior_factor(hyper: PlaceHyper, places: PlaceIndex) -> Array:
     """Cholesky's factor of the prior covariance of the units' effects g, (unit, unit)."""
@@ -81,12 +90,29 @@ def _prior_covariance(hyper: PlaceHyper, places: PlaceIndex) -> Array:
     return K[same][:, same] + nugget * jnp.eye(len(same))
 
 
+class Linear(NamedTuple):
+    """Part of the drift that is linear in coefficients with independent normal priors."""
+
+    columns: Array  # (mission, bound, robot, coefficient)
+    mean: Array  # (coefficient,)
+    sd: Array  # (coefficient,)
+
+
 def log_likelihood(
-    ssm: ScalarSSM, y: Array, weight: Array, hyper: PlaceHyper, places: PlaceIndex
+    ssm: ScalarSSM,
+    y: Array,
+    weight: Array,
+    hyper: PlaceHyper,
+    places: PlaceIndex,
+    linear: Linear | None = None,
 ) -> Array:
-    """Log density of all rates y (mission, bound, robot), each mission weighted."""
-    W, h, rest = _statistics(ssm, y, weight, places)
-    return rest + _log_marginal(_prior_covariance(hyper, places), W, h)
+    """Log density of all rates y (mission, bound, robot), each mission weighted.
+
+    With `linear`, its coefficients integrate out next to the effects, and the drift of `ssm` is the
+    rest.
+    """
+    K, W, h, rest = _unknowns(ssm, y, weight, hyper, places, linear)
+    return rest + _log_marginal(K, W, h)
 
 
 def draw_effects(
@@ -96,14 +122,16 @@ def draw_effects(
     hyper: PlaceHyper,
     places: PlaceIndex,
     key: Array,
-) -> Array:
-    """Effects g of the units given all rates, one exact draw, (unit,)."""
-    W, h, _ = _statistics(ssm, y, weight, places)
-    L = prior_factor(hyper, places)
+    linear: Linear | None = None,
+) -> tuple[Array, Array]:
+    """Effects (unit,) and coefficients (coefficient,) given all rates, one exact draw."""
+    K, W, h, _ = _unknowns(ssm, y, weight, hyper, places, linear)
+    L = jnp.linalg.cholesky(K)
     root = _root(L, W)
     half = solve_triangular(root, L.T @ h, lower=True)
     z = half + jax.random.normal(key, half.shape, half.dtype)
-    return L @ solve_triangular(root, z, lower=True, trans=1)
+    g, c = jnp.split(L @ solve_triangular(root, z, lower=True, trans=1), [len(places.cell_of)])
+    return g, c if linear is None else linear.mean + c
 
 
 @jax.custom_vjp
@@ -138,10 +166,50 @@ def _root(L: Array, W: Array) -> Array:
     return jnp.linalg.cholesky(jnp.eye(len(L)) + L.T @ W @ L)
 
 
-def _statistics(
+def _unknowns(
+    ssm: ScalarSSM,
+    y: Array,
+    weight: Array,
+    hyper: PlaceHyper,
+    places: PlaceIndex,
+    linear: Linear | None,
+) -> tuple[Array, Array, Array, Array]:
+    """Prior covariance K of g, and of coefficients less their means; what the rates add.
+
+    Returns:
+        K, the precision W and the right side h that the rates lend, and the log density of the
+        rates where all unknowns are 0.
+    """
+    r, T, log_scale = _whitened(ssm, y, weight, places)
+    columns, K = r[..., None], _prior_covariance(hyper, places)
+    if linear is not None:
+        X = jnp.einsum("mikj,mjip->mikp", T, linear.columns)
+        columns = jnp.concatenate([columns - (X @ linear.mean)[..., None], X], 3)
+        K = block_diag(K, jnp.diag(linear.sd**2))
+    unit = jnp.swapaxes(jnp.asarray(places.unit), 1, 2)
+    S = jnp.einsum("mikj,mikl->mijl", T, T)
+    B = jnp.einsum("mikj,mikc->mijc", T, columns)
+    if unit.shape[1] == 1:
+        S, B = S.sum(1, keepdims=True), B.sum(1, keepdims=True)
+    size = len(places.cell_of)
+    W = jnp.zeros((size, size)).at[unit[..., :, None], unit[..., None, :]].add(S)
+    B = jnp.zeros((size, columns.shape[3])).at[unit].add(B)
+    flat = columns.reshape(-1, columns.shape[3])
+    A = flat.T @ flat
+    W = jnp.block([[W, B[:, 1:]], [B[:, 1:].T, A[1:, 1:]]])
+    return K, W, jnp.append(B[:, 0], A[1:, 0]), -0.5 * A[0, 0] - log_scale
+
+
+def _whitened(
     ssm: ScalarSSM, y: Array, weight: Array, places: PlaceIndex
 ) -> tuple[Array, Array, Array]:
-    """Precision W and right side h of g, and the log density of the rates at g = 0."""
+    """Rates with independent errors of variance 1; a mission's weight multiplies their squares.
+
+    Returns:
+        Residuals (mission, robot, bound) at g = 0, and 0 where no rate was measured; their response
+        to the drift of each bound, (mission, robot, bound, bound); and the log of the errors' scale
+        before, and of sqrt(2 pi), summed.
+    """
     n_bounds, n_robots = y.shape[1:]
     seen = jnp.swapaxes(~jnp.isnan(y), 1, 2)  # (mission, robot, bound)
     # Robots that share their parameters share the whitening too.
@@ -153,21 +221,12 @@ def _statistics(
     H = jnp.eye(n_bounds, n_bounds + 1, 1) - ssm.lag * jnp.eye(n_bounds, n_bounds + 1)
     mean = start[robot] * ssm.x0_mean + jnp.einsum("ikj,jmi->mik", carried[robot[0]], ssm.drift)
     r = jnp.where(seen, jnp.nan_to_num(jnp.swapaxes(y, 1, 2)) - mean @ H.T, 0.0)
-    pattern = places.pattern_of
+    pattern, w = places.pattern_of, weight[:, None, None]
     # Bounds after the end of a mission do not affect those before, and are left out here.
     r = seen * jnp.einsum("mikj,mij->mik", inverse[robot, pattern], r)
-    T = seen[..., None] * T[robot, pattern]  # (mission, robot, bound, bound)
-    w = weight[:, None]
-    S = jnp.einsum("mikj,mikl->mijl", T, T) * w[..., None, None]
-    h = jnp.einsum("mikj,mik->mij", T, r) * w[..., None]
-    unit = jnp.swapaxes(jnp.asarray(places.unit), 1, 2)
-    if unit.shape[1] == 1:
-        S, h = S.sum(1, keepdims=True), h.sum(1, keepdims=True)
-    size = len(places.cell_of)
-    W = jnp.zeros((size, size)).at[unit[..., :, None], unit[..., None, :]].add(S)
-    right = jnp.zeros(size).at[unit].add(h)
-    rest = r**2 + seen * (2.0 * log_scale[robot, pattern] + jnp.log(2.0 * jnp.pi))
-    return W, right, -0.5 * (rest.sum(-1) * w).sum()
+    T = seen[..., None] * T[robot, pattern]
+    log_scale = seen * (log_scale[robot, pattern] + 0.5 * jnp.log(2.0 * jnp.pi))
+    return jnp.sqrt(w) * r, jnp.sqrt(w)[..., None] * T, (w * log_scale).sum()
 
 
 def _whitening(

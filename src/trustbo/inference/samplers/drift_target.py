@@ -164,7 +164,7 @@ def _draw_effects(
 
     def one(theta: Array, scores: Array, key: Array) -> Array:
         ssm, hyper = _ssm(model, awareness, theta, scores), PlaceHyper(*theta[3:])
-        return place_marginal.draw_effects(ssm, contact_rate, weight, hyper, places, key)
+        return place_marginal.draw_effects(ssm, contact_rate, weight, hyper, places, key)[0]
 
     return jax.vmap(one)(theta, scores, keys)
 

@@ -207,9 +207,7 @@ def _finish(
         params = jax.vmap(target.constrain)(theta)
         if data.places is not None and model.family.integrates_out:
             keys = random.split(key, len(theta))
-            params["place_unit"] = lax.map(
-                lambda arguments: target.draw_effects(*arguments), (theta, keys)
-            )
+            params |= lax.map(lambda arguments: target.draw_effects(*arguments), (theta, keys))
         return theta, params
 
     theta, params = lax.map(finish, (start.chains, jnp.asarray(x), start.effect_keys))

@@ -68,8 +68,8 @@ class Reparametrisation(NamedTuple):
     no mass: each location parameter takes a power of the noise away. That is added, as in REML.
     """
     frame: Frame
-    draw_effects: Callable[[Array, Array], Array]
-    """Effects of places given such a vector, one draw by a key, where these integrate out."""
+    draw_effects: Callable[[Array, Array], Sites]
+    """Effects of places, and collapsed sites, given such a vector: one draw by a key."""
 
 
 def reparametrise(
@@ -110,7 +110,7 @@ def reparametrise(
 
     def profile(theta: Array) -> Array:
         energy = potential({"theta": theta, **zeros})
-        if space.collapsed:
+        if space.collapsed or space.target.collapsed:
             return energy
         total = target.unravel(theta)["delta_w"]  # t, the log of all noise
         of_places = sum(v.size for name, v in target.unravel(theta).items() if name in _OF_PLACES)
@@ -119,7 +119,7 @@ def reparametrise(
 
     starts, longest = _starts(model, target, space.means.scatter)
 
-    def draw_effects(theta: Array, key: Array) -> Array:
+    def draw_effects(theta: Array, key: Array) -> Sites:
         return target.draw_effects(target.values(space.to_sites(theta, robots)[0]), key)
 
     functions = constrain, potential, profile, Frame(target.linearisation, robots), draw_effects
@@ -170,6 +170,8 @@ class Coordinates:
             return self._collapse(site)
         if robots is not None and (pooling := self.model.partial_pooling) is not None:
             return centre(self.target, pooling, site, robots)
+        if self.target.collapsed:
+            return site, log_jacobian
         shifts = self.model.level(self.target.values(site), self.means.y, self.means.z)
         site = site | {name: site[name] - shift for name, shift in shifts.items()}
         return site, log_jacobian

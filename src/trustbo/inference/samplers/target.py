@@ -19,12 +19,13 @@ from numpyro.infer.util import constrain_fn, potential_energy
 
 from trustbo.inference.evidence import gram_jax, place_marginal
 from trustbo.inference.evidence.gram_jax import Spectrum
-from trustbo.inference.evidence.place_marginal import PlaceHyper, PlaceIndex
+from trustbo.inference.evidence.place_marginal import Linear, PlaceHyper, PlaceIndex
 from trustbo.models.families import Observed
 from trustbo.models.model import TrustModel, sample, sample_innovations
 from trustbo.models.params import Params
 from trustbo.models.place import PlaceEffect
 from trustbo.models.state_space.contact_rate import ContactRate
+from trustbo.models.state_space.scalar import ScalarSSM
 
 Sites = dict[str, Array]
 
@@ -52,6 +53,7 @@ class Target:
         unravel: Sites by name from a flat vector.
         inverse: Transform from the real line to each site's support.
         linearisation: Linearisation point, once `linearise` was called.
+        collapsed: Names of sites that integrate out with the effects of places.
     """
 
     def __init__(self, model: TrustModel, data: NutsData, *, complete: bool) -> None:
@@ -65,8 +67,15 @@ class Target:
         self.model, self.data, self.complete = model, data, complete
         self._sizes = data.awareness.shape[2:]
         self.linearisation: Array | None = None
+        priors, pooled = model.priors, model.robot_sets == "all" and model.family.integrates_out
+        normal = all(isinstance(prior, dist.Normal) for prior in (priors.beta, priors.b))
+        self.collapsed = {"beta", "b"} if data.places is not None and pooled and normal else set()
         trace = handlers.trace(handlers.seed(self._sample, random.key(0))).get_trace()
-        sites = {name: site["fn"] for name, site in trace.items() if site["type"] == "sample"}
+        sites = {
+            name: site["fn"]
+            for name, site in trace.items()
+            if site["type"] == "sample" and name not in self.collapsed
+        }
         self.inverse = {name: biject_to(prior.support) for name, prior in sites.items()}
         start = {name: _start(self.inverse[name], prior) for name, prior in sites.items()}
         self.start, self.unravel = ravel_pytree(start)
@@ -84,10 +93,10 @@ class Target:
         return potential_energy(self._program, (), {}, site)  # pyright: ignore[reportReturnType]
 
     def constrain(self, site: Sites) -> Sites:
-        """The model's parameters, by name."""
+        """The model's parameters, by name, but for collapsed ones."""
         values = constrain_fn(self._sample, (), {}, site, return_deterministic=True)
         extra = ("place_unit",) if self._samples_effects else ()
-        return {name: values[name] for name in (*self.model.dims, *extra)}
+        return {name: values[name] for name in (*self.model.dims, *extra) if name in values}
 
     @property
     def _samples_effects(self) -> bool:
@@ -95,8 +104,14 @@ class Target:
         return self.data.places is not None and not self.model.family.integrates_out
 
     def _sample(self) -> tuple[Params, PlaceHyper | None]:
-        """Sample statements; effects of places that are sampled are in the intercepts."""
-        params = self.model.sample_params(*self._sizes)
+        """Sample statements; effects of places that are sampled are in the intercepts.
+
+        Collapsed sites are 0, and their priors are in the likelihood.
+        """
+        nothing = {"beta": jnp.zeros(self._sizes[1]), "b": jnp.zeros(())}
+        fixed = {name: nothing[name] for name in self.collapsed}
+        with handlers.block(hide=list(fixed)), handlers.substitute(data=fixed):
+            params = self.model.sample_params(*self._sizes)
         if self.data.places is None:
             return params, None
         hyper = sample_hyper(cast(PlaceEffect, self.model.place))
@@ -107,12 +122,32 @@ class Target:
             params = params._replace(b=params.b + effect[self.data.places.unit])  # pyright: ignore
         return params, hyper
 
-    def draw_effects(self, values: Sites, key: Array) -> Array:
-        """One exact draw of the effects of units, given parameters of Gaussian rates."""
+    def draw_effects(self, values: Sites, key: Array) -> Sites:
+        """One exact draw of units' effects and collapsed sites, given parameters."""
         params, hyper = handlers.substitute(self._sample, values)()  # pyright: ignore
-        ssm = params.ssm(self.data.awareness, self.model.lag)
-        fixed = self.data.contact_rate, self.data.weight, hyper, self.data.places
-        return place_marginal.draw_effects(ssm, *fixed, key)  # pyright: ignore
+        effects, c = place_marginal.draw_effects(
+            *self._rates(params), hyper, self.data.places, key, self._linear(params)  # pyright: ignore
+        )  # fmt: skip
+        collapsed = {"beta": c[:-1], "b": c[-1]} if self.collapsed else {}
+        return {"place_unit": effects, **collapsed}
+
+    def _rates(self, params: Params) -> tuple[ScalarSSM, Array, Array]:
+        ssm = params.ssm(self.data.awareness, self.model.lag)  # pyright: ignore
+        return ssm, self.data.contact_rate, self.data.weight  # pyright: ignore
+
+    def _linear(self, params: Params) -> Linear | None:
+        """Features of the collapsed sites, and their priors."""
+        if not self.collapsed:
+            return None
+        awareness, priors = self.data.awareness, self.model.priors
+        columns = jnp.concatenate([awareness, jnp.ones((*awareness.shape[:3], 1))], 3)
+        weights, intercept = priors.weights(params.beta0), priors.intercept(params.beta0)  # pyright: ignore
+
+        def moment_of(name: str) -> Array:
+            of_beta = jnp.broadcast_to(getattr(weights, name), (columns.shape[3] - 1,))
+            return jnp.append(of_beta, getattr(intercept, name))
+
+        return Linear(columns, moment_of("loc"), moment_of("scale"))
 
     def log_likelihood(
         self, params: Params, innovations: Array | None = None, *, complete: bool = False
@@ -132,9 +167,8 @@ class Target:
     def _program(self) -> None:
         params, hyper = self._sample()
         if hyper is not None and not self._samples_effects:
-            ssm = params.ssm(self.data.awareness, self.model.lag)  # pyright: ignore
-            fixed = self.data.contact_rate, self.data.weight, hyper, self.data.places
-            numpyro.factor("contact_rate", place_marginal.log_likelihood(ssm, *fixed))  # pyright: ignore
+            fixed = *self._rates(params), hyper, self.data.places, self._linear(params)
+            numpyro.factor("contact_rate", place_marginal.log_likelihood(*fixed))  # pyright: ignore
             return
         if self.data.spectrum is not None:
             sums = gram_jax.log_likelihood(params, self.data.spectrum, self.model.lag)  # pyright: ignore
@@ -165,15 +199,14 @@ class _WeightedRates(ContactRate):
 
 def sample_hyper(place: PlaceEffect) -> PlaceHyper:
     """Sample statements of the hyperparameters of places."""
-    zero, one = jnp.zeros(()), jnp.ones(())
-    tau_s, length_scale, tau_e = zero, one, zero
+    values = {}
     if place.cells:
-        tau_s = sample("tau_s", dist.HalfNormal(place.tau_s))
+        values["tau_s"] = sample("tau_s", dist.HalfNormal(place.tau_s))
         scale = jnp.log(place.length_scale), place.length_scale_sd
-        length_scale = sample("length_scale", dist.LogNormal(*scale))
+        values["length_scale"] = sample("length_scale", dist.LogNormal(*scale))
     if place.bounds:
-        tau_e = sample("tau_e", dist.HalfNormal(place.tau_e))
-    return PlaceHyper(tau_s, length_scale, tau_e)
+        values["tau_e"] = sample("tau_e", dist.HalfNormal(place.tau_e))
+    return PlaceHyper.of(values)
 
 
 def innovations_shape(data: NutsData) -> tuple[int, int, int]:
