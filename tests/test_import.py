@@ -100,6 +100,21 @@ def test_completion_lists_public_names_alone(name):
     assert sorted(dir(module)) == sorted(module.__all__)
 
 
+@pytest.mark.parametrize(
+    ("package", "name", "room"), [("models", "fit", "inference"), ("models", "Hazard", "hazard")]
+)
+def test_a_name_of_version_0_2_is_found_in_its_new_room_with_a_warning(package, name, room):
+    old, new = import_module(f"trustbo.{package}"), import_module(f"trustbo.{room}")
+    with pytest.warns(FutureWarning, match=f"trustbo.{package}.{name} is trustbo.{room}.{name}"):
+        assert getattr(old, name) is getattr(new, name)
+    assert name not in dir(old)
+
+
+def test_a_name_that_never_was_is_refused():
+    with pytest.raises(AttributeError, match=r"'trustbo\.models' has no attribute 'nothing'"):
+        trustbo.models.nothing  # noqa: B018
+
+
 def test_a_missing_package_is_named_itself_and_is_one_of_an_extra():
     """pip finds `trustbo[ros]` only where trustbo is on an index."""
     sources = [file.read_text() for file in (ROOT / "src" / "trustbo").rglob("*.py")]

@@ -9,6 +9,7 @@ from scipy import special, stats
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.hazard.difficulty import difficulty_of
 from trustbo.hazard.exposures import Exposures
 from trustbo.hazard.sampler import _Density, impute, sample
 from trustbo.workspace.moves import MOVES
@@ -258,7 +259,7 @@ def hilly():
 
 
 def test_one_failure_on_steep_ground_teaches_all_that_is_as_steep(hilly):
-    tilt = np.nan_to_num(hilly.difficulty.sel(measure="tilt").values)
+    tilt = np.nan_to_num(difficulty_of(hilly).sel(measure="tilt").values)
     steepest = np.argsort(tilt.ravel())[::-1][:6]
     assert 0.8 < tilt.flat[steepest[-1]] < 1.05
     move, row, col = np.unravel_index(steepest, tilt.shape)
@@ -287,14 +288,14 @@ def test_few_draws_have_the_mean_chance_to_arrive_of_many(hilly):
 
 
 def test_a_group_of_version_0_2_without_a_limit_means_what_it_meant(hilly):
-    names, rng = hilly.difficulty["measure"].values.tolist(), np.random.default_rng(0)
+    names, rng = difficulty_of(hilly)["measure"].values.tolist(), np.random.default_rng(0)
     new = fit_hazard([], hilly).drop_vars(
         ["margin", "width", "coefficient", "measure", "p_fail", "p_fail_sd"]
     )
     weights = rng.uniform(0.0, 4.0, (1000, 4))
     old = new.assign_coords(measure=names).assign(coefficient=(("draw", "measure"), weights))
     risk, exists = BoundRisk.of(old, hilly), hilly.passable_bounds.values
-    x = hilly.difficulty.values[exists] - 0.5
+    x = difficulty_of(hilly).values[exists] - 0.5
     expected = special.expit(old["intercept"].values[:, None] + weights @ x.T).mean(0)
     np.testing.assert_allclose(risk.mean[exists], expected, rtol=1e-7)
 

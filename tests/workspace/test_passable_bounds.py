@@ -68,25 +68,3 @@ def test_without_a_terrain_every_bound_between_passable_cells_is_passable():
     passable = np.array([[True, True], [False, True]])
     workspace = tb.Workspace.from_awareness(np.full((1, 2, 2, 1), 0.5), passable)
     np.testing.assert_array_equal(workspace.passable_bounds.values, existing_bounds(passable))
-    assert workspace.difficulty.shape == (8, 2, 2, 0)
-
-
-def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
-    """A plane of tan 0.3, under limits of tan 1 and tan 0.4; then gaps of two widths."""
-    rows, found = np.arange(60.0), []
-    for limit in (1.0, 0.4):
-        terrain = tb.terrain.synthetic_terrain((60.0, 60.0), resolution=1.0, seed=0)
-        for name in ("dem", "dsm"):
-            terrain[name].values[:] = np.zeros((60, 60)) + 0.3 * rows[:, None]
-        robot = tb.Robot(max_slope=float(np.arctan(limit)))
-        team = tb.Team(robots=(robot,) * 2, lead=robot)
-        workspace = tb.Workspace.from_terrain(terrain, (3, 3), team, sight="bare")
-        found.append(workspace.difficulty.sel(move="e").values[1, 1])
-    for (_, tilt, narrow, tight), limit in zip(found, (1.0, 0.4), strict=True):
-        # Roll along the contour; no robot's way is but straight down, with the whole as pitch.
-        np.testing.assert_allclose(tilt, 0.3 / limit, rtol=1e-10)
-        assert narrow == tight == 0.0  # no impassable pixel
-    wide, slim = (walled(gap).difficulty.values for gap in (slice(20, 40), slice(28, 32)))
-    assert np.nanmean(slim[..., 2]) > np.nanmean(wide[..., 2])
-    # The wall's slope closes a pixel on either side: the way through touches these.
-    assert np.nanmax(slim[..., 3]) > 0.0

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_positive, require_whole
+from trustbo.hazard.difficulty import difficulty_of
 from trustbo.hazard.exposures import CAUSES, Exposures, LostMission
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.sampler import (
@@ -143,7 +144,7 @@ def fit_hazard(
     started, hazard = time.perf_counter(), Hazard() if hazard is None else hazard
     n_draws, seed = require_whole("n_draws", n_draws, 1), require_whole("seed", seed, 0)
     exposures = Exposures.of(missions, lost, weights, lost_weights)
-    difficulty, names = workspace.difficulty.values, measures_of(workspace)
+    difficulty, names = difficulty_of(workspace).values, measures_of(workspace)
     _require_on_grid(exposures, difficulty.shape[1:3])
     met = difficulty[*exposures.bounds.T]
     # A driven bound that does not exist on the map: largest difficulty.
@@ -172,7 +173,7 @@ def _require_on_grid(exposures: Exposures, shape: tuple[int, ...]) -> None:
 
 def measures_of(workspace: Workspace) -> list[str]:
     """Names of the measures of difficulty of a workspace, none without a terrain."""
-    return [str(name) for name in workspace.difficulty["measure"].values]
+    return [str(name) for name in difficulty_of(workspace)["measure"].values]
 
 
 def _dataset(
@@ -190,7 +191,7 @@ def _dataset(
     weights, limit, strength = betas.parts(betas.values(points.z[chosen]))
     degrees = {"units": "degrees"}  # absent without a limit
     of_limit = {n: ("draw", v, degrees) for n, v in zip(LIMIT_NAMES, limit.T, strict=False)}
-    shape = workspace.difficulty.shape[:3]
+    shape = difficulty_of(workspace).shape[:3]
     n, failed = np.zeros(shape), np.zeros(shape)
     n[*exposures.bounds.T], failed[*exposures.bounds.T] = exposures.n, exposures.failed
     longest = max((len(path) for path in exposures.lost), default=0)

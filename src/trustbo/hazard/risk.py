@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.errors import require_whole
+from trustbo.hazard.difficulty import difficulty_of
 from trustbo.hazard.sampler import LIMIT_NAMES, TILT, add_lost, prior_betas, steepness_of
 from trustbo.workspace import Workspace
 
@@ -58,7 +59,7 @@ class BoundRisk:
         names = [str(name) for name in hazard["cause"].values]
         terms = [hazard["intercept"].values[:, None], hazard["coefficient"].values]
         limit = [hazard[name].values for name in LIMIT_NAMES if name in hazard]  # 0.2 has none
-        difficulty, steepness = workspace.difficulty, None
+        difficulty, steepness = difficulty_of(workspace), None
         if limit:
             tilt = difficulty.sel(measure=TILT).values
             steepness = steepness_of(tilt, workspace.team.max_slope)

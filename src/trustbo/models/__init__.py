@@ -1,8 +1,6 @@
 """Trust models: their parameters, priors and effects, and the state space that they share."""
 
-import importlib
-import warnings
-
+from trustbo.errors import moved_names
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
@@ -31,7 +29,8 @@ __all__ = [
 ]
 __dir__ = __all__.copy  # completion lists public names alone
 
-_MOVED = {
+# Names of version 0.2, by the room that has them now.
+__getattr__ = moved_names(__name__, {
     "trustbo.criticism": ("Criticism", "criticise"),
     "trustbo.hazard": ("CAUSES", "BoundRisk", "Hazard", "LostMission", "fit_hazard"),
     "trustbo.inference": (
@@ -39,14 +38,4 @@ _MOVED = {
         "diagnostics", "fit", "loo", "moment_matched", "params_of", "place_maps", "prior_from",
         "prior_predictive", "sample_prior", "sample_statistics", "sbc",
     ),
-}  # fmt: skip
-"""Names of version 0.2, by the room that has them now."""
-
-
-def __getattr__(name: str) -> object:
-    room = next((room for room, names in _MOVED.items() if name in names), None)
-    if room is None:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    message = f"trustbo.models.{name} is {room}.{name} since version 0.3; the old name will go."
-    warnings.warn(message, FutureWarning, stacklevel=2)
-    return getattr(importlib.import_module(room), name)
+})  # fmt: skip

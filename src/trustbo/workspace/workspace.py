@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import FEATURES, Cell, Mission, as_names, default_features, is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
-from trustbo.errors import ShapeError, TrustboError, require_positive
+from trustbo.errors import ShapeError, TrustboError, moved, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -34,7 +34,6 @@ from trustbo.workspace.bound_awareness import (
     sight_features,
 )
 from trustbo.workspace.cells import of_cells
-from trustbo.workspace.difficulty import MEASURES, bound_difficulty
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds, moves_along
@@ -308,23 +307,10 @@ class Workspace(Displayed):
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
 
-    @cached_property
+    @property
     def difficulty(self) -> xr.DataArray:
-        """Difficulty of bounds, (move, row, col, measure); NaN where there is none.
-
-        Measures are `difficulty.MEASURES`, 0 where the way is easy, about 1 at the team's limit; an
-        axis of length 0 without a terrain in memory.
-        """
-        exists, names = self.passable_bounds, ()
-        values = np.empty((*exists.shape, 0))
-        if (ground := self.ground) is not None:
-            assert self.pixels is not None  # noqa: S101  # there are ways
-            names, shape = MEASURES, ground.posts.surface.ground.shape
-            traversability = self.pixels.get(TRAVERSABLE)
-            easy = np.full(shape, np.nan) if traversability is None else traversability.values
-            values = bound_difficulty(ground, easy, exists.values)
-        coords = {**exists.coords, "measure": list(names)}
-        return xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
+        """Difficulty of bounds, as version 0.2 had it: see `hazard.difficulty.difficulty_of`."""
+        return moved("Workspace.difficulty", "trustbo.hazard.difficulty", "difficulty_of")(self)
 
     def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
         """Posts and ways over another surface of the same terrain, such as one with closed areas.

@@ -7,20 +7,22 @@ routes of the lead and of T2. T2's routes assume the next cell straight ahead.
 import math
 from collections.abc import Sequence
 from itertools import batched
-from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
+import xarray as xr
 from numba import njit
 from scipy import ndimage
 
 from trustbo.data import Cell
 from trustbo.parallel import in_order
+from trustbo.workspace import Workspace
+from trustbo.workspace.bound_awareness import TRAVERSABLE
 from trustbo.workspace.moves import MOVES
-from trustbo.workspace.surface import Surface
 from trustbo.workspace.ways import Ways
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
-"""Measures of difficulty, see `bound_difficulty`."""
+"""Measures of difficulty, see `difficulty_of`."""
 _AHEAD = 1.5  # m along its way to the point that a robot faces
 _STEP, _SUSTAINED = 0.25, 4  # m between samples of a way, and samples that a tilt is the mean of
 _WIDTH = 2.0  # m of room on either side that count as half narrow
@@ -29,24 +31,43 @@ _TIGHT = 3.0  # log(1 + m) along impassable ground that count as 1: 19 m
 _BLOCK = 16  # bounds for each call of a thread
 
 
-class _Pixels(NamedTuple):
-    """Maps of pixels (row, col)."""
-
-    traversability: np.ndarray
-    room: np.ndarray  # distance to the nearest impassable pixel, m
+_cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
 
 
-def bound_difficulty(ways: Ways, traversability: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Compute the difficulty of bounds that exist, (move, row, col, measure); NaN elsewhere.
+def difficulty_of(workspace: Workspace) -> xr.DataArray:
+    """Compute the difficulty of a workspace's bounds; cached.
 
     Of a way, `untraversable` is one minus the mean traversability of its pixels; `tilt` the tangent
     of the largest pitch or roll of a robot that faces a point 1.5 m ahead on it, mean over 1 m, as
     a share of that of its `max_slope`; `narrowness` 1 / (1 + w / 2 m) with w the least distance to
     an impassable pixel; `tightness` log(1 + l / 1 m) / 3 with l the length of its pixels that touch
     an impassable one.
+
+    Returns:
+        Dims (move, row, col, measure), NaN where there is no bound; an axis `measure` of length 0
+        without a terrain in memory.
     """
-    maps = _pixel_maps(ways.posts.surface, traversability)
-    out = np.full((*exists.shape, len(MEASURES)), np.nan)
+    if workspace not in _cached:
+        exists, ground = workspace.passable_bounds, workspace.ground
+        names = () if ground is None else MEASURES
+        values = np.full((*exists.shape, len(names)), np.nan)
+        if ground is not None:
+            _measure(workspace, ground, exists.values, values)
+        coords = {**exists.coords, "measure": list(names)}
+        difficulty = xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
+        _cached[workspace] = difficulty
+    return _cached[workspace]
+
+
+def _measure(workspace: Workspace, ways: Ways, exists: np.ndarray, out: np.ndarray) -> None:
+    """Write the measures of bounds that exist, (move, row, col, measure)."""
+    surface, pixels = ways.posts.surface, workspace.pixels
+    room = np.full(surface.ground.shape, np.inf)  # distance to the nearest impassable pixel, m
+    if not surface.passable.all():
+        room = np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
+    easy = np.full(room.shape, np.nan)
+    if pixels is not None and TRAVERSABLE in pixels:
+        easy = pixels[TRAVERSABLE].values
 
     def work(block: Sequence[list[int]]) -> None:
         for m, row, col in block:
@@ -54,14 +75,16 @@ def bound_difficulty(ways: Ways, traversability: np.ndarray, exists: np.ndarray)
             ahead = row + down, col + right
             inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
             onward = ahead if inside and exists[m, *ahead] else None
-            out[m, row, col] = _of_bound(ways, maps, (row - down, col - right), cell, onward)
+            out[m, row, col] = _of_bound(ways, easy, room, (row - down, col - right), cell, onward)
 
     for _ in in_order(work, batched(np.argwhere(exists).tolist(), _BLOCK)):
         pass
-    return out
 
 
-def _of_bound(ways: Ways, maps: _Pixels, a: Cell, c: Cell, onward: Cell | None) -> np.ndarray:
+def _of_bound(
+    ways: Ways, easy: np.ndarray, room: np.ndarray, a: Cell, c: Cell, onward: Cell | None
+) -> np.ndarray:
+    """Maximum of each measure over the robots' ways a -> c, with maps of pixels (row, col)."""
     surface, team = ways.posts.surface, ways.posts.team
     ground = surface.gradient, surface.pixel, surface.origin
     robots = team.lead, *team.robots
@@ -70,13 +93,13 @@ def _of_bound(ways: Ways, maps: _Pixels, a: Cell, c: Cell, onward: Cell | None) 
         if way is None:
             continue  # two posts may be in one pixel, with a route of length 0
         pixels = surface.nearest(*way.T)
-        easy, room = (values[pixels] for values in maps)
-        easy = easy[np.isfinite(easy)]
-        tight = (room <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
+        of_way, gaps = easy[pixels], room[pixels]
+        of_way = of_way[np.isfinite(of_way)]
+        tight = (gaps <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
         measures = (
-            1.0 - easy.mean() if len(easy) else 0.5,
+            1.0 - of_way.mean() if len(of_way) else 0.5,
             min(_tilt(way, *ground) / np.tan(robot.max_slope), _MOST),
-            1.0 / (1.0 + room.min() / _WIDTH),
+            1.0 / (1.0 + gaps.min() / _WIDTH),
             np.log1p(tight) / _TIGHT,
         )
         worst = np.maximum(worst, measures)
@@ -112,10 +135,3 @@ def _point(way, along, s):
     share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0
     x = way[k - 1, 0] + share * (way[k, 0] - way[k - 1, 0])
     return x, way[k - 1, 1] + share * (way[k, 1] - way[k - 1, 1])
-
-
-def _pixel_maps(surface: Surface, traversability: np.ndarray) -> _Pixels:
-    room = np.full(surface.ground.shape, np.inf)
-    if not surface.passable.all():
-        room = np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
-    return _Pixels(traversability, room)
