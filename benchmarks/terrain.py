@@ -129,11 +129,12 @@ def trustbo_cells(dem, out):
 
 
 def cells_of(ground, features):
+    from trustbo.team import Team
     from trustbo.workspace import Grid
-    from trustbo.workspace.awareness import cell_maps, feature_specs
+    from trustbo.workspace.awareness import cell_maps
 
     grid = Grid.over(ground, (10, 10))
-    return cell_maps(ground, grid, feature_specs(features), max_slope=0.8, keep_pixels=False)
+    return cell_maps(ground, grid, features, Team.of(None), keep_pixels=False)
 
 
 def xrspatial_cells(dem, out):

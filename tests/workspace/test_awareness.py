@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import trustbo as tb
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import (
     TRAVERSABILITY,
@@ -19,7 +20,7 @@ from trustbo.terrain import (
     synthetic_terrain,
 )
 from trustbo.workspace import Grid, Workspace
-from trustbo.workspace.awareness import cell_maps, feature_specs
+from trustbo.workspace.awareness import cell_maps
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,7 @@ def terrain():
 def thin(monkeypatch):
     """Strips of a few rows, and a sample that is not the whole raster."""
     monkeypatch.setattr("trustbo.terrain.strips._PIXELS", 90 * 7)
-    monkeypatch.setattr("trustbo.workspace.awareness.MAX_PIXELS", 130 * 90 - 1)
+    monkeypatch.setattr("trustbo.terrain.pixel_awareness.MAX_PIXELS", 130 * 90 - 1)
 
 
 def test_strips_give_what_the_whole_raster_gives(terrain, monkeypatch):
@@ -56,8 +57,8 @@ def test_strips_give_what_the_whole_raster_gives(terrain, monkeypatch):
 def test_a_sample_of_rows_fits_nearly_what_all_pixels_fit(terrain, monkeypatch):
     whole = Workspace.from_terrain(terrain, (4, 3))
     monkeypatch.setattr("trustbo.terrain.strips._PIXELS", 90 * 7)
-    monkeypatch.setattr("trustbo.workspace.awareness.MAX_PIXELS", 130 * 90 - 1)
-    monkeypatch.setattr("trustbo.workspace.awareness.SAMPLE", 130 * 90 // 4)
+    monkeypatch.setattr("trustbo.terrain.pixel_awareness.MAX_PIXELS", 130 * 90 - 1)
+    monkeypatch.setattr("trustbo.terrain.pixel_awareness.SAMPLE", 130 * 90 // 4)
     sampled = Workspace.from_terrain(terrain, (4, 3))
     # A quarter of 11 700 correlated pixels: percentiles are off by a few hundredths.
     np.testing.assert_allclose(sampled.awareness, whole.awareness, atol=0.05)
@@ -161,9 +162,10 @@ def test_pixel_maps_are_those_of_the_terrain(terrain):
 
 def test_with_the_same_composites_a_larger_raster_s_way_gives_the_same(terrain, thin):
     """Feature by feature in one place, the slope of `passable` used again: pixel by pixel equal."""
-    features = feature_specs({"traversability": TRAVERSABILITY, "cover": ["canopy_cover", "tri"]})
+    features = {"traversability": TRAVERSABILITY, "cover": ["canopy_cover", "tri"]}
+    robot = tb.Robot(max_slope=0.3)
     grid = Grid.over(terrain, (4, 3))
-    strip_by_strip = cell_maps(terrain, grid, features, max_slope=0.3)
+    strip_by_strip = cell_maps(terrain, grid, features, tb.Team(robots=(robot,), lead=robot))
     composites = strip_by_strip.composites
     for name, parts in features.items():
         whole = composites[name].transform(pixel_features(terrain, parts))

@@ -1,29 +1,24 @@
-"""Awareness of cells from the features of pixels, strip by strip."""
+"""Awareness of cells, from the pixels of a terrain or from a user's arrays."""
 
-import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
-from trustbo.errors import TerrainError, TrustboError, require_kind
+from trustbo.data import as_array
+from trustbo.errors import ShapeError, TrustboError
 from trustbo.parallel import in_order
 from trustbo.team import Team
-from trustbo.terrain import stencil
-from trustbo.terrain.composite import MAX_PIXELS, CompositeIndex
-from trustbo.terrain.dataset import is_lazy, pixel_size, warn_if_clipped
-from trustbo.terrain.features import openness
-from trustbo.terrain.pixel_feature import FEATURES, PixelFeature, feature_named
-from trustbo.terrain.strips import Strip, sample_strips, strips
+from trustbo.terrain.composite import CompositeIndex
+from trustbo.terrain.dataset import warn_if_clipped
+from trustbo.terrain.pixel_awareness import PixelAwareness
+from trustbo.terrain.strips import Strip
 from trustbo.workspace.grid import CellMeans, Grid, Sums
+from trustbo.workspace.moves import MOVES, existing_bounds
 
-FeatureSpec = PixelFeature | Mapping[str, PixelFeature]
-"""Definition of an awareness feature: a pixel feature in [0, 1], or those of a composite."""
-
-SAMPLE = 1 << 15
-"""Number of pixels that a composite is fitted on, if the raster is larger than `MAX_PIXELS`."""
+_AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
 
 
 class CellMaps(NamedTuple):
@@ -31,239 +26,112 @@ class CellMaps(NamedTuple):
 
     awareness: np.ndarray  # (row, col, feature), in [0, 1]; NaN where a cell has no data
     passable_share: np.ndarray  # (row, col), share of pixels with data that are not too steep
-    composites: dict[str, CompositeIndex]
+    composites: dict[str, CompositeIndex]  # by feature
+    features: tuple[str, ...]
     pixels: xr.Dataset | None
     """Awareness and passability of each pixel, dims (y, x), if kept."""
-
-
-def feature_specs(features: Mapping[str, object]) -> dict[str, FeatureSpec]:
-    """Definitions of awareness features, given by names of pixel features or as pixel features.
-
-    TrustboError: an unknown name, or something that is no feature.
-    """
-    remedy = "give definitions by name, e.g. {'slope': 'slope'}"
-    require_kind("features", features, Mapping, remedy)
-    return {name: _spec(name, parts) for name, parts in features.items()}
-
-
-def _spec(name: str, parts: object) -> FeatureSpec:
-    if isinstance(parts, PixelFeature):
-        return parts
-    if isinstance(parts, str):
-        return feature_named(parts)
-    if isinstance(parts, Mapping) and all(isinstance(p, PixelFeature) for p in parts.values()):
-        chosen = dict(parts)
-    elif isinstance(parts, Iterable) and not isinstance(parts, Mapping):
-        chosen = {part: feature_named(part) for part in parts}
-    else:
-        chosen = {}
-    if not chosen:
-        raise TrustboError(
-            f"feature {name!r} must be names of pixel features, e.g. ['slope', 'tri'], a mapping "
-            f"of names to PixelFeature, or one PixelFeature; got {parts!r}."
-        )
-    return chosen
 
 
 def cell_maps(
     terrain: xr.Dataset,
     grid: Grid,
-    features: Mapping[str, FeatureSpec],
+    features: Mapping[str, object],
+    team: Team,
     *,
-    max_slope: float,
+    observers: ArrayLike | None = None,
     scaling: str = "percentile",
     keep_pixels: bool = True,
 ) -> CellMaps:
-    """Awareness and passability (slope up to `max_slope`, rad) of each cell.
+    """Compute awareness and passability of each cell; see `Workspace.from_terrain`.
 
-    A composite is fitted on all pixels of a raster of up to a million, on rows spread evenly over a
-    larger one; then each pixel's index is added to its cell, strip by strip, so that no feature of
-    the whole raster is in memory, unless `keep_pixels`. `scaling` is `CompositeIndex`'s.
-
-    TrustboError: a feature that is no composite outside [0, 1].
+    Each pixel is added to its cell strip by strip. Pixels of a terrain read lazily are not kept.
     """
-    parts = [p for f in features.values() for p in _parts(f)]
-    halo = max(part.halo for part in parts)
-    whole = list(strips(terrain, halo)) if terrain["dem"].size <= MAX_PIXELS else None
-    strip_features = _StripFeatures(whole)
-    to_fit = {n: f for n, f in features.items() if isinstance(f, Mapping)}
-    fitted = _fit(terrain, to_fit, scaling, strip_features, whole)
-    like = terrain["dem"]
-    cells = {name: CellMeans(grid, like) for name in (*features, "passable")}
-    maps: dict[str, list[np.ndarray]] = {name: [] for name in cells}
+    dem = terrain["dem"]
+    cell_of = grid.cells_along(dem["y"].values, dem["x"].values)
+    diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
+    options = {"reach": diagonal, "observers": observers, "scaling": scaling}
+    pixels = PixelAwareness(terrain, features, team, **options)
+    names = (*pixels.names, "passable")
+    cells = {name: CellMeans(grid.shape, *cell_of) for name in names}
+    kept = names if keep_pixels and not pixels.is_lazy else ()
+    maps: dict[str, list[np.ndarray]] = {name: [] for name in kept}
 
     def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
-        index = {"passable": strip_features.passable(strip, max_slope)}
-        for name, f in features.items():
-            index[name] = strip_features.index(strip, name, f, fitted)
+        index = pixels.of(strip)
         sums = {name: means.sums(index[name], strip.rows.start) for name, means in cells.items()}
-        wanted = index if keep_pixels else ()
-        return strip, {name: index[name].copy() for name in wanted}, sums
+        return strip, {name: index[name].copy() for name in kept}, sums
 
     n_clipped = n_valid = 0.0
-    for strip, index, sums in in_order(work, whole or strips(terrain, halo)):
+    for strip, index, sums in in_order(work, pixels.strips):
         for name, of_strip in sums.items():
             cells[name].merge(of_strip)
         for name, values in index.items():
             maps[name].append(values)
         share = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
         n_clipped, n_valid = n_clipped + share * strip.n_clipped, n_valid + share * strip.n_valid
-    if is_lazy(terrain):
+    if pixels.is_lazy:
         warn_if_clipped(round(n_clipped), round(n_valid), stacklevel=4)
-    return CellMaps(
-        np.stack([cells[name].cells for name in features], axis=-1),
-        cells["passable"].cells,
-        fitted,
-        _assemble(like, maps) if keep_pixels else None,
-    )
-
-
-class _BufferPool(threading.local):
-    """Arrays that are reused: to allocate memory takes longer than to write to it."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[object, ...], np.ndarray] = {}
-
-    def __call__(self, purpose: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        key = purpose, shape, dtype
-        if key not in self._known:
-            self._known[key] = np.empty(shape, dtype)
-        return self._known[key]
-
-
-class _StripFeatures:
-    """Features of strips; they are cached if the whole terrain was sampled for the fit."""
-
-    def __init__(self, whole: Sequence[Strip] | None) -> None:
-        self._keep = whole is not None
-        self._known: dict[tuple[int, str], dict[str, np.ndarray]] = {}
-        self._buffers = _BufferPool()
-
-    def features(
-        self, strip: Strip, name: str, parts: Mapping[str, PixelFeature]
-    ) -> dict[str, np.ndarray]:
-        """Features of the strip's pixels, each of shape (row, col)."""
-        key = (strip.rows.start, name)
-        if key in self._known:
-            return self._known[key]
-        values = {n: part.of_rows(strip.window, strip.core) for n, part in parts.items()}
-        if self._keep:
-            self._known[key] = values
-        return values
-
-    def index(
-        self, strip: Strip, name: str, f: FeatureSpec, fitted: Mapping[str, CompositeIndex]
-    ) -> np.ndarray:
-        """Awareness feature of the strip's pixels, valid until the thread's next strip."""
-        if isinstance(f, Mapping):
-            if self._keep:
-                return fitted[name].of_columns(self.features(strip, name, f))
-            dem = strip.window.variables["dem"].values[strip.core]
-            out = self._buffers(name, dem.shape, dem.dtype)
-            return fitted[name].of_columns(_LazyColumns(strip, f, self._buffers), out)
-        values = f.of_rows(strip.window, strip.core)
-        low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=1.0)
-        if low < 0.0 or high > 1.0:
-            raise TrustboError(
-                f"feature {name!r} is used as it is and must lie in [0, 1]; it has {low:g} to "
-                f"{high:g}. Scale it, or make it a composite of one: {{{name!r}: [...]}}."
-            )
-        return values
-
-    def passable(self, strip: Strip, max_slope: float) -> np.ndarray:
-        """Whether each pixel of the strip is not too steep."""
-        buffer = partial(self._buffers, "slope")
-        return FEATURES["slope"].of_rows(strip.window, strip.core, buffer) <= max_slope
-
-
-class _LazyColumns(Mapping[str, np.ndarray]):
-    """Features of a strip, each computed on access in the buffer of the one before.
-
-    Slope is in its buffer already: `passable` is computed first.
-    """
-
-    def __init__(
-        self, strip: Strip, parts: Mapping[str, PixelFeature], buffers: _BufferPool
-    ) -> None:
-        self._strip, self._parts, self._buffers = strip, parts, buffers
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        part = self._parts[name]
-        if part.kernel is stencil.slope:
-            dem = self._strip.window.variables["dem"].values[self._strip.core]
-            return self._buffers("slope", dem.shape, dem.dtype)
-        buffer = partial(self._buffers, "part")
-        values = part.of_rows(self._strip.window, self._strip.core, buffer)
-        return np.ascontiguousarray(values)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._parts)
-
-    def __len__(self) -> int:
-        return len(self._parts)
-
-
-def _fit(
-    terrain: xr.Dataset,
-    features: Mapping[str, Mapping[str, PixelFeature]],
-    scaling: str,
-    strip_features: _StripFeatures,
-    whole: Sequence[Strip] | None,
-) -> dict[str, CompositeIndex]:
-    """Composites fitted on a sample of pixels, with the halo that the features of each need."""
-    fitted = {}
-    for name, parts in features.items():
-        halo = max(part.halo for part in parts.values())
-        chosen = whole or sample_strips(terrain, halo, SAMPLE)
-        drawn = [strip_features.features(strip, name, parts) for strip in chosen]
-        sample = xr.Dataset(
-            {p: ("pixel", np.concatenate([d[p].ravel() for d in drawn])) for p in parts}
-        )
-        signs = {part: feature.sign for part, feature in parts.items()}
-        try:
-            fitted[name] = CompositeIndex(signs, scaling=scaling).fit(sample)
-        except TerrainError as error:
-            raise TerrainError(f"{name}: {error}") from None
-    return fitted
-
-
-def _parts(f: FeatureSpec) -> list[PixelFeature]:
-    return list(f.values()) if isinstance(f, Mapping) else [f]
-
-
-def _assemble(like: xr.DataArray, maps: Mapping[str, list[np.ndarray]]) -> xr.Dataset:
-    """Maps of all pixels from those of the strips."""
-    whole = {name: np.concatenate(pieces) for name, pieces in maps.items()}
-    return xr.Dataset(
-        {
-            name: xr.DataArray(
-                values, like.coords, like.dims, attrs={} if name == "passable" else {"units": "1"}
-            )
-            for name, values in whole.items()
-        }
-    )
-
-
-def within_reach(
-    features: dict[str, FeatureSpec], terrain: xr.Dataset, grid: Grid, team: Team
-) -> dict[str, FeatureSpec]:
-    """Definitions with openness over the lidar's range, limited by a cell and by the terrain."""
-    height, width = pixel_size(terrain)
-    rows, cols = terrain["dem"].shape
-    reach = min(
-        max(robot.lidar_range for robot in team.robots),
-        float(np.hypot(grid.cell_height, grid.cell_width)),
-        0.5 * min(rows * height, cols * width),
-    )
-    eye, target = team.robots[0].sensor_height, team.lead.target_height
-    ours = PixelFeature(
-        partial(openness, reach=reach, eye=eye, target=target), 1, reach, by_rows=True
-    )
-
-    def fitting(part: PixelFeature) -> PixelFeature:
-        return ours._replace(sign=part.sign) if part.compute is openness else part
-
-    return {
-        name: fitting(f) if isinstance(f, PixelFeature) else {n: fitting(p) for n, p in f.items()}
-        for name, f in features.items()
+    units = {name: {} if name == "passable" else {"units": "1"} for name in maps}
+    whole = {
+        name: xr.DataArray(np.concatenate(strips), dem.coords, dem.dims, attrs=units[name])
+        for name, strips in maps.items()
     }
+    return CellMaps(
+        np.stack([cells[name].cells for name in pixels.names], axis=-1),
+        cells["passable"].cells,
+        pixels.composites,
+        pixels.names,
+        xr.Dataset(whole) if kept else None,
+    )
+
+
+def of_cells(
+    awareness: ArrayLike, passable: ArrayLike | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Check the arrays of `Workspace.from_awareness`.
+
+    Returns awareness of cells (robot, row, col, feature), passability (row, col), and awareness of
+    bounds (robot, move, row, col, feature), or None where it is that of the cells.
+
+    ShapeError: other axes. TrustboError: a value outside [0, 1], NaN in a passable cell or in a
+    bound between two.
+    """
+    z = as_array("awareness", awareness)
+    if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES[8])):
+        raise ShapeError(f"awareness must be {_AXES}; got shape {z.shape}.")
+    if not z.size:
+        raise ShapeError(
+            f"awareness has an axis of length 0; got shape {z.shape}. Without features, give one "
+            "that is 0 everywhere."
+        )
+    if (bad := (z < 0.0) | (z > 1.0)).any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1].")
+    finite = np.isfinite(z).all((0, -1))  # ([move], row, col)
+    reached = finite if z.ndim == 4 else finite.any(0)
+    free = reached if passable is None else np.asarray(passable, dtype=bool)
+    if free.shape != z.shape[-3:-1]:
+        raise ShapeError(f"passable must be (row, col) = {z.shape[-3:-1]}; got {free.shape}.")
+    if (free & ~reached).any():
+        cell = tuple(int(i) for i in np.argwhere(free & ~reached)[0])
+        raise TrustboError(
+            f"awareness of the passable cell {cell} is NaN; fill it, or mark it impassable."
+        )
+    if z.ndim == 4:
+        return z, free, None
+    exists = existing_bounds(free)
+    if (missing := exists & ~finite).any():
+        m, row, col = (int(i) for i in np.argwhere(missing)[0])
+        down, right = MOVES[8][m]
+        raise TrustboError(
+            f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; fill it, "
+            "or mark one of the cells impassable."
+        )
+    bounds = np.where(exists[..., None], z, np.nan)
+    count = np.maximum(exists.sum(0), 1)[..., None]
+    cells = np.nansum(bounds, axis=1) / count
+    # A passable cell without a passable neighbour is entered by no bound.
+    alone = (free & ~exists.any(0))[..., None]
+    fallback = np.nanmean(np.where(free[..., None], z, np.nan), axis=1) if alone.any() else cells
+    cells = np.where(alone, fallback, cells)
+    return np.where(free[..., None], cells, np.nan), free, bounds

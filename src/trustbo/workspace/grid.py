@@ -162,7 +162,7 @@ class Grid(Displayed):
         Returns:
             Shape (row, col); NaN where a cell has no data.
         """
-        means = CellMeans(self, values)
+        means = CellMeans(self.shape, *self.cells_along(values["y"].values, values["x"].values))
         means.merge(means.sums(values.transpose("y", "x").values, 0))
         return means.cells
 
@@ -197,11 +197,10 @@ def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
 class CellMeans:
     """Means over each cell's pixels with data, from rows of pixels added north to south."""
 
-    def __init__(self, grid: Grid, like: xr.DataArray) -> None:
-        """Start without pixels, for a raster of the whole terrain, dims (y, x)."""
-        self._row, col = grid.cells_along(like["y"].values, like["x"].values)
-        self._edges = np.searchsorted(col, np.arange(grid.shape[1] + 1))
-        self._total, self._count = np.zeros(grid.shape), np.zeros(grid.shape)
+    def __init__(self, shape: tuple[int, int], row: np.ndarray, col: np.ndarray) -> None:
+        """Start without pixels; `row` and `col` are the cells of the rows and columns of pixels."""
+        self._row, self._edges = row, np.searchsorted(col, np.arange(shape[1] + 1))
+        self._total, self._count = np.zeros(shape), np.zeros(shape)
 
     def sums(self, values: np.ndarray, first: int) -> Sums:
         """Sums for `merge` of rows of pixels, (row, col), from row `first` of the raster on.

@@ -133,16 +133,17 @@ def survey(
     """
     terrain, team = require_terrain(terrain), Team.of(team)
     grid = Grid.over(terrain, shape)
-    cells = {name: CellMeans(grid, terrain["dem"]) for name in ("known", "even", "height")}
+    cell_of = grid.cells_along(terrain["y"].values, terrain["x"].values)
+    cells = {name: CellMeans(grid.shape, *cell_of) for name in ("valid", "even", "height")}
     low, high = np.inf, -np.inf
     for strip in _strips(terrain, grid):
         dem = strip.window.variables["dem"].values[strip.core]
         slope = FEATURES["slope"].of_rows(strip.window, strip.core)
-        values = {"known": np.isfinite(dem), "even": slope <= team.max_slope, "height": dem}
+        values = {"valid": np.isfinite(dem), "even": slope <= team.max_slope, "height": dem}
         for name, means in cells.items():
             means.merge(means.sums(values[name], strip.rows.start))
         low, high = np.nanmin(dem, initial=low), np.nanmax(dem, initial=high)
-    valid, even, height = (cells[name].cells for name in ("known", "even", "height"))
+    valid, even, height = (cells[name].cells for name in ("valid", "even", "height"))
     with np.errstate(invalid="ignore"):
         steep = 1.0 - even / valid
     dims = ("row", "col")

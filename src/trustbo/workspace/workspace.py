@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -17,23 +17,19 @@ from trustbo.errors import ShapeError, TrustboError, moved, require_positive
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
-from trustbo.terrain.dataset import is_lazy, require_terrain
+from trustbo.terrain.dataset import require_terrain
 from trustbo.terrain.features import (
     PAPER_VISIBILITY,
     TRAVERSABILITY,
     VISIBILITY,
-    exposure,
-    require_observers,
 )
-from trustbo.terrain.pixel_feature import PixelFeature
-from trustbo.workspace.awareness import cell_maps, feature_specs, within_reach
+from trustbo.workspace.awareness import cell_maps, of_cells
 from trustbo.workspace.bound_awareness import (
     TRAVERSABLE,
     of_bounds,
     require_sight,
     sight_features,
 )
-from trustbo.workspace.cells import of_cells
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds, moves_along
@@ -134,36 +130,23 @@ class Workspace(Displayed):
         grid = Grid.over(terrain, shape)
         if bounds:
             require_sight(terrain, sights, features or {})
-        asked = features or {
+        defaults = {
             "traversability": TRAVERSABILITY,
             "visibility": VISIBILITY if bounds else PAPER_VISIBILITY,
         }
-        chosen = within_reach(feature_specs(asked), terrain, grid, team)
-        if observers is not None:
-            place = require_observers(terrain, observers)
-            chosen["exposure"] = PixelFeature(
-                partial(exposure, observers=place), 1, np.inf, by_rows=True
-            )
         maps = cell_maps(
-            terrain,
-            grid,
-            chosen,
-            max_slope=team.max_slope,
-            scaling=scaling,
-            keep_pixels=not is_lazy(terrain),
+            terrain, grid, features or defaults, team, observers=observers, scaling=scaling
         )
         passable = np.nan_to_num(maps.passable_share) >= 1.0 - MAX_MISSING
-        workspace = cls.from_awareness(
+        workspace = cls._of_maps(
             np.repeat(maps.awareness[None], len(team.robots), axis=0),
             passable & np.isfinite(maps.awareness).all(-1),
-            team=team,
-            features=tuple(chosen),
+            grid,
+            team,
+            maps.features,
         )
         workspace = dataclasses.replace(
             workspace,
-            awareness=workspace.awareness.assign_coords(_positions(grid)),
-            passable=workspace.passable.assign_coords(_positions(grid)),
-            grid=grid,
             terrain=terrain,
             pixels=maps.pixels,
             composites=maps.composites,
@@ -202,32 +185,37 @@ class Workspace(Displayed):
         team = Team.of(team, len(z))
         if len(team.robots) != len(z):
             raise ShapeError(f"awareness has {len(z)} robots, the team {len(team.robots)}.")
-        if not free.any():
-            raise TrustboError(
-                "no cell is passable: more than half of every cell is missing or too steep. Use "
-                "other cells, or a team with a larger max_slope."
-            )
         side = require_positive("cell_size", cell_size)
         grid = Grid((z.shape[1], z.shape[2]), 0.0, z.shape[1] * side, side, side)
         names = as_names("features", features) or default_features(z.shape[3])
         if len(names) != z.shape[3]:
             raise ShapeError(f"features must be {z.shape[3]} names; got {names}.")
-        coords = {
-            "robot": list(team.names),
-            "row": np.arange(z.shape[1]),
-            "col": np.arange(z.shape[2]),
-            **_positions(grid),
-        }
-        features_too = coords | {"feature": list(names)}
+        made = cls._of_maps(z, free, grid, team, names)
+        return made if bounds is None else made.with_bounds(bounds)
+
+    @classmethod
+    def _of_maps(
+        cls, z: np.ndarray, passable: np.ndarray, grid: Grid, team: Team, features: tuple[str, ...]
+    ) -> Self:
+        """Label awareness (robot, row, col, feature); TrustboError if no cell is passable."""
+        if not passable.any():
+            raise TrustboError(
+                "no cell is passable: more than half of every cell is missing or too steep. Use "
+                "other cells, or a team with a larger max_slope."
+            )
         dims = ("robot", "row", "col", "feature")
-        coords.pop("robot")
-        made = cls(
-            xr.DataArray(z, features_too, dims, "awareness"),
-            xr.DataArray(free, coords, dims[1:3], "passable"),
+        cells = {
+            **{axis: np.arange(n) for axis, n in zip(dims[1:3], grid.shape, strict=True)},
+            "y": ("row", grid.y),
+            "x": ("col", grid.x),
+        }
+        coords = {"robot": list(team.names), **cells, "feature": list(features)}
+        return cls(
+            xr.DataArray(z, coords, dims, "awareness"),
+            xr.DataArray(passable, cells, dims[1:3], "passable"),
             grid,
             team,
         )
-        return made if bounds is None else made.with_bounds(bounds)
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -453,11 +441,6 @@ class Workspace(Displayed):
             return ""
         missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
         return reason_impassable(missing, self.team)
-
-
-def _positions(grid: Grid) -> dict[str, tuple[str, np.ndarray]]:
-    """Cell centres in CRS metres, as coordinates along row and col."""
-    return {"y": ("row", grid.y), "x": ("col", grid.x)}
 
 
 def _sizes(terrain: xr.Dataset) -> str:
