@@ -11,10 +11,9 @@ from rasterio.crs import CRS
 
 from trustbo.errors import TerrainError, require_positive
 from trustbo.terrain.align import on_one_grid
-from trustbo.terrain.georeference import require_metres, require_metric_crs, require_regular
+from trustbo.terrain.metric import METRE, require_metric
 from trustbo.terrain.open_raster import RasterLike, open_raster
 from trustbo.terrain.raster import Raster
-from trustbo.terrain.units import METRE
 
 CLIP_WARNING_SHARE = 0.02
 _ROWS = 256  # checked together
@@ -200,31 +199,31 @@ def assemble_terrain(dem: xr.DataArray, dsm: xr.DataArray) -> xr.Dataset:
         TerrainError: No CRS, units other than metres, two different or irregular grids, or no
             pixel that has both heights.
     """
-    require_metric_crs(dem.rio.crs, "the terrain")
-    for array, name in ((dem, "dem"), (dsm, "dsm")):
-        require_metres(array, name)
+    crs = dem.rio.crs
+    require_metric({"dem": dem, "dsm": dsm}, crs)
     ground, surface = (
         a.drop_vars("spatial_ref", errors="ignore").transpose("y", "x").astype(float, copy=False)
         for a in (dem, dsm)
     )
-    for axis in ("y", "x"):
-        require_regular(ground[axis].values, axis, "the raster")
     if not _same_coordinates(ground, surface):
         raise TerrainError(
             f"dem {ground.shape} and dsm {surface.shape} are not on one grid; align them first, "
             "e.g. with dsm.rio.reproject_match(dem)."
         )
     surface = surface.assign_coords(x=ground["x"], y=ground["y"])
-    terrain = xr.Dataset({"dem": ground, "dsm": surface})
+    return _assembled(xr.Dataset({"dem": ground, "dsm": surface}), crs)
+
+
+def _assembled(terrain: xr.Dataset, crs: CRS) -> xr.Dataset:
     terrain, clipped, valid = clean(_north_up(terrain))
     if not valid:
         raise TerrainError(
             "no pixel has both a DEM and a DSM height: one of them is all nodata where they "
             "overlap. Check the nodata value of the rasters."
         )
-    warn_if_clipped(clipped, valid, stacklevel=4)
+    warn_if_clipped(clipped, valid, stacklevel=5)
     terrain.attrs = {"clipped_share": clipped / valid}
-    return _with_crs(terrain, dem.rio.crs)
+    return _with_crs(terrain, crs)
 
 
 def clean(terrain: xr.Dataset) -> tuple[xr.Dataset, int, int]:
@@ -265,21 +264,14 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
             f"{type(terrain).__name__}."
         )
     crs = terrain.rio.crs
-    if crs is None:
-        raise TerrainError(
-            "the terrain has no CRS; set it, e.g. terrain.rio.write_crs('EPSG:32633')."
-        )
-    require_metric_crs(crs, "the terrain")
-    for name in ("dem", "dsm"):
-        require_metres(terrain[name], name)
+    require_metric(terrain, crs)
     if is_lazy(terrain):
-        for axis in ("y", "x"):
-            require_regular(terrain[axis].values, axis, "the raster")
         return _with_crs(_north_up(terrain.transpose("y", "x")), crs)
-    clipped = terrain.attrs.get("clipped_share", 0.0)
     if _is_in_order(terrain):
         return _with_crs(terrain.copy(), crs)
-    result = assemble_terrain(terrain["dem"].rio.write_crs(crs), terrain["dsm"])
+    clipped = terrain.attrs.get("clipped_share", 0.0)
+    heights = terrain[["dem", "dsm"]].drop_vars("spatial_ref", errors="ignore")
+    result = _assembled(heights.transpose("y", "x").astype(float), crs)
     result.attrs["clipped_share"] = max(clipped, result.attrs["clipped_share"])
     return result
 
@@ -300,8 +292,6 @@ def _is_in_order(terrain: xr.Dataset) -> bool:
     dem, dsm = terrain["dem"], terrain["dsm"]
     if not dem.dims == dsm.dims == ("y", "x") or {dem.dtype.kind, dsm.dtype.kind} != {"f"}:
         return False
-    for axis in ("y", "x"):
-        require_regular(terrain[axis].values, axis, "the raster")
     if terrain["y"][0] < terrain["y"][-1] or terrain["x"][0] > terrain["x"][-1]:
         return False
     has_data = False

@@ -18,7 +18,7 @@ from scipy.spatial import KDTree, QhullError
 from trustbo.errors import TerrainError, pip_install, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.dataset import CLIP_WARNING_SHARE, assemble_terrain
-from trustbo.terrain.georeference import require_regular
+from trustbo.terrain.metric import require_regular
 
 GROUND_CLASS = 2
 NOISE_CLASSES = (7, 18)  # low and high noise

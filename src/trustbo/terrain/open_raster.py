@@ -23,10 +23,10 @@ from rioxarray.exceptions import MissingSpatialDimensionError
 
 from trustbo.errors import TerrainError
 from trustbo.files import FilePath
-from trustbo.terrain.georeference import known_crs, placed, require_regular
+from trustbo.terrain.georeference import known_crs, placed
+from trustbo.terrain.metric import height_unit, require_regular
 from trustbo.terrain.nodata import decoder, require_real, scaling, tagged
 from trustbo.terrain.raster import Raster
-from trustbo.terrain.units import height_unit
 
 type RasterLike = FilePath | DatasetReader | WarpedVRT | xr.DataArray | xr.Dataset
 

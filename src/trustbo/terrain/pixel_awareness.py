@@ -56,14 +56,21 @@ class PixelAwareness:
         pixels.
         """
         self._features = {name: _spec(name, parts) for name, parts in _checked(features).items()}
-        self._use_lidar(terrain, team, reach)
+        height, width = pixel_size(terrain)
+        n_rows, n_cols = terrain["dem"].shape
+        self._use_lidar(team, min(reach, 0.5 * min(n_rows * height, n_cols * width)))
         if observers is not None:
             compute = partial(exposure, observers=require_observers(terrain, observers))
             self._features["exposure"] = PixelFeature(compute, 1, np.inf, by_rows=True)
-        parts = [p for f in self._features.values() for p in _parts(f)]
-        halo = max(part.halo for part in parts)
-        whole = list(strips(terrain, halo)) if terrain["dem"].size <= MAX_PIXELS else None
-        self.strips: Iterable[Strip] = whole or strips(terrain, halo)
+        # Rows on both sides on which each feature depends.
+        around = {
+            name: int(min(n_rows, np.ceil(max(part.halo for part in _parts(f)) / height) + 2))
+            for name, f in self._features.items()
+        }
+        whole = None
+        if n_rows * n_cols <= MAX_PIXELS:
+            whole = list(strips(terrain, max(around.values())))
+        self.strips: Iterable[Strip] = whole or strips(terrain, max(around.values()))
         self.is_lazy, self.names = is_lazy(terrain), tuple(self._features)
         self._max_slope, self._keep, self._buffers = (
             team.max_slope,
@@ -74,8 +81,8 @@ class PixelAwareness:
         self.composites: dict[str, CompositeIndex] = {}
         for name, f in self._features.items():
             if isinstance(f, Mapping):
-                halo = max(part.halo for part in f.values())
-                self._fit(name, f, scaling, whole or sample_strips(terrain, halo, SAMPLE))
+                chosen = whole or sample_strips(terrain, around[name], SAMPLE)
+                self._fit(name, f, scaling, chosen)
 
     def of(self, strip: Strip) -> dict[str, np.ndarray]:
         """Features of a strip's pixels and "passable", valid until the thread's next strip.
@@ -87,12 +94,9 @@ class PixelAwareness:
         index = {"passable": slope <= self._max_slope}
         return index | {name: self._index(strip, name, f) for name, f in self._features.items()}
 
-    def _use_lidar(self, terrain: xr.Dataset, team: Team, reach: float) -> None:
-        """Compute openness for the team's sensor and target heights, over its lidars' range."""
-        sides = [
-            n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)
-        ]
-        reach = min(max(robot.lidar_range for robot in team.robots), reach, 0.5 * min(sides))
+    def _use_lidar(self, team: Team, reach: float) -> None:
+        """Compute openness for the team's heights, over the range of its lidars up to `reach`."""
+        reach = min(max(robot.lidar_range for robot in team.robots), reach)
         eye, target = team.robots[0].sensor_height, team.lead.target_height
         compute = partial(openness, reach=reach, eye=eye, target=target)
         ours = PixelFeature(compute, 1, reach, by_rows=True)

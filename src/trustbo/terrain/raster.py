@@ -15,7 +15,7 @@ from xarray.backends import BackendArray
 from xarray.core import indexing
 
 from trustbo.errors import TerrainError
-from trustbo.terrain.units import METRE, HeightUnit
+from trustbo.terrain.metric import METRE, HeightUnit
 
 _PIXELS = 1 << 23  # read together, to be averaged
 

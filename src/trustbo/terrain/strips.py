@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.terrain.dataset import clean, is_lazy, pixel_size
+from trustbo.terrain.dataset import clean, is_lazy
 
 _PIXELS = 1 << 19  # per strip: its arrays fit in the caches
 _N_SAMPLED = 32
@@ -27,38 +27,28 @@ class Strip(NamedTuple):
     """Number of pixels of the window with both heights."""
 
 
-def strips(terrain: xr.Dataset, halo: float) -> Iterator[Strip]:
+def strips(terrain: xr.Dataset, around: int) -> Iterator[Strip]:
     """Cut a terrain, in memory or lazily read, into strips from north to south.
 
-    `halo` is the radius of the surroundings that a pixel's features depend on, m; two pixels are
-    added.
+    `around` is the number of rows on both sides on which a pixel's features depend.
     """
     n_rows, n_cols = terrain["dem"].shape
-    around = _halo_rows(terrain, halo)
     step = max(_PIXELS // n_cols, around // 2, 1)
     for first in range(0, n_rows, step):
         yield strip_of(terrain, first, min(first + step, n_rows), around)
 
 
-def sample_strips(terrain: xr.Dataset, halo: float, n_pixels: int) -> Iterator[Strip]:
+def sample_strips(terrain: xr.Dataset, around: int, n_pixels: int) -> Iterator[Strip]:
     """Sample strips (see `strips`) spread evenly over a terrain, about `n_pixels` in all."""
     n_rows, n_cols = terrain["dem"].shape
-    around = _halo_rows(terrain, halo)
     wanted = -(-n_pixels // n_cols)
     if wanted >= n_rows or around >= n_rows:
-        yield from strips(terrain, halo)
+        yield from strips(terrain, around)
         return
     n_strips = min(_N_SAMPLED, wanted)
     height = wanted // n_strips
     for first in np.linspace(0, n_rows - height, n_strips).astype(int):
         yield strip_of(terrain, int(first), int(first) + height, around)
-
-
-def _halo_rows(terrain: xr.Dataset, halo: float) -> int:
-    n_rows = terrain["dem"].shape[0]
-    if np.isinf(halo):
-        return n_rows
-    return min(n_rows, int(np.ceil(halo / pixel_size(terrain)[0])) + 2)
 
 
 def strip_of(terrain: xr.Dataset, first: int, last: int, around: int) -> Strip:

@@ -47,24 +47,21 @@ def cell_maps(
     Each pixel is added to its cell strip by strip. Pixels of a terrain read lazily are not kept.
     """
     dem = terrain["dem"]
-    cell_of = grid.cells_along(dem["y"].values, dem["x"].values)
+    cells = CellMeans(grid.shape, *grid.cells_along(dem["y"].values, dem["x"].values))
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
     options = {"reach": diagonal, "observers": observers, "scaling": scaling}
     pixels = PixelAwareness(terrain, features, team, **options)
-    names = (*pixels.names, "passable")
-    cells = {name: CellMeans(grid.shape, *cell_of) for name in names}
-    kept = names if keep_pixels and not pixels.is_lazy else ()
+    kept = (*pixels.names, "passable") if keep_pixels and not pixels.is_lazy else ()
     maps: dict[str, list[np.ndarray]] = {name: [] for name in kept}
 
     def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
         index = pixels.of(strip)
-        sums = {name: means.sums(index[name], strip.rows.start) for name, means in cells.items()}
-        return strip, {name: index[name].copy() for name in kept}, sums
+        copied = {name: index[name].copy() for name in kept}
+        return strip, copied, cells.sums(index, strip.rows.start)
 
     n_clipped = n_valid = 0.0
     for strip, index, sums in in_order(work, pixels.strips):
-        for name, of_strip in sums.items():
-            cells[name].merge(of_strip)
+        cells.merge(sums)
         for name, values in index.items():
             maps[name].append(values)
         share = (strip.rows.stop - strip.rows.start) / strip.window.sizes["y"]
@@ -77,8 +74,8 @@ def cell_maps(
         for name, strips in maps.items()
     }
     return CellMaps(
-        np.stack([cells[name].cells for name in pixels.names], axis=-1),
-        cells["passable"].cells,
+        np.stack([cells[name] for name in pixels.names], axis=-1),
+        cells["passable"],
         pixels.composites,
         pixels.names,
         xr.Dataset(whole) if kept else None,

@@ -12,7 +12,7 @@ from trustbo.data import LINE_OF_SIGHT, Cell, is_line_of_sight
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.parallel import in_order
 from trustbo.terrain.composite import MAX_PIXELS
-from trustbo.terrain.dataset import is_lazy, pixel_size
+from trustbo.terrain.dataset import is_lazy
 from trustbo.workspace.line_of_sight import bound_features, geometry
 from trustbo.workspace.moves import MOVES, existing_bounds
 from trustbo.workspace.sight import Sight
@@ -51,9 +51,8 @@ def require_sight(
                 f"{name!r} is the name of a feature of bounds; give yours another, or bounds=False."
             )
     if is_lazy(terrain):
-        step = pixel_size(terrain)[0] * max(
-            2.0, np.sqrt(terrain["dem"].size / MAX_PIXELS)
-        )  # a raster in memory
+        fewer = max(2.0, np.sqrt(terrain["dem"].size / MAX_PIXELS))  # a raster in memory
+        step = abs(terrain.rio.resolution()[1]) * fewer
         raise TerrainError(
             f"line of sight needs the terrain in memory, and it is read lazily: average it to "
             f"pixels of {step:.3g} m, read_terrain(..., resolution={step:.3g}), or do without: "

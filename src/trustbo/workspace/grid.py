@@ -1,5 +1,6 @@
 """Planning grid: cells of positions and of pixels, means over cells."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -163,8 +164,8 @@ class Grid(Displayed):
             Shape (row, col); NaN where a cell has no data.
         """
         means = CellMeans(self.shape, *self.cells_along(values["y"].values, values["x"].values))
-        means.merge(means.sums(values.transpose("y", "x").values, 0))
-        return means.cells
+        means.merge(means.sums({"": values.transpose("y", "x").values}, 0))
+        return means[""]
 
     def cell_share(self, condition: xr.DataArray) -> np.ndarray:
         """Share of each cell's pixels where a condition holds, shape (row, col)."""
@@ -195,34 +196,38 @@ def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
 
 
 class CellMeans:
-    """Means over each cell's pixels with data, from rows of pixels added north to south."""
+    """Means of maps over each cell's pixels with data, from rows of pixels added strip by strip."""
 
     def __init__(self, shape: tuple[int, int], row: np.ndarray, col: np.ndarray) -> None:
         """Start without pixels; `row` and `col` are the cells of the rows and columns of pixels."""
-        self._row, self._edges = row, np.searchsorted(col, np.arange(shape[1] + 1))
-        self._total, self._count = np.zeros(shape), np.zeros(shape)
+        self._shape, self._row = shape, row
+        self._edges = np.searchsorted(col, np.arange(shape[1] + 1))
+        self._sums: dict[str, Sums] = {}
 
-    def sums(self, values: np.ndarray, first: int) -> Sums:
-        """Sums for `merge` of rows of pixels, (row, col), from row `first` of the raster on.
+    def sums(self, maps: Mapping[str, np.ndarray], first: int) -> dict[str, Sums]:
+        """Sums for `merge` of maps of pixels, (row, col), from row `first` of the raster on.
 
         Threads may compute them.
         """
-        row = self._row[first : first + len(values)]
-        values = values.view(np.uint8) if values.dtype == bool else values
-        total, count = np.zeros_like(self._total), np.zeros_like(self._count)
-        _add_rows(np.ascontiguousarray(values), row, self._edges, total, count)
-        return total, count
+        sums = {}
+        for name, values in maps.items():
+            values = values.view(np.uint8) if values.dtype == bool else values
+            sums[name] = total, count = np.zeros(self._shape), np.zeros(self._shape)
+            row = self._row[first : first + len(values)]
+            _add_rows(np.ascontiguousarray(values), row, self._edges, total, count)
+        return sums
 
-    def merge(self, sums: Sums) -> None:
+    def merge(self, sums: Mapping[str, Sums]) -> None:
         """Add sums of pixels."""
-        self._total += sums[0]
-        self._count += sums[1]
+        for name, (total, count) in sums.items():
+            before = self._sums.get(name, (0.0, 0.0))
+            self._sums[name] = before[0] + total, before[1] + count
 
-    @property
-    def cells(self) -> np.ndarray:
-        """Means, shape (row, col); NaN where a cell has no data."""
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Means of a map, shape (row, col); NaN where a cell has no data."""
+        total, count = self._sums[name]
         with np.errstate(invalid="ignore"):
-            return self._total / self._count
+            return total / count
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})

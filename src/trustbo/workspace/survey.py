@@ -133,17 +133,15 @@ def survey(
     """
     terrain, team = require_terrain(terrain), Team.of(team)
     grid = Grid.over(terrain, shape)
-    cell_of = grid.cells_along(terrain["y"].values, terrain["x"].values)
-    cells = {name: CellMeans(grid.shape, *cell_of) for name in ("valid", "even", "height")}
+    cells = CellMeans(grid.shape, *grid.cells_along(terrain["y"].values, terrain["x"].values))
     low, high = np.inf, -np.inf
     for strip in _strips(terrain, grid):
         dem = strip.window.variables["dem"].values[strip.core]
         slope = FEATURES["slope"].of_rows(strip.window, strip.core)
         values = {"valid": np.isfinite(dem), "even": slope <= team.max_slope, "height": dem}
-        for name, means in cells.items():
-            means.merge(means.sums(values[name], strip.rows.start))
+        cells.merge(cells.sums(values, strip.rows.start))
         low, high = np.nanmin(dem, initial=low), np.nanmax(dem, initial=high)
-    valid, even, height = (cells[name].cells for name in ("valid", "even", "height"))
+    valid, even, height = (cells[name] for name in ("valid", "even", "height"))
     with np.errstate(invalid="ignore"):
         steep = 1.0 - even / valid
     dims = ("row", "col")
@@ -179,7 +177,7 @@ def _strips(terrain: xr.Dataset, grid: Grid) -> Iterator[Strip]:
     edges = np.linspace(0, n_rows, _BANDS * grid.shape[0] + 1).astype(int)
     depth = max(1, _MOST_PIXELS // (n_cols * (len(edges) - 1)))
     if not is_lazy(terrain) or n_rows * n_cols <= _MOST_PIXELS or (np.diff(edges) <= depth).any():
-        yield from strips(terrain, 1.0)
+        yield from strips(terrain, 1)
         return
     for top, bottom in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         first = (top + bottom - depth) // 2

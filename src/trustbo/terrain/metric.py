@@ -1,11 +1,14 @@
-"""Units of heights, as a band or the vertical axis of a CRS declares them."""
+"""Metric maps: units of heights and coordinates, and even spacing."""
 
 import re
+from collections.abc import Hashable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 import pyproj
+import xarray as xr
 from rasterio.crs import CRS
+from rasterio.errors import CRSError
 
 from trustbo.errors import TerrainError
 
@@ -67,3 +70,51 @@ def _vertical(crs: CRS | None) -> HeightUnit | None:
             length = axis.unit_conversion_factor
             return METRE if length == 1.0 else HeightUnit(axis.unit_name, length)
     return None
+
+
+def require_metric(terrain: Mapping[str, xr.DataArray] | xr.Dataset, crs: CRS | None) -> None:
+    """Refuse a dem and a dsm in other units than metres, or unevenly spaced: TerrainError."""
+    require_metric_crs(crs, "the terrain")
+    for name in ("dem", "dsm"):
+        heights = terrain[name]
+        unit = height_unit(name, heights.attrs.get("units"), heights.rio.crs)
+        if unit != METRE:
+            raise TerrainError(
+                f"{name} has heights in {unit.name!r}, not metres; read it with read_terrain, "
+                "which converts them."
+            )
+    for axis in ("y", "x"):
+        require_regular(terrain["dem"][axis].values, axis, "the raster")
+
+
+def require_metric_crs(crs: CRS | None, name: str) -> None:
+    """Refuse a map without CRS, or with one in another unit than metres: TerrainError."""
+    if crs is None:
+        raise TerrainError(f"{name} has no CRS; set it, e.g. with .rio.write_crs('EPSG:32633').")
+    if crs.is_geographic:
+        raise TerrainError(
+            f"{name} is in degrees; reproject it, e.g. with "
+            "dem.rio.reproject(dem.rio.estimate_utm_crs())."
+        )
+    try:
+        metres = crs.linear_units_factor[1]
+    except CRSError:
+        raise TerrainError(
+            f"{name} is in a CRS that is no map of the Earth; give it a projected one, e.g. "
+            "'EPSG:32633'."
+        ) from None
+    if abs(metres - 1.0) > 1e-9:
+        raise TerrainError(
+            f"{name} is in {crs.linear_units}, but heights and distances must be in metres; warp "
+            "it to a metric CRS and convert its heights."
+        )
+
+
+def require_regular(values: np.ndarray, axis: Hashable, name: str) -> None:
+    """Refuse coordinates that are fewer than two, or not evenly spaced: TerrainError."""
+    steps = np.diff(values)
+    if not len(steps) or not np.allclose(steps, steps[0], rtol=1e-3) or steps[0] == 0.0:
+        raise TerrainError(
+            f"{name}'s {axis} is not a regular axis of two pixels or more; resample it to evenly "
+            "spaced, sorted coordinates."
+        )
