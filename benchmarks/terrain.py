@@ -130,8 +130,8 @@ def trustbo_cells(dem, out):
 
 def cells_of(ground, features):
     from trustbo.team import Team
-    from trustbo.workspace import Grid
     from trustbo.workspace.awareness import cell_maps
+    from trustbo.workspace.grid import Grid
 
     grid = Grid.over(ground, (10, 10))
     return cell_maps(ground, grid, features, Team.of(None), keep_pixels=False)
@@ -174,7 +174,8 @@ def trustbo_averaged(dem, out):
 def visibility(dem, out):
     import rioxarray  # noqa: F401
 
-    from trustbo.terrain import assemble_terrain, openness
+    from trustbo.terrain.dataset import assemble_terrain
+    from trustbo.terrain.features import openness
 
     ground = in_memory(dem)["dem"].astype(float)
     x = np.arange(len(ground))

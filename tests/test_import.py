@@ -101,7 +101,16 @@ def test_completion_lists_public_names_alone(name):
 
 
 @pytest.mark.parametrize(
-    ("package", "name", "room"), [("models", "fit", "inference"), ("models", "Hazard", "hazard")]
+    ("package", "name", "room"),
+    [
+        ("models", "fit", "inference"),
+        ("models", "Hazard", "hazard"),
+        ("terrain", "assemble_terrain", "terrain.dataset"),
+        ("terrain", "slope", "terrain.features"),
+        ("workspace", "Grid", "workspace.grid"),
+        ("workspace", "SIGHT_MODES", "workspace.sight"),
+        ("simulation", "Simulator", "simulation.protocol"),
+    ],
 )
 def test_a_name_of_version_0_2_is_found_in_its_new_room_with_a_warning(package, name, room):
     old, new = import_module(f"trustbo.{package}"), import_module(f"trustbo.{room}")

@@ -11,7 +11,8 @@ from missions import TRUTH
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.models import PooledTrust
-from trustbo.terrain import assemble_terrain, synthetic_terrain
+from trustbo.terrain import synthetic_terrain
+from trustbo.terrain.dataset import assemble_terrain
 from trustbo.workspace import Workspace
 
 CORNER = np.array([100.0, 500.0])  # of `terrain_of`: x of the left edge, y of the top, m

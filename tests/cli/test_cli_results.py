@@ -17,7 +17,7 @@ from trustbo.inference.samplers.choice import SAMPLERS
 from trustbo.models.families import AUTO, FAMILIES
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.study.methods import MODELS
-from trustbo.workspace import SIGHT_MODES
+from trustbo.workspace.sight import SIGHT_MODES
 
 COMMANDS = ("demo", "run", "resume", "report", "export", "study")
 

@@ -10,8 +10,8 @@ import xarray as xr
 from rasterio.transform import from_origin
 
 from trustbo.errors import TerrainError, TrustboError
-from trustbo.terrain import align, pixel_size, read_terrain, synthetic_terrain
-from trustbo.terrain.dataset import clean
+from trustbo.terrain import align, read_terrain, synthetic_terrain
+from trustbo.terrain.dataset import clean, pixel_size
 
 UTM = "EPSG:32633"
 

@@ -9,21 +9,22 @@ import xarray as xr
 from worlds import CORNER, terrain_of
 
 from trustbo.errors import ShapeError, TerrainError, TrustboError
-from trustbo.terrain import (
-    FEATURES,
+from trustbo.terrain import FEATURES, pixel_features, rays, register_feature
+from trustbo.terrain.dataset import assemble_terrain
+from trustbo.terrain.features import (
     aspect,
-    assemble_terrain,
     canopy_cover,
     canopy_height,
+    curvature,
     exposure,
     openness,
-    pixel_features,
-    rays,
-    register_feature,
+    roughness,
     slope,
+    step_height,
+    tpi,
+    tri,
     vegetation_density,
 )
-from trustbo.terrain.features import curvature, roughness, step_height, tpi, tri
 
 GDAL = Path(__file__).parent.parent / "data" / "gdal"
 SHORT = {name: f for name, f in FEATURES.items() if name not in ("openness", "aspect")}

@@ -10,7 +10,7 @@ import rioxarray
 import xarray as xr
 
 from trustbo.errors import TerrainError, TrustboError
-from trustbo.terrain import pixel_size
+from trustbo.terrain.dataset import pixel_size
 from trustbo.terrain.lidar import read_lidar
 
 laspy = pytest.importorskip("laspy", reason="needs the extra lidar")

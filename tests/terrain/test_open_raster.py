@@ -15,8 +15,8 @@ from rasterio.transform import from_origin
 from rasterio.vrt import WarpedVRT
 
 from trustbo.errors import TerrainError, TrustboError
-from trustbo.terrain import assemble_terrain, read_terrain
-from trustbo.terrain.dataset import require_terrain
+from trustbo.terrain import read_terrain
+from trustbo.terrain.dataset import assemble_terrain, require_terrain
 
 UTM = "EPSG:32633"
 CORNER = from_origin(500_000.0, 5_000_000.0, 1.0, 1.0)

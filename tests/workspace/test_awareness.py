@@ -11,16 +11,15 @@ from trustbo.errors import TerrainError, TrustboError
 from trustbo.terrain import (
     TRAVERSABILITY,
     PixelFeature,
-    canopy_cover,
-    exposure,
     pixel_features,
     read_terrain,
-    slope,
     strips,
     synthetic_terrain,
 )
-from trustbo.workspace import Grid, Workspace
+from trustbo.terrain.features import canopy_cover, exposure, slope
+from trustbo.workspace import Workspace
 from trustbo.workspace.awareness import cell_maps
+from trustbo.workspace.grid import Grid
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,8 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.planning import Planner
 from trustbo.simulation import ModelSimulator, Truth
-from trustbo.workspace import Grid, Workspace, survey
+from trustbo.workspace import Workspace, survey
+from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import cell_of, named, position_near
 
 

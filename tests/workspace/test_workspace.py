@@ -5,8 +5,10 @@ import pytest
 
 from trustbo.errors import ShapeError, TerrainError, TrustboError
 from trustbo.team import Robot, Team
-from trustbo.terrain import assemble_terrain, pixel_size, read_terrain, synthetic_terrain
-from trustbo.workspace import Grid, Workspace
+from trustbo.terrain import read_terrain, synthetic_terrain
+from trustbo.terrain.dataset import assemble_terrain, pixel_size
+from trustbo.workspace import Workspace
+from trustbo.workspace.grid import Grid
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,8 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, as_path, to_json
 from trustbo.models import TrustModel
 from trustbo.planning import Plan, Planner, Policy
-from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
-from trustbo.simulation.protocol import require_bounds, require_call, takes
+from trustbo.simulation import KinematicSimulator, ReplaySimulator, Truth
+from trustbo.simulation.protocol import Simulator, require_bounds, require_call, takes
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 

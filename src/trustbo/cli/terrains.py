@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from trustbo.data import Cell
     from trustbo.team import Team
-    from trustbo.workspace import Grid
+    from trustbo.workspace.grid import Grid
 
 _MOST_PIXELS = 9e6
 """Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
@@ -96,7 +96,8 @@ class Rasters(NamedTuple):
 
         TrustboError: one is off the grid, without data or too steep; no awareness was computed.
         """
-        from trustbo.workspace import Grid, survey
+        from trustbo.workspace import survey
+        from trustbo.workspace.grid import Grid
         from trustbo.workspace.location import cell_of
 
         named = dict(zip(("start", "goal"), ends, strict=True))

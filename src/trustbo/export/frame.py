@@ -12,7 +12,8 @@ import yaml
 from trustbo.errors import TrustboError
 from trustbo.export.checks import find_crs
 from trustbo.files import require_file, write_text
-from trustbo.workspace import Grid, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, crs_name, lonlat_of, position_near
 
 AUTO = "auto"

@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
 
 from trustbo.plots.style import MEDIUM, SMALL, Style
-from trustbo.workspace import Grid
+from trustbo.workspace.grid import Grid
 
 PAGE = 7.6
 """Width of a page, inches: figures of several panels are no wider by default."""

@@ -27,9 +27,9 @@ from trustbo.plots.layout import (
     set_titles,
 )
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
-from trustbo.terrain import pixel_size
-from trustbo.workspace import Grid, Workspace
-from trustbo.workspace.grid import over_cells
+from trustbo.terrain.dataset import pixel_size
+from trustbo.workspace import Workspace
+from trustbo.workspace.grid import Grid, over_cells
 
 COLOURS = "viridis"
 """Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""

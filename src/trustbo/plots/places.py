@@ -21,7 +21,8 @@ from trustbo.plots.layout import (
 )
 from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined, robust_limits
 from trustbo.plots.style import Style, StyleOptions, theme
-from trustbo.workspace import Grid, Workspace
+from trustbo.workspace import Workspace
+from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 
 BETTER_WORSE = "RdBu"

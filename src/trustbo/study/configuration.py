@@ -19,7 +19,8 @@ from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
 from trustbo.models.model import TrustModel
 from trustbo.planning import OBJECTIVES, POLICIES, Planner
-from trustbo.simulation import ModelSimulator, Simulator, Truth
+from trustbo.simulation import ModelSimulator, Truth
+from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import FILES, Call, call_of, require_known, takes
 from trustbo.study.experiment import Experiment
 from trustbo.study.methods import Case, model_call, model_of

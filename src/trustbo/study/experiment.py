@@ -28,7 +28,8 @@ from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting
 from trustbo.models.backend import VERSIONS
 from trustbo.planning import Planner
-from trustbo.simulation import Simulator, Truth
+from trustbo.simulation import Truth
+from trustbo.simulation.protocol import Simulator
 from trustbo.study import executors
 from trustbo.study.methods import Case
 from trustbo.study.store import Store

@@ -14,7 +14,8 @@ from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.planning import Planner
-from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import digest, identity_of, imported
 from trustbo.team import Robot, Team
 from trustbo.terrain.example import EXAMPLES, example_files

@@ -1,12 +1,13 @@
 """Planning grid: awareness, passability, positions, routes and sight of every cell."""
 
+from trustbo.errors import moved_names
 from trustbo.workspace.belief import AwarenessBelief
-from trustbo.workspace.grid import Grid
-from trustbo.workspace.sight import SIGHT_MODES, Sight
+from trustbo.workspace.sight import Sight
 from trustbo.workspace.survey import survey
 from trustbo.workspace.workspace import Workspace
 
-__all__ = [
-    "SIGHT_MODES", "AwarenessBelief", "Grid", "Sight", "Workspace", "survey",
-]  # fmt: skip
+__all__ = ["AwarenessBelief", "Sight", "Workspace", "survey"]
 __dir__ = __all__.copy  # completion lists public names alone
+__getattr__ = moved_names(
+    __name__, {"trustbo.workspace.grid": ["Grid"], "trustbo.workspace.sight": ["SIGHT_MODES"]}
+)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.terrain import pixel_size
+from trustbo.terrain.dataset import pixel_size
 from trustbo.terrain.features import gradient
 
 
