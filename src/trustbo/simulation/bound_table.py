@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from trustbo.data import STATUSES, Cell
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.simulation.replicates import END, Edge, Replicates, edges_of
+from trustbo.simulation.replicates import END, Edge, KinematicReplicates, PlainReplicates, edges_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, move_indices, moves_along
 
@@ -47,16 +47,12 @@ class BoundTable:
 
     def failure(self, path: Sequence[Cell]) -> np.ndarray:
         """Chance to fail of the bounds of a path, shape (bound,)."""
-        return self._failure[_along(path)]
+        return 1.0 - self.data["outcome"].sel(status="ok").values[_along(path)]
 
     @property
     def standard_error(self) -> float:
         """Standard error of the contact of a bound: root mean square over all."""
         return _root_mean_square(self.data["standard_error"].values)
-
-    @property
-    def _failure(self) -> np.ndarray:
-        return 1.0 - self.data["outcome"].sel(status="ok").values
 
     def best(self, paths: AdmissiblePaths, objective: str) -> tuple[Cell, ...]:
         """Best admissible path: least contact lost, or for "mean" the largest mean contact."""
@@ -93,7 +89,7 @@ class BoundTable:
 
 def tabulate(
     workspace: Workspace,
-    replicates: Replicates,
+    replicates: KinematicReplicates | PlainReplicates,
     *,
     standard_error: float,
     progress: bool = False,

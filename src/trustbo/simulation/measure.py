@@ -9,13 +9,13 @@ import xarray as xr
 from trustbo.data import Bound
 from trustbo.errors import require_choice
 from trustbo.logs.netcdf import STATES
-from trustbo.team import Robot, Team
+from trustbo.team import Team
 from trustbo.terrain import CompositeIndex, fan
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface
 
-_PARTS, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
+_SHARES, _N_RAYS = (0.25, 0.5, 0.75, 1.0), 12
 _OPAQUE = 1e6
 """Extinction of an opaque canopy, 1/m."""
 
@@ -81,9 +81,17 @@ class Measure:
 
     def states(self, poses: np.ndarray) -> np.ndarray:
         """Values of `STATES` of each robot at each tick, shape (tick, robot, state)."""
-        motion = _motion(self._surface, self._team.robots, poses, self._tick)
-        seen = self._lidar[self._surface.nearest(poses[..., 0], poses[..., 1])]
-        return np.concatenate([motion, seen], axis=-1)
+        row, col = self._surface.nearest(poses[..., 0], poses[..., 1])
+        gx, gy = self._surface.gradient[:, row, col]
+        ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+        way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
+        speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
+        motion = [
+            np.minimum(speed / np.array([robot.speed for robot in self._team.robots]), 1.0),
+            np.abs(np.arctan(gx * ahead + gy * left)),
+            np.abs(np.arctan(gy * ahead - gx * left)),
+        ]
+        return np.concatenate([np.stack(motion, axis=-1), self._lidar[row, col]], axis=-1)
 
     def samples(self, bounds: Sequence[Bound]) -> dict[str, xr.Dataset]:
         """Map's value and mean states by feature, one sample per robot and bound, (sample)."""
@@ -103,44 +111,22 @@ class Measure:
 
     @cached_property
     def _lidar(self) -> np.ndarray:
-        return _lidar_maps(self._team, self._surface, self._sight)
+        """Mean range of a lidar's returns, m, and share of clear beams, by pixel: (row, col, 2).
 
-
-def _lidar_maps(team: Team, surface: Surface, sight: Sight) -> np.ndarray:
-    """Mean range of a lidar's returns, m, and share of clear beams, by pixel: (row, col, 2).
-
-    By rays all around. The mean range of returns is the integral over range of the share of beams
-    that reach it. Beams are blocked by what blocks sight: for "wall", a canopy opaque from the
-    ground up.
-    """
-    sides = [n * step for n, step in zip(surface.ground.shape, surface.pixel, strict=True)]
-    reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
-    heights = team.robots[0].sensor_height, team.lead.target_height
-    canopy = {"bare": (0.0, sight.crown_base), "wall": (_OPAQUE, 0.0)}
-    opacity = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
-    rasters = surface.ground, surface.canopy, surface.pixel
-    shares = [np.ones(surface.ground.shape)]
-    for part in _PARTS:
-        share = fan.openness(*rasters, part * reach, *heights, _N_RAYS, *opacity, slice(None))
-        shares.append(np.nan_to_num(share))
-    return_range = reach * np.trapezoid(shares, [0.0, *_PARTS], axis=0)
-    return np.stack([return_range, shares[-1]], axis=-1)
-
-
-def _motion(
-    surface: Surface, robots: Sequence[Robot], poses: np.ndarray, tick: float
-) -> np.ndarray:
-    """Speed ratio, and absolute pitch and roll, of each robot at each tick, (tick, robot, 3)."""
-    row, col = surface.nearest(poses[..., 0], poses[..., 1])
-    gx, gy = surface.gradient[:, row, col]
-    ahead, left = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
-    speed = np.hypot(way[..., 0], way[..., 1]) / tick
-    return np.stack(
-        [
-            np.minimum(speed / np.array([robot.speed for robot in robots]), 1.0),
-            np.abs(np.arctan(gx * ahead + gy * left)),
-            np.abs(np.arctan(gy * ahead - gx * left)),
-        ],
-        axis=-1,
-    )
+        By rays all around. The mean range of returns is the integral over range of the share of
+        beams that reach it. Beams are blocked by what blocks sight: for "wall", a canopy opaque
+        from the ground up.
+        """
+        team, surface, sight = self._team, self._surface, self._sight
+        sides = [n * step for n, step in zip(surface.ground.shape, surface.pixel, strict=True)]
+        reach = min(max(robot.lidar_range for robot in team.robots), 0.5 * min(sides))
+        heights = team.robots[0].sensor_height, team.lead.target_height
+        canopy = {"bare": (0.0, sight.crown_base), "wall": (_OPAQUE, 0.0)}
+        opacity = canopy.get(sight.mode, (sight.extinction, sight.crown_base))
+        rasters = surface.ground, surface.canopy, surface.pixel
+        seen = [np.ones(surface.ground.shape)]
+        for share in _SHARES:
+            clear = fan.openness(*rasters, share * reach, *heights, _N_RAYS, *opacity, slice(None))
+            seen.append(np.nan_to_num(clear))
+        return_range = reach * np.trapezoid(seen, [0.0, *_SHARES], axis=0)
+        return np.stack([return_range, seen[-1]], axis=-1)

@@ -80,7 +80,8 @@ class ModelContact:
                 "the best path needs trust that rises with the trust before it; got "
                 f"beta0 = {self._transition.tolist()}."
             )
-        u, spread = self._drift_maps(), self._spread(paths.longest)
+        u, spread = drift(self._params, self._awareness), self._spread(paths.longest)
+        u = u.reshape(*u.shape[:2], -1)  # (robot, move or 1, cell)
         cell, move = np.array([paths.flat(paths.start)]), np.array([-1])
         trust = np.full((1, len(u)), self._params.x0_mean, float)
         loss, steps = np.zeros(1), move_indices(paths.connectivity)
@@ -99,7 +100,8 @@ class ModelContact:
             trust = trust[parent] @ self._transition.T + u[:, move % u.shape[1], cell].T
             loss = loss[parent] + 1.0 - self._rate(trust, spread[k : k + 1]).mean(1)
             key = cell if paths.u_turns else cell * len(MOVES[8]) + move
-            kept = _undominated(key, loss, trust)
+            order: Any = np.lexsort((-trust.sum(1), loss, key))
+            kept = order[_undominated(key[order], trust[order])]
             cell, move, loss, trust = cell[kept], move[kept], loss[kept], trust[kept]
             layers.append((cell, parent[kept]))
             there = np.flatnonzero(cell == goal)
@@ -113,11 +115,6 @@ class ModelContact:
             flat.append(cells[label])
             label = parents[label]
         return paths.start, *paths.cells(np.array(flat[::-1]))
-
-    def _drift_maps(self) -> np.ndarray:
-        """Drift of the bounds into each cell, shape (robot, move or 1, cell)."""
-        u = drift(self._params, self._awareness)
-        return u.reshape(*u.shape[:2], -1)
 
     def _spread(self, n_bounds: int) -> np.ndarray:
         """Standard deviation of the measured quantity, shape (bound, robot)."""
@@ -140,14 +137,9 @@ class ModelContact:
         return trust * inside - spread * (norm.pdf(high) - norm.pdf(low)) + norm.sf(high)
 
 
-def _undominated(key: np.ndarray, loss: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """Indices of labels that no other of their key dominates: less loss, and no less trust."""
-    order: Any = np.lexsort((-trust.sum(1), loss, key))
-    return order[_front(key[order], trust[order])]
-
-
 @njit(cache=True, nogil=True)
-def _front(key, trust):
+def _undominated(key, trust):
+    """Mask of labels, by key and loss, of which no other of their key has as much trust."""
     kept = np.zeros(len(key), np.bool_)
     first = 0
     for i in range(len(key)):

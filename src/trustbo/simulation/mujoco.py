@@ -214,7 +214,7 @@ class _Leg:
         self._along = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / 0.25) + 1))
         self._points = np.column_stack([np.interp(self._along, along, xy) for xy in route.T])
         self._robot, self._reach = robot, LOOKAHEAD + 0.25 * robot.speed
-        self._at, self._best = 0, 0.0
+        self._position, self._best = 0, 0.0
         self.idle, self.arrived = 0.0, False
 
     def update(self, position: np.ndarray, speed: float, seconds: float) -> None:
@@ -222,12 +222,12 @@ class _Leg:
 
         A robot that slides past its goal has not arrived.
         """
-        near = self._points[self._at : self._at + 12]
-        self._at += int(np.argmin(((near - position) ** 2).sum(1)))
+        near = self._points[self._position : self._position + 12]
+        self._position += int(np.argmin(((near - position) ** 2).sum(1)))
         there = math.dist(position, self._points[-1]) < ARRIVED
         self.arrived |= there and speed < SLOW
-        if self.arrived or self._along[self._at] >= self._best + PROGRESS:
-            self._best, self.idle = float(self._along[self._at]), 0.0
+        if self.arrived or self._along[self._position] >= self._best + PROGRESS:
+            self._best, self.idle = float(self._along[self._position]), 0.0
         else:
             self.idle += seconds
 
@@ -238,7 +238,7 @@ class _Leg:
         the other robots, shape (robot, 2), CRS metres.
         """
         robot, left = self._robot, math.dist(pose[:2], self._points[-1])
-        ahead = np.searchsorted(self._along, self._along[self._at] + self._reach)
+        ahead = np.searchsorted(self._along, self._along[self._position] + self._reach)
         dx, dy = self._points[min(int(ahead), len(self._points) - 1)] - pose[:2]
         bearing = _around(math.atan2(dy, dx), left, others - pose[:2])
         error = _wrapped(bearing - pose[2])

@@ -273,7 +273,7 @@ class KinematicSimulator(DescribedSimulator):
 
     def _enter(self, mission: int) -> None:
         """Switch to the world of a mission."""
-        self._now = self._worlds.at(require_whole("mission", mission, 0))
+        self._now = self._worlds.of_mission(require_whole("mission", mission, 0))
         self._surface, self._ways, *_ = self._now
 
     # --- one bound ---
@@ -329,10 +329,10 @@ class KinematicSimulator(DescribedSimulator):
         for mover in turns(self.bounding, k, next_cell is None):
             i, members = (0, slice(0, 1)) if mover == "lead" else (1, slice(1, None))
             way, now = (cells[i], cell), poses[-1][-1]
-            part, status = self._phase(i, now, stops, way, next_cell, ticks_left, rng)
-            poses.append(part)
-            lead_moves.append(np.full(len(part), i == 0))
-            ticks_left -= len(part)
+            driven, status = self._phase(i, now, stops, way, next_cell, ticks_left, rng)
+            poses.append(driven)
+            lead_moves.append(np.full(len(driven), i == 0))
+            ticks_left -= len(driven)
             if status != "ok":
                 break
             cells[i], stops[members] = cell, self._goals(i, cell, next_cell)
@@ -358,32 +358,21 @@ class KinematicSimulator(DescribedSimulator):
 
         Routes start at the planned posts `stops`, robots at their current poses.
         """
-        members = slice(1, None) if i else slice(0, 1)
-        robots = self.team.robots if i else (self.team.lead,)
+        if i:
+            members, robots, planned = slice(1, None), self.team.robots, self.workspace.team.robots
+        else:
+            members, robots, planned = slice(0, 1), [self.team.lead], [self.workspace.team.lead]
         window, goals = self._ways.posts.window(*way), self._goals(i, way[1], next_cell)
-        routes = self._routes(i, stops[members], goals, now[members], window)
-        moved, status = self._move(now[members], robots, routes, window, max_ticks, rng)
-        part = np.repeat(now[None], len(moved), axis=0)
-        part[:, members] = moved
-        return part, status
-
-    def _routes(
-        self,
-        i: int,
-        starts: np.ndarray,
-        goals: np.ndarray,
-        poses: np.ndarray,
-        window: tuple[int, int, int, int],
-    ) -> list[np.ndarray | None]:
-        """Planned routes of the lead (i = 0) or T2, started at the robots' current positions."""
-        team = self.workspace.team
-        routes = []
+        routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
-            team.robots if i else (team.lead,), starts, goals, poses, strict=True
+            planned, stops[members], goals, now[members], strict=True
         ):
             route = self._ways.routes.find(robot, start, goal, window)
             routes.append(None if route is None else np.concatenate([pose[None, :2], route[1:]]))
-        return routes
+        moved, status = self._move(now[members], robots, routes, window, max_ticks, rng)
+        poses = np.repeat(now[None], len(moved), axis=0)
+        poses[:, members] = moved
+        return poses, status
 
     def _move(
         self,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from copy import copy
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,17 +33,6 @@ Outcome = tuple[np.ndarray, str]
 """Contact rate of each robot, shape (robot,), and status of a bound."""
 
 
-class Replicates(Protocol):
-    """Source of replicates of bounds."""
-
-    most: int
-    """Maximum number of replicates."""
-
-    def run(self, edges: Sequence[Edge], number: int) -> Iterator[list[Outcome]]:
-        """Run each bound once for each that can follow it: outcomes in the order of the edges."""
-        ...
-
-
 def edges_of(workspace: Workspace) -> list[Edge]:
     """All bounds of a workspace for which its robots have a route."""
     exists = workspace.passable_bounds.values
@@ -68,6 +57,9 @@ class KinematicReplicates:
     Robots stop within half a metre of where they should, hence a replicate begins where one of the
     bounds before it, each in turn, ended in the replicate before, as in missions. In the zeroth,
     which is not counted, all begin in their positions.
+
+    Attributes:
+        most: Maximum number of replicates.
     """
 
     def __init__(self, simulator: KinematicSimulator, mission: int, seed: int) -> None:
@@ -84,7 +76,7 @@ class KinematicReplicates:
             self._simulator.reset(edge.left, seed, mission=mission)
 
     def run(self, edges: Sequence[Edge], number: int) -> Iterator[list[Outcome]]:
-        """See `Replicates`."""
+        """Run each bound once for each that can follow it: outcomes in the order of the edges."""
         if not self._ends and number:
             list(self.run(self._edges, 0))
         ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
@@ -116,7 +108,7 @@ class PlainReplicates:
         self._numbered = {"mission": mission} if takes(simulator.reset, "mission") else {}
 
     def run(self, edges: Sequence[Edge], number: int) -> Iterator[list[Outcome]]:
-        """See `Replicates`."""
+        """See `KinematicReplicates.run`."""
         run = self._simulator
         sees_start, sees_next = takes(run.reset, "next_cell"), takes(run.run_bound, "next_cell")
         for edge in edges:

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -49,27 +49,6 @@ class PathContact(NamedTuple):
     """Probability that no bound fails."""
 
 
-class Contact(Protocol):
-    """Source of a truth: a table of bounds, a model's recursion, or a custom one."""
-
-    @property
-    def standard_error(self) -> float:
-        """Standard error of the contact of a bound."""
-        ...
-
-    def contact(self, path: Sequence[Cell]) -> np.ndarray:
-        """Expected contact rates of the bounds of a path, shape (bound, robot)."""
-        ...
-
-    def failure(self, path: Sequence[Cell]) -> np.ndarray:
-        """Chance to fail of the bounds of a path, shape (bound,)."""
-        ...
-
-    def best(self, paths: AdmissiblePaths, objective: str) -> tuple[Cell, ...]:
-        """Best admissible path."""
-        ...
-
-
 class Truth(Displayed):
     """Expected contact of every path of a simulator, in the world of a mission.
 
@@ -85,11 +64,11 @@ class Truth(Displayed):
     def __init__(
         self,
         workspace: Workspace,
-        bounds: Contact,
+        bounds: BoundTable | ModelContact,
         at_mission: "Callable[[int], Truth] | None" = None,
     ) -> None:
         """Store the contact of bounds; `at(mission)` is the truth of another mission's world."""
-        self.workspace, self.bounds, self._at = workspace, bounds, at_mission
+        self.workspace, self.bounds, self._other = workspace, bounds, at_mission
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
 
     def _card(self) -> Card:
@@ -97,7 +76,7 @@ class Truth(Displayed):
         rows = [
             ("bounds", f"{type(self.bounds).__name__}, of {grid.shape[0]} x {grid.shape[1]} cells"),
             ("standard error", f"{self.standard_error:.2g} of a bound's contact, mean over robots"),
-            ("worlds", "one" if self._at is None else "of each mission, see at(mission)"),
+            ("worlds", "one" if self._other is None else "of each mission, see at(mission)"),
         ]
         return Card("Truth: expected contact of every bound", rows)
 
@@ -114,7 +93,7 @@ class Truth(Displayed):
     ) -> Self:
         """Find the truth of a simulator.
 
-        Of a `ModelSimulator` it is known in closed form. Of another, every bound, followed by each
+        That of a `ModelSimulator` has a closed form. Of another, every bound, followed by each
         that can follow it, is replicated until the standard error is reached; the result is cached
         on disk under a hash of the simulator's `describe()`, the workspace and the code.
 
@@ -143,14 +122,14 @@ class Truth(Displayed):
         numbers = require_whole("seed", seed, 0), require_positive("standard_error", standard_error)
         cached: dict[object, Self] = {}
 
-        def at(number: int) -> Self:
+        def of_mission(number: int) -> Self:
             world = _world(simulator, require_whole("mission", number, 0))
             if world not in cached:
                 table = _table(simulator, number, world, *numbers, folder, progress)
-                cached[world] = cls(workspace, table, at)
+                cached[world] = cls(workspace, table, of_mission)
             return cached[world]
 
-        return at(mission)
+        return of_mission(mission)
 
     @property
     def standard_error(self) -> float:
@@ -159,7 +138,7 @@ class Truth(Displayed):
 
     def at(self, mission: int) -> "Truth":
         """Truth of the world of another mission, counted from 0."""
-        return self if self._at is None else self._at(mission)
+        return self if self._other is None else self._other(mission)
 
     def best(
         self,
@@ -275,8 +254,8 @@ def _table(
         about = [describe(), world, seed, standard_error, VERSIONS["trustbo"], _code()]
         kept = cache_folder("truth") if folder is None else require_folder(folder)
         digest = hashlib.sha256(to_json(about).encode())
-        for part in _content(simulator):
-            digest.update(part)
+        for content in _content(simulator):
+            digest.update(content)
         file = kept / f"{digest.hexdigest()[:20]}.nc"
         if file.exists():
             try:
@@ -295,11 +274,11 @@ def _content(simulator: Any) -> list[bytes]:
     """Contents of the workspace on which contact depends."""
     workspace: Workspace = simulator.workspace
     settings = [workspace.grid, workspace.team, workspace.sights, workspace.formation_radius]
-    parts = [to_json(settings).encode(), _bytes(workspace.passable)]
+    contents = [to_json(settings).encode(), _bytes(workspace.passable)]
     if workspace.terrain is None or workspace.pixels is None:
-        return [*parts, _bytes(workspace.awareness)]
+        return [*contents, _bytes(workspace.awareness)]
     pixels = [_bytes(workspace.pixels[name]) for name in ("traversability", "passable")]
-    return [*parts, digest_of(workspace.terrain).encode(), *pixels]
+    return [*contents, digest_of(workspace.terrain).encode(), *pixels]
 
 
 def _bytes(array: xr.DataArray) -> bytes:

@@ -60,17 +60,17 @@ class Worlds:
                     f"{right:.9g} and y from {bottom:.9g} to {top:.9g}; give CRS metres, and a "
                     "region of a pixel at least."
                 )
-        self._known: dict[object, World] = {}
+        self._worlds: dict[object, World] = {}
         self._ways: dict[object, Ways] = {}
 
-    def at(self, mission: int) -> World:
+    def of_mission(self, mission: int) -> World:
         """World of a mission, counted from 0."""
         threats = tuple(t for t in self._threats if acts_in(t, mission))
         worse = tuple(d for d in self._degradations if acts_in(d, mission))
         key = tuple(map(id, (*threats, *worse)))
-        if key not in self._known:
-            self._known[key] = self._make(threats, worse)
-        return self._known[key]
+        if key not in self._worlds:
+            self._worlds[key] = self._make(threats, worse)
+        return self._worlds[key]
 
     def _make(self, threats: Sequence[Threat], worse: Sequence[Degradation]) -> World:
         detection = np.array([robot.detection for robot in self._team.robots])
@@ -85,7 +85,7 @@ class Worlds:
         key = tuple(map(id, closing))
         if key not in self._ways:
             ground = self._workspace.ground
-            assert ground is not None  # noqa: S101  # `planned_surface` has refused others
+            assert ground is not None  # noqa: S101  # `true_surface` has refused others
             if closing:
                 surface = ground.posts.surface
                 for threat in closing:
@@ -95,24 +95,19 @@ class Worlds:
         return self._ways[key]
 
 
-def planned_surface(workspace: Workspace) -> Surface:
-    """Surface that posts and ways are planned on; TrustboError without a terrain in memory."""
-    if workspace.surface is None:
-        raise TrustboError(
-            "the kinematic simulator needs a terrain in memory; make the workspace with "
-            "Workspace.from_terrain (of a lazily read terrain: coarsen it first), or pass your "
-            "own simulator."
-        )
-    return workspace.surface
-
-
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     """Surface that robots are simulated on: the workspace's, or of another terrain.
 
     TerrainError: it does not cover the grid, has another CRS, or is read lazily. TrustboError: the
     workspace has no terrain in memory.
     """
-    planned = planned_surface(workspace)
+    planned = workspace.surface
+    if planned is None:
+        raise TrustboError(
+            "the kinematic simulator needs a terrain in memory; make the workspace with "
+            "Workspace.from_terrain (of a lazily read terrain: coarsen it first), or pass your "
+            "own simulator."
+        )
     if terrain is None:
         return planned
     terrain = require_terrain(terrain)
@@ -124,15 +119,10 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
         )
     surface = surface_of(terrain, np.isfinite(terrain["dem"].values))
     extent, needed, pixel = surface.extent, planned.extent, max(*surface.pixel, *planned.pixel)
-    short = [
-        (extent[0] - needed[0]),
-        (extent[1] - needed[1]),
-        needed[2] - extent[2],
-        needed[3] - extent[3],
-    ]
-    if max(short) > pixel:
+    short = max(*np.subtract(extent, needed)[:2], *np.subtract(needed, extent)[2:])
+    if short > pixel:
         raise TerrainError(
-            f"the true terrain ends {max(short):.3g} m inside the planning grid; give one that "
+            f"the true terrain ends {short:.3g} m inside the planning grid; give one that "
             "covers it."
         )
     return surface

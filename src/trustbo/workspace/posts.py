@@ -51,7 +51,7 @@ class Posts:
         self._traversability = _smoothed(traversability, surface.pixel)
         self._standable = largest_region(surface.passable)
         self._waypoints: dict[Cell, np.ndarray] = {}
-        self._known: dict[Cell, dict[Cell | None, np.ndarray]] = {}
+        self._cached: dict[Cell, dict[Cell | None, np.ndarray]] = {}
         # Row and column of the cell that each row and column of pixels belongs to, ascending.
         self._cells = grid.cells_along(*surface.axes)
 
@@ -88,11 +88,11 @@ class Posts:
 
         Without a next cell, around the lead at the goal.
         """
-        if cell not in self._known:
-            self._known[cell] = self._posts(cell)
-        if next_cell not in self._known[cell]:  # no neighbour
-            self._known[cell] |= self._aimed(cell, [next_cell])
-        return self._known[cell][next_cell]
+        if cell not in self._cached:
+            self._cached[cell] = self._posts(cell)
+        if next_cell not in self._cached[cell]:  # no neighbour
+            self._cached[cell] |= self._aimed(cell, [next_cell])
+        return self._cached[cell][next_cell]
 
     def _waypoint(self, cell: Cell) -> np.ndarray:
         row, col = self._pixels_of(cell)

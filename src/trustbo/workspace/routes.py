@@ -26,7 +26,7 @@ class Routes:
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
         self._paces: dict[float, np.ndarray] = {}
-        self._known: dict[tuple[object, ...], np.ndarray] = {}
+        self._cached: dict[tuple[object, ...], np.ndarray] = {}
 
     def find(
         self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: tuple[int, int, int, int]
@@ -38,9 +38,9 @@ class Routes:
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
         key = (*ends, window, robot.max_slope)
-        if key not in self._known:
-            self._known[key] = self._search(ends[0], ends[1], window, robot.max_slope)
-        cached = self._known[key]
+        if key not in self._cached:
+            self._cached[key] = self._search(ends[0], ends[1], window, robot.max_slope)
+        cached = self._cached[key]
         if not len(cached):
             return None
         if len(cached) == 1:  # a single-pixel route still needs two ends
