@@ -192,7 +192,7 @@ def _planned(path: Sequence[Cell], workspace: Workspace) -> tuple[np.ndarray, np
     if (ground := workspace.ground) is None:
         return np.array([workspace.grid.center(cell) for cell in path]) - corner, None
     stops = np.stack([ground.posts.waypoint(cell) for cell in path])
-    posts = np.stack([ground.posts.at(a, c) for a, c in pairwise(path)])
+    posts = np.stack([ground.posts.watching(a, c) for a, c in pairwise(path)])
     return stops - corner, posts - corner
 
 

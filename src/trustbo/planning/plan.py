@@ -123,7 +123,7 @@ class Plan(Displayed):
         """Posts where T2 stands while the lead runs each bound, shape (bound, robot, 2)."""
         if (ground := self.workspace.ground) is None:
             return None
-        return np.stack([ground.posts.at(a, c) for a, c in pairwise(self.path)])
+        return np.stack([ground.posts.watching(a, c) for a, c in pairwise(self.path)])
 
     @cached_property
     def ways(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:

@@ -281,7 +281,7 @@ class KinematicSimulator(DescribedSimulator):
     def _start(self, start: Cell, seed: int, next_cell: Cell | None) -> State:
         cell = self.workspace.require_cell("start", start)
         posts = self._ways.posts
-        stops = np.concatenate([posts.waypoint(cell)[None], posts.at(cell, next_cell)])
+        stops = np.concatenate([posts.waypoint(cell)[None], posts.watching(cell, next_cell)])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
         tracks = new_tracks(len(stops) - 1)
         return State((cell, cell), poses, stops, 0.0, require_whole("seed", seed, 0), tracks)
@@ -342,7 +342,7 @@ class KinematicSimulator(DescribedSimulator):
     def _goals(self, i: int, cell: Cell, next_cell: Cell | None) -> np.ndarray:
         """Stops of the lead (i = 0) or T2 in a cell, shape (robot, 2)."""
         posts = self._ways.posts
-        return posts.at(cell, next_cell) if i else posts.waypoint(cell)[None]
+        return posts.watching(cell, next_cell) if i else posts.waypoint(cell)[None]
 
     def _phase(
         self,

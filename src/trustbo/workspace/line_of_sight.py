@@ -51,8 +51,8 @@ def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarr
         route = ways.lead(a, c)
         straight = np.stack([posts.waypoint(a), posts.waypoint(c)])
         of_lead.append(straight if route is None else route)
-        starts.append(posts.at(a, c))
-        ahead = [posts.at(c, b) for b in _onward(passable, a, c)]
+        starts.append(posts.watching(a, c))
+        ahead = [posts.watching(c, b) for b in _onward(passable, a, c)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
     return Geometry(of_lead, np.array(starts), np.array(ends))
 

@@ -83,7 +83,7 @@ class Posts:
             self._waypoints[cell] = self._waypoint(cell)
         return self._waypoints[cell]
 
-    def at(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+    def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
         """Posts of T2 in a cell, shape (robot, 2), from which it watches the next waypoint.
 
         Without a next cell, around the lead at the goal.

@@ -25,7 +25,7 @@ class Ways:
     def closing(self, a: Cell, c: Cell, next_cell: Cell | None) -> list[np.ndarray | None]:
         """Way of each robot of T2, from where it watched a -> c to where it watches c -> next."""
         window = self.posts.window(a, c)
-        ends = zip(self.posts.at(a, c), self.posts.at(c, next_cell), strict=True)
+        ends = zip(self.posts.watching(a, c), self.posts.watching(c, next_cell), strict=True)
         return [
             self.routes.find(robot, start, goal, window)
             for robot, (start, goal) in zip(self.posts.team.robots, ends, strict=True)

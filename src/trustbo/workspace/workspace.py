@@ -319,7 +319,7 @@ class Workspace(Displayed):
             TrustboError: A cell that is off the grid or impassable, or two that are no neighbours.
         """
         pair = self._require_bound(a, c)
-        return None if self.ground is None else self.ground.posts.at(*pair)
+        return None if self.ground is None else self.ground.posts.watching(*pair)
 
     def ways(
         self, a: Cell, c: Cell, next_cell: Cell | None = None
