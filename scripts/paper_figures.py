@@ -15,7 +15,7 @@ from matplotlib.patches import Rectangle
 
 import trustbo as tb
 from trustbo.plots.layout import MARKERS
-from trustbo.plots.maps import VEGETATION, draw_relief, draw_scale_of
+from trustbo.plots.maps import VEGETATION, draw_relief, draw_scale
 from trustbo.plots.plan import COLOURS
 from trustbo.plots.style import theme
 
@@ -173,7 +173,7 @@ def _ground(ax: Axes, plan: tb.planning.Plan, seen: np.ndarray) -> None:
     half, middle = 0.58 * (high - low).max() + 2.0, (low + high) / 2.0
     ax.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
     ax.set(aspect="equal", xticks=[], yticks=[])
-    draw_scale_of(ax, 2.0 * half)
+    draw_scale(ax, grid, width=2.0 * half)
 
 
 def cloud(terrain) -> Figure:

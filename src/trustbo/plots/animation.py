@@ -17,7 +17,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, pip_install, require_choice, require_kind, require_positive
 from trustbo.files import FilePath, write_file
 from trustbo.plots.layout import as_text, extent_of, plain
-from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
+from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale
 from trustbo.plots.style import MEDIUM, SMALL, theme
 from trustbo.workspace import Workspace
 
@@ -73,8 +73,8 @@ def animate_mission(
         TrustboError: The mission has no poses, the suffix is another, a number is not positive, or
             there is no ffmpeg.
     """
-    require_kind("plots.animate_mission", mission, Mission, "give a Mission and its Workspace")
-    require_kind("plots.animate_mission", workspace, Workspace, "give a Mission and its Workspace")
+    for value, kind in ((mission, Mission), (workspace, Workspace)):
+        require_kind("plots.animate_mission", value, kind, "give a Mission and its Workspace")
     target = None if path is None else Path(path)
     if target is not None:
         require_choice("suffix", target.suffix.lower(), SUFFIXES)
@@ -148,26 +148,23 @@ def _stage(mission: Mission, workspace: Workspace, film: Film):
         layout="constrained",
     )
     near, bars = axes["near"], axes["bars"]
+    way = np.array([workspace.grid.center(cell) for cell in mission.path]) - workspace.grid.corner
     for ax in (near, axes["all"]):
-        _draw_ground(ax, mission, workspace)
+        draw_ground(ax, workspace)
+        ax.plot(*way.T, color=theme().quiet, linewidth=1.0, linestyle=_DOTTED)
     draw_path(axes["all"], mission.path, workspace.grid)
     draw_scale(axes["all"], workspace.grid)
     frame = Rectangle((0, 0), 1, 1, fill=False, edgecolor=theme().ink, linewidth=1.2, zorder=9)
     axes["all"].add_patch(frame)
     team = _Team(near, mission.robots)
-    heights = bars.barh(
-        [as_text(name) for name in mission.robots],
-        np.zeros(len(mission.robots)),
-        height=0.6,
-        edgecolor=theme().ink,
-        linewidth=0.6,
-    )
+    names, edge = [as_text(name) for name in mission.robots], theme().ink
+    heights = bars.barh(names, np.zeros(len(names)), height=0.6, edgecolor=edge, linewidth=0.6)
     bars.invert_yaxis()
     bars.set_xlim(0.0, 1.0)
     bars.set_xlabel("contact rate so far", fontsize=SMALL)
     plain(bars)
     center, half = _window(film, workspace)
-    draw_scale_of(near, 2.0 * half)
+    draw_scale(near, workspace.grid, width=2.0 * half)
     # Laid out once; the layout of each frame would take most of the time.
     figure.canvas.draw()
     figure.set_layout_engine("none")
@@ -194,11 +191,10 @@ class _Team:
     def __init__(self, ax: Axes, names: Sequence[str]) -> None:
         style = {"markeredgecolor": "black", "linestyle": "none", "zorder": 5, "color": "white"}
         self.sight = [ax.plot([], [], linewidth=1.8, zorder=4)[0] for _ in names]
+        markers = [_MARKERS[i % len(_MARKERS)] for i in range(len(names))]
         self.robots = [
-            ax.plot([], [], marker=_MARKERS[i % len(_MARKERS)], markersize=8, label=name, **style)[
-                0
-            ]
-            for i, name in enumerate(names)
+            ax.plot([], [], marker=marker, markersize=8, label=name, **style)[0]
+            for marker, name in zip(markers, names, strict=True)
         ]
         lead = style | {"color": "black", "markeredgecolor": "white", "zorder": 6}
         (self.lead,) = ax.plot([], [], marker="*", markersize=15, label="lead", **lead)
@@ -231,16 +227,6 @@ def _window(film: Film, workspace: Workspace) -> tuple[np.ndarray, float]:
     reach = float(np.abs(film.poses - center[:, None]).max())
     left, right, bottom, top = extent_of(workspace.grid)
     return center, min(1.15 * reach + 3.0, max(right - left, top - bottom) / 2.0)
-
-
-def _draw_ground(ax: Axes, mission: Mission, workspace: Workspace) -> None:
-    left, right, bottom, top = extent_of(workspace.grid)
-    draw_ground(ax, workspace)
-    cells = np.array([workspace.grid.center(cell) for cell in mission.path])
-    ax.plot(
-        *(cells - workspace.grid.corner).T, color=theme().quiet, linewidth=1.0, linestyle=_DOTTED
-    )
-    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 
 
 def _ffmpeg() -> str:

@@ -8,15 +8,7 @@ from matplotlib.lines import Line2D
 from scipy import stats
 
 from trustbo.errors import require_kind
-from trustbo.plots.layout import (
-    DASHES,
-    MARKERS,
-    as_text,
-    legend,
-    plain,
-    set_titles,
-    small_multiples,
-)
+from trustbo.plots.layout import DASHES, MARKERS, as_text, plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, curve_colours, theme
 
 _PROBABILITY = 0.95
@@ -75,7 +67,7 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
     cover.set_ylabel("share of truths in it", fontsize=SMALL)
     for ax in made.panels:
         plain(ax)
-    set_titles(made, ["", ""], options)
+    made.titles()
     subtitle = f"{n} data sets, {ranks.attrs.get('sampler', 'unknown')} sampler"
-    legend(made, keys, options, title=subtitle, title_fontsize=SMALL, ncols=min(len(keys), 5))
+    made.legend(keys, title=subtitle, title_fontsize=SMALL, ncols=min(len(keys), 5))
     return made.panels

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.planning import QUANTILES
-from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
+from trustbo.plots.layout import plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 MOST_PANELS = 64
@@ -48,9 +48,7 @@ def parameter_history(
     if not posteriors:
         raise TrustboError("there are no posteriors; give one for each mission.")
     available = [str(name) for name in posteriors[-1]["posterior"].data_vars]
-    chosen = (
-        available if names is None else [require_choice("parameter", n, available) for n in names]
-    )
+    chosen = [require_choice("parameter", n, available) for n in names or available]
     last = _scalars(posteriors[-1], "posterior", chosen)
     if len(last) > MOST_PANELS:
         raise TrustboError(
@@ -70,9 +68,9 @@ def parameter_history(
         ax.xaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
         ax.yaxis.set_major_locator(MaxNLocator(nbins=4))
         plain(ax)
-    set_titles(made, list(last), options)
-    label_lower(made, "missions")
-    legend(made, _keys(truth is not None), options, ncols=4)
+    made.titles(list(last))
+    made.label_lower("missions")
+    made.legend(_keys(truth is not None), ncols=4)
     return made.panels
 
 
@@ -123,12 +121,8 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
         (panels[1], "contact_rate", "contact rate\nmeasured"),
     ):
         values = history[name].values
-        dots = {
-            "linestyle": "none",
-            "marker": "o",
-            "markersize": 5.5,
-            "markeredgecolor": colours.line,
-        }
+        dots = {"linestyle": "none", "marker": "o", "markersize": 5.5}
+        dots["markeredgecolor"] = colours.line
         ax.plot(mission, values, color=colours.inner, linewidth=1.0, zorder=1)
         fills = (changed, colours.line, "a new path"), (~changed, colours.paper, "the same path")
         for which, fill, text in fills:
@@ -143,10 +137,10 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
         panels[1].annotate(
             status[j], (mission[j], rate[j]), (5, 5), textcoords="offset points", fontsize=SMALL
         )
-    label_lower(made, "mission")
+    made.label_lower("mission")
     panels[1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    set_titles(made, ["", ""], options)
-    legend(made, panels[1].get_legend_handles_labels()[0], options)
+    made.titles()
+    made.legend(panels[1].get_legend_handles_labels()[0])
     return panels
 
 

@@ -12,15 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.criticism import Criticism
 from trustbo.errors import require_kind
-from trustbo.plots.layout import (
-    Panels,
-    as_text,
-    colour_bar,
-    legend,
-    plain,
-    set_titles,
-    small_multiples,
-)
+from trustbo.plots.layout import Panels, as_text, plain, small_multiples
 from trustbo.plots.places import BETTER_WORSE
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
@@ -47,18 +39,17 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
         Axes, shape (9,).
     """
     require_kind("plots.criticism", found, Criticism, "give a Criticism, from tb.criticise")
-    options = Style.of(style)
-    made = small_multiples(9, (2.5, 2.2), options, least=1.8)
+    made = small_multiples(9, (2.5, 2.2), Style.of(style), least=1.8)
     tests, pit, cover, correlation, *groups, cells = made.panels
     _draw_tests(tests, found)
     _draw_curves(pit, cover, correlation, found.curves)
     for ax, kind in zip(groups, _KINDS, strict=True):
         _draw_groups(ax, found, kind)
-    _draw_cells(cells, found, made, options)
+    _draw_cells(cells, found, made)
     for ax in made.panels:
         plain(ax)
-    set_titles(made, [""] * 9, options)
-    legend(made, _keys(), options, ncols=4)
+    made.titles()
+    made.legend(_keys(), ncols=4)
     return made.panels
 
 
@@ -154,14 +145,14 @@ def _draw_groups(ax: Axes, criticism: Criticism, kind: str) -> None:
     ax.set_ylabel("mean residual (sd)", fontsize=SMALL)
 
 
-def _draw_cells(ax: Axes, criticism: Criticism, made: Panels, options: Style) -> None:
+def _draw_cells(ax: Axes, criticism: Criticism, made: Panels) -> None:
     groups = _groups_of(criticism, "cell")
     cells = np.array(list(groups["group"]))
     values = np.full(tuple(cells.max(0) + 1), np.nan)
     mean, band = (groups[name].to_numpy(dtype=float) for name in ("mean", "band"))
     values[*cells.T] = mean / band
     far = max(float(np.nanmax(np.abs(values))), 1.0)
-    image = ax.imshow(values, cmap=options.colours(BETTER_WORSE), vmin=-far, vmax=far)
+    image = ax.imshow(values, cmap=made.style.colours(BETTER_WORSE), vmin=-far, vmax=far)
     for row, col in cells[groups["stands_out"].to_numpy(dtype=bool)]:
         corner = col - 0.5, row - 0.5
         ax.add_patch(Rectangle(corner, 1.0, 1.0, fill=False, edgecolor="black", linewidth=1.6))
@@ -169,7 +160,7 @@ def _draw_cells(ax: Axes, criticism: Criticism, made: Panels, options: Style) ->
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("column of the cell entered", fontsize=SMALL)
     ax.set_ylabel("row", fontsize=SMALL)
-    colour_bar(made, image, "mean residual / band", options, axes=[ax])
+    made.colour_bar(image, "mean residual / band", axes=[ax])
 
 
 def _groups_of(criticism: Criticism, kind: str) -> pd.DataFrame:

@@ -2,13 +2,14 @@
 
 import textwrap
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.transforms import Bbox
 
@@ -31,16 +32,113 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (6, 1.5, 1, 1.5)), (0, (3, 1, 1, 
 """Line styles of curves in one panel, in order, distinct without colour."""
 
 
-class Panels(NamedTuple):
-    """Axes of a figure, and the subsets that carry labels."""
+@dataclass(frozen=True, eq=False)
+class Panels:
+    """Panels of a figure, with the options of the user."""
 
-    figure: Figure | SubFigure
     panels: np.ndarray
     """Axes of the panels, (panel,)."""
     left: list[Axes]
     """Those at the left edge."""
     lower: list[Axes]
     """Those with no panel below."""
+    style: Style
+
+    @property
+    def figure(self) -> Figure:
+        """Top-level figure, also of Axes in a subfigure."""
+        figure = self.panels[0].get_figure(root=True)
+        assert isinstance(figure, Figure)  # noqa: S101
+        return figure
+
+    def titles(self, titles: Sequence[str] = ()) -> None:
+        """Write the titles of panels, and the user's above them or in place of a single one."""
+        title = self.style.title
+        if title is not None and len(self.panels) == 1:
+            titles = [title]
+        elif title and self.style.ax is None:
+            self.figure.suptitle(as_text(title), fontsize=MEDIUM + 1.0)
+        for ax, text in zip(self.panels, titles, strict=False):
+            if text:
+                ax.set_title(as_text(text), fontsize=MEDIUM)
+
+    def label_maps(self) -> None:
+        """Label the outer Axes of maps in metres."""
+        for ax in self.panels:
+            ax.set_aspect("equal")
+            ax.tick_params(labelsize=SMALL)
+            ax.locator_params(nbins=4)
+        for ax in self.left:
+            ax.set_ylabel("north (m)", fontsize=SMALL)
+        self.label_lower("east (m)")
+
+    def label_lower(self, text: str) -> None:
+        """Label the Axes with no panel below."""
+        for ax in self.lower:
+            ax.set_xlabel(text, fontsize=SMALL)
+            ax.tick_params(labelbottom=True)
+
+    def colour_bar(self, image: Any, label: str, **options: Any) -> None:
+        """Add a colour bar, unless left out; a label longer than its bar is broken.
+
+        The option `axes=` has the Axes of the bar, by default all panels.
+        """
+        if not self.style.legend:
+            return
+        axes = list(options.pop("axes", self.panels))
+        rows: dict[float, float] = {}  # height of each row of Axes, wherever in the figure it is
+        for ax in axes:
+            box = ax.get_position(original=True)
+            row = round(box.y0 + box.y1, 2)
+            rows[row] = max(rows.get(row, 0.0), box.height)
+        shape = {"aspect": 14 * min(len(rows), 3), "shrink": 0.95, "pad": 0.02}
+        bar = axes[0].figure.colorbar(image, ax=axes, **shape | options)
+        if "location" in options:
+            bar.ax.locator_params(axis="x", nbins=4)
+        else:
+            height = sum(rows.values()) * self.figure.get_figheight()
+            label = textwrap.fill(label, max(18, int(_LETTERS * height)))
+            if bar.norm.__class__ is Normalize:
+                bar.ax.locator_params(axis="y", nbins=5)
+        bar.set_label(label, fontsize=SMALL)
+        bar.ax.tick_params(labelsize=SMALL)
+
+    def legend(self, handles: Sequence[Any], **options: Any) -> None:
+        """Add a legend outside the panels, on the user's Axes inside the first; unless left out."""
+        if not self.style.legend:
+            return
+        shape: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handles": list(handles)}
+        shape |= {"handlelength": 1.6, "columnspacing": 1.2}
+        first, figure = self.panels[0], self.figure
+        width, labels = figure.get_figwidth(), [str(handle.get_label()) for handle in handles]
+        if self.style.ax is not None:
+            letters = int((first.get_position().width * width - _KEY) / _LETTER)
+            lines = [textwrap.fill(label, max(letters, 8)) for label in labels]
+            first.legend(**shape | {"labels": lines, "frameon": True, "framealpha": 0.85})
+            return
+        room = int(width / (_KEY + _LETTER * max(map(len, labels), default=1)))
+        options["ncols"] = max(1, min(options.get("ncols", 3), room))
+        figure.legend(**shape | {"loc": "outside lower center"} | options)
+        lines = -(-len(handles) // options["ncols"]) + ("title" in options)
+        figure.set_figheight(figure.get_figheight() + _LINE * lines)
+
+    def fit_height(self) -> None:
+        """Give a new figure of maps the height that they take at its width.
+
+        It depends on the proportions of the maps and on the width of bars and numbers; any other
+        height would leave a gap above, or at the sides.
+        """
+        if self.style.ax is not None:
+            return
+        figure = self.figure
+        engine = ConstrainedLayoutEngine(compress=True)  # panels keep the terrain's proportions
+        figure.set_layout_engine(engine)
+        figure.set_figheight(1.5 * figure.get_figheight())  # for the width alone to limit the maps
+        engine.execute(figure)
+        boxes = [ax.get_tightbbox() for ax in figure.axes if ax.get_visible()]
+        panels = Bbox.union([box for box in boxes if box is not None])
+        title = (MEDIUM + 4.0) / 72.0 if figure.get_suptitle() else 0.0
+        figure.set_figheight(panels.height / figure.dpi + 2.0 * _PAD + title)
 
 
 def small_multiples(
@@ -70,7 +168,7 @@ def small_multiples(
     """
     if style.ax is not None:
         panels = style.axes(n)
-        return Panels(panels[0].figure, panels, list(panels), list(panels))
+        return Panels(panels, list(panels), list(panels), style)
     margin = margin if style.legend else 0.0
     most = max(1, int(((style.width or PAGE) - margin) / least))
     wanted = style.n_columns or min(columns or _columns(n), most)
@@ -78,19 +176,14 @@ def small_multiples(
     rows = -(-n // cols)
     natural = size[0] * cols + margin
     width = style.width or (natural if cols == style.n_columns else min(natural, PAGE))
-    figure, axes = plt.subplots(
-        rows,
-        cols,
-        figsize=(width, size[1] * rows),
-        squeeze=False,
-        layout="constrained",
-        **shared,
+    _, axes = plt.subplots(
+        rows, cols, figsize=(width, size[1] * rows), squeeze=False, layout="constrained", **shared
     )
     panels = axes.ravel()
     for ax in panels[n:]:
         ax.set_visible(False)
-    left = [row[0] for row in axes]
-    return Panels(figure, panels[:n], left, _lowest(axes))
+    last = {j: ax for row in axes for j, ax in enumerate(row) if ax.get_visible()}
+    return Panels(panels[:n], [row[0] for row in axes], list(last.values()), style)
 
 
 def _columns(n: int) -> int:
@@ -111,7 +204,8 @@ def map_panels(
     least: float = 1.2,
 ) -> Panels:
     """Lay out maps, see `small_multiples`; of a tall terrain there are more in a row."""
-    tall = tallness(grid)
+    ratio = grid.shape[0] * grid.cell_height / (grid.shape[1] * grid.cell_width)
+    tall = float(np.clip(ratio, 0.25, 5.0))  # to fit a page
     if tall >= 2:
         width, columns = 0.6 * width, 5 if columns is None else columns
     room = (style.width or PAGE) - (margin if style.legend else 0.0)
@@ -124,106 +218,9 @@ def map_panels(
     )  # fmt: skip
 
 
-def set_titles(made: Panels, titles: Sequence[str], style: Style) -> None:
-    """Write the titles of panels, and the user's above them or in place of a single one."""
-    titles = list(titles)
-    if style.title is not None and len(titles) == 1:
-        titles = [style.title]
-    elif style.title and style.ax is None and isinstance(made.figure, Figure):
-        made.figure.suptitle(as_text(style.title), fontsize=MEDIUM + 1.0)
-    for ax, title in zip(made.panels, titles, strict=True):
-        if title:
-            ax.set_title(as_text(title), fontsize=MEDIUM)
-
-
-def colour_bar(made: Panels, image: Any, label: str, style: Style, **options: Any) -> None:
-    """Add a colour bar, unless left out; a label longer than its bar is broken.
-
-    The option `axes=` has the Axes of the bar, by default all panels.
-    """
-    if not style.legend:
-        return
-    axes = list(options.pop("axes", made.panels))
-    heights = _heights(axes)
-    shape = {"aspect": 14 * min(len(heights), 3), "shrink": 0.95, "pad": 0.02}
-    bar = made.figure.colorbar(image, ax=axes, **shape | options)
-    if "location" in options:
-        bar.ax.locator_params(axis="x", nbins=4)
-    else:
-        label = textwrap.fill(label, max(18, int(_LETTERS * sum(heights))))
-        if bar.norm.__class__ is Normalize:
-            bar.ax.locator_params(axis="y", nbins=5)
-    bar.set_label(label, fontsize=SMALL)
-    bar.ax.tick_params(labelsize=SMALL)
-
-
-def _heights(axes: Sequence[Axes]) -> list[float]:
-    """Height of each row of Axes, inches, wherever in the figure they are."""
-    rows: dict[float, float] = {}
-    for ax in axes:
-        box = ax.get_position(original=True)
-        row = round(box.y0 + box.y1, 2)
-        rows[row] = max(rows.get(row, 0.0), box.height)
-    return [height * _whole(axes[0]).get_figheight() for height in rows.values()]
-
-
-def _whole(ax: Axes) -> Figure:
-    """Top-level figure of Axes, also if they are in a subfigure."""
-    figure = ax.get_figure(root=True)
-    assert isinstance(figure, Figure)  # noqa: S101
-    return figure
-
-
-def fit_height(made: Panels, style: Style) -> None:
-    """Give a new figure of maps the height that they take at its width.
-
-    It depends on the proportions of the maps and on the width of bars and numbers; any other height
-    would leave a gap above, or at the sides.
-    """
-    if style.ax is not None:
-        return
-    figure = _whole(made.panels[0])
-    engine = ConstrainedLayoutEngine(compress=True)  # panels keep the terrain's proportions
-    figure.set_layout_engine(engine)
-    figure.set_figheight(1.5 * figure.get_figheight())  # for the width alone to limit the maps
-    engine.execute(figure)
-    boxes = [ax.get_tightbbox() for ax in figure.axes if ax.get_visible()]
-    panels = Bbox.union([box for box in boxes if box is not None])
-    title = figure.get_suptitle() and (MEDIUM + 4.0) / 72.0
-    figure.set_figheight(panels.height / figure.dpi + 2.0 * _PAD + (title or 0.0))
-
-
-def legend(made: Panels, handles: Sequence[Any], style: Style, **options: Any) -> None:
-    """Add a legend outside the panels, on the user's Axes inside the first; unless left out."""
-    if not style.legend:
-        return
-    shape: dict[str, Any] = {"fontsize": SMALL, "frameon": False, "handles": list(handles)}
-    shape |= {"handlelength": 1.6, "columnspacing": 1.2}
-    first = made.panels[0]
-    whole = _whole(first)
-    width = whole.get_figwidth()
-    if style.ax is not None:
-        letters = int((first.get_position().width * width - _KEY) / _LETTER)
-        lines = [textwrap.fill(str(handle.get_label()), max(letters, 8)) for handle in handles]
-        first.legend(**shape | {"labels": lines, "frameon": True, "framealpha": 0.85}, loc="best")
-        return
-    longest = max((len(str(handle.get_label())) for handle in handles), default=1)
-    room = int(width / (_KEY + _LETTER * longest))
-    options["ncols"] = max(1, min(options.get("ncols", 3), room))
-    made.figure.legend(**shape | {"loc": "outside lower center"} | options)
-    lines = -(-len(handles) // options["ncols"]) + ("title" in options)
-    whole.set_figheight(whole.get_figheight() + _LINE * lines)
-
-
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:
     """Left, right, bottom and top of a map, m from its lower left corner."""
     return (0.0, grid.shape[1] * grid.cell_width, 0.0, grid.shape[0] * grid.cell_height)
-
-
-def tallness(grid: Grid) -> float:
-    """Height over width, clipped to fit a page."""
-    ratio = grid.shape[0] * grid.cell_height / (grid.shape[1] * grid.cell_width)
-    return float(np.clip(ratio, 0.25, 5.0))
 
 
 def grid_lines(ax: Axes, grid: Grid) -> None:
@@ -232,35 +229,6 @@ def grid_lines(ax: Axes, grid: Grid) -> None:
         ax.axvline(col * grid.cell_width, color="white", linewidth=0.3, alpha=0.5)
     for row in range(1, grid.shape[0]):
         ax.axhline(row * grid.cell_height, color="white", linewidth=0.3, alpha=0.5)
-
-
-def label_maps(made: Panels) -> None:
-    """Label the outer Axes of maps in metres."""
-    for ax in made.panels:
-        ax.set_aspect("equal")
-        ax.tick_params(labelsize=SMALL)
-        ax.locator_params(nbins=4)
-    for ax in made.left:
-        ax.set_ylabel("north (m)", fontsize=SMALL)
-    label_lower(made, "east (m)")
-
-
-def label_lower(made: Panels, text: str) -> None:
-    """Label the Axes with no panel below."""
-    for ax in made.lower:
-        ax.set_xlabel(text, fontsize=SMALL)
-        ax.tick_params(labelbottom=True)
-
-
-def _lowest(axes: np.ndarray) -> list[Axes]:
-    """Return the Axes, of all (row, column), with no visible ones below them."""
-    last = len(axes) - 1
-    return [
-        ax
-        for i, row in enumerate(axes)
-        for j, ax in enumerate(row)
-        if ax.get_visible() and (i == last or not axes[i + 1, j].get_visible())
-    ]
 
 
 def as_text(name: str) -> str:

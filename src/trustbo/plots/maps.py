@@ -17,22 +17,16 @@ from scipy.ndimage import gaussian_filter
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind
 from trustbo.plots.layout import (
-    Panels,
-    colour_bar,
     extent_of,
-    fit_height,
     grid_lines,
-    label_maps,
     map_panels,
-    set_titles,
 )
-from trustbo.plots.style import SMALL, Style, StyleOptions, theme
+from trustbo.plots.style import COLOURS, SMALL, Style, StyleOptions, theme
+from trustbo.terrain import pixel_size
 from trustbo.terrain.dataset import pixel_size
-from trustbo.workspace import Workspace
+from trustbo.workspace import Grid, Workspace
 from trustbo.workspace.grid import Grid, over_cells
 
-COLOURS = "viridis"
-"""Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
 VEGETATION = (0.44, 0.56, 0.39, 0.4)
 """Green that is opaque in part, for light and dark ground."""
 MOMENTS = (1, 2, 4)
@@ -84,29 +78,15 @@ def trust_maps(
     maps = [history["trust_map"].sel(iteration=i) for i in chosen]
     paths: list[Sequence[Cell]] = [_cells(history["path"].sel(iteration=i).values) for i in chosen]
     learned = [len(number) if i is None else i - 1 for i in (*chosen, None)]
-    titles = [_moment(n) for n in learned]
+    titles = ["prior" if n == 0 else f"after {n} mission{'s' if n > 1 else ''}" for n in learned]
     maps, paths = [*maps, trust_map], [*paths, path]
     everything = np.stack([trust.transpose("row", "col").values for trust in maps])
     everything[:, *paths[0][0]] = np.nan
     low, high = robust_limits(everything[learned.index(0) + 1 :] if 0 in learned else everything)
-    high = min(high, 1.0) if low < 1.0 else high
-    made = map_panels(workspace.grid, len(maps), options)
-    colours = options.colours(COLOURS)
-    for ax, trust, cells in zip(made.panels, maps, paths, strict=True):
-        _draw_map(ax, trust, workspace, Normalize(low, high), colours, relief=options.relief)
-        draw_path(ax, cells, workspace.grid)
-    set_titles(made, titles, options)
-    extend = _extend(np.nanmin(everything) < low, np.nanmax(everything) > high)
+    norm = Normalize(low, min(high, 1.0) if low < 1.0 else high)
     label = "expected trust (1: contact kept)"
-    _finish(
-        made,
-        workspace,
-        label,
-        ScalarMappable(Normalize(low, high), colours),
-        options,
-        extend=extend,
-    )
-    return made.panels
+    extend = _extend(everything, norm)
+    return _draw_maps(maps, paths, titles, workspace, label, norm, options, extend=extend)
 
 
 def _chosen(missions: Sequence[int] | str, available: list[int]) -> list[int]:
@@ -122,11 +102,6 @@ def _chosen(missions: Sequence[int] | str, available: list[int]) -> list[int]:
             f"missions must be some of {available[0]}..{available[-1]}; got {missions!r}."
         )
     return list(missions)
-
-
-def _moment(n: int) -> str:
-    """Title of a map learned from n missions."""
-    return "prior" if n == 0 else f"after {n} mission{'s' if n > 1 else ''}"
 
 
 def robust_limits(values: np.ndarray) -> tuple[float, float]:
@@ -165,17 +140,11 @@ def robot_maps(
     values = np.where(workspace.passable.values, maps.values, np.nan)
     if path is not None:
         values[:, *path[0]] = np.nan
-    limits, colours = robust_limits(values), options.colours(COLOURS)
-    made = map_panels(workspace.grid, maps.sizes["robot"], options)
-    for ax, robot_map in zip(made.panels, maps, strict=True):
-        _draw_map(ax, robot_map, workspace, Normalize(*limits), colours, relief=options.relief)
-        if path is not None:
-            draw_path(ax, path, workspace.grid)
-    set_titles(made, [str(name) for name in maps["robot"].values], options)
-    extend = _extend(np.nanmin(values) < limits[0], np.nanmax(values) > limits[1])
-    mappable = ScalarMappable(Normalize(*limits), colours)
-    _finish(made, workspace, label, mappable, options, extend=extend)
-    return made.panels
+    norm, names = Normalize(*robust_limits(values)), [str(name) for name in maps["robot"].values]
+    extend = _extend(values, norm)
+    return _draw_maps(
+        list(maps), [path] * len(names), names, workspace, label, norm, options, extend=extend
+    )
 
 
 def path_posterior(
@@ -197,9 +166,11 @@ def path_posterior(
     """
     such = "give probabilities (row, col), such as planner.path_posterior(posterior)"
     require_kind("plots.path_posterior", share, xr.DataArray, such)
-    return _one_map(
-        share, workspace, path, "P(cell on the best path)", Normalize(0.0, 1.0), Style.of(style)
+    label, options = "P(cell on the best path)", Style.of(style)
+    (ax,) = _draw_maps(
+        [share], [path], [""], workspace, label, Normalize(0.0, 1.0), options, width=3.6
     )
+    return ax
 
 
 def hazard_map(
@@ -226,30 +197,40 @@ def hazard_map(
     worst = np.where(np.isnan(p_fail), -np.inf, p_fail).max(0)
     hazard = workspace.passable.copy(data=np.where(worst >= 0.0, worst, np.nan))
     label, norm = "chance to fail on entering, at most", LogNorm(_LEAST_CHANCE, 1.0, clip=True)
-    return _one_map(hazard, workspace, path, label, norm, Style.of(style), "min")
+    bar: dict[str, Any] = {"extend": "min", "format": "%g"}
+    (ax,) = _draw_maps(
+        [hazard], [path], [""], workspace, label, norm, Style.of(style), width=3.6, **bar
+    )
+    return ax
 
 
-def _one_map(
-    values: xr.DataArray,
+def _draw_maps(
+    maps: Sequence[xr.DataArray],
+    paths: Sequence[Sequence[Cell] | None],
+    titles: Sequence[str],
     workspace: Workspace,
-    path: Sequence[Cell] | None,
     label: str,
     norm: Normalize,
     options: Style,
-    extend: str = "neither",
-) -> Axes:
-    """Draw a single map."""
-    made = map_panels(workspace.grid, 1, options, width=3.6)
-    (ax,) = made.panels
-    colours = options.colours(COLOURS)
-    _draw_map(ax, values, workspace, norm, colours, relief=options.relief)
-    if path is not None:
-        draw_path(ax, path, workspace.grid)
-    if options.title:
-        set_titles(made, [""], options)
-    of_bar = {"extend": extend} | ({"format": "%g"} if isinstance(norm, LogNorm) else {})
-    _finish(made, workspace, label, ScalarMappable(norm, colours), options, **of_bar)
-    return ax
+    *,
+    width: float = 2.6,
+    **bar: Any,
+) -> np.ndarray:
+    """Draw maps on one scale of colours, each with its path, and their colour bar."""
+    made, colours = map_panels(workspace.grid, len(maps), options, width=width), options.colours()
+    for ax, values, path in zip(made.panels, maps, paths, strict=True):
+        _draw_map(ax, values, workspace, norm, colours, relief=options.relief)
+        if path is not None:
+            draw_path(ax, path, workspace.grid)
+    made.titles(titles)
+    draw_scale(made.panels[0], workspace.grid)
+    made.label_maps()
+    if not workspace.passable.all():
+        label = f"{label[:-1]}; " if label.endswith(")") else f"{label} ("
+        label += "grey: impassable)"
+    made.colour_bar(ScalarMappable(norm, colours), label, **bar)
+    made.fit_height()
+    return made.panels
 
 
 def cell_map(
@@ -365,30 +346,34 @@ def draw_ground(
 ) -> None:
     """Draw vegetation and contour lines on a plain ground, or the grid without a terrain.
 
-    Contour lines are those of the surface, `"dsm"`, or of the ground, `"dem"`.
+    Contour lines are those of the surface, `"dsm"`, or of the ground, `"dem"`; axes have no ticks.
     """
     terrain, grid, colours = workspace.terrain, workspace.grid, theme()
+    left, right, bottom, top = extent_of(grid)
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
     ax.set_facecolor(colours.ground)
     if terrain is None or workspace.pixels is None:
         grid_lines(ax, grid)
         return
     grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
-    extent, green = extent_of(grid), ListedColormap([VEGETATION])
+    green, extent = ListedColormap([VEGETATION]), (left, right, bottom, top)
     ax.imshow(grown, cmap=green, extent=extent, interpolation="nearest")
     if relief:
         draw_relief(ax, workspace, heights, colours.contour, 1.0)
 
 
-def draw_scale(ax: Axes, grid: Grid) -> None:
-    """Draw a bar of a round number of metres in the lower right corner of a map."""
-    draw_scale_of(ax, grid.shape[1] * grid.cell_width)
+def draw_scale(
+    ax: Axes, grid: Grid, *, width: float | None = None, corner: tuple[int, int] = (1, 0)
+) -> None:
+    """Draw a bar of a round number of metres in a corner of a map.
 
-
-def draw_scale_of(ax: Axes, width: float, corner: tuple[int, int] = (1, 0)) -> None:
-    """Draw a scale bar, see `draw_scale`, on Axes `width` metres wide.
-
-    `corner` is (1, 0) for the lower right one, (0, 1) for the upper left one.
+    Args:
+        ax: Axes of the map.
+        grid: Grid of the cells.
+        width: Width of the Axes, m, where they show a part of the map.
+        corner: Corner, (1, 0) for the lower right one, (0, 1) for the upper left one.
     """
+    width = grid.shape[1] * grid.cell_width if width is None else width
     magnitude = 10.0 ** np.floor(np.log10(0.4 * width))
     length = max(f * magnitude for f in (1, 2, 5) if f * magnitude <= 0.4 * width * (1 + 1e-9))
     share = length / width  # of the axes
@@ -420,23 +405,7 @@ def _cells(path: np.ndarray) -> list[Cell]:
     return [(int(row), int(col)) for row, col in path if row >= 0]
 
 
-def _extend(below: bool, above: bool) -> str:
+def _extend(values: np.ndarray, norm: Normalize) -> str:
+    """Ends of the colour bar that values go beyond."""
+    below, above = np.nanmin(values) < norm.vmin, np.nanmax(values) > norm.vmax
     return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
-
-
-def _finish(
-    made: Panels,
-    workspace: Workspace,
-    label: str,
-    mappable: ScalarMappable,
-    style: Style,
-    **options: Any,
-) -> None:
-    """Add the scale, labels in metres, and one colour bar for all panels."""
-    draw_scale(made.panels[0], workspace.grid)
-    label_maps(made)
-    if not workspace.passable.all():
-        label = f"{label[:-1]}; " if label.endswith(")") else f"{label} ("
-        label += "grey: impassable)"
-    colour_bar(made, mappable, label, style, **options)
-    fit_height(made, style)

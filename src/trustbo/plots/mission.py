@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import ShapeError, TrustboError, require_kind
 from trustbo.planning import QUANTILES, Plan
-from trustbo.plots.layout import label_lower, legend, plain, set_titles, small_multiples
+from trustbo.plots.layout import plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 _SIZE = 2.5, 1.9
@@ -120,9 +120,9 @@ def _panels(
         dots.set(markeredgecolor=colours.paper, markeredgewidth=0.5)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
         plain(ax)
-    set_titles(made, robots, options)
-    label_lower(made, "bound")
+    made.titles(robots)
+    made.label_lower("bound")
     for ax in made.left:
         ax.set_ylabel("trust, contact rate", fontsize=SMALL)
-    legend(made, made.panels[0].get_legend_handles_labels()[0], options, ncols=4)
+    made.legend(made.panels[0].get_legend_handles_labels()[0], ncols=4)
     return made.panels

@@ -1,6 +1,6 @@
 """Maps of the effects of places that the terrain does not explain: mean and standard deviation."""
 
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import xarray as xr
@@ -11,15 +11,8 @@ from matplotlib.colors import Colormap, Normalize
 
 from trustbo.errors import ShapeError, require_kind
 from trustbo.inference import place_maps
-from trustbo.plots.layout import (
-    colour_bar,
-    extent_of,
-    fit_height,
-    label_maps,
-    map_panels,
-    set_titles,
-)
-from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined, robust_limits
+from trustbo.plots.layout import extent_of, map_panels
+from trustbo.plots.maps import draw_relief, draw_scale, outlined, robust_limits
 from trustbo.plots.style import Style, StyleOptions, theme
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
@@ -75,7 +68,7 @@ def place_map(
     _, top = _ends(abs(maps), "mean", units)
     colours = {
         "mean": (Normalize(-top, top), colormaps[BETTER_WORSE]),
-        "sd": (Normalize(*_ends(maps, "sd", units)), options.colours(COLOURS)),
+        "sd": (Normalize(*_ends(maps, "sd", units)), options.colours()),
     }
     wording = {"mean": "better (+) or worse (\N{MINUS SIGN})", "sd": "how sure"}
     made = map_panels(grid, 2 * len(names), options, columns=2, width=3.4, margin=0.0, least=2.0)
@@ -90,17 +83,14 @@ def place_map(
         if "place_mean" in maps_of_robot:
             _signs(made.panels[2 * i], maps_of_robot, workspace, top)
     draw_scale(made.panels[0], grid)
-    label_maps(made)
-    set_titles(made, titles, options)
+    made.label_maps()
+    made.titles(titles)
     labels = {"mean": "effect on trust, mean", "sd": "effect on trust, sd"}
+    under: dict[str, Any] = {"location": "bottom", "aspect": 24, "pad": 0.02}
     for k, kind in enumerate(colours):
-        of_kind = {
-            "axes": list(made.panels[k::2]),
-            "extend": "both" if kind == "mean" else "neither",
-        }
-        under = {"location": "bottom", "aspect": 24, "pad": 0.02}
-        colour_bar(made, ScalarMappable(*colours[kind]), labels[kind], options, **of_kind, **under)
-    fit_height(made, options)
+        of_kind = {"axes": made.panels[k::2], "extend": "both" if k == 0 else "neither"}
+        made.colour_bar(ScalarMappable(*colours[kind]), labels[kind], **of_kind, **under)
+    made.fit_height()
     return made.panels
 
 

@@ -10,15 +10,8 @@ from matplotlib.patches import Patch
 
 from trustbo.errors import TrustboError, require_kind
 from trustbo.planning import Plan
-from trustbo.plots.layout import (
-    MARKERS,
-    as_text,
-    extent_of,
-    legend,
-    set_titles,
-    small_multiples,
-)
-from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, draw_scale_of
+from trustbo.plots.layout import MARKERS, as_text, extent_of, small_multiples
+from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale
 from trustbo.plots.style import Style, StyleOptions, theme
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
@@ -62,23 +55,17 @@ def plan_map(
     made = small_multiples(1 + len(shown), (2.5, 2.5), options)
     whole, *others = made.panels
     titles = [f"path of {n_bounds} bounds"]
-    _stage(whole, plan, options)
+    for ax in made.panels:
+        draw_ground(ax, plan.workspace, "dem", relief=options.relief)
     draw_path(whole, plan.path, plan.workspace.grid)
     draw_scale(whole, plan.workspace.grid)
     for ax, k in zip(others, shown, strict=True):
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
         titles.append(f"bound {k}: {a},{b} to {c},{d}")
-        _stage(ax, plan, options)
         _draw_bound(ax, plan, k - 1)
-    set_titles(made, titles, options)
-    legend(made, _keys(plan.workspace.team.names), options)
+    made.titles(titles)
+    made.legend(_keys(plan.workspace.team.names))
     return made.panels
-
-
-def _stage(ax: Axes, plan: Plan, options: Style) -> None:
-    draw_ground(ax, plan.workspace, "dem", relief=options.relief)
-    left, right, bottom, top = extent_of(plan.workspace.grid)
-    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
@@ -106,7 +93,8 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
     x, width = _window((low + high)[0] / 2.0, half, left, right)
     y, height = _window((low + high)[1] / 2.0, half, bottom, top)
     ax.set(xlim=(x, x + width), ylim=(y, y + height))
-    draw_scale_of(ax, width, _free_corner((np.concatenate(seen) - (x, y)) / (width, height)))
+    corner = _free_corner((np.concatenate(seen) - (x, y)) / (width, height))
+    draw_scale(ax, plan.workspace.grid, width=width, corner=corner)
 
 
 def _free_corner(points: np.ndarray) -> tuple[int, int]:

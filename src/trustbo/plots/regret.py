@@ -9,15 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice, require_kind
-from trustbo.plots.layout import (
-    DASHES,
-    MARKERS,
-    label_lower,
-    legend,
-    plain,
-    set_titles,
-    small_multiples,
-)
+from trustbo.plots.layout import DASHES, MARKERS, plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, curve_colours, theme
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -80,8 +72,8 @@ def regret_curves(
         n_runs = [int(np.sum(chosen[by].values == name)) for name in names]
         counted = "-".join(str(n) for n in sorted({min(n_runs), max(n_runs)}))
         titles.append(f"{'' if value is None else f'{panels} {value}, '}{counted} runs each")
-    set_titles(made, titles, options)
-    label_lower(made, "mission")
+    made.titles(titles)
+    made.label_lower("mission")
     first = made.panels[0]
     for ax in made.left:
         ax.set_ylabel(
@@ -93,7 +85,7 @@ def regret_curves(
     # Below the panels, so that it covers no curve.
     keys = first.get_legend_handles_labels()[0]
     label = f"{by}: median, 50 % and 90 % of runs"
-    legend(made, keys, options, title=label, title_fontsize=SMALL, ncols=min(len(keys), 4))
+    made.legend(keys, title=label, title_fontsize=SMALL, ncols=min(len(keys), 4))
     return made.panels
 
 

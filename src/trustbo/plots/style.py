@@ -11,6 +11,8 @@ from matplotlib.colors import Colormap, to_hex, to_rgb
 
 from trustbo.errors import TrustboError, require_positive, require_whole, unknown
 
+COLOURS = "viridis"
+"""Perceptually uniform, safe for the colour-blind, and monotone in greyscale."""
 SMALL, MEDIUM = 8.0, 9.0
 """Sizes of text, points: of numbers and keys, and of labels and titles."""
 
@@ -124,7 +126,7 @@ class Style:
                 raise TrustboError(f"{name} must be True or False; got {getattr(self, name)!r}.")
         if self.title is not None and not isinstance(self.title, str):
             raise TrustboError(f"title must be text; got {self.title!r}.")
-        self.colours("viridis")
+        self.colours()
 
     @classmethod
     def of(cls, options: StyleOptions) -> Self:
@@ -135,7 +137,7 @@ class Style:
                 raise unknown("option", name, names)
         return cls(**options)
 
-    def colours(self, default: str | Colormap) -> Colormap:
+    def colours(self, default: str = COLOURS) -> Colormap:
         """Colour map of the user, or a default one."""
         chosen = default if self.cmap is None else self.cmap
         try:
@@ -159,4 +161,4 @@ class Style:
 def curve_colours(n: int, style: Style) -> np.ndarray:
     """Colours of n curves that stand out from the paper, also in grey; shape (n, 4)."""
     ends = (0.35, 1.0) if luminance(theme().paper) < 0.5 else (0.0, 0.8)
-    return style.colours("viridis")(np.linspace(*ends, max(n, 1)))
+    return style.colours()(np.linspace(*ends, max(n, 1)))

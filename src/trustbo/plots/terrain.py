@@ -9,19 +9,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 from trustbo.errors import TrustboError, require_kind
-from trustbo.plots.layout import (
-    as_text,
-    colour_bar,
-    extent_of,
-    fit_height,
-    grid_lines,
-    label_maps,
-    map_panels,
-    plain,
-    set_titles,
-    small_multiples,
-)
-from trustbo.plots.maps import COLOURS, draw_relief, draw_scale, outlined
+from trustbo.plots.layout import as_text, extent_of, grid_lines, map_panels, plain, small_multiples
+from trustbo.plots.maps import draw_relief, draw_scale, outlined
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace import Workspace
@@ -55,7 +44,7 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
         )
     grid, names = workspace.grid, workspace.features
     made = map_panels(grid, 1 + len(names), options)
-    extent, colours = extent_of(grid), options.colours(COLOURS)
+    extent, colours = extent_of(grid), options.colours()
     dsm = terrain["dsm"].values
     surface, *indices = made.panels
     heights = Normalize(float(np.nanmin(dsm)), float(np.nanmax(dsm)))
@@ -72,28 +61,26 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
             draw_relief(ax, workspace)
         grid_lines(ax, grid)
     draw_scale(surface, grid)
-    set_titles(made, ["surface (DSM)", *(name.replace("_", " ") for name in names)], options)
-    label_maps(made)
+    made.titles(["surface (DSM)", *(name.replace("_", " ") for name in names)])
+    made.label_maps()
     label = "index (0 worst, 1 best; grey: too steep)"
-    colour_bar(made, ScalarMappable(Normalize(0, 1), colours), label, options)
+    made.colour_bar(ScalarMappable(Normalize(0, 1), colours), label)
     if options.legend:
-        _draw_heights(surface, heights, float(np.nanmin(dsm)), float(np.nanmax(dsm)))
-    fit_height(made, options)
+        _draw_heights(surface, heights)
+    made.fit_height()
     return made.panels
 
 
-def _draw_heights(ax: Axes, heights: Normalize, low: float, high: float) -> None:
+def _draw_heights(ax: Axes, heights: Normalize) -> None:
     """Draw the bar of heights at the top of the surface: inside, for panels to keep one size."""
+    low, high = float(heights.vmin or 0.0), float(heights.vmax or 0.0)
     inset = ax.inset_axes((0.05, 0.91, 0.9, 0.04))
-    bar = ax.figure.colorbar(
-        ScalarMappable(heights, "cividis"), cax=inset, orientation="horizontal"
-    )
+    image = ScalarMappable(heights, "cividis")
+    bar = ax.figure.colorbar(image, cax=inset, orientation="horizontal")
     bar.set_ticks([])
     digits = 0 if high - low >= 5.0 else 1
-    for x, side, text in (
-        (0.0, "left", f"{low:.{digits}f}"),
-        (1.0, "right", f"{high:.{digits}f} m"),
-    ):
+    texts = (0.0, "left", f"{low:.{digits}f}"), (1.0, "right", f"{high:.{digits}f} m")
+    for x, side, text in texts:
         drawn = inset.text(x, -0.4, text, ha=side, va="top", transform=inset.transAxes)
         drawn.set(fontsize=SMALL, path_effects=outlined(2.0), color="black")
 
@@ -117,23 +104,14 @@ def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOpti
     options = Style.of(style)
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")
-    most = max(len(index.signs) for index in composites.values())
-    made = small_multiples(
-        len(composites),
-        (3.6, 1.0 + 0.3 * most),
-        options,
-        columns=len(composites),
-        least=2.2,
-        sharex=True,
-    )
-    for ax, index in zip(made.panels, composites.values(), strict=True):
+    n, most = len(composites), max(len(index.signs) for index in composites.values())
+    size = 3.6, 1.0 + 0.3 * most
+    made = small_multiples(n, size, options, columns=n, least=2.2, sharex=True)
+    titles = []
+    for ax, (name, index) in zip(made.panels, composites.items(), strict=True):
         _bars(ax, index, legend=options.legend)
-    shares = [float(index.explained_variance_ratio_[0]) for index in composites.values()]
-    set_titles(
-        made,
-        [f"{n}:\n{share:.0%} of the variance" for n, share in zip(composites, shares, strict=True)],
-        options,
-    )
+        titles.append(f"{name}:\n{index.explained_variance_ratio_[0]:.0%} of the variance")
+    made.titles(titles)
     return made.panels
 
 
