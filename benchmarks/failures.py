@@ -25,7 +25,9 @@ from common import Table, arguments, parsed, timed
 from scipy import sparse
 
 import trustbo as tb
-from trustbo.hazard import CAUSES, BoundRisk, fit_hazard
+from trustbo.hazard import fit_hazard
+from trustbo.hazard.exposures import CAUSES
+from trustbo.hazard.risk import BoundRisk
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.simulation import KinematicSimulator, MujocoSimulator, Truth
 from trustbo.study.world import COURSES, World

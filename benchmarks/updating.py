@@ -10,8 +10,8 @@ import numpy as np
 from common import Table, arguments, parsed
 
 from trustbo.data import Mission
-from trustbo.inference import fit, moment_matched, params_of, sample_statistics
-from trustbo.inference.updating import update_statistics
+from trustbo.inference import fit, params_of, sample_statistics
+from trustbo.inference.updating import moment_matched, update_statistics
 from trustbo.models import PooledTrust, TrustParams
 
 TRUTH = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05)

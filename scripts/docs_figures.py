@@ -24,13 +24,13 @@ from PIL import Image
 
 from trustbo import plots
 from trustbo.plots.plan import COLOURS
-from trustbo.plots.style import theme
+from trustbo.plots.style import LIGHT, theme
 
 mpl.use("Agg")
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 TABLES = FIGURES / "tables"
 STEP = re.compile(r"^```python\n(.*?)^```|^!\[[^]]*\]\(figures/(\w+)\.png\)", flags=re.S | re.M)
-PAPERS = {"": plots.LIGHT._replace(paper="#ffffff"), "dark": plots.DARK._replace(paper="#131416")}
+PAPERS = {"": LIGHT._replace(paper="#ffffff"), "dark": plots.DARK._replace(paper="#131416")}
 """Themes by folder; their papers are those of the pages of the documentation."""
 
 

@@ -44,7 +44,8 @@ class Bound(Displayed):
         contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
         n_ticks: Number of ticks, shape (robot,), of which `contact_rate` is the share with contact;
             NaN where not recorded.
-        states: Motion and sensing of each robot, shape (tick, robot, state), see `logs.STATES`.
+        states: Motion and sensing of each robot, shape (tick, robot, state): share of its speed on
+            level ground, pitch and roll (rad), mean range of returns (m), share of clear beams.
             None where not recorded.
 
     Raises:

@@ -1,15 +1,13 @@
 """Errors that trustbo raises for input it refuses; each is also a ValueError."""
 
 import difflib
-import importlib
 import math
 import operator
 import os
 import shlex
 import shutil
 import sys
-import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -121,27 +119,3 @@ def unknown(what: str, name: str, names: Iterable[str]) -> TrustboError:
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
     advice = f"did you mean {', '.join(near)}?" if near else f"choose one of {', '.join(names)}."
     return TrustboError(f"unknown {what} {name!r}; {advice}")
-
-
-def moved(old: str, room: str, name: str) -> Any:
-    """Object that version 0.2 had as `old`, from the module that has it now; FutureWarning."""
-    message = f"{old} is {room}.{name} since version 0.3; the old name will go."
-    warnings.warn(message, FutureWarning, stacklevel=3)
-    return getattr(importlib.import_module(room), name)
-
-
-def moved_names(package: str, rooms: Mapping[str, Iterable[str]]) -> Callable[[str], Any]:
-    """Make the `__getattr__` of a package whose names of version 0.2 are in other modules now.
-
-    Args:
-        package: Name of the package.
-        rooms: Names that moved, by module.
-    """
-    room_of = {name: room for room, names in rooms.items() for name in names}
-
-    def find(name: str) -> Any:
-        if name not in room_of:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return moved(f"{package}.{name}", room_of[name], name)
-
-    return find

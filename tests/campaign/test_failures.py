@@ -11,7 +11,9 @@ from worlds import ModelSimulator, random_cells
 import trustbo as tb
 from trustbo.campaign.planners import to_avoid
 from trustbo.errors import PosteriorError
-from trustbo.hazard import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.hazard import Hazard, fit_hazard
+from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.risk import BoundRisk
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace.moves import moves_along
 

@@ -64,7 +64,7 @@ def test_the_history_has_one_row_per_mission(result):
 
 def test_the_result_recommends_the_best_path_under_the_last_posterior(result, workspace):
     params = tb.inference.params_of(result.posterior).mean()
-    risk = tb.hazard.BoundRisk.of(result.posterior["hazard"].to_dataset(), workspace)
+    risk = tb.hazard.risk.BoundRisk.of(result.posterior["hazard"].to_dataset(), workspace)
     plan = Planner(workspace, *ENDS).with_risk(risk.mean).plan(params)
     assert result.path == list(plan.path)
     assert result.value == plan.value

@@ -214,7 +214,7 @@ def test_bounds_carry_their_chances_to_fail_and_to_get_as_far(result):
     np.testing.assert_array_equal(table["p_arrive"], [1.0, *risk.p_reach])
     assert (np.diff(table["p_arrive"]) < 0.0).all()
     assert table["p_arrive"].iloc[-1] == pytest.approx(result.plan.p_arrive)
-    causes = [table[f"p_fail_{cause}"][1:] for cause in tb.hazard.CAUSES]
+    causes = [table[f"p_fail_{cause}"][1:] for cause in tb.hazard.exposures.CAUSES]
     np.testing.assert_allclose(sum(causes), risk.p_fail, rtol=1e-12)
 
 

@@ -8,9 +8,10 @@ from scipy import special, stats
 
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.hazard import BoundRisk, Hazard, LostMission, fit_hazard
+from trustbo.hazard import Hazard, fit_hazard
 from trustbo.hazard.difficulty import difficulty_of
-from trustbo.hazard.exposures import Exposures
+from trustbo.hazard.exposures import Exposures, LostMission
+from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.sampler import _Density, impute, sample
 from trustbo.workspace.moves import MOVES
 

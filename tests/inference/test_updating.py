@@ -10,10 +10,10 @@ from references import dense_coupled
 
 from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.inference import fit, moment_matched, params_of, sample_statistics
+from trustbo.inference import fit, params_of, sample_statistics
 from trustbo.inference.evidence.gram_jax import log_likelihood, spectrum
 from trustbo.inference.evidence.statistics import gather
-from trustbo.inference.updating import update_statistics
+from trustbo.inference.updating import moment_matched, update_statistics
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,

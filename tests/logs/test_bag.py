@@ -16,8 +16,8 @@ from worlds import hillside
 import trustbo as tb
 from trustbo.data import Bound, Mission
 from trustbo.errors import ShapeError, TrustboError
-from trustbo.logs import STATES
 from trustbo.logs.bag import Topics, read_bag, write_bag
+from trustbo.logs.netcdf import STATES
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replay import ReplaySimulator
 

@@ -33,7 +33,7 @@ def test_ticks_and_states_come_back_as_they_were(driven, tmp_path):
     write_missions(tmp_path / "missions.nc", driven)
     assert sorted(f.name for f in (tmp_path / "ticks").glob("*.nc")) == ["0001.nc", "0002.nc"]
     with xr.open_dataset(tmp_path / "ticks" / "0001.nc") as ticks:
-        assert list(ticks["state"].values) == list(tb.logs.STATES)
+        assert list(ticks["state"].values) == list(tb.logs.netcdf.STATES)
     again = read_missions(tmp_path / "missions.nc")
     for one, other in zip(again, driven, strict=True):
         a, b = one.bounds[0], other.bounds[0]

@@ -14,8 +14,9 @@ from scipy.spatial import cKDTree
 
 import trustbo as tb
 from trustbo.campaign.exploring import scene_of
-from trustbo.plots import DARK, LIGHT
+from trustbo.plots import DARK
 from trustbo.plots.explorer import Layer, Scene, Step, draw_explorer, scene
+from trustbo.plots.style import LIGHT
 
 WIDTHS = {"wide": (1300, 900, False), "phone": (390, 844, True)}
 

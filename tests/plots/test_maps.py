@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 import trustbo as tb
 from trustbo.inference import fit
 from trustbo.models import PlaceEffect, PooledTrust
-from trustbo.plots import LIGHT
 from trustbo.plots.maps import contour_interval, contours
+from trustbo.plots.style import LIGHT
 
 
 def test_one_panel_per_iteration_and_one_for_the_end(result):

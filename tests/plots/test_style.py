@@ -14,7 +14,7 @@ from matplotlib.text import Text
 
 import trustbo as tb
 from trustbo import plots
-from trustbo.plots.style import luminance, theme
+from trustbo.plots.style import LIGHT, luminance, theme
 
 
 @pytest.fixture(scope="module")
@@ -212,13 +212,13 @@ def test_the_theme_is_that_of_the_user_s_paper():
         )  # fmt: skip
     with plt.style.context("default"):
         assert (theme().line, theme().ink, theme().paper) == (
-            plots.LIGHT.line, "#000000", "#ffffff",
+            LIGHT.line, "#000000", "#ffffff",
         )  # fmt: skip
 
 
 def test_no_two_colours_of_a_theme_are_alike():
     """The report replaces each by the other theme's: it must be known which it is."""
-    for colours in (plots.LIGHT, plots.DARK):
+    for colours in (LIGHT, plots.DARK):
         assert len(set(colours)) == len(colours)
         assert all(re.fullmatch("#[0-9a-f]{6}", colour) for colour in colours)
 

@@ -8,7 +8,7 @@ from worlds import hillside
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.logs import STATES
+from trustbo.logs.netcdf import STATES
 from trustbo.simulation import Degradation, KinematicSimulator, Threat
 from trustbo.simulation.sensing import contact_of, new_tracks
 from trustbo.team import Robot, Team

@@ -25,6 +25,7 @@ import trustbo as tb
 from trustbo import study
 from trustbo.cli import app
 from trustbo.study import executors, experiment
+from trustbo.study.configuration import read_study
 
 DATA = Path(__file__).parents[1] / "data"
 TRUTH = {"beta0": 0.6, "beta": [0.3, 0.2], "b": 0.05, "delta_w": 0.05, "delta_v": 0.05}
@@ -148,7 +149,7 @@ def test_a_file_s_content_decides_and_not_its_name(tmp_path):
     for i, (place, text) in enumerate((("a", table[0]), ("b", table[0]), ("b", table[1]))):
         file = tmp_path / place / f"{i}.yaml"
         file.write_text(text)
-        found.append(study.read_study(file).experiment().runs()[0].key)
+        found.append(read_study(file).experiment().runs()[0].key)
     assert found[0] == found[1] != found[2]
 
 
@@ -157,8 +158,7 @@ def test_a_file_of_version_0_2_means_the_same_study(tmp_path):
     for name in ("dem", "dsm"):
         terrain[name].rio.to_raster(tmp_path / f"{name}.tif")
     old, new = (
-        study.read_study(copy(DATA / f"study_{version}.yaml", tmp_path))
-        for version in ("0.2", "0.3")
+        read_study(copy(DATA / f"study_{version}.yaml", tmp_path)) for version in ("0.2", "0.3")
     )
     assert old.settings() != new.settings()  # defaults, which the old one has written out
     table = [one.key for one in new.experiment().runs()]
@@ -170,7 +170,7 @@ def test_a_file_of_version_0_2_means_the_same_study(tmp_path):
 
 def test_a_constructor_of_the_user_is_named_with_its_module(serial, tmp_path, monkeypatch):
     (tmp_path / "my_grids.py").write_text(
-        "from trustbo.study import random_workspace\n"
+        "from trustbo.study.calls import random_workspace\n"
         "def grid(side, seed=0):\n    return random_workspace((side, side), seed=seed)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
@@ -537,7 +537,7 @@ def test_a_study_that_cannot_be_is_refused_before_anything_is_run(change, messag
 
 def test_yaml_that_cannot_be_is_refused(tmp_path):
     with pytest.raises(tb.TrustboError, match=r"cannot read '.*none.yaml': No such file"):
-        study.read_study(tmp_path / "none.yaml")
+        read_study(tmp_path / "none.yaml")
     for text, message in (
         ("terrains: [", "is no YAML: while parsing"),
         ("- terrains", "a study is a Study or a mapping"),
@@ -546,7 +546,7 @@ def test_yaml_that_cannot_be_is_refused(tmp_path):
     ):
         (tmp_path / "odd.yaml").write_text(text)
         with pytest.raises(tb.TrustboError, match=message):
-            study.read_study(tmp_path / "odd.yaml")
+            read_study(tmp_path / "odd.yaml")
 
 
 # --- the command ---

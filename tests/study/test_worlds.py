@@ -18,10 +18,10 @@ from trustbo.errors import TrustboError
 from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.planning.policies import ucb
 from trustbo.simulation import KinematicSimulator, Truth
-from trustbo.study import World, load_study, run_worlds, worlds, worlds_table
+from trustbo.study import load_study, run_worlds, worlds, worlds_table
 from trustbo.study.calls import identity_of
 from trustbo.study.methods import cases_of
-from trustbo.study.world import COURSES, REAL, aged
+from trustbo.study.world import COURSES, REAL, World, aged
 from trustbo.workspace.sight import Sight
 
 TINY = World("tiny", "aged", "synthetic-0", shape=(3, 3), side=60.0)

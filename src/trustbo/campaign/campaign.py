@@ -28,9 +28,10 @@ from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import FilePath, interpreting
-from trustbo.hazard import CAUSES, BoundRisk
-from trustbo.models import TrustModel
+from trustbo.hazard.exposures import CAUSES
+from trustbo.hazard.risk import BoundRisk
 from trustbo.models.backend import VERSIONS
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
@@ -276,8 +277,8 @@ class Campaign(Displayed):
         """Give up the mission that was asked for; the next plan takes it into account.
 
         Args:
-            reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", says that a
-                bound of the plan failed, and is learned from as a hazard.
+            reason: Reason, for the record. One of `hazard.exposures.CAUSES`, such as "stuck", says
+                that a bound of the plan failed, and is learned from as a hazard.
             mission: Bounds that were run, to learn from; None if there are none.
             where: Cell that it failed to enter, where it did not report but that is known.
             other_path: Whether it is known to have followed another path, as for `tell`.

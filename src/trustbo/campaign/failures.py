@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Self
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_pair
-from trustbo.hazard import CAUSES
+from trustbo.hazard.exposures import CAUSES
 
 
 def require_reason(reason: object, mission: Mission | None) -> None:

@@ -15,14 +15,17 @@ from trustbo.data import Mission
 from trustbo.display.bars import place_of, say
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.files import interpreting
-from trustbo.hazard import BoundRisk, LostMission, fit_hazard
-from trustbo.inference import diagnostics, fit, moment_matched, params_of, sample_prior
+from trustbo.hazard import fit_hazard
+from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.risk import BoundRisk
+from trustbo.inference import diagnostics, fit, params_of, sample_prior
 from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.models import PlaceEffect, PooledTrust, TrustModel, TrustParams
+from trustbo.inference.updating import moment_matched
+from trustbo.models import PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.families import AUTO
-from trustbo.models.model import require_model
+from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
 from trustbo.workspace import AwarenessBelief, Workspace
 from trustbo.zheng2023 import MOMENT_MATCHED_WARNING

@@ -20,7 +20,7 @@ from trustbo.campaign.stopping import (
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, as_path, to_json
-from trustbo.models import TrustModel
+from trustbo.models.model import TrustModel
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Truth
 from trustbo.simulation.protocol import Simulator, require_bounds, require_call, takes

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
-from trustbo.hazard import BoundRisk
+from trustbo.hazard.risk import BoundRisk
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location

@@ -15,7 +15,7 @@ from trustbo.files import checksum
 from trustbo.inference import complete
 from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.logs.netcdf import read_tree
-from trustbo.models import TrustModel
+from trustbo.models.model import TrustModel
 
 
 class Posterior:

@@ -20,8 +20,8 @@ from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
-from trustbo.hazard import BoundRisk
 from trustbo.hazard.model import measures_of
+from trustbo.hazard.risk import BoundRisk
 from trustbo.inference import params_of, place_maps
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace

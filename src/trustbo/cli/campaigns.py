@@ -13,7 +13,7 @@ from trustbo.cli.terrains import Rasters, pair, team_of
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
-    from trustbo.models import TrustModel
+    from trustbo.models.model import TrustModel
     from trustbo.simulation import KinematicSimulator
 
 

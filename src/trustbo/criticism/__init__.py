@@ -1,6 +1,6 @@
 """Criticism: tests of a fitted trust model against what may be wrong with it."""
 
-from trustbo.criticism.criticise import Criticism, criticise
+from trustbo.criticism.criticise import criticise
 
-__all__ = ["Criticism", "criticise"]
+__all__ = ["criticise"]
 __dir__ = __all__.copy  # completion lists public names alone

@@ -15,11 +15,7 @@ from trustbo.inference.prior_from import prior_from
 from trustbo.inference.prior_predictive import prior_predictive, sample_prior
 from trustbo.inference.samplers.convergence import diagnostics
 from trustbo.inference.sbc import sbc
-from trustbo.inference.updating import (
-    moment_matched,
-    sample_statistics,
-    update_statistics,
-)
+from trustbo.inference.updating import sample_statistics, update_statistics
 
 __all__ = [
     "TrustFilter",
@@ -29,7 +25,6 @@ __all__ = [
     "diagnostics",
     "fit",
     "loo",
-    "moment_matched",
     "params_of",
     "place_maps",
     "prior_from",

@@ -244,7 +244,7 @@ def _states(where: str, bound: Any) -> np.ndarray:
         return np.full(shape, np.nan)
     if np.shape(bound.states) != shape:
         raise TrustboError(
-            f"{where}: states must be {shape}, (tick, robot, state), see logs.STATES; got "
+            f"{where}: states must be {shape}, (tick, robot, state), see Bound.states; got "
             f"{np.shape(bound.states)}."
         )
     return bound.states

@@ -1,21 +1,18 @@
 """Trust models: their parameters, priors and effects, and the state space that they share."""
 
-from trustbo.errors import moved_names
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams
 from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
-from trustbo.models.state_space.contact_rate import ContactRate
+from trustbo.renamed import moved
 
 __all__ = [
-    "ContactRate",
     "CoupledParams",
     "CoupledTrust",
     "DriftTrust",
@@ -24,18 +21,29 @@ __all__ = [
     "PooledTrust",
     "Priors",
     "RobotParams",
-    "TrustModel",
     "TrustParams",
 ]
 __dir__ = __all__.copy  # completion lists public names alone
 
-# Names of version 0.2, by the room that has them now.
-__getattr__ = moved_names(__name__, {
-    "trustbo.criticism": ("Criticism", "criticise"),
-    "trustbo.hazard": ("CAUSES", "BoundRisk", "Hazard", "LostMission", "fit_hazard"),
-    "trustbo.inference": (
-        "TrustFilter", "by_rate", "complete",
-        "diagnostics", "fit", "loo", "moment_matched", "params_of", "place_maps", "prior_from",
-        "prior_predictive", "sample_prior", "sample_statistics", "sbc",
-    ),
-})  # fmt: skip
+# Names of version 0.2.
+__getattr__ = moved(
+    __name__,
+    {
+        "trustbo.criticism": ["criticise"],
+        "trustbo.criticism.criticise": ["Criticism"],
+        "trustbo.hazard": ["Hazard", "fit_hazard"],
+        "trustbo.hazard.exposures": ["CAUSES", "LostMission"],
+        "trustbo.hazard.risk": ["BoundRisk"],
+        "trustbo.inference": [
+            "TrustFilter", "by_rate", "complete", "diagnostics", "fit", "loo", "params_of",
+            "place_maps", "prior_from", "prior_predictive", "sample_prior", "sample_statistics",
+            "sbc",
+        ],
+        "trustbo.inference.filter": ["TrustForecast", "TrustState"],
+        "trustbo.inference.updating": ["ExactPosterior", "moment_matched"],
+        "trustbo.models.model": ["TrustModel"],
+        "trustbo.models.params": ["DriftParams"],
+        "trustbo.models.state_space.contact_rate": ["ContactRate"],
+        "trustbo.models.state_space.generate": ["TrustSample"],
+    },
+)  # fmt: skip

@@ -17,14 +17,15 @@ from trustbo.plots.mission import mission_trust, plan_trust
 from trustbo.plots.places import place_map
 from trustbo.plots.plan import plan_map
 from trustbo.plots.regret import regret_curves
-from trustbo.plots.style import DARK, LIGHT, Style
+from trustbo.plots.style import DARK
 from trustbo.plots.terrain import loadings, terrain_maps
+from trustbo.renamed import moved
 
 __all__ = [
-    "DARK", "LIGHT", "Style", "animate_mission", "calibration",
-    "campaign_history", "cell_map", "criticism",
+    "DARK", "animate_mission", "calibration", "campaign_history", "cell_map", "criticism",
     "draw_path", "draw_scale", "hazard_map", "loadings", "mission_trust", "parameter_history",
     "path_posterior", "place_map", "plan_map", "plan_trust", "regret_curves", "robot_maps",
     "terrain_maps", "trust_maps",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
+__getattr__ = moved(__name__, {"trustbo.plots.explorer": ["Explorer"]})  # name of version 0.2

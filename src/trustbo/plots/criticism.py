@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.criticism import Criticism
+from trustbo.criticism.criticise import Criticism
 from trustbo.errors import require_kind
 from trustbo.plots.layout import Panels, as_text, plain, small_multiples
 from trustbo.plots.places import BETTER_WORSE

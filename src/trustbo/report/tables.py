@@ -8,7 +8,7 @@ from arviz_stats import sampling_diagnostics
 
 from trustbo.campaign.history import GIVEN_UP
 from trustbo.campaign.result import Result
-from trustbo.criticism import Criticism
+from trustbo.criticism.criticise import Criticism
 from trustbo.files import to_json
 from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.report.blocks import Table

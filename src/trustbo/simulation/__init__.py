@@ -1,6 +1,6 @@
 """Simulators of bounding overwatch, and replay of recorded missions."""
 
-from trustbo.errors import moved_names
+from trustbo.renamed import moved
 from trustbo.simulation.events import Degradation, Threat
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.mujoco import MujocoSimulator
@@ -13,6 +13,4 @@ __all__ = [
     "Threat", "Truth",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone
-__getattr__ = moved_names(
-    __name__, {"trustbo.simulation.protocol": ("BoundSimulator", "Simulator")}
-)
+__getattr__ = moved(__name__, {"trustbo.simulation.protocol": ("BoundSimulator", "Simulator")})

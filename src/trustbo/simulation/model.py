@@ -15,9 +15,10 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.hazard import CAUSES
-from trustbo.models import PooledTrust, TrustModel
+from trustbo.hazard.exposures import CAUSES
+from trustbo.models import PooledTrust
 from trustbo.models.backend import own_settings
+from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.workspace import Workspace
@@ -54,8 +55,9 @@ class ModelSimulator(DescribedSimulator):
                 along their path.
             n_ticks: Ticks of each bound, for `"beta_binomial"`.
             p_fail: Chance that each bound ends the mission, shape (move, row, col), such as a draw
-                of `hazard.BoundRisk`; None for no failures.
-            causes: Share of each of `hazard.CAUSES` among failures; all "stuck" by default.
+                of `hazard.risk.BoundRisk`; None for no failures.
+            causes: Share of each of `hazard.exposures.CAUSES` among failures; by default all
+                "stuck".
 
         Raises:
             ShapeError: Parameters or awareness of other robots or features, or of many draws; or

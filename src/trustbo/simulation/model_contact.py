@@ -18,7 +18,7 @@ from scipy.stats import norm
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
-from trustbo.models import TrustModel
+from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, Params
 from trustbo.planning.dynamics import drift, roll_trust, transition
 from trustbo.planning.paths import AdmissiblePaths

@@ -251,7 +251,7 @@ class KinematicSimulator(DescribedSimulator):
 
         Returns:
             Dataset (sample) by feature: the map's value, `offline`, and the states of
-            `logs.STATES`, averaged over a bound; one sample per robot and bound.
+            `Bound.states`, averaged over a bound; one sample per robot and bound.
         """
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         plain = copy.copy(self)

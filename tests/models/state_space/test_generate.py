@@ -7,9 +7,10 @@ import pytest
 from missions import random_covariance
 from references import dense_joint
 
-from trustbo.models import ContactRate, CoupledParams, RobotParams, TrustParams
+from trustbo.models import CoupledParams, RobotParams, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
+from trustbo.models.state_space.contact_rate import ContactRate
 from trustbo.models.state_space.generate import draw_missions
 
 GAUSSIAN, N = FAMILIES["gaussian"], 40
