@@ -91,7 +91,7 @@ def run(
             progress=_progress(page, quiet),
             options=chosen,
         )
-        write_outputs(result, out, table=not quiet)
+        write_outputs(result, out, table=not quiet, report=not page)
 
 
 def demo(
@@ -166,6 +166,7 @@ def resume(
         state = _state(folder)
         require_outputs(folder, overwrite=True)
         from trustbo.campaign.loop import resume as go_on
+        from trustbo.campaign.progress import PAGE, PAGE_ALONE, continued
         from trustbo.campaign.stopping import RegretBound
 
         stop = None if stop_regret is None else RegretBound(eps=stop_regret)
@@ -177,14 +178,18 @@ def resume(
                 f"{done} done; for more, give --iterations. Figures and report are drawn again.",
                 flush=True,
             )
+        progress = continued(_progress(page, quiet), folder)
         result = go_on(
             folder,
             simulator=_simulator(folder, state["notes"]),
             n_iterations=iterations,
             stop=stop,
-            progress=_progress(page, quiet),
+            progress=progress,
         )
-        write_outputs(result, folder, table=not quiet)
+        # A campaign that its rule had ended need not have gone on, and then made no page.
+        went_on = state["stop_reason"] in ("interrupted", "n_iterations")
+        made = went_on and progress in (PAGE, PAGE_ALONE)
+        write_outputs(result, folder, table=not quiet, report=not made)
 
 
 def _require_names(
