@@ -271,18 +271,9 @@ class Mission(Displayed):
             raise ShapeError(f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}.")
         longest = np.nanmax(np.where(np.isnan(seconds), 0.0, seconds), axis=1)
         last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(longest)])
-        bounds = tuple(
-            Bound(
-                cells[k + 1],
-                z[k],
-                y[k],
-                seconds[k],
-                status if k == last else "ok",
-                float(starts[k]),
-                n_ticks=ticks[k],
-            )
-            for k in range(len(y))
-        )
+        statuses = ["ok"] * last + [status]
+        measured = zip(cells[1:], z, y, seconds, statuses, map(float, starts), ticks, strict=False)
+        bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         names = (("features", features), ("robots", robots))
         return cls(cells, bounds, status, *(as_names(what, given) for what, given in names))
 
@@ -442,7 +433,7 @@ def as_array(what: str, values: ArrayLike) -> np.ndarray:
 
 
 def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
-    """Refuse ticks that are no whole numbers, or a rate that is no share of them; (robot,) both."""
+    """Refuse ticks that are not whole, and rates that are not a share of them; both (robot,)."""
     if ticks.shape != rate.shape:
         raise ShapeError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
     for i in np.flatnonzero((ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)):

@@ -149,7 +149,7 @@ def write_checked(path: FilePath, content: bytes) -> None:
     path = Path(path)
     # Of the file that is there: its kept sum may be that of one whose writing died.
     contents = [content, *([read_file(path)] if path.is_file() else [])]
-    sums = "\n".join(hashlib.sha256(each).hexdigest() for each in contents)
+    sums = "\n".join(hashlib.sha256(one).hexdigest() for one in contents)
     write_file(sum_file(path), lambda file: file.write_text(sums, encoding="utf-8"))
     write_file(path, lambda file: file.write_bytes(content))
     folder_to_disk(path.parent)

@@ -1,4 +1,4 @@
-"""Names of an earlier version, which still work, with a warning."""
+"""Names of version 0.2 that have moved: they still work, with a warning."""
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -6,9 +6,9 @@ from importlib import import_module
 
 
 def moved(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], object]:
-    """Make the `__getattr__` of a room that was the place of names, by their modules of today."""
+    """Make the `__getattr__` of a module for names that it had, listed by their new modules."""
 
-    def look_up(name: str) -> object:
+    def find(name: str) -> object:
         module = next((module for module, given in names.items() if name in given), None)
         if module is None:
             raise AttributeError(f"module {room!r} has no attribute {name!r}")
@@ -16,4 +16,4 @@ def moved(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], obje
         warnings.warn(message, FutureWarning, stacklevel=2)
         return getattr(import_module(module), name)
 
-    return look_up
+    return find

@@ -128,7 +128,7 @@ def test_p_values_of_the_right_model_are_uniform():
     rng, L, p = np.random.default_rng(0), np.linalg.cholesky(normal.cov), []
     for _ in range(100):
         y = normal.mean + L @ rng.standard_normal(len(data.y))
-        found = Innovations.of(normal, y, by_parameter, rng.standard_normal((len(y), 200)))
+        found = Innovations.of_rates(normal, y, by_parameter, rng.standard_normal((len(y), 200)))
         p.append([found.test(each).p for each in tests])
     for name, each in zip((test.name for test in tests), np.transpose(p), strict=True):
         # Six departures: a KS p-value below 1e-3 would come by chance in one of 200 seeds.

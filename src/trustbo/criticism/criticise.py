@@ -139,7 +139,7 @@ def _criticise(
         )
     rng = np.random.default_rng([seed, len(data.y)])
     draws = rng.standard_normal((len(data.y), n_replicates))
-    innovations = Innovations.of(normal, data.y, by_parameter, draws)
+    innovations = Innovations.of_rates(normal, data.y, by_parameter, draws)
     tests, left_out = departures(missions, data, normal, point, place)
     coefficients = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
     outcomes = _test_all(innovations, tests, coefficients, seed)
@@ -216,11 +216,11 @@ def _account_for(
     if label in fault.sources:
         U = fault.sources[label]
         wider = Normal(normal.mean, normal.cov + innovations.size_of(U) * U, normal.carry)
-        return Innovations.of(wider, data.y, by_parameter, draws)
+        return Innovations.of_rates(wider, data.y, by_parameter, draws)
     columns = normal.carry @ fault.effects[label]
     names = [*by_parameter.names, *[label] * columns.shape[1]]
     more = Derivatives(names, np.column_stack([by_parameter.mean, columns]), by_parameter.cov)
-    return Innovations.of(normal, data.y, more, draws)
+    return Innovations.of_rates(normal, data.y, more, draws)
 
 
 def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list[Mission]:

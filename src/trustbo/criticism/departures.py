@@ -118,10 +118,11 @@ def _correlations(data: Data, normal: Normal, point: Point) -> dict[str, np.ndar
         sources["robots in one bound"] = (
             w**2 * (C @ shared) @ (C @ shared).T + v**2 * of_rates @ of_rates.T
         )
-    sequence = (mission * data.n_robots + robot)[data.seen]
+    sequences = mission * data.n_robots + robot
+    sequence = sequences[data.seen]
     gap = np.abs(np.subtract.outer(bound[data.seen], bound[data.seen]))
     sources["successive bounds"] = _MEMORY**gap * np.equal.outer(sequence, sequence)
-    levels = C @ (own_columns(mission, robot, data.n_robots))
+    levels = C @ (sequences[:, None] == np.unique(sequences))
     sources["a robot's rates of one mission"] = levels @ levels.T
     of_mission = C @ (mission[:, None] == np.arange(len(data.n_bounds)))
     sources["rates of one mission"] = of_mission @ of_mission.T
@@ -133,9 +134,3 @@ def _drift(data: Data, normal: Normal) -> np.ndarray:
     missions = np.arange(len(data.n_bounds))
     levels = normal.carry @ (data.slots[:, :1] == missions)
     return levels @ _MEMORY ** np.abs(np.subtract.outer(missions, missions)) @ levels.T
-
-
-def own_columns(mission: np.ndarray, robot: np.ndarray, n_robots: int) -> np.ndarray:
-    """Indicator column of each robot in each mission, over the slots."""
-    sequence = mission * n_robots + robot
-    return (sequence[:, None] == np.unique(sequence)).astype(float)

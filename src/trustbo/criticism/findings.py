@@ -12,6 +12,7 @@ from trustbo.criticism.joint_normal import Data
 from trustbo.criticism.prior_moments import Coefficients, estimate
 from trustbo.criticism.score import Innovations, Outcome, judge
 from trustbo.data import Mission
+from trustbo.display.card import joined
 
 _MOST_CELLS = 3
 _LEVEL = 0.05
@@ -70,13 +71,13 @@ def finding(
         bend = "flattens (saturates)" if effect < 0.0 else "steepens"
         return f"the response to {label} bends: it {bend} as {label} grows."
     if name == "prior":
-        alone = estimate(innovations, coefficients)
+        mean, cov = estimate(innovations, coefficients)
         i = coefficients.labels.index(label.removeprefix("sign of "))
-        data_say = f"{alone.mean[i]:.2f} +- {np.sqrt(alone.cov[i, i]):.2f}"
+        by_rates = f"{mean[i]:.2f} +- {np.sqrt(cov[i, i]):.2f}"
         prior = f"{coefficients.mean[i]:.2f} +- {np.sqrt(coefficients.cov[i, i]):.2f}"
         what = "has the wrong sign" if label.startswith("sign") else "conflicts with its prior"
         return (
-            f"{coefficients.labels[i]} {what}: {data_say} by the rates alone, {prior} by the prior."
+            f"{coefficients.labels[i]} {what}: {by_rates} by the rates alone, {prior} by the prior."
         )
     if name == "correlation":
         return f"noise is correlated: {label} go together beyond what the model says."
@@ -124,11 +125,7 @@ def verdict_of(fault: str, table: pd.DataFrame) -> str:
     gone = [checks[i] for i in others if after[i] * len(others) > _LEVEL]
     left = [checks[i] for i in others if not after[i] * len(others) > _LEVEL]
     if gone:
-        verdict += f" It explains what is found under {_listed(gone)}."
+        verdict += f" It explains what is found under {joined(gone)}."
     if left:
-        verdict += f" It does not explain what is found under {_listed(left)}."
+        verdict += f" It does not explain what is found under {joined(left)}."
     return verdict
-
-
-def _listed(names: list[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -68,21 +68,15 @@ def coefficients_of(
     )
 
 
-class Estimate(NamedTuple):
-    """Estimates of the coefficients from the rates alone."""
+def estimate(innovations: Innovations, coefficients: Coefficients) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the coefficients from the rates alone.
 
-    mean: np.ndarray  # (coefficient,)
-    cov: np.ndarray
-
-
-def estimate(innovations: Innovations, coefficients: Coefficients) -> Estimate:
-    """Generalised least squares of all parameters of the mean, one step from the posterior's."""
+    Generalised least squares of all parameters of the mean, one step from the posterior's.
+    """
     inverse = np.linalg.pinv(innovations.X.T @ innovations.X, rcond=1e-10)
     step = inverse @ (innovations.X.T @ innovations.white)
-    return Estimate(
-        coefficients.fitted + step[coefficients.columns],
-        inverse[np.ix_(coefficients.columns, coefficients.columns)],
-    )
+    columns = coefficients.columns
+    return coefficients.fitted + step[columns], inverse[np.ix_(columns, columns)]
 
 
 def test_prior(innovations: Innovations, coefficients: Coefficients, seed: int) -> Outcome:
@@ -92,29 +86,25 @@ def test_prior(innovations: Innovations, coefficients: Coefficients, seed: int) 
     Moshonov 2006). Wrong sign: the estimate is beyond 0, on the side away from the prior's mean;
     where that is 0, awareness is taken to help.
     """
-    alone, n_replicates = estimate(innovations, coefficients), innovations.e.shape[1] - 1
+    (mean, cov), n_replicates = estimate(innovations, coefficients), innovations.e.shape[1] - 1
     rng = np.random.default_rng([seed, 1])
     sign = np.where(
         np.abs(coefficients.mean) < 0.1 * np.sqrt(np.diag(coefficients.cov)),
         1.0,
         np.sign(coefficients.mean),
     )
-    both = alone.cov + coefficients.cov
-    sd, se = np.sqrt(np.diag(both)), np.sqrt(np.diag(alone.cov))
+    both = cov + coefficients.cov
+    sd, se = np.sqrt(np.diag(both)), np.sqrt(np.diag(cov))
     noise = [
-        np.linalg.cholesky(cov + 1e-12 * np.trace(cov) * np.eye(len(cov)))
-        @ rng.standard_normal((len(cov), n_replicates))
-        for cov in (both, alone.cov)
+        np.linalg.cholesky(C + 1e-12 * np.trace(C) * np.eye(len(C)))
+        @ rng.standard_normal((len(C), n_replicates))
+        for C in (both, cov)
     ]
-    far = np.column_stack([alone.mean - coefficients.mean, noise[0]]) / sd[:, None]
-    off = np.column_stack([alone.mean, noise[1]]) * (-sign / se)[:, None]
+    far = np.column_stack([mean - coefficients.mean, noise[0]]) / sd[:, None]
+    off = np.column_stack([mean, noise[1]]) * (-sign / se)[:, None]
     off = off[coefficients.is_weight]
     log_p = np.concatenate([np.log(2.0) + stats.norm.logsf(np.abs(far)), stats.norm.logsf(off)])
-    labels = [f"{name}" for name in coefficients.labels]
-    labels += [
-        f"sign of {name}"
-        for name, is_weight in zip(coefficients.labels, coefficients.is_weight, strict=True)
-        if is_weight
-    ]
+    weights = np.flatnonzero(coefficients.is_weight)
+    labels = [*coefficients.labels, *(f"sign of {coefficients.labels[i]}" for i in weights)]
     statistic = np.concatenate([far, off])[:, 0]
     return judge(labels, statistic, log_p[:, 0], log_p[:, 1:])

@@ -27,20 +27,11 @@ def table_of_rates(
     before = innovations.L.copy()
     spread = np.diag(before).copy()
     np.fill_diagonal(before, 0.0)
-    return pd.DataFrame(
-        {
-            "mission": j,
-            "bound": k + 1,
-            "robot": np.array(missions[0].robots)[i],
-            "row": cells[:, 0],
-            "col": cells[:, 1],
-            "contact_rate": data.y,
-            "expected": innovations.normal.mean + before @ innovations.white,
-            "sd": spread,
-            "residual": innovations.e[:, 0],
-            "pit": stats.norm.cdf(innovations.e[:, 0]),
-        }
-    )
+    robot, e = np.array(missions[0].robots)[i], innovations.e[:, 0]
+    place = {"mission": j, "bound": k + 1, "robot": robot, "row": cells[:, 0], "col": cells[:, 1]}
+    expected = innovations.normal.mean + before @ innovations.white
+    predicted = {"contact_rate": data.y, "expected": expected, "sd": spread}
+    return pd.DataFrame({**place, **predicted, "residual": e, "pit": stats.norm.cdf(e)})
 
 
 def groups_of(

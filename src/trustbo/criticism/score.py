@@ -64,7 +64,7 @@ class Innovations:
     e: np.ndarray
 
     @classmethod
-    def of(
+    def of_rates(
         cls, normal: Normal, y: np.ndarray, by_parameter: "Derivatives", draws: np.ndarray
     ) -> Self:
         """Innovations of rates y (rate,); `draws` are white noise (rate, replicate)."""

@@ -76,6 +76,11 @@ def number(value: float, unit: str = "", digits: int = 3) -> str:
     return f"{value:.{digits}g}{' ' + unit if unit else ''}"
 
 
+def joined(names: Sequence[str]) -> str:
+    """Join names: "a, b and c"."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
 def arrival(mean: float, band: tuple[float, float] | None) -> str:
     """Text of a chance to arrive, its mean and its 90 % band over the posterior.
 

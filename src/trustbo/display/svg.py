@@ -78,7 +78,7 @@ def curve_picture(
     n, left, top = lines.shape[1], 40.0, 8.0
     wide, tall = _WIDTH - left - 8.0, _HEIGHT - top - 30.0
 
-    def at(k: int, value: float) -> tuple[float, float]:
+    def position(k: int, value: float) -> tuple[float, float]:
         x = left + wide * (k / (n - 1) if n > 1 else 0.5)
         return x, top + tall * (high - value) / (high - low)
 
@@ -94,14 +94,14 @@ def curve_picture(
     ]
     if band is not None:
         below, above = (np.ravel(np.asarray(edge, dtype=float)) for edge in band)
-        there = [at(k, value) for k, value in enumerate(below)]
-        back = [at(k, value) for k, value in enumerate(above)][::-1]
+        there = [position(k, value) for k, value in enumerate(below)]
+        back = [position(k, value) for k, value in enumerate(above)][::-1]
         ring = _points(there + back)
         parts.append(f'<polygon points="{ring}" fill="#0072B2" fill-opacity=".25"/>')
     for i, line in enumerate(lines):
         style = "2" if i == 0 else '1" stroke-opacity=".5'
         for run in _runs(line):
-            points = [at(k, line[k]) for k in run]
+            points = [position(k, line[k]) for k in run]
             parts.append(
                 f'<polyline points="{_points(points)}" fill="none" stroke="#0072B2" '
                 f'stroke-width="{style}"/>'

@@ -1,8 +1,7 @@
 """Export of a result in several formats to one folder."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,18 +25,14 @@ from trustbo.files import FilePath, require_file, require_folder
 from trustbo.logs.bagfile import require_new_bag
 
 
-@dataclass(frozen=True, eq=False)
-class _Content:
+class _Content(NamedTuple):
     """Result to write."""
 
     result: Result
+    maps: Callable[[], xr.Dataset]
+    """Its maps, computed once and only if a format needs them: they are slow."""
     for_ros: dict[str, Any]
     """Arguments of the maps and bags for ROS."""
-
-    @cached_property
-    def maps(self) -> xr.Dataset:
-        """Maps of the result, computed once and only if a format needs them: they are slow."""
-        return self.result.maps()
 
 
 class _Format(NamedTuple):
@@ -106,9 +101,9 @@ def export_result(
     for name in chosen:
         _require_possible(name, result, target)
     origin_xy = None if origin is None else place.origin  # "auto" is not known to a map alone
-    content = _Content(result, given | {"origin": origin_xy})
+    content = _Content(result, cache(result.maps), given | {"origin": origin_xy})
     if for_ros:
-        occupancy(content.maps["cost"], result.workspace, resolution=resolution)
+        occupancy(content.maps()["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
     written = [file for kind in chosen.values() for file in kind.files_in(target, result)]
@@ -149,7 +144,7 @@ def _require_possible(name: str, result: Result, target: Path) -> None:
 
 
 def _write_maps(content: _Content, file: Path) -> None:
-    maps = content.maps
+    maps = content.maps()
     write_geotiff(file, maps, content.result.workspace, style=False)
     row, col = content.result.path[0]
     # The trust of the start cell is assumed; it must not set the limits of the colours.
@@ -157,32 +152,22 @@ def _write_maps(content: _Content, file: Path) -> None:
     write_style(file.with_suffix(".qml"), learned)
 
 
-def _write_cog(content: _Content, file: Path) -> None:
-    write_geotiff(file, content.maps, content.result.workspace, cog=True, style=False)
-
-
 def _write_tables(content: _Content, file: Path) -> None:
     write_csv(file, content.result)
     write_path(file.with_name("path.csv"), content.result)
 
 
-def _write_map(content: _Content, file: Path) -> None:
-    workspace, cost = content.result.workspace, content.maps["cost"]
-    write_ros_map(file, cost, workspace, **content.for_ros)
-
-
 def _write_bag(content: _Content, file: Path) -> None:
-    workspace, cost = content.result.workspace, content.maps["cost"]
-    write_ros_bag(file, content.result, cost, workspace, **content.for_ros)
+    result, cost = content.result, content.maps()["cost"]
+    write_ros_bag(file, result, cost, result.workspace, **content.for_ros)
 
 
 def _write_path(content: _Content, file: Path) -> None:
     write_path(file, content.result)
 
 
-def _require_netcdf(result: Result) -> None:
-    # Result.maps renames features that have the name of a coordinate.
-    require_names_for_netcdf(name for name in result.workspace.features if "/" in name)
+def _require_topics(result: Result) -> None:
+    require_robots(result.workspace)
 
 
 _BAGS = ("ros1_bag", "ros2_bag")
@@ -197,13 +182,21 @@ _FORMATS = {
         on_earth=True,
     ),
     "cog": _Format(
-        "all maps as a Cloud Optimized GeoTIFF", ("maps_cog.tif",), _write_cog, on_earth=True
+        "all maps as a Cloud Optimized GeoTIFF",
+        ("maps_cog.tif",),
+        lambda content, file: write_geotiff(
+            file, content.maps(), content.result.workspace, cog=True, style=False
+        ),
+        on_earth=True,
     ),
     "netcdf": _Format(
         "all maps as netCDF by the CF conventions",
         ("maps.nc",),
-        lambda content, file: write_netcdf(file, content.maps, content.result.workspace),
-        require=_require_netcdf,
+        lambda content, file: write_netcdf(file, content.maps(), content.result.workspace),
+        # Result.maps renames features that have the name of a coordinate.
+        require=lambda result: require_names_for_netcdf(
+            name for name in result.workspace.features if "/" in name
+        ),
     ),
     "geojson": _Format(
         "path, posts and ways in longitude and latitude",
@@ -231,19 +224,23 @@ _FORMATS = {
         on_terrain=tuple(file.name for file in tables_beside(Path("path.csv"))),
     ),
     "ros_map": _Format(
-        "the cost map for map_server and Nav2", ("cost_map.yaml", "cost_map.pgm"), _write_map
+        "the cost map for map_server and Nav2",
+        ("cost_map.yaml", "cost_map.pgm"),
+        lambda content, file: write_ros_map(
+            file, content.maps()["cost"], content.result.workspace, **content.for_ros
+        ),
     ),
     "ros1_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 1",
         ("path.bag",),
         _write_bag,
-        require=lambda result: require_robots(result.workspace),
+        require=_require_topics,
     ),
     "ros2_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 2 (mcap)",
         ("path_ros2",),
         _write_bag,
-        require=lambda result: require_robots(result.workspace),
+        require=_require_topics,
     ),
 }
 FORMATS = {name: kind.text for name, kind in _FORMATS.items()}

@@ -24,11 +24,10 @@ def gpx_routes(plan: Plan, name: str) -> str:
     root = ET.Element("gpx", version="1.1", creator="trustbo", xmlns=_NAMESPACE)
     centers = bounds_layer(plan).drop(columns="geometry")
     rows = centers.to_dict("records")
-    names = ["start", *(f"bound {k}" for k in range(1, len(rows) - 1)), "goal"]
     descriptions = ["start", *(_trust(row, plan.workspace.team.names) for row in rows[1:])]
     about = "expected trust in each robot after each bound, and its 90 % band"
     place = centers[["x", "y"]].to_numpy()
-    _add(root, plan, name, about, place, list(zip(names, descriptions, strict=True)))
+    _add(root, plan, name, about, place, list(zip(_ends(plan), descriptions, strict=True)))
     if (surface := plan.workspace.surface) is not None:
         near = 0.5 * min(surface.pixel)
         for robot, ways in routes_of(plan).items():
@@ -43,8 +42,7 @@ def _route(
     """Return the description of a robot's route, its points (point, 2), and their labels."""
     n_bounds, names = len(plan.path) - 1, (LEAD, *plan.workspace.team.names)
     cells = [f"cell {row}, {col}" for row, col in plan.path]
-    ends = ["start", *(f"bound {k}" for k in range(1, n_bounds)), "goal"]
-    stops = [(end, f"waypoint of {cell}") for end, cell in zip(ends, cells, strict=True)]
+    stops = [(end, f"waypoint of {cell}") for end, cell in zip(_ends(plan), cells, strict=True)]
     about = "ways of the lead; it stops at points with a name, while the others close up"
     first = plan.waypoints
     if robot != LEAD:
@@ -87,6 +85,11 @@ def _add(
         if stop:
             ET.SubElement(element, "name").text = stop
             ET.SubElement(element, "desc").text = text
+
+
+def _ends(plan: Plan) -> list[str]:
+    """Names of the cells of a path."""
+    return ["start", *(f"bound {k}" for k in range(1, len(plan.path) - 1)), "goal"]
 
 
 def _trust(row: dict, robots: tuple[str, ...]) -> str:

@@ -6,7 +6,7 @@ import pandas as pd
 from trustbo.campaign.result import Result
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, require_file, write_text
-from trustbo.logs.rows import column_of
+from trustbo.logs.rows import KEYS, column_of
 from trustbo.spreadsheet import frame_as_csv
 
 _TRUST = ("trust_mean", "trust_sd")
@@ -38,20 +38,11 @@ def write_csv(path: FilePath, result: Result) -> None:
     for j, mission in enumerate(result.missions):
         for k, bound in enumerate(mission.bounds):
             for i, robot in enumerate(mission.robots):
-                row, col = bound.cell
+                rates = {n: getattr(bound, n)[i] for n in ("contact_rate", "duration", "n_ticks")}
                 rows.append(
-                    {
-                        "mission": j,
-                        "bound": k + 1,
-                        "robot": robot,
-                        "row": row,
-                        "col": col,
-                        "contact_rate": bound.contact_rate[i],
-                        "duration": bound.duration[i],
-                        "n_ticks": bound.n_ticks[i],
-                        "status": bound.status,
-                        "mission_status": mission.status,
-                    }
+                    dict(zip(KEYS, (j, k + 1, robot, *bound.cell), strict=True))
+                    | rates
+                    | {"status": bound.status, "mission_status": mission.status}
                     | dict(zip(map(_column, mission.features), bound.awareness[i], strict=True))
                     | {n: a[j][k, i] if j in a else np.nan for n, a in trust.items()}
                 )

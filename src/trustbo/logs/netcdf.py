@@ -1,8 +1,7 @@
 """Missions as trees of arrays, for netCDF files."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,28 +122,21 @@ def read_missions(path: FilePath) -> list[Mission]:
 
 def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
     """Missions of a tree that was read from a file, see `read_missions`."""
-    with _holding_missions(path):
-        kept = tree["missions"].to_dataset()
-        table = {str(n): a.values for n, a in kept.variables.items()}
-        folder = str(kept.attrs.get(_TICKS, _TICKS))  # files of version 0.2 do not name it
-        if "exposure" in table:  # its name in version 0.1
-            table["n_ticks"] = table.pop("exposure")
-        old = tree["ticks"].to_dataset() if "ticks" in tree.children else None
-        missions = []
-        for j in range(len(table["status"])):
-            ticks = None if old is None else old.isel(tick=old["mission"].values == j)
-            if ticks is None and (file := ticks_file(path, folder, j)).exists():
-                ticks = read_tree(file).to_dataset()
-            missions.append(_mission(table, j, ticks))
-        return missions
-
-
-@contextmanager
-def _holding_missions(path: FilePath) -> Iterator[None]:
-    """Convert errors to one that names what a file of missions lacks."""
     with interpreting(path):
         try:
-            yield
+            kept = tree["missions"].to_dataset()
+            table = {str(n): a.values for n, a in kept.variables.items()}
+            folder = str(kept.attrs.get(_TICKS, _TICKS))  # files of version 0.2 do not name it
+            if "exposure" in table:  # its name in version 0.1
+                table["n_ticks"] = table.pop("exposure")
+            old = tree["ticks"].to_dataset() if "ticks" in tree.children else None
+            missions = []
+            for j in range(len(table["status"])):
+                ticks = None if old is None else old.isel(tick=old["mission"].values == j)
+                if ticks is None and (file := ticks_file(path, folder, j)).exists():
+                    ticks = read_tree(file).to_dataset()
+                missions.append(_mission(table, j, ticks))
+            return missions
         except KeyError as error:
             raise DamagedFileError(f"{str(path)!r} holds no missions: it lacks {error}.") from None
 
@@ -200,8 +192,7 @@ def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> 
 
 def _ticks_of(ticks: xr.Dataset | None, k: int) -> tuple[np.ndarray | None, ...]:
     """Poses, contact and states of bound k; None if not recorded."""
-    mine = None if ticks is None else ticks["bound"].values == k
-    if ticks is None or mine is None or not mine.any():
+    if ticks is None or not (mine := ticks["bound"].values == k).any():
         return None, None, None
     states = ticks["states"].values[mine] if "states" in ticks else None
     if states is not None and np.isnan(states).all():
@@ -228,7 +219,7 @@ def _ticks(mission: Mission) -> xr.Dataset | None:
             "bound": ("tick", np.repeat([k for k, _ in recorded], lengths).astype(int)),
             "pose": (
                 ("tick", "member", "component"),
-                np.concatenate([bound.poses for _, bound in recorded]),
+                np.concatenate([b.poses for _, b in recorded]),
             ),
             "contact": (("tick", "robot"), np.concatenate([b.contact for _, b in recorded])),
             **states,
@@ -240,11 +231,10 @@ def _ticks(mission: Mission) -> xr.Dataset | None:
 def _states(where: str, bound: Any) -> np.ndarray:
     """States of a bound's ticks, NaN if not recorded."""
     shape = (*np.shape(bound.contact), len(STATES))
-    if bound.states is None:
-        return np.full(shape, np.nan)
-    if np.shape(bound.states) != shape:
+    states = np.full(shape, np.nan) if bound.states is None else bound.states
+    if np.shape(states) != shape:
         raise TrustboError(
             f"{where}: states must be {shape}, (tick, robot, state), see Bound.states; got "
-            f"{np.shape(bound.states)}."
+            f"{np.shape(states)}."
         )
-    return bound.states
+    return states

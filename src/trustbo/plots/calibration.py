@@ -30,7 +30,7 @@ def calibration(ranks: xr.Dataset, **style: Unpack[StyleOptions]) -> np.ndarray:
         Axes, shape (2,).
     """
     require_kind("plots.calibration", ranks, xr.Dataset, "give the Dataset of inference.sbc")
-    options, colours = Style.of(style), theme()
+    options, colours = Style.from_options(style), theme()
     made = small_multiples(2, (3.6, 2.9), options, least=2.4)
     curves, cover = made.panels
     n, names = ranks.sizes["dataset"], [str(name) for name in ranks["parameter"].values]

@@ -44,7 +44,7 @@ def parameter_history(
     """
     such = "give a list of posteriors, such as Result.posteriors"
     require_kind("plots.parameter_history", posteriors, Sequence, such)
-    options, colours = Style.of(style), theme()
+    options, colours = Style.from_options(style), theme()
     if not posteriors:
         raise TrustboError("there are no posteriors; give one for each mission.")
     available = [str(name) for name in posteriors[-1]["posterior"].data_vars]
@@ -107,7 +107,7 @@ def campaign_history(history: xr.Dataset, **style: Unpack[StyleOptions]) -> np.n
     require_kind(
         "plots.campaign_history", history, xr.Dataset, "give a history, such as Result.history"
     )
-    options, colours = Style.of(style), theme()
+    options, colours = Style.from_options(style), theme()
     if not history.sizes.get("iteration"):
         raise TrustboError("the history has no mission yet; tell the campaign one first.")
     made = small_multiples(2, (4.6, 1.6), options, columns=1, sharex=True)

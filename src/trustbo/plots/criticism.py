@@ -39,7 +39,7 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
         Axes, shape (9,).
     """
     require_kind("plots.criticism", found, Criticism, "give a Criticism, from tb.criticise")
-    made = small_multiples(9, (2.5, 2.2), Style.of(style), least=1.8)
+    made = small_multiples(9, (2.5, 2.2), Style.from_options(style), least=1.8)
     tests, pit, cover, correlation, *groups, cells = made.panels
     _draw_tests(tests, found)
     _draw_curves(pit, cover, correlation, found.curves)

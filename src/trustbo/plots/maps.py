@@ -73,7 +73,7 @@ def trust_maps(
         TrustboError: There is no such mission.
     """
     require_kind("plots.trust_maps", history, xr.Dataset, "give a history, such as Result.history")
-    options, number = Style.of(style), history["iteration"].values.tolist()
+    options, number = Style.from_options(style), history["iteration"].values.tolist()
     chosen = _chosen(missions, number)
     maps = [history["trust_map"].sel(iteration=i) for i in chosen]
     paths: list[Sequence[Cell]] = [_cells(history["path"].sel(iteration=i).values) for i in chosen]
@@ -136,7 +136,7 @@ def robot_maps(
     """
     such = "give maps (robot, row, col), such as planner.cost_map(params, per_robot=True)"
     require_kind("plots.robot_maps", maps, xr.DataArray, such)
-    options, maps = Style.of(style), maps.transpose("robot", "row", "col")
+    options, maps = Style.from_options(style), maps.transpose("robot", "row", "col")
     values = np.where(workspace.passable.values, maps.values, np.nan)
     if path is not None:
         values[:, *path[0]] = np.nan
@@ -166,7 +166,7 @@ def path_posterior(
     """
     such = "give probabilities (row, col), such as planner.path_posterior(posterior)"
     require_kind("plots.path_posterior", share, xr.DataArray, such)
-    label, options = "P(cell on the best path)", Style.of(style)
+    label, options = "P(cell on the best path)", Style.from_options(style)
     (ax,) = _draw_maps(
         [share], [path], [""], workspace, label, Normalize(0.0, 1.0), options, width=3.6
     )
@@ -199,7 +199,7 @@ def hazard_map(
     label, norm = "chance to fail on entering, at most", LogNorm(_LEAST_CHANCE, 1.0, clip=True)
     bar: dict[str, Any] = {"extend": "min", "format": "%g"}
     (ax,) = _draw_maps(
-        [hazard], [path], [""], workspace, label, norm, Style.of(style), width=3.6, **bar
+        [hazard], [path], [""], workspace, label, norm, Style.from_options(style), width=3.6, **bar
     )
     return ax
 
@@ -219,7 +219,7 @@ def _draw_maps(
     """Draw maps on one scale of colours, each with its path, and their colour bar."""
     made, colours = map_panels(workspace.grid, len(maps), options, width=width), options.colours()
     for ax, values, path in zip(made.panels, maps, paths, strict=True):
-        _draw_map(ax, values, workspace, norm, colours, relief=options.relief)
+        draw_cells(ax, values, workspace, norm, colours, relief=options.relief)
         if path is not None:
             draw_path(ax, path, workspace.grid)
     made.titles(titles)
@@ -257,10 +257,10 @@ def cell_map(
     Returns:
         Image, for a colour bar.
     """
-    return _draw_map(ax, values, workspace, Normalize(low, high), cmap, relief=relief)
+    return draw_cells(ax, values, workspace, Normalize(low, high), cmap, relief=relief)
 
 
-def _draw_map(
+def draw_cells(
     ax: Axes,
     values: xr.DataArray,
     workspace: Workspace,
@@ -269,6 +269,7 @@ def _draw_map(
     *,
     relief: bool,
 ) -> AxesImage:
+    """Draw a map of the planning cells, see `cell_map`."""
     shown = over_cells(values).transpose("row", "col").values
     data = np.where(workspace.passable.values, shown, np.nan)
     ax.set_facecolor(theme().closed)

@@ -37,7 +37,7 @@ def mission_trust(
     require_kind(
         "plots.mission_trust", posterior, xr.DataTree, "give a posterior, such as Result.posterior"
     )
-    options, latent = Style.of(style), posterior["latent"].to_dataset()
+    options, latent = Style.from_options(style), posterior["latent"].to_dataset()
     n_missions = latent.sizes["mission"]
     if not isinstance(mission, int | np.integer) or not -n_missions <= mission < n_missions:
         raise TrustboError(
@@ -77,7 +77,7 @@ def plan_trust(
     require_kind(
         "plots.plan_trust", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()"
     )
-    options, (n_bounds, n_robots) = Style.of(style), plan.trust.shape
+    options, (n_bounds, n_robots) = Style.from_options(style), plan.trust.shape
     if len(robots) != n_robots:
         raise ShapeError(f"the plan has {n_robots} robots; got the names {tuple(robots)}.")
     rates = np.full(plan.trust.shape, np.nan)

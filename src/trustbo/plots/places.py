@@ -11,10 +11,10 @@ from matplotlib.colors import Colormap, Normalize
 
 from trustbo.errors import ShapeError, require_kind
 from trustbo.inference import place_maps
-from trustbo.plots.layout import extent_of, map_panels
-from trustbo.plots.maps import draw_relief, draw_scale, outlined, robust_limits
-from trustbo.plots.style import Style, StyleOptions, theme
-from trustbo.workspace import Workspace
+from trustbo.plots.layout import map_panels
+from trustbo.plots.maps import draw_cells, draw_scale, outlined, robust_limits
+from trustbo.plots.style import Style, StyleOptions
+from trustbo.workspace import Grid, Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 
@@ -55,7 +55,7 @@ def place_map(
     such = "give a posterior with places, such as Result.posterior, and a Workspace"
     require_kind("plots.place_map", posterior, xr.DataTree, such)
     require_kind("plots.place_map", workspace, Workspace, such)
-    options, maps = Style.of(style), place_maps(posterior)
+    options, maps = Style.from_options(style), place_maps(posterior)
     have, grid = (maps.sizes["row"], maps.sizes["col"]), workspace.grid
     if have[0] > grid.shape[0] or have[1] > grid.shape[1]:
         raise ShapeError(
@@ -76,9 +76,7 @@ def place_map(
     for i, name in enumerate(names):
         maps_of_robot = maps.isel(robot=i)
         for ax, (kind, drawn) in zip(made.panels[2 * i : 2 * i + 2], colours.items(), strict=True):
-            _draw(ax, maps_of_robot, kind, units, i, workspace, *drawn)
-            if options.relief:
-                draw_relief(ax, workspace)
+            _draw(ax, maps_of_robot, kind, units, i, workspace, *drawn, relief=options.relief)
             titles.append(f"{name}: {wording[kind]}" if name else wording[kind])
         if "place_mean" in maps_of_robot:
             _signs(made.panels[2 * i], maps_of_robot, workspace, top)
@@ -114,18 +112,18 @@ def _draw(
     workspace: Workspace,
     norm: Normalize,
     colours: Colormap,
+    *,
+    relief: bool,
 ) -> None:
     """Draw cells and visited bounds of one robot, or of all of them."""
-    ax.set_facecolor(theme().closed)
     data = np.full(workspace.passable.shape, np.nan)
     if f"place_{kind}" in maps:
         of_cells = maps[f"place_{kind}"].transpose("row", "col").values
         data[: of_cells.shape[0], : of_cells.shape[1]] = of_cells
     elif kind == "mean":
         data[:] = 0.0
-    data[~workspace.passable.values] = np.nan
-    extent = extent_of(workspace.grid)
-    ax.imshow(data, cmap=colours, norm=norm, extent=extent, interpolation="nearest")
+    cells = workspace.passable.copy(data=data)
+    draw_cells(ax, cells, workspace, norm, colours, relief=relief)
     if f"place_bound_{kind}" in maps:
         mine = units["bound_effect"].values == effect
         move, row, col = (units[f"bound_{n}"].values[mine] for n in _OF_BOUND[1:])

@@ -42,7 +42,7 @@ def plan_map(
         TrustboError: The workspace has no terrain in memory, or there is no such bound.
     """
     require_kind("plots.plan_map", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()")
-    options = Style.of(style)
+    options = Style.from_options(style)
     if plan.waypoints is None:
         raise TrustboError(
             "plan_map needs a plan on a workspace made with Workspace.from_terrain of a terrain in "

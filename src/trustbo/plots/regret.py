@@ -51,7 +51,7 @@ def regret_curves(
     such = "give a study's dataset, from study.load_study"
     require_kind("plots.regret_curves", dataset, xr.Dataset, such)
     require_choice("variable", variable, _MEANING)
-    options = Style.of(style)
+    options = Style.from_options(style)
     for name in (by, panels or by):
         require_choice(
             "coordinate", name, [str(n) for n, c in dataset.coords.items() if "run" in c.dims]

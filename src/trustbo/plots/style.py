@@ -129,7 +129,7 @@ class Style:
         self.colours()
 
     @classmethod
-    def of(cls, options: StyleOptions) -> Self:
+    def from_options(cls, options: StyleOptions) -> Self:
         """Check the keyword arguments of a figure."""
         names = [f.name for f in fields(cls)]
         for name in options:

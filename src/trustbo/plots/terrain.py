@@ -36,7 +36,7 @@ def terrain_maps(workspace: Workspace, **style: Unpack[StyleOptions]) -> np.ndar
         TrustboError: The workspace has no terrain, or one that is read lazily.
     """
     require_kind("plots.terrain_maps", workspace, Workspace, "give a Workspace")
-    options, terrain, pixels = Style.of(style), workspace.terrain, workspace.pixels
+    options, terrain, pixels = Style.from_options(style), workspace.terrain, workspace.pixels
     if terrain is None or pixels is None:
         raise TrustboError(
             "terrain_maps needs a workspace made with Workspace.from_terrain of a terrain in "
@@ -101,7 +101,7 @@ def loadings(composites: Mapping[str, CompositeIndex], **style: Unpack[StyleOpti
     require_kind(
         "plots.loadings", composites, Mapping, "give composites by name, `Workspace.composites`"
     )
-    options = Style.of(style)
+    options = Style.from_options(style)
     if not composites:
         raise TrustboError("there are no composites: this workspace was not made from a terrain.")
     n, most = len(composites), max(len(index.signs) for index in composites.values())

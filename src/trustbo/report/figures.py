@@ -5,11 +5,12 @@ import numpy as np
 from trustbo import plots
 from trustbo.campaign.result import Result
 from trustbo.criticism.criticise import Criticism
+from trustbo.display.card import joined
 from trustbo.inference import params_of, place_maps
 from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.report.blocks import Picture
 from trustbo.report.drawing import picture
-from trustbo.report.numbers import counted, joined, number
+from trustbo.report.numbers import counted, number
 
 MOST_BOUNDS = 3
 """Number of bounds with a map of posts and ways: the first, the last, and some between."""
@@ -159,14 +160,14 @@ def parameters(result: Result) -> Picture | None:
     )
 
 
-def criticism(found: Criticism) -> Picture:
+def criticism(outcome: Criticism) -> Picture:
     """Draw the tests and residuals of the model's criticism."""
-    odd = found.groups.loc[found.groups["stands_out"].to_numpy(), :]
+    odd = outcome.groups.loc[outcome.groups["stands_out"].to_numpy(), :]
     sentence = (
         f"{counted(len(odd), 'mean')} outside a band" if len(odd) else "all within their bands"
     )
     return picture(
-        lambda: plots.criticism(found),
+        lambda: plots.criticism(outcome),
         "Nine panels: adjusted p of each test, PIT, coverage, autocorrelation, and mean residuals "
         f"by mission, bound, robot, expected contact and cell; {sentence}. "
         "The table has the tests.",

@@ -49,7 +49,7 @@ class LivePage:
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
-        at: TracebackType | None,
+        traceback: TracebackType | None,
     ) -> None:
         if kind is not None:
             self._write("It was interrupted", refresh=0)
@@ -87,16 +87,11 @@ def _if_long_ago(campaign: Campaign | None) -> str:
 def _sections(result: Result) -> list[Section]:
     """Sections of the first screen, drawn without figures that take seconds."""
     grid, start = result.workspace.grid, result.path[0]  # where trust is assumed
+    aspect, contacts = grid.cell_height / grid.cell_width, result.history["contact_rate"].values
     area = map_picture(
-        result.trust_map.values,
-        result.path,
-        aspect=grid.cell_height / grid.cell_width,
-        label="expected trust",
-        apart=start,
+        result.trust_map.values, result.path, aspect=aspect, label="expected trust", apart=start
     )
-    rates = curve_picture(
-        result.history["contact_rate"].values, label="contact rate", x_label="missions"
-    )
+    rates = curve_picture(contacts, label="contact rate", x_label="missions")
     path = (
         "Expected trust now, and the path recommended now, from circle to star. Grey cells are "
         "impassable, or the start, whose trust is assumed."

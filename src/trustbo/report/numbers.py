@@ -1,7 +1,6 @@
 """Numbers and words as text."""
 
 import math
-from collections.abc import Sequence
 
 MINUS, NONE = "\N{MINUS SIGN}", "\N{EN DASH}"
 
@@ -28,16 +27,6 @@ def decimals_for(spread: float) -> int:
     if not math.isfinite(spread) or spread <= 0.0:
         return 3
     return min(max(1 - math.floor(math.log10(spread)), 0), 6)
-
-
-def cell_text(cell: Sequence[int]) -> str:
-    """Format a cell as on the command line: "9,0"."""
-    return f"{cell[0]},{cell[1]}"
-
-
-def joined(names: Sequence[str]) -> str:
-    """Join names: "a, b and c"."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def counted(n: int, noun: str) -> str:

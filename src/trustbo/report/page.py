@@ -3,13 +3,12 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import jinja2
-
 from trustbo.campaign.result import Result
 from trustbo.criticism import criticise
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.models.backend import VERSIONS
+from trustbo.plots.explorer.page import page_of
 from trustbo.report import figures, tables
 from trustbo.report.blocks import Fact, Section
 from trustbo.report.numbers import counted
@@ -37,10 +36,8 @@ def write_report(path: FilePath, result: Result, *, title: str | None = None) ->
     target = require_file(path, ".html", ".htm")
     if not result.missions:
         raise TrustboError("the result has no mission; run one first.")
-    explorer_name = (
-        "explore.html" if target.name == "report.html" else f"{target.stem}-explore.html"
-    )
-    explorer = require_file(target.with_name(explorer_name))
+    prefix = "" if target.name == "report.html" else f"{target.stem}-"
+    explorer = require_file(target.with_name(f"{prefix}explore.html"))
     result.explore().save(explorer)
     name = title or f"The most trustworthy path after {counted(len(result.missions), 'mission')}"
     page = render(
@@ -74,15 +71,8 @@ def render(
             never; None for the report of one that did.
         version: Version that made the result.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("trustbo.report", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     filled = {"facts": facts, "sections": sections, "explorer": explorer, "refresh": refresh}
-    return environment.get_template("page.html").render(title=title, version=version, **filled)
+    return page_of("trustbo.report").render(title=title, version=version, **filled)
 
 
 def _sections(result: Result) -> Iterator[Section]:
@@ -116,22 +106,13 @@ def _sections(result: Result) -> Iterator[Section]:
     if on_terrain:
         yield Section("terrain", "Terrain", "", [figures.terrain(result)])
     parameters = figures.parameters(result)
-    yield Section(
-        "learned",
-        "Parameters",
-        _meaning_of_parameters(result),
-        [*([] if parameters is None else [parameters]), tables.parameter_table(result)],
-    )
+    learned = [*([] if parameters is None else [parameters]), tables.parameter_table(result)]
+    yield Section("learned", "Parameters", _meaning_of_parameters(result), learned)
     yield _criticism(result)
-    yield Section(
-        "last",
-        "Trust along the last mission",
-        _last_outcome(result),
-        [figures.last_mission(result)],
-    )
-    yield Section(
-        "history", "The campaign", "", [figures.history(result), tables.history_table(result)]
-    )
+    last = [figures.last_mission(result)]
+    yield Section("last", "Trust along the last mission", _last_outcome(result), last)
+    history = [figures.history(result), tables.history_table(result)]
+    yield Section("history", "The campaign", "", history)
     yield Section("settings", "Settings", "", [tables.settings_table(result)])
 
 

@@ -3,11 +3,12 @@
 import numpy as np
 
 from trustbo.campaign.result import Result
-from trustbo.display.card import arrival
+from trustbo.data import path_text
+from trustbo.display.card import arrival, joined
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import PathRisk, Plan
 from trustbo.report.blocks import Fact
-from trustbo.report.numbers import cell_text, counted, joined, number
+from trustbo.report.numbers import counted, number
 
 _MEANS = {
     "lost_contact": "minus the contact expected to be lost on the way, in bounds",
@@ -60,9 +61,9 @@ def _missions(result: Result) -> str:
 def _path(result: Result, plan: Plan) -> str:
     revisits = f", entering {counted(plan.revisits, 'cell')} again" if plan.revisits else ""
     return (
-        f"From cell {cell_text(plan.path[0])} (row, column) to {cell_text(plan.path[-1])} in "
+        f"From cell {path_text(plan.path[:1])} (row, column) to {path_text(plan.path[-1:])} in "
         f"{counted(len(plan.path) - 1, 'bound')}, {number(plan.length, 0)} m{revisits}: "
-        f"{' \N{RIGHTWARDS ARROW} '.join(cell_text(cell) for cell in plan.path)}."
+        f"{path_text(plan.path).replace(' ', ' \N{RIGHTWARDS ARROW} ')}."
     )
 
 

@@ -9,10 +9,11 @@ from arviz_stats import sampling_diagnostics
 from trustbo.campaign.history import GIVEN_UP
 from trustbo.campaign.result import Result
 from trustbo.criticism.criticise import Criticism
+from trustbo.data import path_text
 from trustbo.files import to_json
 from trustbo.inference.posterior_tree import labelled_draws
 from trustbo.report.blocks import Table
-from trustbo.report.numbers import NONE, cell_text, decimals_for, number
+from trustbo.report.numbers import NONE, decimals_for, number
 
 
 def bounds_table(result: Result) -> Table:
@@ -27,12 +28,12 @@ def bounds_table(result: Result) -> Table:
         return f"{number(plan.trust[k, i], places)} ({ends})"
 
     rows = [
-        (str(k + 1), cell_text(cell), *(trust(k, i) for i in range(len(names))))
+        (str(k + 1), path_text([cell]), *(trust(k, i) for i in range(len(names))))
         for k, cell in enumerate(plan.path[1:])
     ]
     return Table(
         "Expected trust after each bound of the recommended path, from cell "
-        f"{cell_text(plan.path[0])} on; in brackets the 90 % band over the posterior.",
+        f"{path_text(plan.path[:1])} on; in brackets the 90 % band over the posterior.",
         ("bound", "cell", *names),
         rows,
     )
@@ -80,16 +81,7 @@ def history_table(result: Result) -> Table:
         "status": [_outcome(row) for row in table.to_dict("records")],
         "contact rate": [number(rate, 2) for rate in table["contact_rate"]],
         "objective": [number(value, 3) for value in table["objective"]],
-        "path": [
-            NONE
-            if np.isnan(row["objective"])
-            else "first"
-            if label == 1
-            else "new"
-            if row["path_changed"]
-            else "same"
-            for label, row in zip(table.index, table.to_dict("records"), strict=True)
-        ],
+        "path": [_path(label, row) for label, row in table.iterrows()],
     }
     for name, label, places in (
         ("regret", "regret (%)", 1), ("r_hat", "R-hat", 3), ("ess_bulk", "bulk ESS", 0),
@@ -113,6 +105,12 @@ def history_table(result: Result) -> Table:
         rows,
         text_columns=(1, 4),
     )
+
+
+def _path(label: Hashable, row: Any) -> str:
+    if np.isnan(row["objective"]):
+        return NONE
+    return "first" if label == 1 else "new" if row["path_changed"] else "same"
 
 
 def _outcome(row: dict[Hashable, Any]) -> str:

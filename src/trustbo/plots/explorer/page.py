@@ -51,13 +51,6 @@ def draw_explorer(scene: Scene) -> Explorer:
     from bokeh.embed import json_item
     from bokeh.resources import Resources
 
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("trustbo.plots.explorer", "."),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     record = scene.record()
     colours = {layer["colours"] for layer in record["layers"]}
     marks = canvas.robot_marks(len(record["robots"]))
@@ -67,7 +60,7 @@ def draw_explorer(scene: Scene) -> Explorer:
     for i, layer in enumerate(record["layers"]):
         groups.setdefault(layer["group"], []).append((i, layer["label"]))
     figures = {"map": canvas.draw_map(scene), "chart": canvas.draw_chart(scene)}
-    page = environment.get_template("page.html").render(
+    page = page_of("trustbo.plots.explorer").render(
         title=scene.title,
         groups=groups,
         n_steps=len(scene.steps),
@@ -84,6 +77,18 @@ def draw_explorer(scene: Scene) -> Explorer:
         version=VERSIONS["trustbo"],
     )
     return Explorer(scene.title, page)
+
+
+def page_of(package: str) -> jinja2.Template:
+    """Template `page.html` of a package."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader(package, "."),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html")
 
 
 def _script(record: object) -> str:

@@ -81,17 +81,13 @@ class Step:
 
     def record(self) -> dict[str, Any]:
         """JSON-serialisable step."""
+        posts = None if self.posts is None else to_list(self.posts.round(2))
         return {
-            "title": self.title,
-            "note": self.note,
-            "heading": self.heading,
-            "path": [list(cell) for cell in self.path],
-            "stops": to_list(self.stops.round(2)),
-            "posts": None if self.posts is None else to_list(self.posts.round(2)),
-            "contact": to_list(self.contact),
-            "trust": to_list(self.trust),
+            "title": self.title, "note": self.note, "heading": self.heading,
+            "path": [list(cell) for cell in self.path], "stops": to_list(self.stops.round(2)),
+            "posts": posts, "contact": to_list(self.contact), "trust": to_list(self.trust),
             "numbers": self.numbers,
-        }
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
