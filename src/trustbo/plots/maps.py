@@ -22,9 +22,8 @@ from trustbo.plots.layout import (
     map_panels,
 )
 from trustbo.plots.style import COLOURS, SMALL, Style, StyleOptions, theme
-from trustbo.terrain import pixel_size
 from trustbo.terrain.dataset import pixel_size
-from trustbo.workspace import Grid, Workspace
+from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
 
 VEGETATION = (0.44, 0.56, 0.39, 0.4)

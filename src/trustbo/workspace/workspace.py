@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from trustbo.data import FEATURES, Cell, Mission, as_names, default_features, is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
-from trustbo.errors import ShapeError, TrustboError, moved, require_positive
+from trustbo.errors import ShapeError, TrustboError, require_positive
+from trustbo.renamed import former
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -298,7 +299,7 @@ class Workspace(Displayed):
     @property
     def difficulty(self) -> xr.DataArray:
         """Difficulty of bounds, as version 0.2 had it: see `hazard.difficulty.difficulty_of`."""
-        return moved("Workspace.difficulty", "trustbo.hazard.difficulty", "difficulty_of")(self)
+        return former("Workspace.difficulty", "trustbo.hazard.difficulty", "difficulty_of")(self)
 
     def ways_over(self, surface: Surface, sight: Sight | None = None) -> Ways:
         """Posts and ways over another surface of the same terrain, such as one with closed areas.
