@@ -12,9 +12,9 @@ import xarray as xr
 from worlds import hillside
 
 import trustbo as tb
+from trustbo.hazard.risk import PathRisk
 from trustbo.models import CoupledTrust, TrustParams
 from trustbo.models.params import CoupledParams
-from trustbo.planning import PathRisk
 from trustbo.report import LivePage, live, write_report
 from trustbo.report.numbers import decimals_for, number
 from trustbo.report.summary import _arrival, facts_of

@@ -1,17 +1,24 @@
-"""Risk of bounds: the posterior of their chances to fail, for planning."""
+"""Risk: the posterior of the chances of bounds to fail, and those of a path, for planning."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
-from trustbo.errors import require_whole
+from trustbo.data import Cell
+from trustbo.errors import ShapeError, TrustboError, require_whole
 from trustbo.hazard.difficulty import difficulty_of
 from trustbo.hazard.sampler import LIMIT_NAMES, TILT, add_lost, prior_betas, steepness_of
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import moves_along
 
+ROUNDING = 1e-12
+"""Rounding of the risk of a path that is just within a limit."""
+_BAND = (0.05, 0.95)
 _ENTRIES = 1 << 20  # of (draw, bound) at a time
 _SOME = 256  # number of bounds whose mean chance orders the draws
 
@@ -164,3 +171,127 @@ def _parts(n: int, other: int) -> list[slice]:
     """Slices of n rows of `other` entries each, of limited size."""
     step = max(1, _ENTRIES // max(1, other))
     return [slice(i, min(i + step, n)) for i in range(0, n, step)]
+
+
+@dataclass(frozen=True, eq=False)
+class Risk:
+    """Chance that a bound ends the mission, of all bounds of a workspace.
+
+    Attributes:
+        p_fail: Posterior mean, shape (move, row, col) with the moves of `MOVES[8]`; NaN where there
+            is no bound.
+        draws: Draws from its posterior, shape (draw, move, row, col), or None.
+        causes: Shares of the causes of a failure, each a number or an array (move, row, col); they
+            add up to 1.
+
+    Raises:
+        ShapeError: Another shape.
+        TrustboError: A chance outside [0, 1].
+    """
+
+    p_fail: np.ndarray
+    draws: np.ndarray | None = None
+    causes: Mapping[str, ArrayLike] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, p in (("p_fail", self.p_fail), ("draws of p_fail", self.draws)):
+            if p is None:
+                continue
+            if p.shape[-3:] != self.p_fail.shape or p.ndim != 3 + (p is self.draws):
+                expected = ("draw, " if p is self.draws else "") + "move, row, col"
+                raise ShapeError(f"{name} must have axes ({expected}); got shape {p.shape}.")
+            if ((p < 0.0) | (p > 1.0)).any():
+                worst = float(p[(p < 0.0) | (p > 1.0)][0])
+                raise TrustboError(f"{name} must be in [0, 1]; got {worst:g}.")
+
+    def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Product of 1 - p_fail along a path, what the limits and costs of planning go by.
+
+        Where the draws have bounds fail together, the chance to arrive is larger: see `along`.
+        """
+        return float(np.prod(1.0 - self.p_fail[_at(path)]))
+
+    def share_within(self, path: Sequence[Cell] | np.ndarray, max_failure: float) -> float:
+        """Share of the draws under which a path fails with a chance of at most `max_failure`."""
+        if self.draws is None:
+            return np.nan
+        p_fail = 1.0 - np.prod(1.0 - self.draws[_at(path)], axis=1)
+        return float((p_fail <= max_failure + ROUNDING).mean())
+
+    def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
+        """Select the bounds of a path."""
+        at = _at(path)
+        p = self.p_fail[at]
+        shares = {
+            cause: np.broadcast_to(s, self.p_fail.shape)[at] for cause, s in self.causes.items()
+        }
+        band, arrive = np.full((2, len(p)), np.nan), (np.nan, np.nan)
+        reach = np.cumprod(1.0 - p)
+        if self.draws is not None:
+            drawn = self.draws[at]
+            band = np.quantile(drawn, _BAND, axis=0)
+            low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
+            arrive = low, high
+            reach = np.minimum.accumulate(np.minimum(reach * _dependence(drawn), 1.0 - p))
+        by_cause = {cause: share * p for cause, share in shares.items()}
+        return PathRisk(p, band, float(reach[-1]), arrive, by_cause, reach)
+
+
+def _at(path: Sequence[Cell] | np.ndarray) -> tuple[Any, ...]:
+    """Index of the bounds of a path in arrays (..., move, row, col)."""
+    rows, cols = np.asarray(path)[1:].T
+    return ..., moves_along(path), rows, cols
+
+
+def _dependence(draws: np.ndarray) -> np.ndarray:
+    """Mean over draws of the product of 1 - p, over the product of the means, (bound,).
+
+    For draws (draw, bound), of the first bound, the first two, and so on: the factor by which
+    bounds are likelier to be passed together than if they were independent. Times the product of
+    1 - p_fail it is the mean over draws with the error of few draws in each p_fail taken out.
+    """
+    together = np.cumprod(1.0 - draws, axis=1).mean(0)
+    apart = np.cumprod((1.0 - draws).mean(0))
+    return np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
+
+
+class PathRisk(NamedTuple):
+    """Chance that a path's bounds end the mission, each given that it is begun."""
+
+    p_fail: np.ndarray
+    """Posterior mean, shape (bound,)."""
+    p_fail_band: np.ndarray
+    """Ends of its 90 % band over draws, shape (end, bound); NaN without draws."""
+    p_arrive: float
+    """Chance to reach the goal: the mean over draws of the product of 1 - p_fail, as bounds depend
+    on what they have in common; without draws, the product of the means."""
+    p_arrive_band: tuple[float, float]
+    """Ends of its 90 % band over draws; NaN without draws."""
+    by_cause: Mapping[str, np.ndarray]
+    """`p_fail` by cause of the failure, each of shape (bound,)."""
+    p_reach: np.ndarray
+    """Chance to complete each bound and all before it, shape (bound,); the last is `p_arrive`."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Convert to plain lists and numbers."""
+        by_cause = {cause: p.tolist() for cause, p in self.by_cause.items()}
+        return {
+            **self._asdict(),
+            "p_fail": self.p_fail.tolist(),
+            "p_fail_band": self.p_fail_band.tolist(),
+            "by_cause": by_cause,
+            "p_reach": self.p_reach.tolist(),
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """Convert the record of `to_record` back."""
+        (low, high), p_fail = record["p_arrive_band"], np.array(record["p_fail"])
+        return cls(
+            p_fail,
+            np.array(record["p_fail_band"]),
+            record["p_arrive"],
+            (low, high),
+            {cause: np.array(p) for cause, p in record["by_cause"].items()},
+            np.array(record.get("p_reach", np.cumprod(1.0 - p_fail))),  # not in version 0.2
+        )

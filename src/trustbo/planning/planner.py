@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import Cell
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
+from trustbo.hazard.risk import Risk
 from trustbo.models.families import FAMILIES
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
@@ -23,7 +24,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.posterior import DrawnPaths, choose_draws
 from trustbo.planning.problem import PlanningProblem, draws_of
-from trustbo.planning.risk import FailureRule, Risk
+from trustbo.planning.risk import FailureRule
 from trustbo.planning.search import solve
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.planning.values import evaluate

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
+from trustbo.hazard.risk import Risk
 from trustbo.inference.draws import params_of
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
 from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.risk import NO_RULE, FailureRule, Risk, RiskTable, risk_table
+from trustbo.planning.risk import NO_RULE, FailureRule, RiskTable, risk_table
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, along, move_indices
 

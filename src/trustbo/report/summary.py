@@ -5,8 +5,9 @@ import numpy as np
 from trustbo.campaign.result import Result
 from trustbo.data import path_text
 from trustbo.display.card import arrival, joined
+from trustbo.hazard.risk import PathRisk
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
-from trustbo.planning import PathRisk, Plan
+from trustbo.planning import Plan
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import counted, number
 

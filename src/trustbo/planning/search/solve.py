@@ -9,10 +9,11 @@ from scipy.special import expit, logit
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
+from trustbo.hazard.risk import Risk
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.risk import FailureRule, InfeasibleError, Risk, RiskTable
+from trustbo.planning.risk import FailureRule, InfeasibleError, RiskTable
 from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
 from trustbo.planning.search.reference import plan_networkx, with_costs
 from trustbo.planning.values import entry_cost
