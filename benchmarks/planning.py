@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.search.buckets import best_stationary
 from trustbo.planning.values import entry_cost
 from trustbo.workspace import Workspace
@@ -165,7 +165,7 @@ def large(n, kind, peers):
     start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
 
     def scipy_plan():
-        admissible = AdmissiblePaths(workspace, (0, 0), (n - 1, n - 1), 8, "shortest+2", True)
+        admissible = AdmissiblePaths(workspace, (0, 0), (n - 1, n - 1), PathClass(8, "shortest+2"))
         matrix = csr_of(admissible)
         matrix.data = cost.ravel()[matrix.indices]
         total, before = dijkstra(matrix, indices=start, return_predecessors=True)

@@ -9,7 +9,7 @@ from trustbo.data import Bound
 from trustbo.errors import TrustboError
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.simulation import KinematicSimulator, ModelSimulator, Threat, Truth, truth
 from trustbo.simulation.bound_table import BoundTable
 from trustbo.simulation.model_contact import ModelContact
@@ -203,7 +203,7 @@ def test_the_best_path_is_that_of_enumeration(objective, connectivity, max_bound
         )
         known = Truth(workspace, table)
         ends = (2, 0), (0, 3) if seed < 3 else (1, 2)
-        paths = AdmissiblePaths(workspace, *ends, connectivity, max_bounds, True)
+        paths = AdmissiblePaths(workspace, *ends, PathClass(connectivity, max_bounds))
         options = {"objective": objective, "max_bounds": max_bounds, "connectivity": connectivity}
         best = known.best(*ends, **options)
         values = {path: known.value(path) for path in walks(paths)}
@@ -289,7 +289,7 @@ def test_a_model_s_best_path_is_that_of_enumeration(name, objective, max_bounds)
         known = Truth(workspace, ModelContact(MODELS[name], PARAMS[name], workspace.bound_maps))
         ends = (2, 0), (0, 3)
         best = known.best(*ends, objective, max_bounds)
-        paths = AdmissiblePaths(workspace, *ends, 8, max_bounds, True)
+        paths = AdmissiblePaths(workspace, *ends, PathClass(8, max_bounds))
         values = [known.value(path) for path in walks(paths)]
         if objective == "mean":
             most = max(value.mean for value in values)

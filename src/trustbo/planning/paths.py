@@ -5,6 +5,7 @@ import operator
 import re
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import networkx as nx
 import numpy as np
@@ -38,19 +39,42 @@ DEFAULT_EXTRA = 8
 SIMPLE_EXTRA = 2
 """Bounds beyond the fewest possible up to which a path without U-turns enters no cell twice."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
-
-
 _MOST_STATES = 20_000_000
 """Most nodes of the layered DAG, whose tables take some 3 GB."""
+
+
+class PathClass(NamedTuple):
+    """Paths that are admissible between two cells; the fields are explained at `Planner`."""
+
+    connectivity: int = 8
+    max_bounds: int | str | None = None
+    """None: shortest + `DEFAULT_EXTRA`."""
+    revisit: bool = True
+
+    def longest(self, shortest: int) -> int:
+        """Largest number of bounds where the fewest are `shortest`.
+
+        TrustboError: an unknown name, or no whole number.
+        """
+        if self.max_bounds is None:
+            return shortest + DEFAULT_EXTRA
+        if isinstance(self.max_bounds, str):
+            if (named := _SHORTEST.fullmatch(self.max_bounds)) is None:
+                raise TrustboError(
+                    f"unknown max_bounds {self.max_bounds!r}; choose shortest, shortest+n for n "
+                    "bounds more without U-turns, such as shortest+2, or a number of bounds."
+                )
+            return shortest + int(named[1] or 0)
+        return int(require_whole("max_bounds", self.max_bounds, 1))
 
 
 class AdmissiblePaths:
     """Start, goal and the admissible paths between them, with the tables that engines need.
 
-    A path ends on entering the goal, and has `shortest` to `longest` bounds; `max_bounds` is the
-    limit as `Planner` takes it. With `u_turns`, where it is a number, a bound may lead back to the
-    cell that the last one left; with `revisit` a path may enter a cell twice. `steps` are the moves
-    to neighbouring cells, shape (move, 2), `lengths` theirs in metres, shape (move,), and `bounds`
+    A path ends on entering the goal, and has `shortest` to `longest` bounds; `connectivity`,
+    `max_bounds` and `revisit` are those of its `path_class`. With `u_turns`, where `max_bounds` is
+    a number, a bound may lead back to the cell that the last one left. `steps` are the moves to
+    neighbouring cells, shape (move, 2), `lengths` theirs in metres, shape (move,), and `bounds`
     those that a path may take, (move, row, col): the workspace's, less the `avoided`.
     """
 
@@ -59,17 +83,12 @@ class AdmissiblePaths:
         workspace: Workspace,
         start: Location,
         goal: Location,
-        connectivity: int,
-        max_bounds: int | str | None,
-        revisit: bool,
+        path_class: PathClass,
         avoided: np.ndarray | None = None,
     ) -> None:
-        """Prepare the tables; see `Planner`, and `avoiding` for bounds (8 moves, row, col).
-
-        `max_bounds` None: shortest + `DEFAULT_EXTRA`.
-        """
+        """Prepare the tables; see `Planner`, and `avoiding` for bounds (8 moves, row, col)."""
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        self.workspace, self.connectivity = workspace, require_connectivity(connectivity)
+        self.workspace, connectivity = workspace, require_connectivity(path_class.connectivity)
         self.start = workspace.require_cell("start", start)
         self.goal = workspace.require_cell("goal", goal)
         if self.start == self.goal:
@@ -85,10 +104,17 @@ class AdmissiblePaths:
         ends = self.start, self.goal, connectivity
         require_way(self.bounds, self.bounds_to_goal, *ends, n_passable)
         self.shortest = int(self.bounds_to_goal[self.start])
-        self.longest = self._most_bounds(max_bounds)
-        self.max_bounds = max_bounds if isinstance(max_bounds, str) else self.longest
-        self.u_turns = not isinstance(max_bounds, str)
-        self.revisit = revisit
+        self.longest = path_class.longest(self.shortest)
+        if self.longest < self.shortest:
+            raise TrustboError(
+                f"max_bounds = {self.longest} is below the fewest possible from {self.start} to "
+                f"{self.goal}, which is {self.shortest}."
+            )
+        self.u_turns = not isinstance(path_class.max_bounds, str)
+        if self.u_turns:
+            path_class = path_class._replace(max_bounds=self.longest)
+        self.path_class = path_class
+        self.connectivity, self.max_bounds, self.revisit = path_class
 
     @cached_property
     def graph(self) -> nx.DiGraph:
@@ -188,21 +214,16 @@ class AdmissiblePaths:
             if least is not None:
                 avoided[*least] = False
             try:
-                return self._with(self.start, self.goal, self.max_bounds, avoided.copy())
+                ends = self.workspace, self.start, self.goal
+                return AdmissiblePaths(*ends, self.path_class, avoided.copy())
             except TrustboError:  # the goal is out of reach, or of the bounds that are allowed
                 continue
         return self
 
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
         """Return the paths to another cell, of so many bounds more than the fewest."""
-        ends = self.workspace, self.start, cell, self.connectivity
-        return AdmissiblePaths(*ends, f"shortest+{extra}", True, self.avoided)
-
-    def _with(
-        self, start: Cell, goal: Cell, max_bounds: int | str, avoided: np.ndarray | None
-    ) -> "AdmissiblePaths":
-        ends = self.workspace, start, goal, self.connectivity
-        return AdmissiblePaths(*ends, max_bounds, self.revisit, avoided)
+        admitted = PathClass(self.connectivity, f"shortest+{extra}")
+        return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
 
     def onward(self, done: Sequence[Cell]) -> "AdmissiblePaths":
         """Restrict to the rest of a mission that entered the cells `done` so far, start first.
@@ -226,10 +247,9 @@ class AdmissiblePaths:
             raise NoPathError(
                 f"from {here} to {self.goal} it takes {fewest} bounds, but {left} are left."
             )
-        max_bounds = left
-        if not self.u_turns:
-            max_bounds = f"shortest+{left - fewest}"
-        return self._with(here, self.goal, max_bounds, self.avoided)
+        max_bounds = left if self.u_turns else f"shortest+{left - fewest}"
+        admitted = self.path_class._replace(max_bounds=max_bounds)
+        return AdmissiblePaths(self.workspace, here, self.goal, admitted, self.avoided)
 
     def flat(self, cell: Cell) -> int:
         """Index of a cell in row-major order."""
@@ -269,23 +289,6 @@ class AdmissiblePaths:
                 f"the path is broken: no bound leads from {cells[k]} to {cells[k + 1]}."
             )
         return cells
-
-    def _most_bounds(self, max_bounds: int | str | None) -> int:
-        if max_bounds is None:
-            return self.shortest + DEFAULT_EXTRA
-        if isinstance(max_bounds, str):
-            if (named := _SHORTEST.fullmatch(max_bounds)) is None:
-                raise TrustboError(
-                    f"unknown max_bounds {max_bounds!r}; choose shortest, shortest+n for n bounds "
-                    "more without U-turns, such as shortest+2, or a number of bounds."
-                )
-            return self.shortest + int(named[1] or 0)
-        if require_whole("max_bounds", max_bounds, 1) < self.shortest:
-            raise TrustboError(
-                f"max_bounds = {max_bounds} is below the fewest possible from {self.start} to "
-                f"{self.goal}, which is {self.shortest}."
-            )
-        return int(max_bounds)
 
 
 def _by_cell(bounds: np.ndarray) -> dict[Cell, int]:

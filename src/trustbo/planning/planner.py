@@ -20,11 +20,11 @@ from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import DEFAULT_MAX_BOUNDS, Objective
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.plan import Plan
 from trustbo.planning.posterior import DrawnPaths, choose_draws
 from trustbo.planning.problem import PlanningProblem, draws_of
-from trustbo.planning.risk import FailureRule
+from trustbo.planning.risk import RiskRule
 from trustbo.planning.search import solve
 from trustbo.planning.trust_map import cost_of, summary_of, trust_map
 from trustbo.planning.values import evaluate
@@ -115,14 +115,15 @@ class Planner(Displayed):
             NoPathError: The goal cannot be reached.
         """
         self.engine, self._engine = engine, solve.Engine(engine, backend)
-        self.family = FAMILIES[require_choice("observation", observation, FAMILIES)]
-        self.lag = float(require_choice("response", response, RESPONSES) == "change")
+        family = FAMILIES[require_choice("observation", observation, FAMILIES)]
+        lag = float(require_choice("response", response, RESPONSES) == "change")
         require_choice("engine", engine, solve.ENGINES)
         if max_bounds is None:
             max_bounds = DEFAULT_MAX_BOUNDS.get(objective, "shortest+2")
-        paths = AdmissiblePaths(workspace, start, goal, connectivity, max_bounds, revisit)
-        chosen = Objective(objective, length_weight, self.family, self.lag)
-        rule = FailureRule(max_failure, confidence, failure_cost, infeasible)
+        admitted = PathClass(connectivity, max_bounds, revisit)
+        paths = AdmissiblePaths(workspace, start, goal, admitted)
+        rule = RiskRule(max_failure, confidence, failure_cost, infeasible)
+        chosen = Objective(objective, length_weight, family, lag)
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
     def _card(self) -> Card:
@@ -146,7 +147,8 @@ class Planner(Displayed):
         self.start, self.goal = paths.start, paths.goal
         self.shortest, self.longest = paths.shortest, paths.longest
         self.max_bounds, self.connectivity = paths.max_bounds, paths.connectivity
-        self.objective, self.team = problem.objective.name, problem.team
+        self.objective, _, self.family, self.lag = problem.objective
+        self.team = problem.team
 
     def _with(self, problem: PlanningProblem) -> Self:
         other = copy(self)
@@ -201,9 +203,7 @@ class Planner(Displayed):
         if family is self.family:  # what the problem has computed stays
             return self
         objective = self.problem.objective._replace(family=family)
-        other = self._with(replace(self.problem, objective=objective))
-        other.family = family
-        return other
+        return self._with(replace(self.problem, objective=objective))
 
     def with_risk(
         self,

@@ -17,7 +17,7 @@ from trustbo.models.params import Params
 from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
 from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.risk import NO_RULE, FailureRule, RiskTable, risk_table
+from trustbo.planning.risk import NO_RULE, RiskRule, RiskTable, risk_table
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, along, move_indices
 
@@ -44,7 +44,7 @@ class PlanningProblem:
     team: str
     cells: np.ndarray | None = None
     mean_cells: np.ndarray | None = None
-    rule: FailureRule = NO_RULE
+    rule: RiskRule = NO_RULE
     risk: Risk | None = None
 
     def __post_init__(self) -> None:

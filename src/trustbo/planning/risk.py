@@ -30,7 +30,7 @@ class InfeasibleError(TrustboError):
         self.path, self.p_fail = path, p_fail
 
 
-class FailureRule(NamedTuple):
+class RiskRule(NamedTuple):
     """Amount of failure that a planner accepts, and the cost of a failure."""
 
     max_failure: float | None = None
@@ -69,7 +69,7 @@ class FailureRule(NamedTuple):
         return self
 
 
-NO_RULE = FailureRule()
+NO_RULE = RiskRule()
 
 
 class RiskTable(NamedTuple):
@@ -113,7 +113,7 @@ class RiskTable(NamedTuple):
 
 
 def risk_table(
-    risk: Risk, rule: FailureRule, failure_cost: float, paths: AdmissiblePaths
+    risk: Risk, rule: RiskRule, failure_cost: float, paths: AdmissiblePaths
 ) -> RiskTable | None:
     """Build the table for admissible paths, None where risk does not matter to a planner.
 

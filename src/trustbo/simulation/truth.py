@@ -22,7 +22,7 @@ from trustbo.files import FilePath, cache_folder, require_folder, to_json
 from trustbo.logs.netcdf import read_tree, write_tree
 from trustbo.models.backend import VERSIONS
 from trustbo.planning import Plan
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.simulation.bound_table import BoundTable, tabulate
 from trustbo.simulation.events import acts_in
 from trustbo.simulation.model import ModelSimulator
@@ -166,7 +166,7 @@ class Truth(Displayed):
         a, b = (self.workspace.require_cell(*e) for e in (("start", start), ("goal", goal)))
         key = a, b, objective, max_bounds, connectivity
         if key not in self._best:
-            paths = AdmissiblePaths(self.workspace, a, b, connectivity, max_bounds, True)
+            paths = AdmissiblePaths(self.workspace, a, b, PathClass(connectivity, max_bounds))
             self._best[key] = self.bounds.best(paths, objective)
         return self._best[key]
 

@@ -18,7 +18,7 @@ from trustbo.models.params import Params
 from trustbo.models.record import model_to_record
 from trustbo.planning import POLICIES, Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.policies import random, seed_of
 from trustbo.study.calls import Call, identity_of, imported
 from trustbo.workspace import Workspace
@@ -125,8 +125,8 @@ def shortest_path() -> Unlearned:
 
 
 def _random_shortest(key: Array, posterior: Params, planner: Planner) -> Plan:
-    ends = planner.start, planner.goal
-    paths = AdmissiblePaths(planner.workspace, *ends, planner.connectivity, "shortest", True)
+    admitted = PathClass(planner.connectivity, "shortest")
+    paths = AdmissiblePaths(planner.workspace, planner.start, planner.goal, admitted)
     path = path_sampler(paths).draw(np.random.default_rng(seed_of(key)))
     return planner.evaluate(path, posterior.mean())
 

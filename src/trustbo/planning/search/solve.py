@@ -13,7 +13,7 @@ from trustbo.hazard.risk import Risk
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.risk import FailureRule, InfeasibleError, RiskTable
+from trustbo.planning.risk import InfeasibleError, RiskRule, RiskTable
 from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
 from trustbo.planning.search.reference import plan_networkx, with_costs
 from trustbo.planning.values import entry_cost
@@ -84,7 +84,7 @@ def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T 
     return found
 
 
-def _infeasible(rule: FailureRule, risk: Risk, path: tuple[Cell, ...]) -> InfeasibleError:
+def _infeasible(rule: RiskRule, risk: Risk, path: tuple[Cell, ...]) -> InfeasibleError:
     p_fail, most = 1.0 - risk.survival(path), rule.max_failure or 0.0
     sure, held = "", ""
     if rule.confidence is not None:
