@@ -173,7 +173,7 @@ class Planner(Displayed):
         Raises:
             TrustboError: abs(beta0) >= 1, for which trust settles nowhere.
         """
-        return solve.graph_of(self.problem, self.dynamics(params))
+        return solve.graph_of(self.problem, self.problem.dynamics(params))
 
     @property
     def awareness(self) -> np.ndarray:
@@ -270,13 +270,15 @@ class Planner(Displayed):
                 f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
                 "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
             )
-        path, gap, engine = solve.find_path(self.problem, self.dynamics(params, x0), self._engine)
-        plan = evaluate(self.problem, path, params, x0)
+        dynamics = self.problem.dynamics(params, x0).flat()
+        found = solve.find_paths(self.problem, dynamics, self._engine)
+        plan = evaluate(self.problem, self.paths.cells(found.paths[0]), params, x0)
+        gap = float(found.gap[0])
         return replace(
             plan,
             exact=gap <= solve.EXACT,
             bound=solve.value_bound(self.objective, plan.value, gap),
-            engine=engine,
+            engine=self._engine.used,
             seconds=time.perf_counter() - started,
         )
 
@@ -289,7 +291,8 @@ class Planner(Displayed):
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        return solve.find_path(self.problem, dynamics, self._engine).path
+        found = solve.find_paths(self.problem, dynamics.flat(), self._engine)
+        return self.paths.cells(found.paths[0])
 
     def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
         """Find the path with the best expectation over draws of terminal, mean or lost contact.
@@ -307,7 +310,7 @@ class Planner(Displayed):
         """
         started = time.perf_counter()
         params = draws_of(posterior)
-        path = solve.find_expected(self.problem, self.dynamics(params))
+        path = solve.find_expected(self.problem, self.problem.dynamics(params))
         plan = evaluate(self.problem, path, params, cap=False)
         seconds = time.perf_counter() - started
         return replace(plan, exact=True, bound=plan.value, engine="numba", seconds=seconds)
@@ -326,10 +329,9 @@ class Planner(Displayed):
             TrustboError: beta0 of a draw is outside the range the objective is exact for.
         """
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
-        dynamics = self.dynamics(params, draws=chosen)
-        return DrawnPaths(
-            self.problem, dynamics, *solve.find_paths(self.problem, dynamics, self._engine), chosen
-        )
+        dynamics = self.problem.dynamics(params, draws=chosen)
+        found = solve.find_paths(self.problem, dynamics, self._engine)
+        return DrawnPaths(self.problem, dynamics, found.paths, found.gap, chosen)
 
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None

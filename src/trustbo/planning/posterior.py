@@ -10,8 +10,9 @@ from trustbo.data import Cell
 from trustbo.errors import require_whole
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
+from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.values import path_value
+from trustbo.planning.values import path_length, path_trust
 
 _ROUNDING = 1e-12
 """Difference of the values of two paths that may be the same."""
@@ -91,8 +92,9 @@ class DrawnPaths:
         return (count / len(self.paths)).reshape(passable.shape)
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
-        value = path_value(dynamics, self.problem.objective, self.problem.paths, path)
-        return value - self.problem.cost_of_failure(path)
+        objective, length = self.problem.objective, path_length(self.problem.paths, path)
+        trust = path_trust(dynamics.along(path), objective, length)
+        return OBJECTIVES[objective.name](trust) - self.problem.cost_of_failure(path)
 
     @cached_property
     def _unique(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import SIMPLE_EXTRA, AdmissiblePaths
 from trustbo.planning.problem import PlanningProblem
+from trustbo.planning.search.case import Case
 from trustbo.planning.search.compiled import plan_compiled
 from trustbo.planning.search.reachable_trust import best_trust
 from trustbo.planning.values import team_trust
@@ -83,7 +84,7 @@ def _trust_at(
     """Largest trust at one cell, by planning a path to it: vector trust has no scalar recursion."""
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
-    found = plan_compiled(admissible.to(cell, extra), dynamics, Objective("terminal"))
+    found = plan_compiled(Case(admissible.to(cell, extra), dynamics, Objective("terminal")))
     assert found is not None  # as there is no risk  # noqa: S101
     paths = found.paths
     return np.array(

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.models.params import Params
-from trustbo.planning.dynamics import Dynamics, as_map, roll, roll_trust, trust_dynamics
-from trustbo.planning.objectives import OBJECTIVES, SCORES, Objective, PathTrust, softplus
+from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
+from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import PlanningProblem
@@ -18,29 +18,18 @@ Path = Sequence[Cell] | np.ndarray
 """Cells, start first; or an array of them, shape (cell, 2)."""
 
 
-def path_value(
-    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
-) -> np.ndarray:
-    """Value of one path, shape (...,) as the leading axes of `dynamics`."""
-    return OBJECTIVES[objective.name](_of_path(dynamics, objective, admissible, path))
-
-
-def path_score(
-    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
-) -> np.ndarray:
-    """Score of one path, by which to compare it; see `SCORES`, shape (...,)."""
-    return SCORES[objective.name](_of_path(dynamics, objective, admissible, path))
-
-
-def _of_path(
-    dynamics: Dynamics, objective: Objective, admissible: AdmissiblePaths, path: Path
+def path_trust(
+    along: Dynamics, objective: Objective, length: float, *, cap: bool = True
 ) -> PathTrust:
-    length_cost = objective.length_weight * path_length(admissible, path)
-    return _path_trust(objective.capped(dynamics.along(path)), objective, length_cost)
+    """Trust on the path whose bounds `along` has, and what `SCORES` and `OBJECTIVES` need of it.
 
-
-def _path_trust(along: Dynamics, objective: Objective, length_cost: float) -> PathTrust:
-    """Trust (..., bound) on the path whose bounds `along` has, and what the objective needs."""
+    Args:
+        along: Recursion of expected trust on the path, see `Dynamics.along`.
+        objective: Objective of the values.
+        length: Length of the path, m.
+        cap: False to leave trust as it is for `lost_contact` too, see `Objective.capped`.
+    """
+    along = objective.capped(along) if cap else along
     trust = team_trust(along)
     steady_state = lost = np.full(trust.shape, np.nan)
     if objective.name == "stationary":
@@ -48,7 +37,7 @@ def _path_trust(along: Dynamics, objective: Objective, length_cost: float) -> Pa
     if objective.name == "lost_contact":
         before = (along.start @ along.views.T).min(-1)
         lost = objective.contact_lost(trust, before, along.noise_sd)
-    return PathTrust(trust, steady_state, length_cost, lost)
+    return PathTrust(trust, steady_state, objective.length_weight * length, lost)
 
 
 def team_trust(along: Dynamics) -> np.ndarray:
@@ -83,17 +72,16 @@ def evaluate(
     cells = flat.reshape(-1, 2)
     rows, cols = cells.T
     z, along = problem.awareness_along(cells, params), params.along(cells)
-    draws = roll_trust(along, z, x0)
+    z = as_map(z)
+    draws = roll(trust_dynamics(along, z, "min", x0))
     draws = draws.reshape(-1, *draws.shape[-2:])
     trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
     team = trust.mean(1) if problem.team == "mean" else trust.min(1)
-    cost = objective.length_weight * length
     if objective.name in ("stationary", "lost_contact"):
-        dynamics = trust_dynamics(along, as_map(z), problem.team, x0)
-        dynamics = objective.capped(dynamics) if cap else dynamics
-        value = OBJECTIVES[objective.name](_path_trust(dynamics, objective, cost)).mean()
+        dynamics = trust_dynamics(along, z, problem.team, x0)
+        value = OBJECTIVES[objective.name](path_trust(dynamics, objective, length, cap=cap)).mean()
     else:
-        value = OBJECTIVES[objective.name](PathTrust(team, team, cost))
+        value = OBJECTIVES[objective.name](PathTrust(team, team, objective.length_weight * length))
     risk = None if problem.risk is None else problem.risk.along(cells)
     return Plan(
         path=path,

@@ -1,81 +1,28 @@
-"""The compiled engine: the search for each kind of problem, in one table.
-
-| kind | value of a path | objectives |
-|---|---|---|
-| `sum` | a sum of weights of its bounds | `terminal`, `mean`, Gaussian `lost_contact` |
-| `history` | losses of one trust along it | `success`, `bottleneck`, other `lost_contact` |
-| `vector` | any of these of several trusts, or without revisits | all but `stationary` |
-| `free` | costs of its bounds, without history | `stationary` |
-"""
+"""The compiled engine: the search for each kind of case, in one table."""
 
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import over_rows, plain
-from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.risk import RiskTable
 from trustbo.planning.search import labels, labels_vector
 from trustbo.planning.search.buckets import best_stationary
+from trustbo.planning.search.case import Case
 from trustbo.planning.search.costs_to_go import safest_to_go
 from trustbo.planning.search.graph import Best, Graph, Resources, SearchProblem, no_resources
 from trustbo.planning.search.labels import solve
-from trustbo.planning.search.layers import Weights, additive_weights, best_additive
+from trustbo.planning.search.layers import Weights, best_additive
 from trustbo.planning.search.losses import EXPECTED, LEAST, NONE, SOFTPLUS, TINY_SD
 from trustbo.planning.values import entry_cost
 
 
-class Case(NamedTuple):
-    """Admissible paths, trust under every draw, objective, and a risk or none."""
-
-    admissible: AdmissiblePaths
-    dynamics: Dynamics
-    objective: Objective
-    risk: RiskTable | None
-
-    @property
-    def kind(self) -> str:
-        """Kind of the problem; see the head of this file."""
-        if self.objective.name == "stationary":
-            return "free"
-        if not self.objective.has_labels:
-            return "sum" if len(self.dynamics.views) == 1 else "vector"
-        scalar = self.dynamics.is_scalar and self.admissible.revisit
-        return "history" if scalar and self.admissible.can_unroll else "vector"
-
-    @property
-    def length_cost(self) -> np.ndarray:
-        """Cost of the length of each move, (move,)."""
-        return self.objective.length_weight * self.admissible.lengths
-
-    @property
-    def weights(self) -> Weights:
-        """Weights of the bounds of a sum, by the bounds left.
-
-        TrustboError: so many bounds are admissible that their graph is too large to be held.
-        """
-        _ = self.admissible.layers  # which refuses that, before weights of so many bounds are
-        view, longest = self.dynamics.views[0], self.admissible.longest
-        return additive_weights(self.dynamics, view, self.objective, longest)
-
-
-def plan_compiled(
-    admissible: AdmissiblePaths,
-    dynamics: Dynamics,
-    objective: Objective,
-    risk: RiskTable | None = None,
-) -> Best | None:
-    """Find the best path of every draw; `dynamics` with a leading axis (draw,).
-
-    None if no path is feasible under a risk, which no draw changes.
-    """
-    case = Case(admissible, dynamics, objective, risk)
-    best = SEARCHES[case.kind, risk is not None](case)
+def plan_compiled(case: Case) -> Best | None:
+    """Find the best path of every draw; None if none is feasible under a risk."""
+    best = SEARCHES[case.kind, case.risk is not None](case)
     missing = best.paths[:, 0] < 0
     if (missing & (best.lower < np.inf)).any():
         raise _too_many_labels(case)
@@ -256,12 +203,7 @@ SEARCHES = {
 """Search by the kind of a problem, and whether there is a risk."""
 
 
-def expected_path(
-    admissible: AdmissiblePaths,
-    dynamics: Dynamics,
-    objective: Objective,
-    risk: RiskTable | None = None,
-) -> np.ndarray | None:
+def expected_path(case: Case) -> np.ndarray | None:
     """Find the path with the best *expectation* of terminal or mean trust, or of lost contact.
 
     These are linear in u with weights that do not depend on the path, so the expectation of weight
@@ -270,14 +212,13 @@ def expected_path(
     Returns:
         Flat indices of cells, filled with -1; None if no path is feasible under a risk.
     """
-    case = Case(admissible, dynamics, objective, risk)
-    weights = case.weights
+    weights, dynamics = case.weights, case.dynamics
     u = dynamics.drift.reshape(*dynamics.drift.shape[:3], -1)
     # E[w_j . u] for every number of bounds left j, move and cell: one state for every j.
     gain = np.einsum("djs,dsmc->jmc", weights.per_bound, np.nan_to_num(u)) / len(u)
-    pick = np.eye(admissible.longest + 1)[None]
+    pick = np.eye(case.admissible.longest + 1)[None]
     averaged = Weights(pick, weights.constant.mean(0, keepdims=True), weights.scale)
-    if risk is None:
+    if case.risk is None:
         return _best_of_lengths(case, gain[None], averaged).paths[0]
     best = _best_sums(case, [gain.reshape(len(gain), -1)], averaged)
     if best.paths[0, 0] >= 0:

@@ -20,33 +20,40 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.planning.dynamics import Dynamics
-from trustbo.planning.objectives import Objective, softplus
+from trustbo.planning.objectives import SCORES, Objective, softplus
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import RiskTable
+from trustbo.planning.search.case import Case
 from trustbo.planning.search.dominance import dominance_tests
+from trustbo.planning.search.graph import Best
 from trustbo.planning.search.layers import additive_weights
-from trustbo.planning.values import entry_cost, path_score
+from trustbo.planning.values import entry_cost, path_length, path_trust
 from trustbo.workspace.moves import MOVES
 
 Path = tuple[Cell, ...]
 _dijkstra: Any = nx.dijkstra_path  # annotations of networkx exclude `backend=None`
 
 
-def plan_networkx(
-    admissible: AdmissiblePaths,
-    dynamics: Dynamics,
-    objective: Objective,
-    backend: str | None = None,
-    risk: RiskTable | None = None,
-) -> Path | None:
-    """Find the best path of one draw, `dynamics` without leading axes; `backend` is networkx's.
+def plan_networkx(case: Case, backend: str | None = None) -> Best | None:
+    """Find the best path of every draw; None if none is feasible. `backend` is networkx's."""
+    found = []
+    for d in range(len(case.dynamics.start)):
+        if (path := _of_draw(case, case.dynamics.take(d), backend)) is None:
+            return None
+        found.append([case.admissible.flat(cell) for cell in path])
+    paths = np.full((len(found), max(map(len, found))), -1)
+    for flat, cells in zip(paths, found, strict=True):
+        flat[: len(cells)] = cells
+    return Best(paths, np.zeros(len(found)), np.zeros(len(found)))
 
-    None if there is no path that is feasible under a risk.
-    """
+
+def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None:
+    """Best path of one draw, `dynamics` without leading axes."""
+    admissible, _, objective, risk = case
     if risk is not None:
         feasible = feasible_paths(admissible, dynamics, objective, risk)
         cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
-        scores = [path_score(dynamics, objective, admissible, path) for path in feasible]
+        scores = [_score_of(case, dynamics, path) for path in feasible]
         return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
     if objective.name == "stationary":
         cost = entry_cost(admissible.passable, dynamics)
@@ -67,7 +74,13 @@ def plan_networkx(
             path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
         if path is not None:
             paths.append(path)
-    return max(paths, key=lambda path: float(path_score(dynamics, objective, admissible, path)))
+    return max(paths, key=lambda path: _score_of(case, dynamics, path))
+
+
+def _score_of(case: Case, dynamics: Dynamics, path: Path) -> float:
+    length = path_length(case.admissible, path)
+    trust = path_trust(dynamics.along(path), case.objective, length)
+    return float(SCORES[case.objective.name](trust))
 
 
 def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:

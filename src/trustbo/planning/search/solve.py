@@ -1,4 +1,4 @@
-"""Search for the best path: validity of the objective, choice of the engine, optimality gap."""
+"""Search for the best path: validity of the objective, choice of the engine, upper limits."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,13 +8,15 @@ import numpy as np
 from scipy.special import expit, logit
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError
 from trustbo.hazard.risk import Risk
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.risk import InfeasibleError, RiskRule, RiskTable
+from trustbo.planning.search.case import Case
 from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
+from trustbo.planning.search.graph import Best
 from trustbo.planning.search.reference import plan_networkx, with_costs
 from trustbo.planning.values import entry_cost
 from trustbo.workspace.moves import move_indices
@@ -31,47 +33,30 @@ class Engine(NamedTuple):
     backend: str | None = None
 
     @property
-    def is_reference(self) -> bool:
-        """Whether it is networkx; `auto` and `numba` are compiled."""
-        return require_choice("engine", self.name, ENGINES) == "networkx"
+    def used(self) -> str:
+        """Name of what searches: networkx, or for `auto` too numba."""
+        return "networkx" if self.name == "networkx" else "numba"
 
 
-class FoundPath(NamedTuple):
-    """A best path, its optimality gap and the name of the engine."""
-
-    path: tuple[Cell, ...]
-    gap: float
-    engine: str
-
-
-def find_path(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> FoundPath:
-    """Find the best path under one draw, `dynamics` without leading axes.
+def find_paths(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> Best:
+    """Find the best path under every draw, `dynamics` with leading axis (draw,).
 
     InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     """
-    paths, objective = problem.paths, problem.objective
-    require_valid(dynamics, objective)
-    dynamics = objective.capped(dynamics)
-
-    def best(risk: RiskTable | None) -> FoundPath | None:
-        if engine.is_reference:
-            path = plan_networkx(paths, dynamics, objective, engine.backend, risk)
-            return None if path is None else FoundPath(path, 0.0, "networkx")
-        found = plan_compiled(paths, dynamics.flat(), objective, risk)
-        if found is None:
-            return None
-        return FoundPath(paths.cells(found.paths[0]), float(found.gap[0]), "numba")
-
-    return _feasible(problem, best)
+    require_valid(dynamics, problem.objective)
+    case = Case(problem.paths, problem.objective.capped(dynamics), problem.objective)
+    if engine.used == "networkx":
+        return _feasible(problem, case, lambda case: plan_networkx(case, engine.backend))
+    return _feasible(problem, case, plan_compiled)
 
 
-def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T | None]) -> T:
+def _feasible[T](problem: PlanningProblem, case: Case, search: Callable[[Case], T | None]) -> T:
     """Find the best under the planner's risk, or under that of the safest path.
 
     InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     """
     risk = problem.risk_table
-    if (found := best(risk)) is not None:
+    if (found := search(case._replace(risk=risk))) is not None:
         return found
     assert risk is not None and problem.risk is not None  # noqa: S101, PT018
     path, limit = safest_path(problem.paths, problem.objective.name, risk.of_bounds[0])
@@ -79,7 +64,8 @@ def _feasible[T](problem: PlanningProblem, best: Callable[[RiskTable | None], T 
         raise _infeasible(problem.rule, problem.risk, path)
     # The best of those that are as safe, as rounding tells them apart.
     limits = np.array([limit + 1e-12 * max(1.0, limit)])
-    found = best(RiskTable(risk.of_bounds[:1], limits, 1, risk.failure_cost))
+    safest = RiskTable(risk.of_bounds[:1], limits, 1, risk.failure_cost)
+    found = search(case._replace(risk=safest))
     assert found is not None  # noqa: S101
     return found
 
@@ -99,34 +85,6 @@ def _infeasible(rule: RiskRule, risk: Risk, path: tuple[Cell, ...]) -> Infeasibl
     )
 
 
-def find_paths(
-    problem: PlanningProblem, dynamics: Dynamics, engine: Engine
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the best path under every draw: flat indices (draw, length), padded by -1; and gaps.
-
-    InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
-    """
-    paths, objective, n_draws = problem.paths, problem.objective, len(dynamics.start)
-    require_valid(dynamics, objective)
-    dynamics = objective.capped(dynamics)
-    if not engine.is_reference:
-        found = _feasible(problem, lambda risk: plan_compiled(paths, dynamics, objective, risk))
-        return found.paths, found.gap
-
-    def best(risk: RiskTable | None) -> list[tuple[Cell, ...]] | None:
-        found = [
-            plan_networkx(paths, dynamics.take(d), objective, engine.backend, risk)
-            for d in range(n_draws)
-        ]
-        return None if None in found else found  # pyright: ignore[reportReturnType]
-
-    found = _feasible(problem, best)
-    padded = np.full((n_draws, max(map(len, found))), -1)
-    for flat, path in zip(padded, found, strict=True):
-        flat[: len(path)] = [paths.flat(cell) for cell in path]
-    return padded, np.zeros(n_draws)
-
-
 def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, ...]:
     """Find the path with the best expectation over draws of the objective, trust not capped.
 
@@ -142,8 +100,7 @@ def find_expected(problem: PlanningProblem, dynamics: Dynamics) -> tuple[Cell, .
             "linear in trust, 'lost_contact' of a team's mean trust; got "
             f"{objective.name!r} of {objective.family.name!r} rates with team={problem.team!r}."
         )
-    found = _feasible(problem, lambda risk: expected_path(paths, dynamics, objective, risk))
-    return paths.cells(found)
+    return paths.cells(_feasible(problem, Case(paths, dynamics, objective), expected_path))
 
 
 def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
