@@ -270,7 +270,7 @@ class Planner(Displayed):
                 f"give one draw at a time: the parameters have leading axes {params.leading}. Use "
                 "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
             )
-        dynamics = self.problem.dynamics(params, x0).flat()
+        dynamics = self.problem.dynamics(params, x0)
         found = solve.find_paths(self.problem, dynamics, self._engine)
         plan = evaluate(self.problem, self.paths.cells(found.paths[0]), params, x0)
         gap = float(found.gap[0])
@@ -291,7 +291,7 @@ class Planner(Displayed):
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        found = solve.find_paths(self.problem, dynamics.flat(), self._engine)
+        found = solve.find_paths(self.problem, dynamics, self._engine)
         return self.paths.cells(found.paths[0])
 
     def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:

@@ -108,8 +108,8 @@ class RiskTable(NamedTuple):
         return bool((total <= self.limits).sum() >= self.needed)
 
     def cost(self, total: np.ndarray) -> float:
-        """Cost of a failure times its chance, for sums (resource,)."""
-        return float(-self.failure_cost * np.expm1(-total[0]))
+        """Cost of a failure times its chance, for sums (resource,); 0 without any."""
+        return float(-self.failure_cost * np.expm1(-total[:1].sum()))
 
 
 def risk_table(

@@ -3,10 +3,10 @@
 A path ends when it first enters the goal. Dijkstra with "trust on arrival" as the label is wrong
 for every history-dependent objective: the best label of a cell need not extend to the best path.
 
-Where plans have a risk: labels with Pareto dominance, for every objective. A label is a walk, its
-trust, score and risk. Of two that are in one cell after as many bounds, the one that has at least
-as good a score, as much trust at every bound to come, and no more of any risk has the better of
-every completion; so labels that no other dominates suffice.
+Where plans have a risk, and for sums of the least of several trusts: labels with Pareto dominance,
+bound by bound. A label is a walk, its trust, score and risk. Of two that are in one cell after as
+many bounds, the one that has at least as good a score, as much trust at every bound to come, and no
+more of any risk has the better of every completion; so labels that no other dominates suffice.
 """
 
 import heapq
@@ -50,37 +50,42 @@ def plan_networkx(case: Case, backend: str | None = None) -> Best | None:
 def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None:
     """Best path of one draw, `dynamics` without leading axes."""
     admissible, _, objective, risk = case
-    if risk is not None:
-        feasible = feasible_paths(admissible, dynamics, objective, risk)
-        cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
-        scores = [_score_of(case, dynamics, path) for path in feasible]
-        return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
-    if objective.name == "stationary":
-        cost = entry_cost(admissible.passable, dynamics)
-        return best_stationary(admissible, cost, objective.length_weight, backend)
-    if objective.has_labels:
-        return best_labelled(admissible, dynamics, objective)
-    paths = []
+
+    def score(path: Path) -> float:
+        trust = path_trust(dynamics.along(path), objective, path_length(admissible, path))
+        return float(SCORES[objective.name](trust))
+
+    if risk is None:
+        if objective.name == "stationary":
+            cost = entry_cost(admissible.passable, dynamics)
+            return best_stationary(admissible, cost, objective.length_weight, backend)
+        if objective.has_labels:
+            return best_labelled(admissible, dynamics, objective)
+        if len(dynamics.views) == 1:  # the least of several views is no sum of weights
+            return max(_best_sums(case, dynamics, backend), key=score)
+        nothing = np.zeros((0, len(admissible.steps), admissible.passable.size))
+        risk = RiskTable(nothing, np.zeros(0), 0, 0.0)
+    feasible = feasible_paths(admissible, dynamics, objective, risk)
+    cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
+    scores = [score(path) for path in feasible]
+    return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
+
+
+def _best_sums(case: Case, dynamics: Dynamics, backend: str | None) -> list[Path]:
+    """Best path of each number of bounds, where the score is a sum of weights."""
+    admissible, _, objective, _ = case
     weights = additive_weights(dynamics.flat(), dynamics.views[0], objective, admissible.longest)
     gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, move, row, col)
+    paths = []
     for n_bounds in range(admissible.shortest, admissible.longest + 1):
-        if len(dynamics.views) > 1:  # the least of several views is no sum of weights
-            path = best_layered(admissible, dynamics, objective, n_bounds)
-        else:
 
-            def gain(k: int, before: Cell, cell: Cell, n: int = n_bounds) -> float:
-                return float(_of_bound(gains[n - k], before, cell) / weights.scale[n])
+        def gain(k: int, before: Cell, cell: Cell, n: int = n_bounds) -> float:
+            return float(_of_bound(gains[n - k], before, cell) / weights.scale[n])
 
-            path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
+        path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
         if path is not None:
             paths.append(path)
-    return max(paths, key=lambda path: _score_of(case, dynamics, path))
-
-
-def _score_of(case: Case, dynamics: Dynamics, path: Path) -> float:
-    length = path_length(case.admissible, path)
-    trust = path_trust(dynamics.along(path), case.objective, length)
-    return float(SCORES[case.objective.name](trust))
+    return paths
 
 
 def _of_bound(values: np.ndarray, before: Cell, cell: Cell) -> Any:
@@ -183,52 +188,9 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: Ob
     raise TrustboError(f"no path has at most {max_bounds} bounds.")
 
 
-def best_layered(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, n_bounds: int
-) -> Path | None:
-    """Find the path of `n_bounds` bounds with the best sum of trust for `team="min"`.
-
-    Bound by bound, with all labels at each cell that no other dominates. Scores of `mean` are sums,
-    divided by the number of bounds at the end, so each length costs as many times as much.
-    """
-    graph, tests = admissible.graph, dominance_tests(dynamics, n_bounds)
-    per_metre = objective.length_weight * (n_bounds if objective.name == "mean" else 1)
-    labels: dict[object, list[tuple[np.ndarray, float, np.ndarray, Path]]] = {
-        (None, admissible.start): [
-            (tests @ dynamics.start, 0.0, dynamics.start, (admissible.start,))
-        ]
-    }
-    for k in range(1, n_bounds + 1):
-        new: dict[object, list[tuple[np.ndarray, float, np.ndarray, Path]]] = {}
-        for (before, cell), here in labels.items():  # pyright: ignore[reportGeneralTypeIssues]
-            for other in graph.successors(cell):
-                if not _on_time(admissible, other, n_bounds - k) or other == before:
-                    continue
-                length_cost = per_metre * graph.edges[cell, other]["length"]
-                at = new.setdefault((None if admissible.u_turns else cell, other), [])
-                for _, score, x, path in here:
-                    reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
-                    trust = float((dynamics.views @ reached).min())
-                    gained = trust if objective.name != "terminal" or k == n_bounds else 0.0
-                    score_now = score + gained - length_cost
-                    _keep(at, (tests @ reached, score_now, reached, (*path, other)))
-        labels = new
-    ends = [label for at in labels.values() for label in at]
-    return max(ends, key=lambda label: label[1])[3] if ends else None
-
-
 def _on_time(admissible: AdmissiblePaths, cell: Cell, left: int) -> bool:
     """True if a path may enter a cell with so many bounds left; the goal only by the last."""
     return admissible.to_goal.get(cell, np.inf) <= left and (cell == admissible.goal) == (left == 0)
-
-
-def _keep(at: list[Any], label: Any) -> None:
-    """Add a label unless another dominates it; drop those that it dominates."""
-    tested, score = label[:2]
-    if any(s >= score and (q >= tested).all() for q, s, *_ in at):
-        return
-    at[:] = [old for old in at if not (score >= old[1] and (tested >= old[0]).all())]
-    at.append(label)
 
 
 def best_stationary(

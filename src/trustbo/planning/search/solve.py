@@ -39,12 +39,12 @@ class Engine(NamedTuple):
 
 
 def find_paths(problem: PlanningProblem, dynamics: Dynamics, engine: Engine) -> Best:
-    """Find the best path under every draw, `dynamics` with leading axis (draw,).
+    """Find the best path under every draw of `dynamics`, or the only one.
 
     InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     """
     require_valid(dynamics, problem.objective)
-    case = Case(problem.paths, problem.objective.capped(dynamics), problem.objective)
+    case = Case(problem.paths, problem.objective.capped(dynamics).flat(), problem.objective)
     if engine.used == "networkx":
         return _feasible(problem, case, lambda case: plan_networkx(case, engine.backend))
     return _feasible(problem, case, plan_compiled)
