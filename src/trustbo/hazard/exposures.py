@@ -71,7 +71,7 @@ class Exposures(NamedTuple):
         weight = _weights("weights", weights, len(missions))
         lost_weight = _weights("lost_weights", lost_weights, len(lost))
         runs = [_reported(m, w) for m, w in zip(missions, weight, strict=True)]
-        located = [_known_place(m, w) for m, w in zip(lost, lost_weight, strict=True) if m.where]
+        located = [_located(m, w) for m, w in zip(lost, lost_weight, strict=True) if m.where]
         unknown = [m for m in lost if m.where is None]
         met = [run.bounds for run in (*runs, *located)]
         planned = [_bounds_of(m.path) for m in unknown]
@@ -109,7 +109,7 @@ def _reported(mission: Mission, weight: float) -> _Run:
     return _Run(_bounds_of(mission.path[: survived + 1]), None, weight)
 
 
-def _known_place(mission: LostMission, weight: float) -> _Run:
+def _located(mission: LostMission, weight: float) -> _Run:
     cause = require_choice("cause", mission.cause, CAUSES)
     for k, (_, cell) in enumerate(pairwise(mission.path), start=1):
         if cell == mission.where:

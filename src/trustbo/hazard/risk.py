@@ -120,8 +120,8 @@ class BoundRisk:
         out = np.full((require_whole("n", n, 1), *self.exists.shape), np.nan)
         every, order = np.flatnonzero(self.exists), self._mildest_first
         chosen = rng.permutation(order[((np.arange(n) + 0.5) / n * len(order)).astype(int)])
-        for part in _parts(n, len(every)):
-            out[part, self.exists] = rng.beta(*self._betas(chosen[part], every))
+        for block in _blocks(n, len(every)):
+            out[block, self.exists] = rng.beta(*self._betas(chosen[block], every))
         return out
 
     @cached_property
@@ -137,14 +137,14 @@ class BoundRisk:
         mean, sd = np.full((2, *self.exists.shape), np.nan)
         draws = np.arange(len(self.strength))
         every = np.flatnonzero(self.exists)
-        for part in _parts(len(every), len(draws)):
-            a, b = self._betas(draws, every[part])
+        for block in _blocks(len(every), len(draws)):
+            a, b = self._betas(draws, every[block])
             total = a + b
             chance = a / total
             first = chance.mean(0)
             second = (chance * (a + 1.0) / (total + 1.0)).mean(0)
-            mean.flat[every[part]] = first
-            sd.flat[every[part]] = np.sqrt(np.maximum(0.0, second - first**2))
+            mean.flat[every[block]] = first
+            sd.flat[every[block]] = np.sqrt(np.maximum(0.0, second - first**2))
         return mean, sd
 
     def _betas(self, draws: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,7 +167,7 @@ def _places_in(bounds: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.where(bounds[nearest] == wanted, nearest, -1)
 
 
-def _parts(n: int, other: int) -> list[slice]:
+def _blocks(n: int, other: int) -> list[slice]:
     """Slices of n rows of `other` entries each, of limited size."""
     step = max(1, _ENTRIES // max(1, other))
     return [slice(i, min(i + step, n)) for i in range(0, n, step)]
@@ -205,30 +205,30 @@ class Risk:
                 raise TrustboError(f"{name} must be in [0, 1]; got {worst:g}.")
 
     def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Product of 1 - p_fail along a path, what the limits and costs of planning go by.
+        """Product of 1 - p_fail along a path, which limits and costs of plans use.
 
-        Where the draws have bounds fail together, the chance to arrive is larger: see `along`.
+        The chance to arrive is larger where bounds fail together under the draws: see `along`.
         """
-        return float(np.prod(1.0 - self.p_fail[_at(path)]))
+        return float(np.prod(1.0 - self.p_fail[_index_of(path)]))
 
     def share_within(self, path: Sequence[Cell] | np.ndarray, max_failure: float) -> float:
         """Share of the draws under which a path fails with a chance of at most `max_failure`."""
         if self.draws is None:
             return np.nan
-        p_fail = 1.0 - np.prod(1.0 - self.draws[_at(path)], axis=1)
+        p_fail = 1.0 - np.prod(1.0 - self.draws[_index_of(path)], axis=1)
         return float((p_fail <= max_failure + ROUNDING).mean())
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Select the bounds of a path."""
-        at = _at(path)
-        p = self.p_fail[at]
+        index = _index_of(path)
+        p = self.p_fail[index]
         shares = {
-            cause: np.broadcast_to(s, self.p_fail.shape)[at] for cause, s in self.causes.items()
+            cause: np.broadcast_to(s, self.p_fail.shape)[index] for cause, s in self.causes.items()
         }
         band, arrive = np.full((2, len(p)), np.nan), (np.nan, np.nan)
         reach = np.cumprod(1.0 - p)
         if self.draws is not None:
-            drawn = self.draws[at]
+            drawn = self.draws[index]
             band = np.quantile(drawn, _BAND, axis=0)
             low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
             arrive = low, high
@@ -237,18 +237,19 @@ class Risk:
         return PathRisk(p, band, float(reach[-1]), arrive, by_cause, reach)
 
 
-def _at(path: Sequence[Cell] | np.ndarray) -> tuple[Any, ...]:
+def _index_of(path: Sequence[Cell] | np.ndarray) -> tuple[Any, ...]:
     """Index of the bounds of a path in arrays (..., move, row, col)."""
     rows, cols = np.asarray(path)[1:].T
     return ..., moves_along(path), rows, cols
 
 
 def _dependence(draws: np.ndarray) -> np.ndarray:
-    """Mean over draws of the product of 1 - p, over the product of the means, (bound,).
+    """Ratio of the mean over draws of the product of 1 - p to the product of the means, (bound,).
 
     For draws (draw, bound), of the first bound, the first two, and so on: the factor by which
-    bounds are likelier to be passed together than if they were independent. Times the product of
-    1 - p_fail it is the mean over draws with the error of few draws in each p_fail taken out.
+    bounds are likelier to be passed together than if they were independent. Multiplied by the
+    product of 1 - p_fail it estimates the mean over draws without the error that few draws make in
+    each p_fail.
     """
     together = np.cumprod(1.0 - draws, axis=1).mean(0)
     apart = np.cumprod((1.0 - draws).mean(0))
@@ -263,8 +264,8 @@ class PathRisk(NamedTuple):
     p_fail_band: np.ndarray
     """Ends of its 90 % band over draws, shape (end, bound); NaN without draws."""
     p_arrive: float
-    """Chance to reach the goal: the mean over draws of the product of 1 - p_fail, as bounds depend
-    on what they have in common; without draws, the product of the means."""
+    """Chance to reach the goal: the mean over draws of the product of 1 - p_fail, as the chances of
+    bounds are correlated; without draws, the product of the means."""
     p_arrive_band: tuple[float, float]
     """Ends of its 90 % band over draws; NaN without draws."""
     by_cause: Mapping[str, np.ndarray]

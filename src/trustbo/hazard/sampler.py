@@ -57,7 +57,7 @@ class Points(NamedTuple):
 
 
 class BetaPriors(NamedTuple):
-    """Means and strength of the Betas of the bounds that were met, from hyperparameters."""
+    """Beta priors of the chances of the bounds met, as functions of the hyperparameters."""
 
     center: np.ndarray  # (parameter,), means of the priors
     scale: np.ndarray  # (parameter,), their sds
@@ -187,7 +187,7 @@ def impute(
             within[:, k] = survived * fails
             survived = survived * (1.0 - fails)
             done[:, e] += 1.0  # a path may enter a cell again
-        favour = _look_ahead(path, exposures.lost[j + 1 :], a, b)
+        favour = _lookahead(path, exposures.lost[j + 1 :], a, b)
         cumulative = (within * favour).cumsum(1)
         total = cumulative[:, -1]
         places[:, j] = (cumulative < uniform[:, j, None] * total[:, None]).sum(1)
@@ -198,7 +198,7 @@ def impute(
     return places, log_weight
 
 
-def _look_ahead(
+def _lookahead(
     path: np.ndarray, later: tuple[np.ndarray, ...], a: np.ndarray, b: np.ndarray
 ) -> np.ndarray:
     """Factor by which a failure at each bound of a path makes that of later missions likelier.

@@ -26,7 +26,7 @@ class Dynamics(NamedTuple):
     one beta0 and trust of the team is the mean.
 
     Drift is that of the bound into (row, col) by a move of `MOVES`, of 4 or 8; the axis of moves
-    has length 1 where it is that of the cell entered, whichever way. NaN where there is no bound.
+    has length 1 where all bounds into a cell are alike. NaN where there is no bound.
     """
 
     transition: np.ndarray
@@ -63,7 +63,7 @@ class Dynamics(NamedTuple):
         return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
 
     def steady_state(self) -> np.ndarray:
-        """Limit of the team's trust if all bounds were as each one, shape (..., move, row, col)."""
+        """Limit of the team's trust if a bound were repeated, shape (..., move, row, col)."""
         if self.is_scalar:
             return self.drift[..., 0, :, :, :] / (1.0 - self.transition[..., None])
         n_states = self.start.shape[-1]
@@ -150,7 +150,7 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
     elif isinstance(params, RobotParams):
         u = np.einsum("...im,...idrcm->...idrc", np.asarray(params.beta, dtype=float), z)
     elif isinstance(params, DriftParams):
-        u = _own_drift(params, z)
+        u = _custom_drift(params, z)
         b = b if b.ndim else np.broadcast_to(b, params.leading)
         b = b[..., None] if b.ndim == len(params.leading) else b
     else:
@@ -167,8 +167,8 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
     return _with_places(u, params, moves)
 
 
-def _own_drift(params: DriftParams, z: np.ndarray) -> np.ndarray:
-    """Drift by a function of the user's own, (..., robot, move, row, col)."""
+def _custom_drift(params: DriftParams, z: np.ndarray) -> np.ndarray:
+    """Drift by a function that the user gave, (..., robot, move, row, col)."""
     leading, shape = params.leading, z.shape[-4:-1]
 
     def flat(value: np.ndarray, n: int) -> np.ndarray:
@@ -221,7 +221,7 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
 
 
 def as_map(awareness: np.ndarray) -> np.ndarray:
-    """Awareness of a path's bounds as a map: (..., bound, robot, feature) to one of one row."""
+    """Convert awareness of a path's bounds, (..., bound, robot, feature), to a map of one row."""
     return np.swapaxes(awareness, -3, -2)[..., None, None, :, :]
 
 

@@ -56,43 +56,24 @@ def fewest_bounds(
     # A closed margin saves the test whether a move leaves the grid.
     closed = np.pad(bounds, ((0, 0), (1, 1), (1, 1)))
     rows, cols = closed.shape[1:]
-    known = np.full(rows * cols, -1, np.int32)
+    fewest = np.full(rows * cols, -1, np.int32)
     steps = np.array(MOVES[connectivity]) @ (cols, 1)
     start = (cell[0] + 1) * cols + cell[1] + 1
-    _breadth_first(known, closed.reshape(len(bounds), -1), start, steps, back)
-    return known.reshape(rows, cols)[1:-1, 1:-1]
+    _breadth_first(fewest, closed.reshape(len(bounds), -1), start, steps, back)
+    return fewest.reshape(rows, cols)[1:-1, 1:-1]
 
 
 @njit(cache=True, nogil=True)
-def _breadth_first(known, bounds, start, steps, back):
-    queue = np.empty(len(known), np.int32)
-    queue[0], known[start] = start, 0
+def _breadth_first(fewest, bounds, start, steps, back):
+    queue = np.empty(len(fewest), np.int32)
+    queue[0], fewest[start] = start, 0
     first, last = 0, 1
     while first < last:
         c = queue[first]
         first += 1
         for m in range(len(steps)):
             other = c - steps[m] if back else c + steps[m]
-            if bounds[m, c if back else other] and known[other] == -1:
-                known[other] = known[c] + 1
+            if bounds[m, c if back else other] and fewest[other] == -1:
+                fewest[other] = fewest[c] + 1
                 queue[last] = other
                 last += 1
-
-
-def require_way(
-    bounds: np.ndarray,
-    to_goal: np.ndarray,
-    start: Cell,
-    goal: Cell,
-    connectivity: int,
-    n_passable: int,
-) -> None:
-    """Refuse ends that are not connected: NoPathError, which counts the cells in reach."""
-    if to_goal[start] < 0:
-        n_reached = int((fewest_bounds(bounds, start, connectivity) >= 0).sum())
-        n_goal = int((to_goal >= 0).sum())
-        raise NoPathError(
-            f"no path from {start} to {goal}: {n_reached} of {n_passable} passable cells can be "
-            f"reached from the start, and the goal from {n_goal}. Choose ends in one part, or a "
-            "team with a larger max_slope."
-        )

@@ -12,15 +12,15 @@ from trustbo.planning.dynamics import Dynamics
 
 
 class Objective(NamedTuple):
-    """An objective by name, the weight of the path's length in it, and the law of the rates."""
+    """Name of an objective, weight of the path's length in it, and the family of the rates."""
 
     name: str
     length_weight: float = 0.0
     """Cost of a metre of the path, in units of trust, of lost bounds or of log probability."""
     family: Family = FAMILIES["gaussian"]
-    """Family of the contact rates, and"""
+    """Family of the contact rates."""
     lag: float = 0.0
-    """0 where they measure trust, 1 where they measure its change over a bound."""
+    """0 where rates measure trust, 1 where they measure its change over a bound."""
 
     @property
     def has_labels(self) -> bool:
@@ -34,7 +34,7 @@ class Objective(NamedTuple):
 
         u <= 1 - B0 1 and x0 <= 1 for each state (the mean of robots alike in all, else each robot),
         so that trust is at most 1 if B0 >= 0: no bound gains contact, and a loop never pays. Other
-        dynamics are returned as they are.
+        dynamics are returned unchanged.
         """
         if self.name != "lost_contact" or self.has_labels or self.lag:
             return dynamics
@@ -60,11 +60,11 @@ class PathTrust(NamedTuple):
     trust: np.ndarray
     """Expected trust of the team after each bound, shape (..., bound)."""
     steady_state: np.ndarray
-    """Limit of the team's trust if all bounds were as each one, u / (1 - beta0), likewise."""
+    """Limit of the team's trust if each bound were repeated, u / (1 - beta0), (..., bound)."""
     length_cost: np.ndarray | float = 0.0
     """Length of the path times `length_weight`."""
     contact_lost: np.ndarray | float = np.nan
-    """Expected contact lost in each bound, 1 - E[rate given trust], likewise."""
+    """Expected contact lost in each bound, 1 - E[rate given trust], (..., bound)."""
 
 
 def softplus(x: ArrayLike) -> np.ndarray:
@@ -104,7 +104,7 @@ cost).
 ADDITIVE = ("lost_contact", "terminal", "mean", "stationary")
 """Objectives that admit a length weight."""
 LABELLED = ("success", "bottleneck")
-"""Objectives that depend on the whole history of a path, whatever the law of the rates."""
+"""Objectives that depend on the whole history of a path, for every family of rates."""
 DEFAULT_MAX_BOUNDS: Mapping[str, str | None] = {"lost_contact": "shortest+4"} | {
     name: None for name in LABELLED
 }

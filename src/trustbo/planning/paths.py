@@ -13,13 +13,7 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_cells, require_kind, require_whole
 from trustbo.parallel import plain
-from trustbo.planning.graph import (
-    NoPathError,
-    cell_graph,
-    fewest_bounds,
-    move_lengths,
-    require_way,
-)
+from trustbo.planning.graph import NoPathError, cell_graph, fewest_bounds, move_lengths
 from trustbo.planning.search.graph import Graph, grid_graph
 from trustbo.planning.search.layers import build_layers
 from trustbo.workspace import Workspace
@@ -89,6 +83,7 @@ class AdmissiblePaths:
         """Prepare the tables; see `Planner`, and `avoiding` for bounds (8 moves, row, col)."""
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace, connectivity = workspace, require_connectivity(path_class.connectivity)
+        self.connectivity = connectivity
         self.start = workspace.require_cell("start", start)
         self.goal = workspace.require_cell("goal", goal)
         if self.start == self.goal:
@@ -100,9 +95,7 @@ class AdmissiblePaths:
         open_ = open_ if avoided is None else open_ & ~avoided
         self.bounds = open_[move_indices(connectivity)]
         self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, connectivity, back=True)
-        n_passable = int(self.passable.sum())
-        ends = self.start, self.goal, connectivity
-        require_way(self.bounds, self.bounds_to_goal, *ends, n_passable)
+        self._require_way()
         self.shortest = int(self.bounds_to_goal[self.start])
         self.longest = path_class.longest(self.shortest)
         if self.longest < self.shortest:
@@ -114,7 +107,18 @@ class AdmissiblePaths:
         if self.u_turns:
             path_class = path_class._replace(max_bounds=self.longest)
         self.path_class = path_class
-        self.connectivity, self.max_bounds, self.revisit = path_class
+        _, self.max_bounds, self.revisit = path_class
+
+    def _require_way(self) -> None:
+        """Refuse ends that are not connected: NoPathError, which counts the cells in reach."""
+        if self.bounds_to_goal[self.start] < 0:
+            n_reached = int((self.bounds_from_start >= 0).sum())
+            n_goal = int((self.bounds_to_goal >= 0).sum())
+            raise NoPathError(
+                f"no path from {self.start} to {self.goal}: {n_reached} of "
+                f"{int(self.passable.sum())} passable cells can be reached from the start, and the "
+                f"goal from {n_goal}. Choose ends in one part, or a team with a larger max_slope."
+            )
 
     @cached_property
     def graph(self) -> nx.DiGraph:
@@ -124,7 +128,8 @@ class AdmissiblePaths:
     @cached_property
     def to_goal(self) -> dict[Cell, int]:
         """Fewest bounds to the goal by cell, for cells that can reach it."""
-        return _by_cell(self.bounds_to_goal)
+        fewest = self.bounds_to_goal
+        return {(r, c): int(fewest[r, c]) for r, c in np.argwhere(fewest >= 0).tolist()}
 
     @cached_property
     def bounds_from_start(self) -> np.ndarray:
@@ -197,9 +202,9 @@ class AdmissiblePaths:
         return np.where(inside & open_, other, -1)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
-        """Restrict to paths that take none of some bounds, if there are any.
+        """Restrict to paths that take none of some bounds.
 
-        Otherwise those of the least risk are taken back one by one, until there is a path.
+        Where there is none, the bounds of least risk are admitted again one by one until there is.
 
         Args:
             bounds: Bounds to avoid, (move, row, col) of the eight `MOVES`.
@@ -289,11 +294,6 @@ class AdmissiblePaths:
                 f"the path is broken: no bound leads from {cells[k]} to {cells[k + 1]}."
             )
         return cells
-
-
-def _by_cell(bounds: np.ndarray) -> dict[Cell, int]:
-    cells = np.argwhere(bounds >= 0)
-    return {(r, c): int(bounds[r, c]) for r, c in cells.tolist()}
 
 
 def _shortened(cells: tuple[Cell, ...]) -> str:

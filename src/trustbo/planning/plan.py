@@ -32,20 +32,20 @@ class Plan(Displayed):
         bands: Quantiles of expected trust over draws of the parameters, shape (quantile, bound,
             robot), see `QUANTILES`; equal to `trust` where the plan is for one draw.
         value: Value of the objective, to be maximised (see `OBJECTIVES`): for lost_contact, minus
-            the bounds' worth of contact expected to be lost, with trust capped at 1.
-        success_index: Product over the bounds of sigma(team's trust). It compares paths, and is no
-            probability of anything; see `p_arrive`.
+            the contact expected to be lost, in bounds, with trust capped at 1.
+        success_index: Product over the bounds of sigma(team's trust), to compare paths by. It is
+            no probability; see `p_arrive`.
         objective: Name of the objective.
         exact: True if no admissible path is better.
-        bound: Upper bound on the value of any admissible path; `value` where exact, NaN for a given
+        bound: Upper limit on the value of any admissible path; `value` where exact, NaN for a given
             path.
         revisits: Number of bounds that enter a cell again.
         engine: Engine that found the path, "networkx" or "numba"; or "given".
         seconds: Time of the search, s.
         workspace: Workspace of the path.
         risk: Chance of each bound to end the mission, None without a hazard.
-        infeasible: Whether its chance to fail is beyond `max_failure`: it is the safest, as no
-            admissible path keeps within that, or it was given.
+        infeasible: Whether its chance to fail exceeds `max_failure`: the path was given, or is the
+            safest where no admissible path respects the limit.
     """
 
     path: tuple[Cell, ...]

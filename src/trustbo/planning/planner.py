@@ -277,7 +277,7 @@ class Planner(Displayed):
         return replace(
             plan,
             exact=gap <= solve.EXACT,
-            bound=solve.value_bound(self.objective, plan.value, gap),
+            bound=solve.value_limit(self.objective, plan.value, gap),
             engine=self._engine.used,
             seconds=time.perf_counter() - started,
         )

@@ -89,9 +89,9 @@ def random(key: Array, posterior: Params, planner: Planner) -> Plan:
         TrustboError: Revisits are forbidden, and each of 10 000 walks drawn had one.
         InfeasibleError: No path respects `max_failure`.
     """
-    found = _random_paths(planner, np.random.default_rng(seed_of(key)), 1)
+    paths = _random_paths(planner, np.random.default_rng(seed_of(key)), 1)
     return (
-        planner.evaluate(found[0], posterior.mean()) if found else greedy(key, posterior, planner)
+        planner.evaluate(paths[0], posterior.mean()) if paths else greedy(key, posterior, planner)
     )
 
 
@@ -136,14 +136,14 @@ def _require_arguments(policy: Policy) -> None:
 
 def _random_paths(planner: Planner, rng: np.random.Generator, n: int) -> list[tuple[Cell, ...]]:
     """Draw up to n paths that respect `max_failure`, each equally likely, in `_TRIES` tries."""
-    sampler, risk, found = path_sampler(planner.paths), planner.problem.risk_table, []
-    for _ in range(n if risk is None else _TRIES):
+    sampler, problem, paths = path_sampler(planner.paths), planner.problem, []
+    for _ in range(n if problem.rule.max_failure is None else _TRIES):
         path = sampler.draw(rng)
-        if risk is None or risk.is_feasible(risk.along(path, planner.paths.passable.shape)):
-            found.append(path)
-            if len(found) == n:
+        if problem.is_within_risk(path):
+            paths.append(path)
+            if len(paths) == n:
                 break
-    return found
+    return paths
 
 
 def seed_of(key: Array) -> int:

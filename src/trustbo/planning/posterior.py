@@ -47,11 +47,11 @@ class DrawnPaths:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """Value of each draw's own best path, shape (draw,)."""
+        """Value of the best path of each draw, shape (draw,)."""
         values, inverse = np.empty(len(self.paths)), self._unique[1]
         for i, path in enumerate(self._unique[0]):
-            of = np.flatnonzero(inverse == i)
-            values[of] = self._value(self.dynamics.take(of), self.problem.paths.cells(path))
+            draws = np.flatnonzero(inverse == i)
+            values[draws] = self._value(self.dynamics.take(draws), self.problem.paths.cells(path))
         return values
 
     def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
@@ -63,23 +63,23 @@ class DrawnPaths:
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
 
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
-        """Regret of a path as a share of what each draw's best path is worth, shape (draw,).
+        """Regret of a path as a share of the value of each draw's best path, shape (draw,).
 
         For lost_contact, of the contact that the best path keeps, its bounds less those lost; for
-        other objectives, of the best path's value. Infinite where that is nothing.
+        other objectives, of the best path's value. Infinite where that is 0.
         """
-        worth = np.abs(self.values)
+        scale = np.abs(self.values)
         if self.problem.objective.name == "lost_contact":
-            worth = np.maximum(0.0, (self.paths >= 0).sum(1) - 1 + self.values)
+            scale = np.maximum(0.0, (self.paths >= 0).sum(1) - 1 + self.values)
         regret = self.regret(path)
         nothing = np.where(regret > _ROUNDING, np.inf, 0.0)
-        return np.divide(regret, worth, out=nothing, where=worth > 0.0)
+        return np.divide(regret, scale, out=nothing, where=scale > 0.0)
 
     def expected_value_of_information(self) -> float:
         """Expected gain in value from knowing the parameters.
 
         Mean of the draws' best values, less the best mean value of any one path. That path is
-        sought among `candidates`, so the number is an upper bound, tight where they include it.
+        sought among `candidates`, so the number is an upper limit, tight where they include it.
         """
         return float(self.values.mean() - self.values_of(self.candidates).mean(0).max())
 

@@ -31,9 +31,9 @@ class PlanningProblem:
 
     Trust of the `team` is the `"mean"` or the least (`"min"`) of its robots'. Where the awareness
     is not the workspace's, `cells` has that of cells, (robot, row, col, feature), with a leading
-    axis (draw,) where it is uncertain, and `mean_cells` the mean over these. What cells differ in
-    from the workspace's is added to the awareness of all bounds into them. `rule` says how much
-    failure is accepted, and `risk` how probable it is.
+    axis (draw,) where it is uncertain, and `mean_cells` the mean over these. Their difference from
+    the workspace's awareness of a cell is added to that of all bounds into it. `rule` limits the
+    chance that a plan fails, and `risk` has the chances that its bounds do.
 
     TrustboError: unknown team or objective; a length weight that is negative, or for success or
     bottleneck.
@@ -100,7 +100,7 @@ class PlanningProblem:
         return np.swapaxes(z, -3, -2)
 
     def _of_bounds(self, cells: np.ndarray | None, moves: slice | np.ndarray = _ALL) -> np.ndarray:
-        """Awareness of bounds out of that of cells, of all or some moves."""
+        """Awareness of bounds, by all or some moves, from that of cells."""
         if cells is None:
             maps = self.workspace.bound_maps
             return maps if maps.shape[1] == 1 else maps[:, moves]
@@ -214,10 +214,10 @@ class PlanningProblem:
         # Awareness of all robots, moves and features is large: only drift is kept for all draws.
         whole = trust_dynamics(params, self._of_bounds(None, moves), team, x0, moves)
         n = max(1, _ENTRIES // (len(moves) * cells[0].size))
-        for part in (slice(i, i + n) for i in range(0, len(which), n)):
-            z = self._of_bounds(cells[which[part]], moves)
-            some: Params = params.draw(part)  # pyright: ignore[reportArgumentType]
-            whole.drift[part] = trust_dynamics(some, z, team, moves=moves).drift
+        for block in (slice(i, i + n) for i in range(0, len(which), n)):
+            z = self._of_bounds(cells[which[block]], moves)
+            some: Params = params.draw(block)  # pyright: ignore[reportArgumentType]
+            whole.drift[block] = trust_dynamics(some, z, team, moves=moves).drift
         return whole
 
 
@@ -227,9 +227,9 @@ def _any_move(cells: np.ndarray) -> np.ndarray:
 
 
 def draws_of(posterior: Params | xr.DataTree) -> Params:
-    """Parameters as they are, or the draws of a posterior: leading axis (draw,).
+    """Return parameters unchanged, or the draws of a posterior: leading axis (draw,).
 
-    TrustboError: neither.
+    TrustboError: another object.
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior)

@@ -22,7 +22,7 @@ class InfeasibleError(TrustboError):
 
     Attributes:
         path: Safest admissible path.
-        p_fail: Chance that it fails, the least that can be had.
+        p_fail: Chance that it fails, the least of all admissible paths.
     """
 
     def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:
@@ -31,7 +31,7 @@ class InfeasibleError(TrustboError):
 
 
 class RiskRule(NamedTuple):
-    """Amount of failure that a planner accepts, and the cost of a failure."""
+    """Limit on the chance that a plan fails, and the cost of a failure."""
 
     max_failure: float | None = None
     """Largest chance that a path fails, in [0, 1); None for no limit."""

@@ -35,8 +35,8 @@ def trust_map(
     else:
         values, like = _largest_trust(problem.paths, dynamics), like.isel(robot=0, drop=True)
     like = like.expand_dims(draw=len(values)) if params.leading else like
-    found = like.copy(data=values if params.leading else values[0])
-    return found.rename("trust").assign_attrs(long_name="expected trust")
+    trust = like.copy(data=values if params.leading else values[0])
+    return trust.rename("trust").assign_attrs(long_name="expected trust")
 
 
 def cost_of(trust: xr.DataArray) -> xr.DataArray:
@@ -56,7 +56,7 @@ def summary_of(trust: xr.DataArray) -> xr.Dataset:
 
 
 def _of_robot(dynamics: Dynamics, robot: int) -> Dynamics:
-    """Dynamics viewed by one robot; its own state suffices where robots do not interact."""
+    """Dynamics whose view is one robot; its state suffices where robots do not interact."""
     n_robots, one = dynamics.start.shape[-1], slice(robot, robot + 1)
     transition, drift, start, _, sd = dynamics
     if (transition == transition * np.eye(n_robots)).all():
@@ -84,12 +84,8 @@ def _trust_at(
     """Largest trust at one cell, by planning a path to it: vector trust has no scalar recursion."""
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
-    found = plan_compiled(Case(admissible.to(cell, extra), dynamics, Objective("terminal")))
-    assert found is not None  # as there is no risk  # noqa: S101
-    paths = found.paths
-    return np.array(
-        [
-            team_trust(dynamics.take(d).along(admissible.cells(path)))[-1]
-            for d, path in enumerate(paths)
-        ]
-    )
+    best = plan_compiled(Case(admissible.to(cell, extra), dynamics, Objective("terminal")))
+    assert best is not None  # as there is no risk  # noqa: S101
+    paths = [admissible.cells(flat) for flat in best.paths]
+    along = [dynamics.take(d).along(path) for d, path in enumerate(paths)]
+    return np.array([team_trust(one)[-1] for one in along])

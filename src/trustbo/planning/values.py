@@ -27,7 +27,7 @@ def path_trust(
         along: Recursion of expected trust on the path, see `Dynamics.along`.
         objective: Objective of the values.
         length: Length of the path, m.
-        cap: False to leave trust as it is for `lost_contact` too, see `Objective.capped`.
+        cap: False to keep trust above 1 for `lost_contact`, see `Objective.capped`.
     """
     along = objective.capped(along) if cap else along
     trust = team_trust(along)

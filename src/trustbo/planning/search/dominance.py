@@ -36,7 +36,7 @@ def dominance_tests(dynamics: Dynamics, longest: int) -> np.ndarray:
 
 
 class Heuristic(NamedTuple):
-    """Upper bounds on the team's trust to come, for every cell and number of bounds.
+    """Upper limits on the team's trust to come, for every cell and number of bounds.
 
     After j more bounds it is at most the least over views of powers[view, j] . x + gains[view, j,
     cell]. Empty tables (no views) where the grid is too large for them.
@@ -55,7 +55,7 @@ def build_heuristic(
     and no other, must enter the goal.
     """
     n_states, n_cells = len(dynamics.start), len(neighbours)
-    # The mean of the views bounds their least too, and keeps to one path for all of them.
+    # The mean of the views limits their least too, and keeps to one path for all of them.
     views = dynamics.views
     if len(views) > 1:
         views = np.concatenate([views, views.mean(0, keepdims=True)])

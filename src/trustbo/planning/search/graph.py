@@ -1,7 +1,7 @@
 """The problem of the searches: a directed graph with costs, drifts and resources of its edges.
 
-`SearchProblem` is the one record of a path problem, whatever the graph is of: cells unrolled over
-the bounds left (`layers`), cells alone (`grid_graph`), or other nodes and edges given in CSR form.
+`SearchProblem` is the one record of a path problem on any graph: that of cells unrolled over the
+bounds left (`layers`), cells alone (`grid_graph`), or other nodes and edges given in CSR form.
 """
 
 from typing import NamedTuple

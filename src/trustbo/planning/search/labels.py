@@ -6,8 +6,8 @@ Irnich and Desaulniers 2005), pruned by the Lagrangian dual of `dual`.
 State: a label at a node has its cost so far, the trust x of the team, which follows x -> beta0 x +
 u, and the sum r of each resource along its edges. An edge costs its toll and a loss l(x) that falls
 in x; `NONE` has no loss and needs no trust, `LEAST` takes the largest loss instead of the sum. A
-path is feasible if enough of its r are within their limits, and costs a failure cost F times
-1 - exp(-r) of the first resource besides. Without resources every path is feasible.
+path is feasible if enough of its r are within their limits, and costs in addition a failure cost F
+times 1 - exp(-r) of the first resource. Without resources every path is feasible.
 
 A label is dropped if its cost with a lower limit on that of its completions, (a) or (b) of `dual`,
 cannot beat the best path known, or if the safest completion, resource by resource, exceeds the
@@ -58,7 +58,7 @@ def solve(problem: SearchProblem, below: np.ndarray | None = None) -> Best:
     """Find the feasible path of least cost under every draw.
 
     No cells where there is no path that costs less than `below` (draw,), by default infinite; the
-    cost is then `below`. A lower limit of inf says that no path is feasible.
+    cost is then `below`. A lower limit of inf: no path is feasible.
     """
     n_draws = len(problem.trust)
     below = np.full(n_draws, np.inf) if below is None else below

@@ -11,10 +11,10 @@ Cost, to be minimised: `success` sum of softplus(-trust), `bottleneck` max of -t
 latter two are over paths of exactly `max_bounds` bounds, and `lost_contact` is like `mean` where
 rates are linear in trust; to these three length costs are added. None rises if trust rises.
 
-Invariant: a label leaves the queue in the order of a lower bound on the cost of its completions
+Invariant: a label leaves the queue in the order of a lower limit on the cost of its completions
 (`Heuristic`). It is expanded unless an expanded label of the same cell dominates it (see
 `dominance`): fewer or as many bounds, no higher cost, and at least as much trust at every bound
-still to come, whatever cells follow, and no more of any risk. Every completion of the dominated
+still to come, through any cells, and no more of any risk. Every completion of the dominated
 label is then a completion of the other, at no higher cost, so the first label that leaves the queue
 at the goal is optimal.
 
@@ -348,7 +348,7 @@ def _add_cost(mode, cost, trust, length_cost, noise_sd):
 
 @_part
 def _estimate(mode, heuristic, x, cost, cell, left, noise_sd):
-    """Lower bound on the cost of a label's completions."""
+    """Lower limit on the cost of a label's completions."""
     if mode == TERMINAL:
         return cost - _max_trust(heuristic, x, left, cell)
     if len(heuristic.powers) == 0:
@@ -361,7 +361,7 @@ def _estimate(mode, heuristic, x, cost, cell, left, noise_sd):
 
 @_part
 def _max_trust(heuristic, x, j, cell):
-    """Upper bound on the team's trust after j more bounds."""
+    """Upper limit on the team's trust after j more bounds."""
     powers, gains = heuristic.powers, heuristic.gains
     least = np.inf
     for view in range(len(powers)):

@@ -12,10 +12,10 @@ State: node (j, c), if the goal can be reached from c in j bounds and c from the
 
 Invariant: nodes are processed in the order of j, so the best sums of all heads of a node's edges
 are final. Where U-turns are forbidden, each node holds the best sum and the best by another first
-move: a predecessor excludes one first move at most, the one back to its own cell.
+move: a predecessor excludes one first move at most, the one back to itself.
 
-Exact because the value is a sum of edge weights in a DAG, whatever their signs. The length K is
-then chosen by the start's nodes: (constant_K + sum) / scale_K.
+Exact because the value is a sum of edge weights in a DAG, of either sign. The length K is then
+chosen by the start's nodes: (constant_K + sum) / scale_K.
 """
 
 from typing import NamedTuple

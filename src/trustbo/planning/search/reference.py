@@ -108,8 +108,8 @@ def best_additive(
     `backend` networkx's.
 
     The grid is unrolled over the bounds into a layered DAG. All paths through it are equally long,
-    so each layer's weights may be shifted to be non-negative: Dijkstra then applies, whatever the
-    signs of the gains.
+    so each layer's weights may be shifted to be non-negative: Dijkstra then applies, to gains of
+    either sign.
     """
     graph, dag = admissible.graph, nx.DiGraph()
     source, sink = (0, None, admissible.start), "goal"

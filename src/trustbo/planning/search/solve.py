@@ -122,11 +122,11 @@ def require_valid(dynamics: Dynamics, objective: Objective) -> None:
     TrustboError: success, bottleneck or lost_contact with beta0 < 0; stationary with abs(beta0) >=
     1.
     """
-    own = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
-    if (objective.has_labels or objective.name == "lost_contact") and (own < 0.0).any():
+    beta0 = np.diagonal(dynamics.transition, axis1=-2, axis2=-1)
+    if (objective.has_labels or objective.name == "lost_contact") and (beta0 < 0.0).any():
         raise TrustboError(
-            f"objective {objective.name!r} needs beta0 >= 0; got {own.min():g}. Use 'terminal' or "
-            "'mean'."
+            f"objective {objective.name!r} needs beta0 >= 0; got {beta0.min():g}. Use "
+            "'terminal' or 'mean'."
         )
     if objective.name == "stationary":
         radius = np.abs(np.linalg.eigvals(dynamics.transition))
@@ -137,8 +137,8 @@ def require_valid(dynamics: Dynamics, objective: Objective) -> None:
             )
 
 
-def value_bound(objective: str, value: float, gap: float) -> float:
-    """Upper bound on the value of every admissible path from a path's value and gap."""
+def value_limit(objective: str, value: float, gap: float) -> float:
+    """Upper limit on the value of every admissible path from a path's value and gap."""
     if gap <= EXACT:
         return value
     if objective == "terminal":
