@@ -9,7 +9,8 @@ from references import walks
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
-from trustbo.planning import NoPathError, Planner, policies, roll_trust
+from trustbo.planning import Planner, policies, roll_trust
+from trustbo.planning.graph import NoPathError
 from trustbo.planning.policies import resolve_policy
 from trustbo.workspace import Workspace
 

@@ -7,7 +7,8 @@ from references import walks
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import HierarchicalTrust, PooledTrust
-from trustbo.planning import NoPathError, Planner, problem, roll_trust
+from trustbo.planning import Planner, problem, roll_trust
+from trustbo.planning.graph import NoPathError
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along
 

@@ -9,7 +9,7 @@ import xarray as xr
 from trustbo.campaign.result import Result
 from trustbo.data import Cell, Mission
 from trustbo.inference import params_of, place_maps
-from trustbo.planning import QUANTILES
+from trustbo.planning.plan import QUANTILES
 from trustbo.planning.posterior import choose_draws
 from trustbo.planning.values import team_trust
 from trustbo.plots.explorer import Layer, Scene, Step

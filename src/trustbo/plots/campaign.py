@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.inference.posterior_tree import labelled_draws
-from trustbo.planning import QUANTILES
+from trustbo.planning.plan import QUANTILES
 from trustbo.plots.layout import plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 

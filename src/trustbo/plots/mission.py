@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import ShapeError, TrustboError, require_kind
-from trustbo.planning import QUANTILES, Plan
+from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.layout import plain, small_multiples
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 

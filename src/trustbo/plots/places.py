@@ -14,7 +14,7 @@ from trustbo.inference import place_maps
 from trustbo.plots.layout import map_panels
 from trustbo.plots.maps import draw_cells, draw_scale, outlined, robust_limits
 from trustbo.plots.style import Style, StyleOptions
-from trustbo.workspace import Grid, Workspace
+from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 

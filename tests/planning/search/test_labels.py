@@ -8,7 +8,8 @@ from references import path_value, walks
 
 from trustbo.errors import TrustboError
 from trustbo.models import TrustParams
-from trustbo.planning import NoPathError, Planner
+from trustbo.planning import Planner
+from trustbo.planning.graph import NoPathError
 from trustbo.workspace import Workspace
 
 BETA0 = (-0.8, 0.0, 0.3, 0.7, 1.0, 1.3)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import Colormap, LinearSegmentedColormap, to_hex
 
-from trustbo.planning import QUANTILES
+from trustbo.planning.plan import QUANTILES
 from trustbo.plots.explorer.scene import Scene
 from trustbo.plots.maps import COLOURS, contours
 from trustbo.plots.plan import COLOURS as ROBOTS
