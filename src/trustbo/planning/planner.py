@@ -271,9 +271,9 @@ class Planner(Displayed):
                 "params.draw(i) or params.mean(), or planner.plan_draws for all of them."
             )
         dynamics = self.problem.dynamics(params, x0)
-        found = solve.find_paths(self.problem, dynamics, self._engine)
-        plan = evaluate(self.problem, self.paths.cells(found.paths[0]), params, x0)
-        gap = float(found.gap[0])
+        best = solve.find_paths(self.problem, dynamics, self._engine)
+        plan = evaluate(self.problem, self.paths.cells(best.paths[0]), params, x0)
+        gap = float(best.gap[0])
         return replace(
             plan,
             exact=gap <= solve.EXACT,
@@ -291,8 +291,8 @@ class Planner(Displayed):
         Raises:
             TrustboError: beta0 is outside the range the objective is exact for.
         """
-        found = solve.find_paths(self.problem, dynamics, self._engine)
-        return self.paths.cells(found.paths[0])
+        best = solve.find_paths(self.problem, dynamics, self._engine)
+        return self.paths.cells(best.paths[0])
 
     def plan_expected(self, posterior: Params | xr.DataTree) -> Plan:
         """Find the path with the best expectation over draws of terminal, mean or lost contact.
@@ -330,8 +330,8 @@ class Planner(Displayed):
         """
         params, chosen = choose_draws(draws_of(posterior), n_draws, seed)
         dynamics = self.problem.dynamics(params, draws=chosen)
-        found = solve.find_paths(self.problem, dynamics, self._engine)
-        return DrawnPaths(self.problem, dynamics, found.paths, found.gap, chosen)
+        best = solve.find_paths(self.problem, dynamics, self._engine)
+        return DrawnPaths(self.problem, dynamics, best.paths, best.gap, chosen)
 
     def evaluate(
         self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None

@@ -36,15 +36,15 @@ _dijkstra: Any = nx.dijkstra_path  # annotations of networkx exclude `backend=No
 
 def plan_networkx(case: Case, backend: str | None = None) -> Best | None:
     """Find the best path of every draw; None if none is feasible. `backend` is networkx's."""
-    found = []
+    best = []
     for d in range(len(case.dynamics.start)):
         if (path := _of_draw(case, case.dynamics.take(d), backend)) is None:
             return None
-        found.append([case.admissible.flat(cell) for cell in path])
-    paths = np.full((len(found), max(map(len, found))), -1)
-    for flat, cells in zip(paths, found, strict=True):
+        best.append([case.admissible.flat(cell) for cell in path])
+    paths = np.full((len(best), max(map(len, best))), -1)
+    for flat, cells in zip(paths, best, strict=True):
         flat[: len(cells)] = cells
-    return Best(paths, np.zeros(len(found)), np.zeros(len(found)))
+    return Best(paths, np.zeros(len(best)), np.zeros(len(best)))
 
 
 def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None:
@@ -171,10 +171,10 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: Ob
         if cell == admissible.goal:
             return path
         seen |= bit.get(cell, 0)
-        known, tested = settled.setdefault((before, cell), []), tests @ x
-        if any((q >= tested).all() and n <= n_bounds and s & ~seen == 0 for q, n, s in known):
+        earlier, tested = settled.setdefault((before, cell), []), tests @ x
+        if any((q >= tested).all() and n <= n_bounds and s & ~seen == 0 for q, n, s in earlier):
             continue
-        known.append((tested, n_bounds, seen))
+        earlier.append((tested, n_bounds, seen))
         for other in graph.successors(cell):
             if n_bounds + 1 + to_goal.get(other, np.inf) > max_bounds or seen & bit.get(other, 0):
                 continue
@@ -238,7 +238,7 @@ def feasible_paths(
     first = np.inf if objective.name == "bottleneck" else 0.0
     start = np.concatenate([[first, 0.0], np.zeros(len(risk.limits)), tests @ dynamics.start])
     labels = {(None, admissible.start): [_Label(start, dynamics.start, (admissible.start,))]}
-    found, n_risks = [], len(risk.limits)
+    paths, n_risks = [], len(risk.limits)
     for k in range(1, longest + 1):
         layer: dict[tuple[Cell | None, Cell], list[_Label]] = {}
         for (_, cell), here in labels.items():
@@ -261,12 +261,12 @@ def feasible_paths(
                     criteria = np.concatenate([[score, length], total, tests @ x])
                     new = _Label(criteria, x, (*label.path, other))
                     if other == admissible.goal:
-                        found.append(new.path)
+                        paths.append(new.path)
                     else:
-                        at = layer.setdefault((None if admissible.u_turns else cell, other), [])
-                        _keep_label(at, new, simple=simple)
+                        before = None if admissible.u_turns else cell
+                        _keep_label(layer.setdefault((before, other), []), new, simple=simple)
         labels = layer
-    return found
+    return paths
 
 
 _ONE = np.ones((1, 1))
@@ -296,12 +296,12 @@ def _score(objective: Objective, score: float, trust: float, noise_sd: np.ndarra
     return score if at_end else score + trust
 
 
-def _keep_label(at: list[_Label], new: _Label, *, simple: bool) -> None:
+def _keep_label(labels: list[_Label], new: _Label, *, simple: bool) -> None:
     """Add a label unless another dominates it; drop those that it dominates."""
-    if any(_dominates(old, new, simple) for old in at):
+    if any(_dominates(old, new, simple) for old in labels):
         return
-    at[:] = [old for old in at if not _dominates(new, old, simple)]
-    at.append(new)
+    labels[:] = [old for old in labels if not _dominates(new, old, simple)]
+    labels.append(new)
 
 
 def _dominates(a: _Label, b: _Label, simple: bool) -> bool:

@@ -56,8 +56,8 @@ def _feasible[T](problem: PlanningProblem, case: Case, search: Callable[[Case], 
     InfeasibleError: no path respects `max_failure`, unless the rule is to plan the safest.
     """
     risk = problem.risk_table
-    if (found := search(case._replace(risk=risk))) is not None:
-        return found
+    if (best := search(case._replace(risk=risk))) is not None:
+        return best
     assert risk is not None and problem.risk is not None  # noqa: S101, PT018
     path, limit = safest_path(problem.paths, problem.objective.name, risk.of_bounds[0])
     if problem.rule.infeasible == "refuse":
@@ -65,9 +65,9 @@ def _feasible[T](problem: PlanningProblem, case: Case, search: Callable[[Case], 
     # The best of those that are as safe, as rounding tells them apart.
     limits = np.array([limit + 1e-12 * max(1.0, limit)])
     safest = RiskTable(risk.of_bounds[:1], limits, 1, risk.failure_cost)
-    found = search(case._replace(risk=safest))
-    assert found is not None  # noqa: S101
-    return found
+    best = search(case._replace(risk=safest))
+    assert best is not None  # noqa: S101
+    return best
 
 
 def _infeasible(rule: RiskRule, risk: Risk, path: tuple[Cell, ...]) -> InfeasibleError:
