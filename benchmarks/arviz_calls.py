@@ -135,7 +135,7 @@ def subjects(quick: bool) -> tuple[dict[str, xr.DataTree], dict[str, xr.DataTree
     robots = tb.simulation.ModelSimulator(workspace, truth)
     model = tb.models.PooledTrust()
     campaign = tb.Campaign(workspace, (5, 0), (0, 5), policy="random", model=model)
-    for _ in tb.missions(campaign, robots, n_iterations=25):
+    for _ in campaign.run(robots, n_iterations=25):
         pass
     missions = campaign.missions
     found = {"exact": tb.fit(missions, model, sampler="exact")}

@@ -170,7 +170,7 @@ def round_trip(folder, parent):
     first = before = tb.load_result(folder)
     with tb.Campaign.load(folder) as campaign:
         campaign.save(parent / "saved")
-        told = [np.nan_to_num(m.contact_rate, nan=-1.0) for m in campaign.log.measured]
+        told = [np.nan_to_num(m.contact_rate, nan=-1.0) for m in campaign.state.measured]
     for n in range(2):
         before.save(parent / f"round{n}")
         before = tb.load_result(parent / f"round{n}")
@@ -180,7 +180,7 @@ def round_trip(folder, parent):
             return f"the history differs after {n + 1} rounds"
     for n in range(2):
         with tb.Campaign.load(parent / "saved") as campaign:
-            again = [np.nan_to_num(m.contact_rate, nan=-1.0) for m in campaign.log.measured]
+            again = [np.nan_to_num(m.contact_rate, nan=-1.0) for m in campaign.state.measured]
             if not all(map(np.array_equal, told, again)):
                 return "the missions as they were told differ"
             campaign.save(parent / "saved")  # over itself

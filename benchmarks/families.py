@@ -78,7 +78,7 @@ def driven(world, n=15):
     workspace = world.workspace()
     options = {"policy": "random", "max_bounds": "shortest+4", "sampler": "exact"}
     campaign = tb.Campaign(workspace, *world.ends("sw-ne"), **options)
-    run = tb.missions(campaign, world.simulator(workspace), n_iterations=n)
+    run = campaign.run(world.simulator(workspace), n_iterations=n)
     return [workspace.fill(mission) for _, mission in run]
 
 

@@ -7,6 +7,8 @@ Multi-robot Bounding Overwatch" (2021). Names are loaded at first use; `__init__
 import lazy_loader
 
 _getattr, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_RENAMED = {"missions": "Campaign.run", "Seconds": "TimeLimit"}
+"""Names of version 0.2, by those of now."""
 
 
 def __getattr__(name: str) -> object:
@@ -14,4 +16,11 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("trustbo")
+    if name in _RENAMED:
+        import operator
+        import warnings
+
+        message = f"trustbo.{name} is {_RENAMED[name]} since version 0.3; the old name will go."
+        warnings.warn(message, FutureWarning, stacklevel=2)
+        return operator.attrgetter(_RENAMED[name])(_getattr("campaign"))
     return _getattr(name)

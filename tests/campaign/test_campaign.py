@@ -36,7 +36,7 @@ def test_ask_is_the_same_until_told(workspace):
     assert campaign.posterior is campaign.posterior
     np.testing.assert_array_equal(campaign.posterior["posterior"]["b"], posterior["posterior"]["b"])
     assert campaign.missions[0].path == plan.path
-    assert campaign.plans == [plan]
+    assert [entry.plan for entry in campaign.state.entries] == [plan]
     assert campaign.ask() is not plan
 
 
@@ -220,7 +220,7 @@ def test_a_belief_learns_the_awareness_that_missions_measure(workspace):
     campaign.tell(ModelSimulator(truth).run(plan.path, seed=0))
     cell = plan.path[1]
     before = np.abs(workspace.awareness.values - truth.awareness.values)[:, *cell].mean()
-    believed = campaign.awareness.mean()
+    believed = campaign.learner.awareness.mean()
     after = np.abs(believed - truth.awareness.values)[:, *cell].mean()
     assert after < 0.5 * before
     assert campaign.ask().path[0] == ENDS[0]

@@ -26,7 +26,7 @@ def kept(tmp_path_factory):
     terrain = tb.terrain.synthetic_terrain((60.0, 60.0), resolution=2.0, seed=1, relief=5.0)
     workspace = tb.Workspace.from_terrain(terrain, (2, 2), tb.Team(2))
     with tb.Campaign(workspace, *ENDS, sampler="exact", directory=folder) as campaign:
-        for _ in tb.missions(campaign, n_iterations=1):
+        for _ in campaign.run(n_iterations=1):
             pass
         campaign.fail("stuck", where=campaign.ask().path[-1])
         campaign.ask()

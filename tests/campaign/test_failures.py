@@ -143,7 +143,7 @@ def test_a_reason_that_would_teach_nothing_by_mistake_is_refused(workspace, reas
     campaign = begin(workspace)
     with pytest.raises(tb.TrustboError, match=message):
         campaign.fail(reason)
-    assert campaign.log.failures == []
+    assert campaign.state.failures == []
 
 
 def test_a_mission_that_arrived_did_not_fail(workspace):
@@ -160,11 +160,11 @@ def test_a_mission_is_not_given_up_twice_unless_it_is_asked_for_again(workspace)
     campaign.fail("stuck")
     with pytest.raises(tb.TrustboError, match=r"given up already: 'stuck'. Ask .* again=True"):
         campaign.fail("tipped")
-    assert [failure.reason for failure in campaign.log.failures] == ["stuck"]
+    assert [failure.reason for failure in campaign.state.failures] == ["stuck"]
     campaign.fail("stuck", again=True)
     campaign.ask()
     campaign.fail("rain")
-    assert [failure.reason for failure in campaign.log.failures] == ["stuck", "stuck", "rain"]
+    assert [failure.reason for failure in campaign.state.failures] == ["stuck", "stuck", "rain"]
 
 
 def test_a_failure_that_was_told_may_be_given_up_again_where_it_is_another(workspace):
@@ -174,7 +174,7 @@ def test_a_failure_that_was_told_may_be_given_up_again_where_it_is_another(works
     with pytest.raises(tb.TrustboError, match="told already"):
         campaign.fail("stuck", stuck, other_path=True)
     campaign.fail("stuck", stuck, other_path=True, again=True)
-    assert len(campaign.missions) == len(campaign.log.failures) == 2
+    assert len(campaign.missions) == len(campaign.state.failures) == 2
 
 
 def test_tables_have_a_row_for_each_mission_that_failed(workspace, tmp_path):
@@ -212,7 +212,7 @@ def test_where_is_checked(workspace):
         campaign.fail("rain", where=path[1])
     with pytest.raises(tb.TrustboError, match="the mission tells where it failed"):
         campaign.fail("stuck", ModelSimulator(workspace).run(path, seed=0), where=path[1])
-    assert campaign.log.failures == []
+    assert campaign.state.failures == []
 
 
 def test_a_campaign_resumes_with_the_same_hazard(workspace, tmp_path):
@@ -227,7 +227,7 @@ def test_a_campaign_resumes_with_the_same_hazard(workspace, tmp_path):
     with campaign:
         pass
     with tb.Campaign.load(tmp_path) as again:
-        assert again.log.failures == campaign.log.failures
+        assert again.state.failures == campaign.state.failures
         assert again.hazard.drop_attrs().identical(campaign.hazard.drop_attrs())
         np.testing.assert_array_equal(again.risk.draw(5), campaign.risk.draw(5))
         assert again.ask().path == campaign.ask().path

@@ -4,6 +4,7 @@ import pytest
 
 from trustbo.campaign.migrate import migrate_notes, migrate_result, migrate_state
 from trustbo.campaign.options import arguments_of
+from trustbo.campaign.stopping import rules_of
 from trustbo.errors import TrustboError
 
 STATE = {
@@ -33,6 +34,13 @@ def test_replanning_of_version_0_1_becomes_an_option_and_the_tilt_of_0_2_goes():
     tilted = STATE | {"options": {"replan": "mission", "hazard": {"log_tilt": 1.0, "cause": 0.1}}}
     options = migrate_state(tilted)["options"]
     assert options == {"replan": "mission", "hazard": {"cause": 0.1}}
+
+
+def test_the_rule_seconds_of_version_0_2_is_a_time_limit():
+    rules = [{"rule": "Seconds", "own": False, "limit": 60.0}, {"rule": "bold", "own": True}]
+    stop = migrate_state(STATE | {"notes": {"stop": rules}})["notes"]["stop"]
+    assert rules_of(stop[:1])[0].limit == 60.0
+    assert stop == [{"rule": "TimeLimit", "own": False, "limit": 60.0}, rules[1]]
 
 
 def test_a_record_of_this_version_stays_as_it_is():

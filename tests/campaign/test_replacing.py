@@ -204,9 +204,14 @@ def numbers(folder):
     shutil.copytree(folder, copy, symlinks=True)
     try:
         with tb.Campaign.load(copy) as campaign:
-            rates = [mission.contact_rate.tobytes() for mission in campaign.log.measured]
-            states = [entry.state for entry in campaign.log.entries]
-            whole = (rates, states, campaign.workspace.awareness.values.tobytes(), campaign.seed)
+            rates = [mission.contact_rate.tobytes() for mission in campaign.state.measured]
+            states = [entry.state for entry in campaign.state.entries]
+            whole = (
+                rates,
+                states,
+                campaign.workspace.awareness.values.tobytes(),
+                campaign.state.seed,
+            )
     finally:
         shutil.rmtree(copy)
     return read, whole
@@ -267,7 +272,7 @@ def test_wherever_it_dies_there_is_the_old_campaign_or_the_new(
 def test_a_replacement_that_fails_leaves_everything(workspace, folder, monkeypatch):
     before = contents(own_files(folder))
     with tb.Campaign.load(folder) as campaign, monkeypatch.context() as patch:
-        patch.setattr("trustbo.campaign.result_files.write_missions", None)
+        patch.setattr("trustbo.campaign.storage.write_missions", None)
         with pytest.raises(TypeError):
             campaign.save(folder)
         patch.undo()
@@ -352,6 +357,27 @@ def test_saving_to_its_own_folder_keeps_hold_of_it_when_it_fails(tmp_path, monke
         tb.Campaign.load(tmp_path / "kept")
     with campaign:
         pass
+
+
+def test_properties_of_version_0_2_are_found_and_name_the_part_that_has_them():
+    campaign = tb.Campaign(random_cells(3, 3), (2, 0), (0, 2), sampler="exact", seed=4)
+    found = {
+        "log": campaign.state,
+        "seed": 4,
+        "plans": [],
+        "waiting": [],
+        "awareness": None,
+        "observation": "gaussian",
+    }
+    for name, value in found.items():
+        with pytest.warns(
+            FutureWarning, match=rf"Campaign\.{name} is .*state|learner.* since version 0.3"
+        ):
+            assert getattr(campaign, name) == value
+    with pytest.warns(FutureWarning, match=r"Campaign\.summary is table since"):
+        assert campaign.summary().equals(campaign.table())
+    with pytest.raises(AttributeError, match="'Campaign' object has no attribute 'sede'"):
+        _ = campaign.sede
 
 
 def test_keep_and_close_of_version_0_2_are_found_and_name_what_replaced_them(tmp_path):

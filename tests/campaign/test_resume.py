@@ -154,7 +154,7 @@ def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, tmp_path, mo
         pass
     again = tb.Campaign.load(tmp_path / "half")
     assert len(again.missions) == 2
-    assert again.waiting == []
+    assert again.state.numbers("told") == []
     np.testing.assert_array_equal(
         again.posterior["posterior"]["beta"].values, whole.posterior["posterior"]["beta"].values
     )
@@ -193,14 +193,12 @@ def test_saving_is_a_copy_and_loading_goes_on(workspace, tmp_path):
     with tb.Campaign.load(tmp_path) as again:
         again.save(tmp_path)  # into the folder it is kept in
         assert again.ask().path == operator.path
-        assert [f[:2] for f in again.log.failures] == [(1, "rain")]
+        assert [f[:2] for f in again.state.failures] == [(1, "rain")]
         assert again.settings == campaign.settings
         assert (
-            again.summary()
-            .drop(columns=[c for c in again.summary() if "seconds" in c])
-            .equals(
-                campaign.summary().drop(columns=[c for c in campaign.summary() if "seconds" in c])
-            )
+            again.table()
+            .drop(columns=[c for c in again.table() if "seconds" in c])
+            .equals(campaign.table().drop(columns=[c for c in campaign.table() if "seconds" in c]))
         )
         for each in (campaign, again):
             each.tell(simulator.run(operator.path, seed=1))
@@ -271,7 +269,7 @@ def test_failing_keeps_the_bounds_there_are(workspace):
     posterior = campaign.fail("tipped", replace(part))
     np.testing.assert_array_equal(posterior["posterior"]["b"], campaign.posterior["posterior"]["b"])
     assert len(campaign.missions[0].bounds) == 2
-    assert campaign.log.failures[-1] == (1, "tipped", (), None, True)
+    assert campaign.state.failures[-1] == (1, "tipped", (), None, True)
 
 
 def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):
@@ -284,9 +282,11 @@ def test_a_folder_of_version_0_1_is_read_and_goes_on(tmp_path):
         assert campaign.options == tb.CampaignOptions(
             team="min", max_bounds="shortest", initial="prior_draw", replan="bound"
         )
-        assert (campaign.settings["policy"], campaign.seed) == ("thompson", 3)
+        assert (campaign.settings["policy"], campaign.state.seed) == ("thompson", 3)
         assert [mission.path for mission in campaign.missions] == [tuple(result.path)]
-        assert campaign.plans[0].success_index == 0.6837119175124123  # `success` in its file
+        assert (
+            campaign.state.entries[0].plan.success_index == 0.6837119175124123
+        )  # `success` in its file
         assert (campaign.ask().path[0], campaign.ask().path[-1]) == ((2, 0), (0, 2))
 
 

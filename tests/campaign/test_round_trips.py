@@ -90,15 +90,15 @@ def test_a_result_and_its_workspace(kept, workspace, tmp_path):
 
 def test_a_campaign(kept, tmp_path):
     def state(campaign):
-        entries = [(e.row, e.extra, e.plan.path) for e in campaign.log.entries]
-        return repr((campaign.settings, entries, campaign.log.failures, campaign.log.notes))
+        entries = [(e.row, e.extra, e.plan.path) for e in campaign.state.entries]
+        return repr((campaign.settings, entries, campaign.state.failures, campaign.state.notes))
 
     with tb.Campaign.load(kept) as first:
         state_of_first = state(first)
         campaigns = rounds(tb.Campaign.save, tb.Campaign.load, first, tmp_path)
         for again in campaigns:
             assert state(again) == state_of_first
-            same_missions(first.log.measured, again.log.measured)
+            same_missions(first.state.measured, again.state.measured)
             same_workspace(first.workspace, again.workspace)
             with again:
                 pass

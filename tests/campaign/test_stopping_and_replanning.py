@@ -108,7 +108,7 @@ def test_seconds_and_rules_of_one_s_own_stop_too(workspace):
         return len(campaign.missions) >= 2
 
     assert iterate(workspace, stop=enough).stop_reason == "enough"
-    limit = tb.Seconds(0.001)
+    limit = tb.TimeLimit(0.001)
     time.sleep(0.01)
     result = iterate(workspace, stop=[lambda campaign: None, limit])
     assert (len(result.missions), result.stop_reason) == (1, "seconds: 0.001")
@@ -123,8 +123,8 @@ def test_bad_rules_are_refused_before_work(workspace):
     ):
         with pytest.raises(tb.TrustboError, match=message):
             tb.RegretBound(**options)
-    with pytest.raises(tb.TrustboError, match=r"Seconds.limit must be positive"):
-        tb.Seconds(-1.0)
+    with pytest.raises(tb.TrustboError, match=r"TimeLimit.limit must be positive"):
+        tb.TimeLimit(-1.0)
     with pytest.raises(tb.TrustboError, match=r"stop must be callables .* got 7"):
         iterate(workspace, stop=[7])
     with pytest.raises(
@@ -198,13 +198,13 @@ def test_the_generator_gives_each_mission_as_it_is_learned(workspace):
     campaign = tb.Campaign(
         workspace, *ENDS, sampler="exact", callbacks=[lambda c, mission: seen.append(mission)]
     )
-    steps = tb.missions(campaign, ModelSimulator(workspace), n_iterations=5)
+    steps = campaign.run(ModelSimulator(workspace), n_iterations=5)
     for plan, mission in itertools.islice(steps, 2):
         assert mission.path == plan.path
         assert campaign.missions[-1].path == plan.path
     assert len(campaign.missions) == len(seen) == 2
     assert campaign.result().stop_reason == "interrupted"
-    table = campaign.summary()
+    table = campaign.table()
     assert list(table.index) == [1, 2]
     assert table.loc[2, "path"].startswith("3,0 ")
     assert table.loc[1, "status"] == "ok"

@@ -64,7 +64,7 @@ def test_a_mission_that_is_refused_stays_told_and_is_learned_with_the_next(
         ("exact", 1000), ("exact", 2000), ("nuts", 2000)
     ]  # fmt: skip
     assert len({seed for _, seed, _ in tried}) == 3
-    assert len(campaign.waiting) == len(campaign.missions) == 1
+    assert len(campaign.state.numbers("told")) == len(campaign.missions) == 1
     assert campaign.posterior is None
     assert campaign.history["state"].values.tolist() == ["told"]
     assert "R-hat" in str(campaign.history["reason"].values[0])
@@ -72,9 +72,9 @@ def test_a_mission_that_is_refused_stays_told_and_is_learned_with_the_next(
         pass
 
     again = tb.Campaign.load(tmp_path)  # it opens, and fits nothing
-    assert len(again.waiting) == 1
+    assert len(again.state.numbers("told")) == 1
     again.tell(rates(workspace, again.ask().path, seed=1))
-    assert again.waiting == []
+    assert again.state.numbers("told") == []
     assert again.history["state"].values.tolist() == ["learned", "learned"]
     assert again.posteriors[0] is None
     assert again.posterior["constant_data"].sizes["mission"] == 2
@@ -121,7 +121,7 @@ def test_a_defect_of_a_fit_costs_no_mission(workspace, monkeypatch):
     monkeypatch.setattr("trustbo.campaign.learning.fit", break_down)
     with pytest.warns(UserWarning, match="LinAlgError: Singular matrix"):
         campaign.tell(rates(workspace, campaign.ask().path))
-    assert len(campaign.waiting) == 1
+    assert len(campaign.state.numbers("told")) == 1
 
 
 def test_a_mission_that_measured_nothing_is_set_aside_and_the_folder_opens(workspace, tmp_path):
@@ -309,7 +309,7 @@ def test_a_campaign_told_numbers_by_names_reserved_since_is_loaded(
             mission = tb.Mission.from_arrays(campaign.ask().path, measured, rates)
             campaign.tell(mission, robot=2.0, x=3.0)
     with tb.Campaign.load(tmp_path) as again:
-        assert again.log.entries[0].extra == {"robot": 2.0, "x": 3.0}
+        assert again.state.entries[0].extra == {"robot": 2.0, "x": 3.0}
         row = again.table().loc[1]
         assert (row["robot"], row["told_x"]) == (2.0, 3.0)
         with pytest.raises(tb.TrustboError, match="'robot' is a column of the history"):
@@ -357,7 +357,7 @@ def test_the_caller_s_jax_flags_do_not_change_a_campaign(workspace, policy):
             with jax.enable_x64(x64), jax.threefry_partitionable(not x64):
                 with jax.default_prng_impl("rbg" if x64 else "threefry2x32"):
                     campaign.tell(rates(workspace, campaign.ask().path, seed=j))
-        return [plan.path for plan in campaign.plans]
+        return [entry.plan.path for entry in campaign.state.entries]
 
     assert paths(False, False, False, False) == paths(True, True, True, True)
     assert paths(False, False, False, False) == paths(False, True, False, True)

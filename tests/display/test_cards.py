@@ -32,7 +32,7 @@ def shown():
     simulator = ModelSimulator(workspace, params.mean())
     campaign = tb.Campaign(workspace, (3, 0), (0, 2), sampler="exact")
     fresh = repr(campaign)
-    for _ in tb.missions(campaign, simulator, n_iterations=2):
+    for _ in campaign.run(simulator, n_iterations=2):
         pass
     result, mission = campaign.result(), campaign.missions[0]
     objects = [

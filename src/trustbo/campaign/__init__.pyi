@@ -1,18 +1,17 @@
 from .campaign import Campaign
-from .loop import iterate, missions, resume
+from .loop import iterate, resume
 from .options import CampaignOptions
 from .result import Result
-from .result_files import load_result
-from .stopping import RegretBound, Seconds
+from .stopping import RegretBound, TimeLimit
+from .storage import load_result
 
 __all__ = [
     "Campaign",
     "CampaignOptions",
     "RegretBound",
     "Result",
-    "Seconds",
+    "TimeLimit",
     "iterate",
     "load_result",
-    "missions",
     "resume",
 ]

@@ -1,10 +1,11 @@
-"""A campaign: ask for a path, run it by whatever means, tell the mission."""
+"""A campaign: ask for a path, run it by any means, tell the mission."""
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Self
+from functools import partial
+from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import numpy as np
@@ -12,46 +13,61 @@ import pandas as pd
 import xarray as xr
 from jax import random
 
-from trustbo.campaign.card import campaign_card
-from trustbo.campaign.failures import Failure, require_another, require_reason
+from trustbo.campaign.checks import require_extra, require_mission, require_reason, require_where
 from trustbo.campaign.history import history_of, table_of
 from trustbo.campaign.learning import Learner
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions, arguments_of
 from trustbo.campaign.planners import planner_of, to_avoid, under_risk
-from trustbo.campaign.posteriors import Posterior, whole_posterior
+from trustbo.campaign.posteriors import Posterior, Posteriors, whole_posterior
 from trustbo.campaign.replacing import STATE
 from trustbo.campaign.result import Result
-from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState
+from trustbo.campaign.running import run_missions
+from trustbo.campaign.state import SET_ASIDE, TOLD, CampaignState, Failure
+from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import Storage
-from trustbo.campaign.told import require_extra, require_mission, require_new
+from trustbo.campaign.summary import summary_of
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.files import FilePath, interpreting
-from trustbo.hazard.exposures import CAUSES
-from trustbo.hazard.risk import BoundRisk
+from trustbo.files import FilePath, as_path, interpreting
+from trustbo.hazard import CAUSES, BoundRisk
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
+from trustbo.simulation import Simulator, Truth
 from trustbo.stacking import fill_awareness
-from trustbo.workspace import AwarenessBelief, Workspace
+from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
 
 _N_MAPS = 500
 """Draws of the awareness that plans are made with; the first `_N_KEPT` are in the result."""
 _N_KEPT = 200
-_RENAMED = "Campaign.{} is {} since version 0.3; the old name will go."
+_MOVED: dict[str, tuple[str, Callable[["Campaign"], Any]]] = {
+    "log": ("state", lambda campaign: campaign.state),
+    "seed": ("state.seed", lambda campaign: campaign.state.seed),
+    "plans": ("state.entries[j].plan", lambda campaign: [e.plan for e in campaign.state.entries]),
+    "waiting": (
+        'those of state.numbers("told")',
+        lambda campaign: [campaign.state.measured[j] for j in campaign.state.numbers(TOLD)],
+    ),
+    "awareness": ("learner.awareness", lambda campaign: campaign.learner.awareness),
+    "observation": ("learner.observation", lambda campaign: campaign.learner.observation),
+    "summary": ("table", lambda campaign: campaign.table),
+    "keep": ("save(folder, keep=True)", lambda campaign: partial(campaign.save, keep=True)),
+    "close": ("the end of `with campaign:`", lambda campaign: campaign.__exit__),
+}
+"""Names of version 0.2: those of now, and their values."""
 
 
 class Campaign(Displayed):
     """Learns from missions and proposes the next path.
 
-    A mission is planned by `ask`, then told, then learned from. One that cannot be learned from yet
-    stays told and is tried with every later one; one that never can be is set aside. With a
+    A mission is planned by `ask`, then recorded, then learned from. One that cannot be learned from
+    yet waits, and is tried with every later one; one that never can be is excluded. With a
     `directory`, every mission is on disk before anything is learned from it, and everything before
     the next is asked for: `Campaign.load` goes on where the process ended, with identical results.
 
@@ -59,7 +75,7 @@ class Campaign(Displayed):
         workspace: Workspace of the paths.
         options: Options of the campaign.
         state: Missions as measured, their states, plans and posteriors, failures and notes.
-        learner: Model, fit and hazard, and what is believed now.
+        learner: Model, fit and hazard, and the current belief.
         planner: Planner on the workspace's awareness map; see `planner_now`.
         policy: Policy that chooses the paths.
         storage: Files of the campaign; None where it is in memory only.
@@ -105,25 +121,26 @@ class Campaign(Displayed):
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace = workspace
         self.state = CampaignState(require_whole("seed", seed, 0))
-        prior = self.state.seed_of("prior")
-        self.learner = Learner(workspace, self.options, model, sampler, prior)
-        model = self.learner.model
-        law = model.family.name, model.response
-        self.planner = planner_of(self.options, workspace, start, goal, objective, law)
+        self.learner = Learner(workspace, self.options, model, sampler, self.seed_of("prior"))
+        model = self.model
+        self.planner = planner_of(
+            self.options, workspace, start, goal, objective, model.family.name, model.response
+        )
         self.storage: Storage | None = None
-        self._believed: Planner | None = None
+        self._planner_now: Planner | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
-        own_policy = not isinstance(policy, str)
-        named = {
+        custom_policy = not isinstance(policy, str)
+        record = {
             "start": list(self.planner.start),
             "goal": list(self.planner.goal),
-            "policy": getattr(policy, "__name__", type(policy).__name__) if own_policy else policy,
+            "policy": getattr(policy, "__name__", type(policy).__name__)
+            if custom_policy
+            else policy,
             "objective": objective,
             "sampler": sampler,
             "seed": self.state.seed,
-        }
-        record = named | self.options.to_record()
+        } | self.options.to_record()
         self.settings = record | {
             "model": type(model).__name__ + " with places" * (model.place is not None),
             "observation": model.observation,
@@ -132,14 +149,15 @@ class Campaign(Displayed):
         }
         self.state.options = record | {
             "model": model_to_record(model),
-            "own_policy": own_policy,
+            "own_policy": custom_policy,
             "own_awareness": self.options.own_awareness,
         }
         if directory is not None:
             self._save_to(Storage(directory, begun=False), keep=True)
 
     def _card(self) -> Card:
-        told, settings = len(self.missions), self.settings
+        told, waiting = len(self.missions), len(self.state.numbers(TOLD))
+        settings = self.settings
         others = {
             "set aside": len(self.state.numbers(SET_ASIDE)),
             "given up": len(self.state.failures),
@@ -147,16 +165,45 @@ class Campaign(Displayed):
         also = "".join(f", {n} {what}" for what, n in others.items() if n)
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
-            ("missions", f"{told} told, {len(self.waiting)} not learned from yet{also}"),
+            (
+                "missions",
+                f"{told} told, {waiting} not learned from yet{also}",
+            ),
             ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
-        return campaign_card(
+        return summary_of(
             f"Campaign: {told} missions", rows, self.workspace, settings, self.history,
             self.trust_map if told else None, lambda: self.recommend().path,
         )  # fmt: skip
 
     # --- ask and tell ---
+
+    def run(
+        self,
+        simulator: Simulator | None = None,
+        n_iterations: int = 8,
+        *,
+        truth: Truth | None = None,
+        stop: Stop | Sequence[Stop] | None = None,
+        progress: bool | str = False,
+    ) -> Iterator[tuple[Plan, Mission]]:
+        """Run missions in a simulator, one for each step of this generator.
+
+        Args:
+            simulator: Simulator, as in `iterate`.
+            n_iterations: Largest number of missions in all.
+            truth: Truth of the simulator, as in `iterate`.
+            stop: Rules to end before `n_iterations`, as in `iterate`.
+            progress: Progress to show, as in `iterate`.
+
+        Yields:
+            Plan of each mission, and the mission, learned from already.
+
+        Raises:
+            TrustboError: Bad input, before any work starts.
+        """
+        return run_missions(self, simulator, n_iterations, truth, stop, progress)
 
     def ask(self) -> Plan:
         """Plan the next path to run; the same one until `tell`, `fail` or `suggest`.
@@ -164,21 +211,21 @@ class Campaign(Displayed):
         Raises:
             TrustboError: The policy returned a path that is broken, or no plan.
         """
-        if self.state.suggested is None:
-            started = time.perf_counter()
-            planner = self.planner_now()
-            with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
-                key = random.key(self.seed_of("policy"), impl="threefry2x32")
-                plan = self.policy(key, self.belief, planner)
-            name = self.settings["policy"]
-            if not isinstance(plan, Plan):
-                raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")
-            try:
-                planner.require_path(plan.path)
-            except TrustboError as error:
-                raise TrustboError(f"the policy {name!r}: {error}") from None
-            return self._accept(plan, started)
-        return self.state.suggested
+        if self.state.suggested is not None:
+            return self.state.suggested
+        started = time.perf_counter()
+        planner = self.planner_now()
+        with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
+            key = random.key(self.seed_of("policy"), impl="threefry2x32")
+            plan = self.policy(key, self.belief, planner)
+        name = self.settings["policy"]
+        if not isinstance(plan, Plan):
+            raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")
+        try:
+            planner.require_path(plan.path)
+        except TrustboError as error:
+            raise TrustboError(f"the policy {name!r}: {error}") from None
+        return self._accept(plan, started)
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
         """Let the operator choose the next path; `ask` then returns it.
@@ -193,266 +240,8 @@ class Campaign(Displayed):
         plan = self.planner_now().evaluate(path, self.belief.mean())
         return self._accept(plan, started)
 
-    def tell(
-        self, mission: Mission, *, other_path: bool = False, again: bool = False, **extra: float
-    ) -> xr.DataTree | None:
-        """Take a mission, keep it, and learn from it.
-
-        Awareness that the mission did not measure (NaN) is taken from the map, or from the belief.
-        Robots and features may be in any order of their names.
-
-        Args:
-            mission: Mission as measured, whether or not the goal was reached.
-            other_path: Whether it is known to have followed another path than the one asked for.
-            again: Whether a mission equal to an earlier one in every number is another one.
-            **extra: More numbers for its row of the history, such as its regret.
-
-        Returns:
-            Posterior of the parameters given all missions that can be learned from; with a warning
-            the last one, or None, where this mission cannot be learned from yet, or never.
-
-        Raises:
-            ShapeError: Robots or features differ from the workspace's.
-            TrustboError: The path leaves the grid, jumps or is not the one asked for; the mission
-                was told before; or an extra is no number. Nothing is kept then.
-        """
-        plan = self.ask()
-        mission = require_mission(self.workspace, mission, plan.path, other_path=other_path)
-        if not again:
-            earlier = (e.measured for e in self.state.entries if e.state != SET_ASIDE)
-            require_new(mission, list(earlier))
-        self._take(mission, require_extra(extra))
-        return self.state.last_tree
-
-    def set_aside(self, reason: str, mission: int | None = None) -> xr.DataTree | None:
-        """Leave a mission out of what is learned from, for good; telling it again takes it back.
-
-        Args:
-            reason: Reason, for the record.
-            mission: Number of the mission, from 1; by default the last.
-
-        Returns:
-            Posterior of the parameters given the others; None if there is nothing to learn from.
-
-        Raises:
-            TrustboError: There is no such mission, or it is set aside already.
-        """
-        n = len(self.state.entries)
-        number = n if mission is None else require_whole("mission", mission, 1)
-        if not 1 <= number <= n:
-            raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
-        if (entry := self.state.entries[number - 1]).state == SET_ASIDE:
-            raise TrustboError(f"mission {number} is set aside already: {entry.row['reason']}")
-        if self.options.update == "moment_matched":
-            raise TrustboError('update="moment_matched" cannot forget a mission; use "refit".')
-        entry.become(SET_ASIDE, str(reason))
-        self.learner.learn(self.state, self.seed_of("fit"))
-        self.state.suggested = self._believed = None
-        if self.storage is not None:  # the last posterior is another now
-            self.storage.replace(self.workspace, self.state, self.result())
-        return self.state.last_tree
-
-    def _take(self, mission: Mission, extra: dict[str, float]) -> None:
-        """Keep a mission on disk, then learn from it."""
-        plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
-        filled = fill_awareness(mission, self.known_along(mission.path))
-        told = time.perf_counter()
-        if self.storage is not None:
-            self.storage.write_told(self.state, mission, extra)
-        seconds = {"seconds_plan": self._asked[0], "seconds_run": told - self._asked[1]}
-        entry = self.state.add(mission, filled, plan, trust_map, extra, **seconds)
-        self.learner.take(self.state, seed)
-        entry.row["seconds_fit"] = time.perf_counter() - told
-        self._go_on()
-
-    def fail(
-        self,
-        reason: str,
-        mission: Mission | None = None,
-        *,
-        where: Cell | None = None,
-        other_path: bool = False,
-        again: bool = False,
-    ) -> xr.DataTree | None:
-        """Give up the mission that was asked for; the next plan takes it into account.
-
-        Args:
-            reason: Reason, for the record. One of `hazard.exposures.CAUSES`, such as "stuck", says
-                that a bound of the plan failed, and is learned from as a hazard.
-            mission: Bounds that were run, to learn from; None if there are none.
-            where: Cell that it failed to enter, where it did not report but that is known.
-            other_path: Whether it is known to have followed another path, as for `tell`.
-            again: Whether another mission failed alike, with no `ask` in between; or one equal to
-                an earlier one in every number, as for `tell`.
-
-        Returns:
-            Posterior of the parameters, if there was something to learn.
-
-        Raises:
-            TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
-                a cause; a reason that is empty, or nearly a cause; a `where` that the plan does
-                not enter, beside a mission, or for another reason; or a second failure of the
-                mission that was asked for.
-        """
-        if mission is not None and where is not None:
-            raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
-        require_reason(reason, mission)
-        posterior, path = None, ()
-        if mission is not None:
-            posterior = self.tell(mission, other_path=other_path, again=again)
-        else:
-            if not again and self.state.suggested is None:
-                require_another(self.state.failures, len(self.missions))
-            path = self.ask().path if where is not None or reason in CAUSES else ()
-        failure = Failure.of(len(self.missions), reason, path, where)
-        self.state.failures.append(failure._replace(told=mission is not None))
-        self._go_on()
-        return posterior
-
-    def recommend(self) -> Plan:
-        """Plan the best path under the mean of the belief, whatever the policy would try next."""
-        return self.planner_now().plan(self.belief.mean())
-
-    def trust_map(self) -> xr.DataArray:
-        """Compute the team's trust map under the mean of the belief, dims (row, col)."""
-        return self.planner_now().trust_map(self.belief.mean())
-
-    # --- results ---
-
-    def result(self) -> Result:
-        """Collect everything learned so far, as `iterate` returns it.
-
-        Raises:
-            TrustboError: Nothing was learned yet.
-        """
-        if not self.state.entries:
-            raise TrustboError("the campaign has no mission yet; tell it one first.")
-        best = self.recommend()
-        return Result(
-            self.workspace,
-            self.state.missions,
-            self.state.posteriors,
-            list(best.path),
-            best.trust,
-            best.value,
-            self.trust_map(),
-            self.history,
-            {**self.settings, **self.state.notes, "trustbo_version": VERSIONS["trustbo"]},
-            self.state.stop_reason,
-            self._believed_awareness(),
-            tuple(self.state.failures),
-        )
-
-    def stop(self, reason: str) -> Result:
-        """End the campaign, which may still go on later, and return its result.
-
-        Args:
-            reason: Reason, for `Result.stop_reason`.
-        """
-        self.state.stop_reason = reason
-        result = self.result()
-        if self.storage is not None:
-            self.storage.write(self.state, result, ended=True)
-        return result
-
-    # --- the folder ---
-
-    def save(self, directory: FilePath, *, keep: bool = False) -> None:
-        """Write everything to a folder that `Campaign.load` reads.
-
-        Another campaign in it is replaced.
-
-        Args:
-            directory: Folder to write to.
-            keep: Whether to keep the campaign there from now on, as with a `directory`, until the
-                end of `with campaign:`.
-
-        Raises:
-            TrustboError: Another campaign holds the folder, or its name belongs to a file.
-        """
-        own = self.storage
-        here = own is not None and own.is_at(directory)
-        self._save_to(own if own is not None and here else Storage(directory), keep)
-
-    def _save_to(self, storage: Storage, keep: bool) -> None:
-        own = self.storage
-        try:
-            storage.replace(self.workspace, self.state, self._result_so_far())
-            if keep:
-                self.storage = storage
-        finally:
-            for held in (own, storage):
-                if held is not None and held is not self.storage:
-                    held.release()
-
-    @classmethod
-    def load(
-        cls,
-        directory: FilePath,
-        *,
-        model: TrustModel | None = None,
-        policy: Policy | None = None,
-        **own: Any,
-    ) -> Self:
-        """Go on with a campaign where it stopped, in the same folder.
-
-        A mission that was told and not yet learned from is learned from now.
-
-        Args:
-            directory: Folder of its `directory`, or of `save`.
-            model: The same model, if it has priors of your own, or is your own.
-            policy: The same policy, if it is your own.
-            **own: The same `callbacks`, and the same `awareness`, as it was before the first
-                mission, if it is your own.
-
-        Raises:
-            TrustboError: There is no campaign; another process is at work on it; or something of
-                your own is missing.
-        """
-        storage = Storage(directory, begun=True)
-        try:
-            state, workspace, pending = storage.read()
-            with interpreting(storage.path / STATE):
-                given, kind = arguments_of(state.options, policy, **own)
-                learned = model_from_record(kind) if model is None else None
-            # Not within: an error of the user's own model is none of the file.
-            learned = model_from_record(kind, model) if learned is None else learned
-            campaign = cls(workspace, model=learned, **given)
-            state.options = campaign.state.options  # as this version writes them
-            campaign.state, campaign.storage = state, storage
-            campaign.learner.restore(state)
-            for mission, extra in pending:
-                campaign._take(mission, extra)
-        except BaseException:
-            storage.release()
-            raise
-        return campaign
-
-    def keep(self, directory: FilePath) -> None:
-        """Save with `keep=True`, by its name in version 0.2."""
-        warnings.warn(_RENAMED.format("keep(folder)", "save(folder, keep=True)"), FutureWarning, 2)
-        self.save(directory, keep=True)
-
-    def close(self) -> None:
-        """Let go of the folder as `with campaign:` does, by its name in version 0.2."""
-        warnings.warn(_RENAMED.format("close()", "the end of `with campaign:`"), FutureWarning, 2)
-        self.__exit__()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self.storage is not None:
-            self.storage.release()
-            self.storage = None
-
-    def _result_so_far(self) -> Result | None:
-        return self.result() if self.state.entries else None
-
-    # --- inside ---
-
     def _accept(self, plan: Plan, started: float) -> Plan:
-        """Keep a plan as the next to be run."""
+        """Store a plan as the next to be run."""
         bands = self.planner_now().bands(plan.path, self.belief)
         now = time.perf_counter()
         self._asked = now - started, now
@@ -469,29 +258,158 @@ class Campaign(Displayed):
             self.storage.write(self.state, None)
         return accepted
 
+    def tell(
+        self, mission: Mission, *, other_path: bool = False, again: bool = False, **extra: float
+    ) -> xr.DataTree | None:
+        """Record a mission and learn from it.
+
+        Awareness that the mission did not measure (NaN) is taken from the map, or from the belief.
+        Robots and features may be in any order of their names.
+
+        Args:
+            mission: Mission as measured, whether or not the goal was reached.
+            other_path: Whether it really followed another path than the one asked for.
+            again: Whether a mission equal to an earlier one in every number is another one.
+            **extra: More numbers for its row of the history, such as its regret.
+
+        Returns:
+            Posterior of the parameters given all missions that can be learned from; with a warning
+            the last one, or None, where this mission cannot be learned from yet, or never.
+
+        Raises:
+            ShapeError: Robots or features differ from the workspace's.
+            TrustboError: The path leaves the grid, jumps or is not the one asked for; the mission
+                was recorded before; or an extra is no number. Nothing is stored then.
+        """
+        earlier = [] if again else [e.measured for e in self.state.entries if e.state != SET_ASIDE]
+        asked = self.ask().path
+        mission = require_mission(mission, self.workspace, asked, earlier, other_path=other_path)
+        self._take(mission, require_extra(extra))
+        return self.state.last_tree
+
+    def _take(self, mission: Mission, extra: dict[str, float]) -> None:
+        """Write a mission to disk, then learn from it."""
+        plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
+        filled = fill_awareness(mission, self.known_along(mission.path))
+        started = time.perf_counter()
+        if self.storage is not None:
+            extras = [*(entry.extra for entry in self.state.entries), extra]
+            self.storage.write_measured([*self.state.measured, mission], extras)
+        seconds = {"seconds_plan": self._asked[0], "seconds_run": started - self._asked[1]}
+        entry = self.state.add(mission, filled, plan, trust_map, extra, **seconds)
+        self.learner.take(self.state, seed)
+        entry.row["seconds_fit"] = time.perf_counter() - started
+        self._go_on()
+
     def _go_on(self) -> None:
-        """Forget the plan that was run or given up, and write what it added."""
-        self.state.suggested = self._believed = None
+        """Drop the plan that was run or given up, and write what it added."""
+        self.state.suggested = self._planner_now = None
         if self.storage is not None:
             self.storage.write(self.state, self._result_so_far())
 
-    def planner_now(self) -> Planner:
-        """Planner with the awareness that is believed in now, away from bounds that stopped robots.
+    def set_aside(self, reason: str, mission: int | None = None) -> xr.DataTree | None:
+        """Exclude a mission from learning, for good; `tell` with the same mission adds it again.
 
-        A bound that did so twice is not entered again unless there is no other way, or its chance
+        Args:
+            reason: Reason, for the record.
+            mission: Number of the mission, from 1; by default the last.
+
+        Returns:
+            Posterior of the parameters given the others; None if there is nothing to learn from.
+
+        Raises:
+            TrustboError: There is no such mission, or it is excluded already.
+        """
+        n = len(self.state.entries)
+        number = n if mission is None else require_whole("mission", mission, 1)
+        if not 1 <= number <= n:
+            raise TrustboError(f"there is no mission {number} to set aside; {n} were told.")
+        if (entry := self.state.entries[number - 1]).state == SET_ASIDE:
+            raise TrustboError(f"mission {number} is set aside already: {entry.row['reason']}")
+        if self.options.update == "moment_matched":
+            raise TrustboError('update="moment_matched" cannot forget a mission; use "refit".')
+        entry.become(SET_ASIDE, str(reason))
+        self.learner.learn(self.state, self.seed_of("fit"))
+        self.state.suggested = self._planner_now = None
+        if self.storage is not None:  # the last posterior is another now
+            self.storage.replace(self.workspace, self.state, self.result())
+        return self.state.last_tree
+
+    def fail(
+        self,
+        reason: str,
+        mission: Mission | None = None,
+        *,
+        where: Cell | None = None,
+        other_path: bool = False,
+        again: bool = False,
+    ) -> xr.DataTree | None:
+        """Give up the mission that was asked for; the next plan takes it into account.
+
+        Args:
+            reason: Reason, for the record. One of `hazard.CAUSES`, such as "stuck", means that a
+                bound of the plan failed, and is learned from as a hazard.
+            mission: Bounds that were run, to learn from; None if there are none.
+            where: Cell that it failed to enter, if that is certain though it did not report.
+            other_path: Whether it really followed another path, as for `tell`.
+            again: Whether another mission failed alike, with no `ask` in between; or one equal to
+                an earlier one in every number, as for `tell`.
+
+        Returns:
+            Posterior of the parameters, if there was something to learn.
+
+        Raises:
+            TrustboError: The mission is one that `tell` refuses, or reached the goal in spite of
+                a cause; a reason that is empty, or nearly a cause; a `where` that the plan does
+                not enter, together with a mission, or for another reason; or a second failure of
+                the mission that was asked for.
+        """
+        if mission is not None and where is not None:
+            raise TrustboError(f"the mission tells where it failed; leave where = {where}.")
+        require_reason(reason, mission)
+        state, posterior, path = self.state, None, ()
+        if mission is not None:
+            posterior = self.tell(mission, other_path=other_path, again=again)
+        else:
+            last = state.failures[-1] if state.failures and state.suggested is None else None
+            if last is not None and last.after == len(state.entries) and not again:
+                raise TrustboError(
+                    f"the mission that was asked for was given up already: {last.reason!r}. Ask "
+                    "for the next one; or, if another really failed too, fail(reason, again=True)."
+                )
+            if where is not None or reason in CAUSES:
+                path = self.ask().path
+                where = None if where is None else require_where(where, reason, path)
+        failure = Failure(len(state.entries), reason, tuple(path), where, mission is not None)
+        state.failures.append(failure)
+        self._go_on()
+        return posterior
+
+    def recommend(self) -> Plan:
+        """Plan the best path under the mean of the belief, regardless of the policy."""
+        return self.planner_now().plan(self.belief.mean())
+
+    def trust_map(self) -> xr.DataArray:
+        """Compute the team's trust map under the mean of the belief, dims (row, col)."""
+        return self.planner_now().trust_map(self.belief.mean())
+
+    def planner_now(self) -> Planner:
+        """Planner with the current belief about the awareness, away from bounds that failed.
+
+        A bound that failed twice is not entered again unless there is no other way, or its chance
         to fail fell below 0.2.
         """
-        if self._believed is None:
-            planner = self.planner.with_observation(self.observation)
-            if self.awareness is not None:
+        if self._planner_now is None:
+            planner = self.planner.with_observation(self.learner.observation)
+            if (awareness := self.learner.awareness) is not None:
                 n_maps = min(_N_MAPS, self.belief.leading[0])
-                maps = self.awareness.draw(n_maps, self.seed_of("awareness"))
-                planner = planner.with_awareness(maps, self.awareness.mean())
-            if self.state.entries or self.state.failures:
-                avoided = to_avoid(self.risk)
-                planner = planner.avoiding(avoided, self.risk.mean) if avoided.any() else planner
-            self._believed = under_risk(planner, self.risk)
-        return self._believed
+                maps = awareness.draw(n_maps, self.seed_of("awareness"))
+                planner = planner.with_awareness(maps, awareness.mean())
+            risk = self.risk
+            if (self.state.entries or self.state.failures) and (avoid := to_avoid(risk)).any():
+                planner = planner.avoiding(avoid, risk.mean)
+            self._planner_now = under_risk(planner, risk)
+        return self._planner_now
 
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
         """Awareness expected in the bounds of a path, shape (bound, robot, feature).
@@ -500,7 +418,7 @@ class Campaign(Displayed):
         missions take where robots do not measure it.
 
         Args:
-            path: Cell where the team is and the cells to be entered; need not begin at the start.
+            path: Current cell of the team and the cells to be entered; need not begin at the start.
 
         Raises:
             TrustboError: A cell is off the grid, or no neighbour of the one before.
@@ -509,45 +427,60 @@ class Campaign(Displayed):
         moves_along(cells)
         return np.swapaxes(along(self.planner_now().mean_awareness, cells), 0, 1)
 
-    def _believed_awareness(self) -> xr.Dataset | None:
-        """`Result.believed`."""
-        like, problem = self.workspace.awareness, self.planner_now().problem
-        if problem.cells is None:
-            return None
-        # Single precision: they are written after every mission.
-        maps = problem.cells[:_N_KEPT].astype(np.float32)
-        draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
-        return xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
+    # --- results ---
 
-    # --- state and belief ---
+    def result(self) -> Result:
+        """Collect everything learned so far, as `iterate` returns it.
 
-    @property
-    def log(self) -> CampaignState:
-        """The `state`, by its name in version 0.2."""
-        return self.state
+        Raises:
+            TrustboError: Nothing was learned yet.
+        """
+        if not self.state.entries:
+            raise TrustboError("the campaign has no mission yet; tell it one first.")
+        best, believed, problem = self.recommend(), None, self.planner_now().problem
+        if problem.cells is not None:
+            like = self.workspace.awareness
+            # Single precision: they are written after every mission.
+            maps = problem.cells[:_N_KEPT].astype(np.float32)
+            draws = xr.DataArray(maps, like.coords, ("draw", *like.dims))
+            believed = xr.Dataset({"mean": like.copy(data=problem.mean_cells), "draws": draws})
+        return Result(
+            self.workspace,
+            self.missions,
+            self.posteriors,
+            list(best.path),
+            best.trust,
+            best.value,
+            self.trust_map(),
+            self.history,
+            {**self.settings, **self.state.notes, "trustbo_version": VERSIONS["trustbo"]},
+            self.state.stop_reason,
+            believed,
+            tuple(self.state.failures),
+        )
 
-    @property
-    def seed(self) -> int:
-        """Seed of everything random."""
-        return self.state.seed
+    def _result_so_far(self) -> Result | None:
+        return self.result() if self.state.entries else None
+
+    def stop(self, reason: str) -> Result:
+        """End the campaign, which may still go on later, and return its result.
+
+        Args:
+            reason: Reason, for `Result.stop_reason`.
+        """
+        self.state.stop_reason = reason
+        result = self.result()
+        if self.storage is not None:
+            self.storage.write(self.state, result, ended=True)
+        return result
 
     @property
     def missions(self) -> list[Mission]:
-        """Missions told so far, their awareness filled in."""
+        """Missions recorded so far, their awareness filled in."""
         return self.state.missions
 
     @property
-    def waiting(self) -> list[Mission]:
-        """Missions that were told, and are to be learned from with a later one."""
-        return [self.state.entries[j].measured for j in self.state.numbers(TOLD)]
-
-    @property
-    def plans(self) -> list[Plan]:
-        """Plan of each mission."""
-        return [entry.plan for entry in self.state.entries]
-
-    @property
-    def posteriors(self) -> Sequence[xr.DataTree]:
+    def posteriors(self) -> Posteriors:
         """Posterior of the parameters after each mission; None where nothing was learned yet."""
         return self.state.posteriors
 
@@ -572,14 +505,6 @@ class Campaign(Displayed):
         """Table with a row for each mission, as `Result.table`."""
         return table_of(self.history, self.missions, self.state.failures)
 
-    def summary(self) -> pd.DataFrame:
-        """Return `table`, by the name that it had in version 0.2."""
-        return self.table()
-
-    def seed_of(self, stream: str) -> int:
-        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
-        return self.state.seed_of(stream)
-
     @property
     def model(self) -> TrustModel:
         """Trust model."""
@@ -591,21 +516,107 @@ class Campaign(Displayed):
         return self.learner.belief
 
     @property
-    def awareness(self) -> AwarenessBelief | None:
-        """Belief about the awareness; None where the map is trusted."""
-        return self.learner.awareness
-
-    @property
-    def observation(self) -> str:
-        """Family of observations of the belief: the posterior's, or that of the prior at first."""
-        return self.learner.observation(self.state)
-
-    @property
     def hazard(self) -> xr.Dataset:
         """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
-        return self.learner.hazard(self.state)
+        return self.learner.hazard(self.state)[0]
 
     @property
     def risk(self) -> BoundRisk:
         """Chances of the bounds to fail, of all missions so far."""
-        return self.learner.risk(self.state)
+        return self.learner.hazard(self.state)[1]
+
+    def seed_of(self, stream: str) -> int:
+        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
+        return self.state.seed_of(stream)
+
+    # --- the folder ---
+
+    def save(self, directory: FilePath, *, keep: bool = False) -> None:
+        """Write everything to a folder that `Campaign.load` reads.
+
+        Another campaign in it is replaced.
+
+        Args:
+            directory: Folder to write to.
+            keep: Whether to keep the campaign there from now on, as with a `directory`, until the
+                end of `with campaign:`.
+
+        Raises:
+            TrustboError: Another campaign holds the folder, or its name belongs to a file.
+        """
+        storage, path = self.storage, as_path(directory).resolve()
+        if storage is None or storage.path.resolve() != path:
+            storage = Storage(directory)
+        self._save_to(storage, keep)
+
+    def _save_to(self, storage: Storage, keep: bool) -> None:
+        before = self.storage
+        try:
+            storage.replace(self.workspace, self.state, self._result_so_far())
+            if keep:
+                self.storage = storage
+        finally:
+            for one in (before, storage):
+                if one is not None and one is not self.storage:
+                    one.release()
+
+    @classmethod
+    def load(
+        cls,
+        directory: FilePath,
+        *,
+        model: TrustModel | None = None,
+        policy: Policy | None = None,
+        **custom: Any,
+    ) -> Self:
+        """Go on with a campaign where it stopped, in the same folder.
+
+        A mission that was recorded and not yet learned from is learned from now.
+
+        Args:
+            directory: Folder of its `directory`, or of `save`.
+            model: The same model, if it or its priors are custom.
+            policy: The same policy, if it is custom.
+            **custom: The same `callbacks`, and the same `awareness`, as it was before the first
+                mission, if it is custom.
+
+        Raises:
+            TrustboError: There is no campaign; another process is at work on it; or a custom object
+                is missing.
+        """
+        storage = Storage(directory, begun=True)
+        try:
+            state, workspace, pending = storage.read()
+            with interpreting(storage.path / STATE):
+                given, kind = arguments_of(state.options, policy, **custom)
+                restored = model_from_record(kind) if model is None else None
+            # Not within: an error of the user's model is none of the file.
+            restored = model_from_record(kind, model) if restored is None else restored
+            campaign = cls(workspace, model=restored, **given)
+            state.options = campaign.state.options  # as this version writes them
+            campaign.state, campaign.storage = state, storage
+            campaign.learner.restore(state)
+            for mission, extra in pending:
+                campaign._take(mission, extra)
+        except BaseException:
+            storage.release()
+            raise
+        return campaign
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.storage is not None:
+            self.storage.release()
+            self.storage = None
+
+    if not TYPE_CHECKING:  # to which a misspelt name would be an attribute too
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in _MOVED:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            now, value = _MOVED[name]
+            message = f"Campaign.{name} is {now} since version 0.3; the old name will go."
+            warnings.warn(message, FutureWarning, stacklevel=2)
+            return value(self)

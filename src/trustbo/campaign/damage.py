@@ -1,4 +1,4 @@
-"""Damaged files of a campaign: what is wrong, and what can still be read."""
+"""Records of a campaign's folder, checked field by field; and the remedy for a damaged file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,17 @@ from trustbo.campaign.replacing import MEASURED, MISSIONS, RESULT, STATE
 from trustbo.errors import DamagedFileError
 from trustbo.files import interpreting, read_record
 
-_TELL = "tell them, in order, to a new campaign in another folder, with other_path=True"
+MISSIONS_AS_TOLD = (
+    "All missions as they were told can be read: trustbo.logs.read_missions({!r}); tell them, in "
+    "order, to a new campaign in another folder, with other_path=True."
+)
+_MISSIONS_FILLED = (
+    "The missions can be read: trustbo.logs.read_missions({!r}); tell them, in order, to a new "
+    "campaign in another folder, with other_path=True. They are not quite as they were told: "
+    "awareness that was not measured is filled in there from the map or the belief. A campaign "
+    "with awareness='belief' would take it for measured, and be too sure of its map; with "
+    "awareness='map' nothing changes."
+)
 
 # Kinds of values: a type (float for any number), alternatives in a tuple, a list of one kind or of
 # one for each place, and a dict of those by name, `str` for all other names.
@@ -71,26 +81,25 @@ def read_fields(file: Path) -> dict[str, Any]:
     Raises:
         DamagedFileError: The file is missing or damaged, or a field is missing or no such value.
     """
-    record, needed = read_record(file), _NEEDED[file.name]
+    record = read_record(file)
+
+    def damaged(reason: str) -> DamagedFileError:
+        return DamagedFileError(f"{str(file)!r} is damaged: {reason}")
+
     if not isinstance(record, dict):
-        raise DamagedFileError(f"{str(file)!r} is damaged: no record of fields.")
-    if missing := [name for name in needed if name not in record]:
-        raise DamagedFileError(f"{str(file)!r} is damaged: it lacks {', '.join(missing)}.")
+        raise damaged("no record of fields.")
+    if missing := [name for name in _NEEDED[file.name] if name not in record]:
+        raise damaged(f"it lacks {', '.join(missing)}.")
     for name, kind in _FIELDS[file.name].items():
         if name in record and not _fits(record[name], kind):
-            raise DamagedFileError(
-                f"{str(file)!r} is damaged: {name} = {str(record[name])[:60]} is none."
-            )
+            raise damaged(f"{name} = {str(record[name])[:60]} is none.")
     for row in record.get("rows", []):
         if lacks := [name for name in _COLUMNS if name not in row]:
-            raise DamagedFileError(f"{str(file)!r} is damaged: a mission lacks {', '.join(lacks)}.")
+            raise damaged(f"a mission lacks {', '.join(lacks)}.")
     n = record["n_missions"]
     for name in ("plans", "rows", "posterior_after"):
         if len(record.get(name, range(n))) != n:
-            raise DamagedFileError(
-                f"{str(file)!r} is damaged: {name} has {len(record[name])} entries for "
-                f"{n} missions."
-            )
+            raise damaged(f"{name} has {len(record[name])} entries for {n} missions.")
     with interpreting(file):
         return migrate_state(record) if file.name == STATE else migrate_result(record)
 
@@ -99,14 +108,14 @@ def _fits(value: Any, kind: Any) -> bool:
     """Whether a value is of a kind."""
     match kind:
         case tuple():
-            return any(_fits(value, one) for one in kind)
+            return any(_fits(value, choice) for choice in kind)
         case range():
             return _fits(value, int) and value in kind
-        case [one]:
-            return isinstance(value, list) and all(_fits(v, one) for v in value)
+        case [every]:
+            return isinstance(value, list) and all(_fits(v, every) for v in value)
         case list():
-            alike = isinstance(value, list) and len(value) == len(kind)
-            return alike and all(map(_fits, value, kind))
+            same_length = isinstance(value, list) and len(value) == len(kind)
+            return same_length and all(map(_fits, value, kind))
         case dict():
             return isinstance(value, dict) and all(
                 _fits(v, kind.get(name, kind.get(str, object))) for name, v in value.items()
@@ -121,29 +130,11 @@ def _fits(value: Any, kind: Any) -> bool:
 
 @contextmanager
 def naming_what_is_left(folder: Path) -> Iterator[None]:
-    """Add to the error of a damaged file that the missions as told can be read, if they can."""
+    """Add to the error of a damaged file that the missions can be read, if they can."""
     try:
         yield
     except DamagedFileError as error:
-        for name, described in ((MEASURED, salvage), (MISSIONS, _salvage_filled)):
+        for name, remedy in ((MEASURED, MISSIONS_AS_TOLD), (MISSIONS, _MISSIONS_FILLED)):
             if str(folder / name) not in str(error) and (folder / name).exists():
-                raise DamagedFileError(f"{error} {described(folder / name)}") from None
+                raise DamagedFileError(f"{error} {remedy.format(str(folder / name))}") from None
         raise
-
-
-def salvage(measured: Path) -> str:
-    """Describe the way on where only the missions as told can be read."""
-    return (
-        "All missions as they were told can be read: trustbo.logs.read_missions("
-        f"{str(measured)!r}); {_TELL}."
-    )
-
-
-def _salvage_filled(missions: Path) -> str:
-    """Describe the way on where only the missions with awareness filled in can be read."""
-    return (
-        f"The missions can be read: trustbo.logs.read_missions({str(missions)!r}); {_TELL}. They "
-        "are not quite as they were told: awareness that was not measured is filled in there from "
-        "the map or the belief. A campaign with awareness='belief' would take it for measured, and "
-        "be too sure of its map; with awareness='map' nothing changes."
-    )

@@ -7,10 +7,10 @@ from typing import Any, cast
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.checks import never_to_be_learned
 from trustbo.campaign.options import CampaignOptions
 from trustbo.campaign.posteriors import Posterior
 from trustbo.campaign.state import LEARNED, SET_ASIDE, TOLD, CampaignState
-from trustbo.campaign.told import never_to_be_learned
 from trustbo.data import Mission
 from trustbo.display.bars import place_of, say
 from trustbo.errors import PosteriorError, TrustboError
@@ -46,6 +46,7 @@ class Learner:
         model: Trust model, by default `PooledTrust` with effects of places.
         sampler: Sampler of the posterior.
         belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
+        observation: Family of observations of the belief.
         awareness: Belief about the awareness; None where the map is trusted.
         progress: Whether fits show their progress, see `tb.fit`.
     """
@@ -70,15 +71,16 @@ class Learner:
             model = PooledTrust(place=PlaceEffect() if options.update == "refit" else None)
         _require_learnable(model, sampler, options)
         self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
-        self.belief = self._prior = _prior_belief(model, options.initial, workspace, seed)
+        self._prior = _prior_belief(model, options.initial, workspace, seed)
+        self._believe(None)
         self.awareness: AwarenessBelief | None = None
         if options.awareness != "map":
-            own = options.awareness
-            self.awareness = AwarenessBelief(workspace) if isinstance(own, str) else own
-        self._known: tuple[object, xr.Dataset, BoundRisk] | None = None
+            given = options.awareness
+            self.awareness = AwarenessBelief(workspace) if isinstance(given, str) else given
+        self._hazard: tuple[object, xr.Dataset, BoundRisk] | None = None
 
     def take(self, state: CampaignState, seed: int) -> None:
-        """Learn from the last mission of a state, or set it aside where nothing ever can be.
+        """Learn from the last mission of a state, or exclude it where nothing can be learned.
 
         Args:
             state: State whose last mission is new.
@@ -94,11 +96,12 @@ class Learner:
             self.awareness.update(entry.measured)
 
     def learn(self, state: CampaignState, seed: int) -> None:
-        """Fit the posterior of all missions that are not set aside; if it is refused, go on."""
+        """Fit the posterior of all missions that are not excluded; if it is refused, go on."""
         entries, waiting = state.entries, state.numbers(TOLD)
         numbers, last = state.numbers(TOLD, LEARNED), state.last
         if not numbers:
-            entries[-1].posterior, self.belief = None, self._prior
+            entries[-1].posterior = None
+            self._believe(None)
             return
         missions = [entries[j].mission for j in numbers]
         try:
@@ -106,16 +109,16 @@ class Learner:
         except CannotLearnError as error:
             for j in waiting:
                 entries[j].become(TOLD, str(error))
-            known = "the prior" if last is None else "the posterior before"
+            belief = "the prior" if last is None else "the posterior before"
             warnings.warn(
                 f"mission {len(entries)} is kept, but cannot be learned from yet: {error} "
-                f"The campaign goes on with {known}, and tries again with the next mission.",
+                f"The campaign goes on with {belief}, and tries again with the next mission.",
                 stacklevel=5,
             )
             return
         alone = self.options.update == "moment_matched"  # the prior stands for those before
         tree.attrs["missions"] = waiting if alone else numbers
-        tree["hazard"] = xr.DataTree(self.hazard(state))
+        tree["hazard"] = xr.DataTree(self.hazard(state)[0])
         if "latent" not in tree.children:
             tree = parameters_alone(tree)
         if last is not None:
@@ -124,10 +127,10 @@ class Learner:
             entries[j].become(LEARNED)
         entries[-1].row |= diagnostics(tree)
         entries[-1].posterior = Posterior(len(entries), tree)
-        self.belief = params_of(tree)
+        self._believe(tree)
 
     def restore(self, state: CampaignState) -> None:
-        """Believe again what was learned from the missions of a state that was read.
+        """Restore the belief after the missions of a state that was read.
 
         Raises:
             DamagedFileError: The last posterior cannot be read.
@@ -138,52 +141,50 @@ class Learner:
         if (last := state.last) is not None:
             tree = last()
             with interpreting(last.file or ""):
-                self.belief = params_of(tree)
+                self._believe(tree)
 
-    def observation(self, state: CampaignState) -> str:
-        """Family of observations of the belief: the posterior's, or that of the prior at first."""
-        last = state.last_tree
-        return self.model.family.name if last is None else last.attrs["observation"]
+    def _believe(self, tree: xr.DataTree | None) -> None:
+        """Take the belief from a posterior; from the prior if there is none."""
+        self.belief = self._prior if tree is None else params_of(tree)
+        self.observation: str = (
+            self.model.family.name if tree is None else tree.attrs["observation"]
+        )
 
-    def hazard(self, state: CampaignState) -> xr.Dataset:
-        """Group `hazard` of the posterior, see `hazard.fit_hazard`; of the prior at first."""
-        return self._hazard_and_risk(state)[0]
+    def hazard(self, state: CampaignState) -> tuple[xr.Dataset, BoundRisk]:
+        """Fit the hazard of all missions of a state when it is first asked for.
 
-    def risk(self, state: CampaignState) -> BoundRisk:
-        """Chances of the bounds to fail, of all missions of a state."""
-        return self._hazard_and_risk(state)[1]
-
-    def _hazard_and_risk(self, state: CampaignState) -> tuple[xr.Dataset, BoundRisk]:
-        """Hazard of a state, fitted when it is first asked for."""
-        asides = tuple(state.numbers(SET_ASIDE))
-        key = len(state.entries), len(state.failures), asides
-        if self._known is None or self._known[0] != key:
+        Returns:
+            Group `hazard` of the posterior, see `hazard.fit_hazard`, of the prior at first; and the
+            chances of the bounds to fail under it.
+        """
+        key = len(state.entries), len(state.failures), tuple(state.numbers(SET_ASIDE))
+        if self._hazard is None or self._hazard[0] != key:
             hazard, last = self._fit_hazard(state), state.last_tree
             if hazard is None and last is not None and "hazard" in last.children:
                 hazard = last["hazard"].to_dataset()
             if hazard is None:
                 hazard = fit_hazard([], self.workspace, self.options.prior_hazard)
-            self._known = key, hazard, BoundRisk.of(hazard, self.workspace)
-        return self._known[1:]
+            self._hazard = key, hazard, BoundRisk.of(hazard, self.workspace)
+        return self._hazard[1:]
 
     def _fit_hazard(self, state: CampaignState) -> xr.Dataset | None:
-        """Fit the hazard of bounds to all missions that were not set aside by hand.
+        """Fit the hazard of bounds to all missions that were not excluded by hand.
 
-        A mission set aside because it measured no contact rate tells all the same where it failed.
+        A mission excluded because it measured no contact rate still shows where it failed.
         None, with a warning, where the posterior is refused.
         """
         entries = state.entries
-        told = [
-            (j, entry.measured)
+        measured = {
+            j: entry.measured
             for j, entry in enumerate(entries)
             if entry.state != SET_ASIDE or never_to_be_learned(entry.mission)
-        ]
+        }
         lost = [failure for failure in state.failures if failure.path]
-        ages = [len(entries) - 1 - j for j, _ in told], [len(entries) - f.after for f in lost]
+        ages = [len(entries) - 1 - j for j in measured], [len(entries) - f.after for f in lost]
         weights = [self.options.forgetting ** np.array(age, dtype=float) for age in ages]
         try:
             return fit_hazard(
-                [mission for _, mission in told],
+                list(measured.values()),
                 self.workspace,
                 self.options.prior_hazard,
                 lost=[LostMission(f.path, f.reason, f.where) for f in lost],
@@ -202,7 +203,7 @@ class Learner:
 
         Args:
             missions: Missions to learn from, in order.
-            new: Number of the last of them that `last` does not know.
+            new: Number of the last of them that are not in `last`.
             last: Posterior of the others.
             seed: Seed of the sampler.
 
@@ -242,7 +243,7 @@ class Learner:
         raise CannotLearnError(reason)
 
     def _attempts(self) -> list[tuple[str, dict[str, Any]]]:
-        """Sampler of each attempt, and the number and care of its draws."""
+        """Sampler and sampling options of each attempt."""
         sampler, _ = resolve_sampler(self.model, self.sampler)
         # Draws of the exact sampler are nearly independent, and effects of places make them large.
         n = _N_DRAWS // 4 if sampler == "exact" and self.model.place else _N_DRAWS

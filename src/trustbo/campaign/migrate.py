@@ -12,13 +12,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _PLANNING = {"max_failure": None, "failure_cost": None}
-"""Options of planning that version 0.1 had not, which knew of no failures."""
+"""Options of planning that version 0.1, which had no failures, lacks."""
 _LEARNED = {"state": "learned", "reason": ""}
 """State of every mission of version 0.1, which had no other."""
 _SIMULATORS = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulator"}
 """Simulators by their names in version 0.1."""
 _MOST = 10_000
 """Missions of a record of version 0.1 at most; a damaged one may count more."""
+_RULES = {"Seconds": "TimeLimit"}
+"""Rules to stop by their names in version 0.2."""
 
 
 def migrate_state(record: dict[str, Any]) -> dict[str, Any]:
@@ -31,6 +33,7 @@ def migrate_state(record: dict[str, Any]) -> dict[str, Any]:
     return {
         **record,
         "options": options | {"hazard": hazard},
+        "notes": _notes(notes),
         "rows": [row if "state" in row else row | _LEARNED for row in record["rows"]],
         "posterior_after": posterior_after(record),
         "failures": _failures(record),
@@ -55,9 +58,8 @@ def posterior_after(record: Mapping[str, Any]) -> list[int | None]:
 
 
 def extras_of(attributes: Mapping[Any, Any], n: int) -> list[dict[str, Any]]:
-    """Numbers that `n` missions were told with; version 0.1 kept none."""
-    text = attributes.get("extra")
-    return [{} for _ in range(n)] if text is None else json.loads(text)
+    """Numbers that were passed with each of `n` missions; version 0.1 stored none."""
+    return json.loads(attributes.get("extra", json.dumps([{}] * n)))
 
 
 def migrate_notes(notes: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,12 +77,19 @@ def migrate_notes(notes: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str,
     return before
 
 
+def _notes(notes: dict[str, Any]) -> dict[str, Any]:
+    """Notes whose rules to stop have their names of now."""
+    rules = notes.get("stop", [])
+    renamed = [rule | {"rule": _RULES.get(rule["rule"], rule["rule"])} for rule in rules]
+    return notes | {"stop": renamed} if rules else notes
+
+
 def is_whole(posterior: "xr.DataTree") -> bool:
     """Whether a posterior was written with all groups, as version 0.1 did."""
     return "missions" not in posterior.attrs
 
 
 def _failures(record: Mapping[str, Any]) -> list[list[Any]]:
-    """Failures with a path, a cell and whether they were told; version 0.1 had the reason alone."""
+    """Failures with all fields of `Failure`; version 0.1 had the number and the reason alone."""
     rest = [], None, False
-    return [[*one, *rest[max(len(one) - 2, 0) :]] for one in record.get("failures", [])]
+    return [[*failure, *rest[max(len(failure) - 2, 0) :]] for failure in record.get("failures", [])]

@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 POLICY, OBJECTIVE, SAMPLER = "optimistic", "lost_contact", "auto"
 """Defaults of keywords that are no options; commands and studies have the same."""
 PLANNING, LEARNING, RUNNING = "planning", "learning", "running"
-_OWN = ("awareness", "callbacks")
-"""Options that a folder cannot hold if they are the user's own."""
+_CUSTOM = ("awareness", "callbacks")
+"""Options that may be objects which a folder cannot hold."""
 
 
-def _of(part: str, *choices: str) -> dict[str, Any]:
+def _option(part: str, *choices: str) -> dict[str, Any]:
     return {"part": part, "choices": choices}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignOptions:
-    """Options of a campaign besides its model, policy, objective, sampler and seed.
+    """Options of a campaign, in addition to its model, policy, objective, sampler and seed.
 
     `iterate` and `Campaign` take them one by one, or all as `options=CampaignOptions(...)`. The
     flags of `trustbo run` and the options of studies are made from the fields; the help of a flag
@@ -55,7 +55,7 @@ class CampaignOptions:
         forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
             environment is followed; for `"refit"` with Gaussian observations.
         awareness: Trust in the awareness map: map (blind) or belief (missions correct it). Under
-            `"belief"`, or an `AwarenessBelief` of your own, policies draw from it too.
+            `"belief"`, or a given `AwarenessBelief`, policies draw from it too.
         hazard: Priors of the chance that a bound fails. A `hazard.Hazard`, or some of its fields
             by name.
         n_chains: Number of chains of NUTS; draws of other samplers are divided among them.
@@ -64,35 +64,36 @@ class CampaignOptions:
         target_accept: Acceptance rate of NUTS, .9 by default; towards 1 it takes smaller steps.
         max_tree_depth: Doublings of a trajectory of NUTS at most, 10 by default.
         replan: Replanning after each mission or after each bound. Under `"bound"` the rest is
-            planned from the trust of now, see `replanning.run_replanning`; for `iterate` and
-            `missions`.
+            planned again from the current trust; for `iterate` and `Campaign.run`.
         callbacks: Functions `callback(campaign, mission)`, called after each mission by `iterate`
-            and `missions`.
+            and `Campaign.run`.
 
     Raises:
         TrustboError: An unknown name, or a number outside its range.
     """
 
-    connectivity: int = field(default=8, metadata=_of(PLANNING))
-    max_bounds: int | str | None = field(default=None, metadata=_of(PLANNING))
-    team: str = field(default="mean", metadata=_of(PLANNING, "mean", "min"))
-    length_weight: float = field(default=0.0, metadata=_of(PLANNING))
-    max_failure: float | None = field(default=None, metadata=_of(PLANNING))
-    failure_cost: float | None = field(default=None, metadata=_of(PLANNING))
-    initial: str = field(default="prior_mean", metadata=_of(LEARNING, "prior_mean", "prior_draw"))
-    update: str = field(default="refit", metadata=_of(LEARNING, "refit", "moment_matched"))
-    forgetting: float = field(default=1.0, metadata=_of(LEARNING))
-    awareness: "str | AwarenessBelief" = field(
-        default="map", metadata=_of(LEARNING, "map", "belief")
+    connectivity: int = field(default=8, metadata=_option(PLANNING))
+    max_bounds: int | str | None = field(default=None, metadata=_option(PLANNING))
+    team: str = field(default="mean", metadata=_option(PLANNING, "mean", "min"))
+    length_weight: float = field(default=0.0, metadata=_option(PLANNING))
+    max_failure: float | None = field(default=None, metadata=_option(PLANNING))
+    failure_cost: float | None = field(default=None, metadata=_option(PLANNING))
+    initial: str = field(
+        default="prior_mean", metadata=_option(LEARNING, "prior_mean", "prior_draw")
     )
-    hazard: "Hazard | Mapping[str, Any]" = field(default_factory=dict, metadata=_of(LEARNING))
-    n_chains: int | None = field(default=None, metadata=_of(LEARNING))
-    warmup: int | None = field(default=None, metadata=_of(LEARNING))
-    draws: int | None = field(default=None, metadata=_of(LEARNING))
-    target_accept: float | None = field(default=None, metadata=_of(LEARNING))
-    max_tree_depth: int | None = field(default=None, metadata=_of(LEARNING))
-    replan: str = field(default="mission", metadata=_of(RUNNING, "mission", "bound"))
-    callbacks: "Sequence[Callback]" = field(default=(), metadata=_of(RUNNING))
+    update: str = field(default="refit", metadata=_option(LEARNING, "refit", "moment_matched"))
+    forgetting: float = field(default=1.0, metadata=_option(LEARNING))
+    awareness: "str | AwarenessBelief" = field(
+        default="map", metadata=_option(LEARNING, "map", "belief")
+    )
+    hazard: "Hazard | Mapping[str, Any]" = field(default_factory=dict, metadata=_option(LEARNING))
+    n_chains: int | None = field(default=None, metadata=_option(LEARNING))
+    warmup: int | None = field(default=None, metadata=_option(LEARNING))
+    draws: int | None = field(default=None, metadata=_option(LEARNING))
+    target_accept: float | None = field(default=None, metadata=_option(LEARNING))
+    max_tree_depth: int | None = field(default=None, metadata=_option(LEARNING))
+    replan: str = field(default="mission", metadata=_option(RUNNING, "mission", "bound"))
+    callbacks: "Sequence[Callback]" = field(default=(), metadata=_option(RUNNING))
 
     def __post_init__(self) -> None:
         from trustbo.inference.evidence.gram import require_forgetting
@@ -115,18 +116,18 @@ class CampaignOptions:
         """Options given one by one, or as one object by the name `options`.
 
         Args:
-            given: Keywords of a call besides its own.
+            given: Keywords of a call that are none of its parameters.
             call: Function that was called; a misspelt option may mean a keyword of it.
 
         Raises:
-            TrustboError: An unknown option, or some besides the object.
+            TrustboError: An unknown option, or some in addition to the object.
         """
         if "options" not in given:
             names = [option.name for option in fields(cls)]
             for name in given:
                 if name not in names:
-                    own = getattr(call, "__kwdefaults__", None) or {}
-                    raise unknown("option", name, [*names, *own])
+                    keywords = getattr(call, "__kwdefaults__", None) or {}
+                    raise unknown("option", name, [*names, *keywords])
             return cls(**given)
         whole, *others = given["options"], *(name for name in given if name != "options")
         if others or not isinstance(whole, cls):
@@ -164,32 +165,9 @@ class CampaignOptions:
         record["hazard"] = {n: list(v) if isinstance(v, tuple) else v for n, v in priors}
         return record | ({"awareness": "belief"} if self.own_awareness else {})
 
-    @classmethod
-    def restore(cls, record: Mapping[str, Any], own_awareness: bool, **own: Any) -> Self:
-        """Options of a record.
-
-        Args:
-            record: Record of `to_record`; an option that it lacks has its default.
-            own_awareness: Whether the awareness was the user's own.
-            **own: The user's own awareness and callbacks, given again.
-
-        Raises:
-            TrustboError: An awareness that was not given again, or that was none of the user's own;
-                another option.
-        """
-        for name in own:
-            if name not in _OWN:
-                raise unknown("option of one's own", name, _OWN)
-        awareness = again("awareness", record["awareness"], own.get("awareness"), own_awareness)
-        return cls.of({**record, **own, "awareness": awareness})
-
 
 def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
-    """Priors of a hazard, as they are or by name.
-
-    Raises:
-        TrustboError: An unknown name, or neither.
-    """
+    """Priors of a hazard, given as such or by name; TrustboError: neither, or an unknown name."""
     from trustbo.hazard import Hazard
 
     if isinstance(given, Hazard):
@@ -203,40 +181,48 @@ def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
     return Hazard(**given)
 
 
-def options_of(part: str) -> list[str]:
+def options_of(group: str) -> list[str]:
     """Names of the options of planning, learning or running."""
-    return [o.name for o in fields(CampaignOptions) if o.metadata["part"] == part]
-
-
-def again(name: str, kept: Any, given: Any, was_own: bool) -> Any:
-    """The value that was kept, or, if it was the user's own, the one given again.
-
-    Raises:
-        TrustboError: The user's own is missing, or there was none.
-    """
-    if was_own and given is None:
-        raise TrustboError(
-            f"the campaign's {name} was your own ({kept!r}); give it again with {name}=."
-        )
-    if given is not None and not was_own:
-        raise TrustboError(f"the campaign's {name} is {kept!r}, none of your own; leave {name}=.")
-    return kept if given is None else given
+    return [o.name for o in fields(CampaignOptions) if o.metadata["part"] == group]
 
 
 def arguments_of(
-    record: Mapping[str, Any], policy: "Policy | None", **own: Any
+    record: Mapping[str, Any], policy: "Policy | None", **custom: Any
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Arguments of `Campaign` in the record of its state, and the record of its model.
 
     Args:
-        record: Field `options` of `CampaignState`.
-        policy: The same policy, if it is the user's own.
-        **own: The user's own awareness and callbacks, given again.
+        record: Field `options` of `CampaignState`; an option that it lacks has its default.
+        policy: The same policy, if it is custom.
+        **custom: The same awareness, if it is custom, and callbacks.
+
+    Raises:
+        TrustboError: A custom object is missing, or given where there was none; another option.
     """
+    for name in custom:
+        if name not in _CUSTOM:
+            raise unknown("option of one's own", name, _CUSTOM)
     record = dict(record)
     given: dict[str, Any] = {name: tuple(record.pop(name)) for name in ("start", "goal")}
-    given["policy"] = again("policy", record.pop("policy"), policy, record.pop("own_policy"))
+    given["policy"] = _restored("policy", record.pop("policy"), policy, record.pop("own_policy"))
     given |= {name: record.pop(name) for name in ("objective", "sampler", "seed")}
-    model = record.pop("model")
-    given["options"] = CampaignOptions.restore(record, record.pop("own_awareness"), **own)
-    return given, model
+    model, custom_awareness = record.pop("model"), record.pop("own_awareness")
+    custom["awareness"] = _restored(
+        "awareness", record["awareness"], custom.get("awareness"), custom_awareness
+    )
+    return given | {"options": CampaignOptions.of({**record, **custom})}, model
+
+
+def _restored(name: str, stored: Any, given: Any, custom: bool) -> Any:
+    """Return the stored value, or the user's object where it could not be stored.
+
+    Raises:
+        TrustboError: The object is missing, or there was none.
+    """
+    if custom and given is None:
+        raise TrustboError(
+            f"the campaign's {name} was your own ({stored!r}); give it again with {name}=."
+        )
+    if given is not None and not custom:
+        raise TrustboError(f"the campaign's {name} is {stored!r}, none of your own; leave {name}=.")
+    return stored if given is None else given

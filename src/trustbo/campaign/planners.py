@@ -11,10 +11,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
 _N_DRAWS = 200
-STOPPED = 2
-"""Failures of a bound from which on it is not entered again without need."""
-RECOVERED = 0.2
-"""Mean chance to fail below which such a bound may be entered again all the same."""
+_STOPPED, _RECOVERED = 2, 0.2
+"""Failures from which on a bound is avoided, and the chance to fail below which it no longer is."""
 
 
 def planner_of(
@@ -23,12 +21,13 @@ def planner_of(
     start: Location,
     goal: Location,
     objective: str,
-    law: tuple[str, str],
+    observation: str,
+    response: str,
 ) -> Planner:
-    """Planner by the options of a campaign; `law` is the observation and response of its rates."""
+    """Planner by the options of a campaign, for the observation and response of its model."""
     chosen: dict[str, Any] = {name: getattr(options, name) for name in options_of(PLANNING)}
-    chosen |= {"observation": law[0], "response": law[1], "infeasible": "safest"}
-    return Planner(workspace, start, goal, objective, **chosen)
+    chosen |= {"observation": observation, "response": response}
+    return Planner(workspace, start, goal, objective, **chosen, infeasible="safest")
 
 
 def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
@@ -39,4 +38,16 @@ def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
 def to_avoid(risk: BoundRisk) -> np.ndarray:
     """Bounds that stopped robots twice, and whose posterior has not recovered, (move, row, col)."""
     with np.errstate(invalid="ignore"):
-        return (risk.stopped >= STOPPED - 1e-9) & ~(risk.mean < RECOVERED)
+        return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)
+
+
+def path_class(planner: Planner) -> dict[str, Any]:
+    """Arguments of `Truth.best` and `Truth.regret` for the planner's admissible paths.
+
+    The objective is contact lost, or mean contact where that is the planner's.
+    """
+    return {
+        "objective": "mean" if planner.objective == "mean" else "lost_contact",
+        "max_bounds": planner.max_bounds,
+        "connectivity": planner.connectivity,
+    }

@@ -22,7 +22,7 @@ class Posterior:
     """A posterior in memory, or in a file until it is asked for.
 
     Attributes:
-        after: Number of missions told when it was fitted; also that of its file.
+        after: Number of missions recorded when it was fitted; also that of its file.
         file: File that holds it; None where it is in memory only.
     """
 
@@ -34,10 +34,10 @@ class Posterior:
         self._sum = None if file is None else checksum(file)
 
     def __call__(self) -> xr.DataTree:
-        """Posterior as it is kept: parameters alone, unless its trust was sampled too.
+        """Posterior as stored: parameters alone, unless its trust was sampled too.
 
         Raises:
-            DamagedFileError: Its file is missing, damaged or another's by now.
+            DamagedFileError: Its file is missing, damaged or replaced.
         """
         if self._tree is None:
             file = Path(self.file or "")
@@ -48,58 +48,61 @@ class Posterior:
         return self._tree
 
     def shrink(self) -> None:
-        """Keep the parameters alone from now on; a later posterior has the rest."""
+        """Drop all groups except for the parameters; `complete` computes them again."""
         if self._tree is not None and "latent" in self._tree.children:
             self._tree, self.file = parameters_alone(self._tree), None
 
 
 class Posteriors(Sequence[xr.DataTree]):
-    """Posterior after each mission told; None where nothing could be learned yet."""
+    """Posterior after each recorded mission; None where nothing could be learned yet."""
 
-    def __init__(self, kept: Iterable[Posterior | None]) -> None:
-        """Take posteriors as they are kept."""
-        self.kept = list(kept)
+    def __init__(self, stored: Iterable[Posterior | None]) -> None:
+        """Take posteriors as stored."""
+        self.stored = list(stored)
+
+    @classmethod
+    def of(cls, posteriors: Sequence[xr.DataTree | None]) -> "Posteriors":
+        """Posteriors of a result, whose trees may be in a plain list."""
+        if isinstance(posteriors, Posteriors):
+            return posteriors
+        return cls(t if t is None else Posterior(j, t) for j, t in enumerate(posteriors, start=1))
+
+    @property
+    def after(self) -> list[int | None]:
+        """Number of missions after which the posterior of each was fitted."""
+        return [one and one.after for one in self.stored]
 
     def __len__(self) -> int:
-        return len(self.kept)
+        return len(self.stored)
 
     def __iter__(self) -> Iterator[xr.DataTree]:
         return (self[j] for j in range(len(self)))
 
     def __getitem__(self, j: Any) -> Any:
         if isinstance(j, slice):
-            return Posteriors(self.kept[j])
-        one = self.kept[j]
+            return Posteriors(self.stored[j])
+        one = self.stored[j]
         return None if one is None else one()
 
 
 def whole_posterior(
-    kept: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None = None
+    stored: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None = None
 ) -> xr.DataTree:
     """Posterior with all groups, its missions labelled by their numbers in the campaign, from 0.
 
     Args:
-        kept: Posterior as a campaign keeps it.
-        missions: All missions told so far, their awareness filled in.
-        model: Its model, for `log_prior`; needed where the priors are the user's own.
+        stored: Posterior as a campaign stores it.
+        missions: All missions recorded so far, their awareness filled in.
+        model: Model of the posterior, for `log_prior`; needed where its priors are not the default.
     """
-    if is_whole(kept):
-        return kept
-    numbers = np.atleast_1d(kept.attrs["missions"]).astype(int)
-    whole = complete(kept, [missions[j] for j in numbers], model=model)
-    parts = {name: part.to_dataset() for name, part in whole.children.items()}
-    for name, part in parts.items():
-        if "mission" in part.dims:
-            parts[name] = part.assign_coords(mission=numbers)
-    labelled = xr.DataTree.from_dict(parts)
+    if is_whole(stored):
+        return stored
+    numbers = np.atleast_1d(stored.attrs["missions"]).astype(int)
+    whole = complete(stored, [missions[j] for j in numbers], model=model)
+    groups = {name: group.to_dataset() for name, group in whole.children.items()}
+    for name, group in groups.items():
+        if "mission" in group.dims:
+            groups[name] = group.assign_coords(mission=numbers)
+    labelled = xr.DataTree.from_dict(groups)
     labelled.attrs = whole.attrs
     return labelled
-
-
-def kept_of(posteriors: Sequence[xr.DataTree | None]) -> list[Posterior | None]:
-    """Posteriors as they are kept, one for each mission; trees are numbered in order."""
-    if isinstance(posteriors, Posteriors):
-        return posteriors.kept
-    return [
-        None if tree is None else Posterior(j, tree) for j, tree in enumerate(posteriors, start=1)
-    ]

@@ -28,7 +28,6 @@ from trustbo.files import (
     naming_refusal,
     not_ours,
     read_record,
-    remove_checked,
     remove_leftovers,
     require_folder,
     sum_file,
@@ -38,10 +37,9 @@ from trustbo.files import (
 STATE, RESULT, WORKSPACE, MEASURED = "campaign.json", "result.json", "workspace.nc", "measured.nc"
 MISSIONS, HISTORY, TABLE = "missions.nc", "history.nc", "history.csv"
 BELIEVED, POSTERIOR = "believed.nc", "posterior.nc"
-_RECORDS = (STATE, RESULT)
 _NAMES = (MISSIONS, HISTORY, TABLE, BELIEVED, POSTERIOR, MEASURED, WORKSPACE, RESULT, STATE)
 """Names of our files, the records last: what they describe is removed before them."""
-POSTERIORS, TICKS = _ROOMS = ("posteriors", "ticks")
+POSTERIORS, TICKS = _FOLDERS = ("posteriors", "ticks")
 """Folders of numbered files."""
 _NEXT, _NEW, _OLD = ".trustbo-next", ".trustbo-new-", ".trustbo-old-"
 _MARKED = re.compile(r"\.trustbo-(new|old)-\w+")
@@ -55,18 +53,11 @@ def current(folder: Path) -> Path:
     return successor if successor.is_dir() and not successor.is_symlink() else folder
 
 
-@contextmanager
-def held(directory: FilePath, remedy: str = "") -> Iterator[Path]:
-    """Hold a folder, made if need be, against every other process; TrustboError if it is held."""
-    lock = hold(directory, remedy)
-    try:
-        yield Path(directory)
-    finally:
-        lock.release()
-
-
 def hold(directory: FilePath, remedy: str = "") -> FileLock:
-    """Return the lock of a folder, with nothing half-done left in it; see `held`."""
+    """Hold a folder, made if need be, against every other process; TrustboError if it is held.
+
+    The lock is returned; nothing half-done is left in the folder.
+    """
     folder = require_folder(directory)
     lock = FileLock(folder / ".trustbo.lock", timeout=0)
     with naming_refusal(folder, remedy=remedy):
@@ -79,7 +70,7 @@ def hold(directory: FilePath, remedy: str = "") -> FileLock:
                 "another folder."
             ) from None
         try:
-            for room in (folder, *(folder / name for name in _ROOMS)):
+            for room in (folder, *(folder / name for name in _FOLDERS)):
                 remove_leftovers(room)
             for left in [f for f in folder.iterdir() if _MARKED.fullmatch(f.name)]:
                 _clear(left)
@@ -122,34 +113,33 @@ def finish_replacing(folder: Path) -> None:
 def require_ours(folder: Path, *others: str) -> None:
     """Refuse a folder in which a file of another program has the name of one of ours.
 
-    `others` are names of more files to be written. Other files of a folder that was not ours stay,
-    and a warning names them.
+    `others` are names of more files to be written.
 
     Raises:
         TrustboError: Such a file, or a link in place of a folder of ours.
     """
     if not folder.is_dir():
         return
-    for room in _ROOMS:
+    for room in _FOLDERS:
         if (folder / room).is_symlink():
             raise TrustboError(
                 f"{str(folder / room)!r} is a link; files are replaced there that may be of "
                 "another campaign. Make it a folder, or choose another folder for the campaign."
             )
-    known, ours = own_files(folder), _is_ours(folder)
-    more = [] if ours else [folder / name for name in others]
+    written = own_files(folder)
+    more = [] if _is_ours(folder) else [folder / name for name in others]
     for file in (*_files(folder), *more):
-        if os.path.lexists(file) and file not in known:
+        if os.path.lexists(file) and file not in written:
             raise not_ours(file)
 
 
 def warn_of_others(folder: Path) -> None:
-    """Warn of what lies in a folder that no campaign or result was kept in before."""
+    """Warn of other files in a folder that held no campaign or result before."""
     if not folder.is_dir() or _is_ours(folder):
         return
-    own = {f.relative_to(folder).parts[0] for f in own_files(folder)} | set(_INPUTS)
+    ours = {f.relative_to(folder).parts[0] for f in own_files(folder)} | set(_INPUTS)
     names = sorted(f.name for f in folder.iterdir())
-    names = [name for name in names if name not in own and not name.startswith(".")]
+    names = [name for name in names if name not in ours and not name.startswith(".")]
     if names:
         listed = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         warnings.warn(
@@ -164,24 +154,20 @@ def own_files(folder: Path) -> list[Path]:
     Our names in a folder of ours; numbered ones if they have a sum, or a record counts them, for
     version 0.1 wrote no sums.
     """
-    known, counted = _is_ours(folder), {f"{after:04d}.nc" for after in _counted(folder)}
-    return [
-        file
-        for file in _files(folder)
-        if file.is_file()
-        and (
-            known
-            if file.parent == folder
-            else sum_file(file).is_file()
-            or (file.parent.name == _ROOMS[0] and file.name in counted)
-        )
-    ]
+    ours, counted = _is_ours(folder), _counted(folder)
+
+    def is_ours(file: Path) -> bool:
+        if file.parent == folder:
+            return ours
+        return sum_file(file).is_file() or (file.parent.name, file.name) in counted
+
+    return [file for file in _files(folder) if file.is_file() and is_ours(file)]
 
 
 def _files(folder: Path) -> list[Path]:
     """Names of ours in a folder, numbered ones that are there and others that may be."""
     numbered = []
-    for room in (folder / name for name in _ROOMS):
+    for room in (folder / name for name in _FOLDERS):
         if room.is_dir() and not room.is_symlink():
             numbered += [f for f in sorted(room.iterdir()) if re.fullmatch(r"\d{4,}\.nc", f.name)]
     return [*numbered, *(folder / name for name in _NAMES)]
@@ -189,28 +175,29 @@ def _files(folder: Path) -> list[Path]:
 
 def _is_ours(folder: Path) -> bool:
     """Whether a folder holds a campaign or result, be it damaged, or one whose writing died."""
-    names = (folder / name for name in (*_RECORDS, WORKSPACE, MEASURED))
+    names = (folder / name for name in (STATE, RESULT, WORKSPACE, MEASURED))
     return any(f.is_file() and sum_file(f).is_file() for f in names) or bool(_records(folder))
 
 
 def _records(folder: Path) -> list[dict[str, Any]]:
     """Records in a folder that can be read, of a campaign or a result."""
-    found = []
-    for name in _RECORDS:
+    records = []
+    for name in (STATE, RESULT):
         with suppress(DamagedFileError):
             record = read_record(folder / name)
             if isinstance(record, dict) and {"n_missions", "stop_reason"} <= record.keys():
-                found.append(record)
-    return found
+                records.append(record)
+    return records
 
 
-def _counted(folder: Path) -> set[int]:
-    """Numbers of the posteriors that the records of a folder count."""
-    found = set()
+def _counted(folder: Path) -> set[tuple[str, str]]:
+    """Folder and file name of the posteriors that the records of a folder count."""
+    files = set()
     for record in _records(folder):
         with suppress(TypeError):  # of a damaged record
-            found |= {number for number in posterior_after(record) if isinstance(number, int)}
-    return found
+            numbers = [after for after in posterior_after(record) if isinstance(after, int)]
+            files |= {(POSTERIORS, f"{after:04d}.nc") for after in numbers}
+    return files
 
 
 def _put_in_place(folder: Path) -> None:
@@ -218,11 +205,12 @@ def _put_in_place(folder: Path) -> None:
     successor = current(folder)
     if successor == folder:
         return
-    written = [f for own in own_files(successor) for f in (own, sum_file(own)) if f.is_file()]
+    written = [f for ours in own_files(successor) for f in (ours, sum_file(ours)) if f.is_file()]
     files = [file.relative_to(successor) for file in written]
     for file in own_files(folder):
         if file.relative_to(folder) not in files:
-            _remove(file)
+            file.unlink(missing_ok=True)
+            sum_file(file).unlink(missing_ok=True)
     for name in files:
         _link(successor / name, folder / name)
     folder_to_disk(folder)
@@ -231,13 +219,6 @@ def _put_in_place(folder: Path) -> None:
     os.rename(successor, old)
     folder_to_disk(folder)
     _clear(old)
-
-
-def _remove(file: Path) -> None:
-    if sum_file(file).is_file():
-        remove_checked(file)
-    else:
-        file.unlink(missing_ok=True)
 
 
 def _link(source: Path, target: Path) -> None:
@@ -258,13 +239,13 @@ def _clear(folder: Path) -> None:
     """Remove what we wrote to a hidden folder of ours, and the folder if nothing else is in it."""
     if folder.is_symlink() or not folder.is_dir():
         return
-    for room in (*(folder / name for name in _ROOMS), folder):
+    for room in (*(folder / name for name in _FOLDERS), folder):
         if room.is_symlink() or not room.is_dir():
             continue
         remove_leftovers(room)
-        own = {f for file in _files(folder) for f in (file, sum_file(file)) if f.parent == room}
-        own |= {f for f in room.glob(".*.sha256") if re.fullmatch(r"\.\d+\.nc\.sha256", f.name)}
-        for file in own:
+        ours = {f for file in _files(folder) for f in (file, sum_file(file)) if f.parent == room}
+        ours |= {f for f in room.glob(".*.sha256") if re.fullmatch(r"\.\d+\.nc\.sha256", f.name)}
+        for file in ours:
             file.unlink(missing_ok=True)
         with suppress(OSError):  # not empty
             room.rmdir()

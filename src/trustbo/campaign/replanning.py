@@ -1,11 +1,10 @@
 """A mission whose path is planned again after each bound."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trustbo.campaign.campaign import Campaign
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import TrustFilter, params_of
@@ -14,18 +13,21 @@ from trustbo.planning import Plan, Planner
 from trustbo.simulation.protocol import takes
 from trustbo.stacking import fill_awareness
 
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+
 THRESHOLD = 0.01
 """Least gain in the objective's value for which another continuation is taken."""
 
 
 def run_replanning(
-    campaign: Campaign, simulator: Any, plan: Plan, *, threshold: float = THRESHOLD, **start: Any
+    campaign: "Campaign", simulator: Any, plan: Plan, *, threshold: float = THRESHOLD, **start: Any
 ) -> Mission:
     """Run a plan bound by bound; a continuation that has become better is taken.
 
-    After each bound, a `TrustFilter` gives the trust of now and a weight of each posterior draw.
+    After each bound, a `TrustFilter` gives the current trust and a weight of each posterior draw.
     The rest of the path is planned again from there, among the admissible paths that are left, and
-    taken if it is worth more than the old rest by the threshold.
+    replaced if the value of the new rest is greater by the threshold.
 
     Args:
         campaign: Campaign with its posterior; before its first mission there is none, and the plan
@@ -38,52 +40,42 @@ def run_replanning(
     Returns:
         Mission along the cells that were chosen.
     """
-    path, bounds = list(plan.path), []
-    live = _live(campaign)
+    path, bounds, live = list(plan.path), [], None
+    names = [tuple(map(str, campaign.workspace.awareness[d].values)) for d in ("feature", "robot")]
+    if (posterior := campaign.state.last_tree) is not None:
+        response, observation = campaign.model.response, campaign.learner.observation
+        live = TrustFilter(
+            params_of(posterior), len(names[1]), response=response, observation=observation
+        )
     if takes(simulator.reset, "next_cell"):
         start["next_cell"] = path[1]
     simulator.reset(path[0], **start)
     k = 1
     while k < len(path):
-        ahead = path[k + 1] if k + 1 < len(path) else None
-        bound: Bound = _run_bound(simulator, k, path[k], ahead)
-        bounds.append(bound)
+        bounds.append(bound := _run_bound(simulator, k, path))
         if bound.status != "ok":
             break
         if live is not None and k + 1 < len(path):
             planner = campaign.planner_now().onward(path[: k + 1])
-            awareness = _known(campaign, path[k - 1], bound)
             crossed = path[k - 1], bound.cell
-            live.update(awareness, bound.contact_rate, crossed, n_ticks=bound.n_ticks)
+            one = Mission(crossed, (bound,), bound.status)
+            filled = fill_awareness(one, campaign.known_along(crossed))
+            live.update(filled.awareness[0], bound.contact_rate, crossed, n_ticks=bound.n_ticks)
             path = [*path[:k], *better_rest(planner, live, path[k:], threshold)]
         k += 1
     getattr(simulator, "close", lambda: None)()
-    names = (
-        tuple(str(n) for n in campaign.workspace.awareness[d].values) for d in ("feature", "robot")
-    )
     return Mission(tuple(path), tuple(bounds), bounds[-1].status, *names)
-
-
-def _live(campaign: Campaign) -> TrustFilter | None:
-    """Filter of the campaign's posterior; None before anything was learned."""
-    last, n_robots = campaign.state.last_tree, campaign.workspace.awareness.sizes["robot"]
-    if last is None:
-        return None
-    model = campaign.model
-    return TrustFilter(
-        params_of(last), n_robots, response=model.response, observation=campaign.observation
-    )
 
 
 def better_rest(
     planner: Planner, live: TrustFilter, rest: Sequence[Cell], threshold: float
 ) -> tuple[Cell, ...]:
-    """Plan the rest of a path from the trust of now; the old rest if that is nearly as good.
+    """Plan the rest of a path from the current trust; the old rest if that is nearly as good.
 
     Args:
         planner: Planner of the paths that are left, see `Planner.onward`.
         live: Filter of trust and parameters after the last bound.
-        rest: Cells planned so far, from the team's on.
+        rest: Cells planned so far, from that of the team on.
         threshold: Difference of values.
     """
     params, now = weighted_mean(live.params, live.weights), live.state.mean
@@ -98,16 +90,11 @@ def weighted_mean(params: Params, weights: np.ndarray) -> Params:
     return flat.map(lambda value, _: np.tensordot(weights, value, 1))
 
 
-def _run_bound(simulator: Any, k: int, cell: Cell, ahead: Cell | None) -> Bound:
-    """Run a bound; a simulator that takes `next_cell`, which is optional, gets it."""
-    known = {"next_cell": ahead} if takes(simulator.run_bound, "next_cell") else {}
-    bound = simulator.run_bound(k, cell, **known)
+def _run_bound(simulator: Any, k: int, path: Sequence[Cell]) -> Bound:
+    """Run bound `k` of a path; a simulator that takes `next_cell`, which is optional, gets it."""
+    following = path[k + 1] if k + 1 < len(path) else None
+    optional = {"next_cell": following} if takes(simulator.run_bound, "next_cell") else {}
+    bound = simulator.run_bound(k, path[k], **optional)
     if not isinstance(bound, Bound):
-        raise TrustboError(f"run_bound({k}, {cell}) must return a trustbo.Bound; got {bound!r}.")
+        raise TrustboError(f"run_bound({k}, {path[k]}) must return a trustbo.Bound; got {bound!r}.")
     return bound
-
-
-def _known(campaign: Campaign, left: Cell, bound: Bound) -> np.ndarray:
-    """Awareness of a bound, filled in by the map or the belief where it was not measured."""
-    one = Mission((left, bound.cell), (bound,), bound.status)
-    return fill_awareness(one, campaign.known_along(one.path)).awareness[0]

@@ -10,15 +10,15 @@ import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
-from trustbo.campaign.card import campaign_card
-from trustbo.campaign.failures import Failure
 from trustbo.campaign.history import table_of
 from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
 from trustbo.campaign.planners import planner_of, under_risk
-from trustbo.campaign.posteriors import kept_of, whole_posterior
+from trustbo.campaign.posteriors import Posteriors, whole_posterior
+from trustbo.campaign.state import Failure
+from trustbo.campaign.summary import summary_of
 from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_pair
 from trustbo.files import FilePath
 from trustbo.hazard.model import measures_of
 from trustbo.hazard.risk import BoundRisk
@@ -78,7 +78,7 @@ class Result(Displayed):
             ("contact rate", f"{self.history['contact_rate'].values[-1]:.3f} on the last mission"),
             ("outcomes", ", ".join(map(str, self.history["status"].values))),
         ]
-        return campaign_card(
+        return summary_of(
             f"Result: {len(self.missions)} missions", rows, self.workspace, self.settings,
             self.history, lambda: self.trust_map, lambda: self.path,
         )  # fmt: skip
@@ -86,7 +86,7 @@ class Result(Displayed):
     @property
     def has_posterior(self) -> bool:
         """Whether anything could be learned yet."""
-        return len(self.posteriors) > 0 and kept_of(self.posteriors)[-1] is not None
+        return len(self.posteriors) > 0 and Posteriors.of(self.posteriors).stored[-1] is not None
 
     @cached_property
     def posterior(self) -> xr.DataTree:
@@ -128,13 +128,16 @@ class Result(Displayed):
                 "or by hand; plan with a Planner of your own."
             )
         options = CampaignOptions(**{name: self.settings[name] for name in names})
-        start, goal = (_cell(self.settings[name]) for name in ("start", "goal"))
-        law = (
+        start, goal = (require_pair(name, self.settings[name]) for name in ("start", "goal"))
+        planner = planner_of(
+            options,
+            self.workspace,
+            start,
+            goal,
+            self.settings["objective"],
             self.posterior.attrs.get("observation", "gaussian"),
             self.settings.get("response", "level"),
         )
-        objective = self.settings["objective"]
-        planner = planner_of(options, self.workspace, start, goal, objective, law)
         if "hazard" in self.posterior.children:
             hazard = self.posterior["hazard"].to_dataset()
             # The workspace has no measures where the terrain was taken away.
@@ -191,8 +194,8 @@ class Result(Displayed):
         taken = {*maps.variables, *maps.dims, "path_probability", "x", "y", "spatial_ref", *places}
         for name in [str(feature) for feature in awareness["feature"].values]:
             values = awareness.sel(feature=name, drop=True).mean("robot")
-            own = f"awareness_{name}" if name in taken else name
-            maps[own] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
+            free = f"awareness_{name}" if name in taken else name
+            maps[free] = values.assign_attrs(long_name=f"{name}, 0 worst, 1 best")
         maps["path_probability"] = share
         maps = maps.assign(places.data_vars)
         return self.workspace.grid.place(maps.where(self.workspace.passable))
@@ -204,12 +207,11 @@ class Result(Displayed):
         effects = place_maps(self.posterior)
         if "place_bound_mean" in effects:
             into = effects["place_bound_mean"].where(self.workspace.passable_bounds).mean("move")
-            into.attrs = {
-                "long_name": "mean effect on trust of the bounds into a cell", "units": "1"
-            }  # fmt: skip
+            label = "mean effect on trust of the bounds into a cell"
+            into.attrs = {"long_name": label, "units": "1"}
             effects["place_bounds_mean"] = into
-        found = effects.drop_vars(["place_bound_mean", "place_bound_sd", "move"], errors="ignore")
-        return found.mean("robot", keep_attrs=True) if "robot" in found.dims else found
+        maps = effects.drop_vars(["place_bound_mean", "place_bound_sd", "move"], errors="ignore")
+        return maps.mean("robot", keep_attrs=True) if "robot" in maps.dims else maps
 
     def plot_maps(self, **options: Any) -> np.ndarray:
         """Draw trust maps and paths of four moments; options and Axes as of `plots.trust_maps`."""
@@ -244,11 +246,6 @@ class Result(Displayed):
             TrustboError: The folder's name belongs to a file, a file in it that trustbo did not
                 write would be replaced, or it holds a campaign that this result is not of.
         """
-        from trustbo.campaign.result_files import save_result  # it reads results too
+        from trustbo.campaign.storage import save_result  # it reads results too
 
         save_result(self, directory)
-
-
-def _cell(pair: Any) -> Cell:
-    row, col = pair
-    return int(row), int(col)

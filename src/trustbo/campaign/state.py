@@ -1,37 +1,61 @@
 """State of a campaign: missions, failures and notes, as data and as a record."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.failures import Failure
 from trustbo.campaign.posteriors import Posterior, Posteriors
-from trustbo.data import Mission
+from trustbo.data import Cell, Mission
 from trustbo.models.backend import VERSIONS
 from trustbo.planning import Plan
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace import Workspace
 
 TOLD, LEARNED, SET_ASIDE = "told", "learned", "set aside"
-"""States of a mission: on disk, in the posterior, or never to be."""
+"""States of a mission: on disk, in the posterior, or excluded from it."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard")
 """Streams of randomness; a seed depends on the place, so that names are added at the end."""
 
 
+class Failure(NamedTuple):
+    """A mission that was given up."""
+
+    after: int
+    """Number of missions recorded before."""
+    reason: str
+    path: tuple[Cell, ...] = ()
+    """Path that was asked for, start first; empty where the failure is of no bound."""
+    where: Cell | None = None
+    """Cell that it failed to enter, where that is recorded."""
+    reported: bool = False
+    """Whether the bounds that were run were recorded, as a mission with a row of the history."""
+
+    @classmethod
+    def restore(cls, record: Sequence[Any]) -> Self:
+        """Failure of a record."""
+        after, reason, path, where, reported = record
+        cells = tuple((row, col) for row, col in path)
+        cell = None if where is None else (where[0], where[1])
+        if cell is not None and cell not in cells[1:]:
+            raise ValueError(f"no path enters {cell}")
+        return cls(after, reason, cells, cell, reported)
+
+
 @dataclass(eq=False)
 class Entry:
-    """One mission that was told.
+    """One recorded mission.
 
     Attributes:
         mission: Mission, its awareness filled in where it was not measured.
-        measured: The same mission as it was told.
+        measured: The same mission as measured.
         plan: Plan that it was asked for with.
         trust_map: Trust map that it was planned on, dims (row, col).
         row: Numbers of the mission, by name; its `state` and the `reason` of that among them.
         posterior: Posterior after it; None where nothing could be learned yet.
-        extra: Numbers that it was told with.
+        extra: Numbers that were passed with it.
     """
 
     mission: Mission
@@ -52,23 +76,15 @@ class Entry:
         self.row |= {"state": state, "reason": reason}
 
 
-class Kept(NamedTuple):
-    """Missions of a saved result, the posterior after each, and `Result.history`."""
-
-    missions: list[Mission]
-    posteriors: Posteriors
-    history: xr.Dataset
-
-
 @dataclass(eq=False)
 class CampaignState:
-    """Data of a campaign: all that a folder holds, besides the workspace.
+    """Data of a campaign: all that a folder holds, except for the workspace.
 
     Attributes:
         seed: Seed of everything random.
         options: Record of the arguments that the campaign was made with.
         suggested: Plan that was asked for and not run yet.
-        entries: One for each mission told.
+        entries: One for each recorded mission.
         failures: Missions given up.
         notes: More for `Result.settings`, by the loop.
         stop_reason: Reason of the end.
@@ -84,12 +100,12 @@ class CampaignState:
 
     @property
     def missions(self) -> list[Mission]:
-        """Missions told, their awareness filled in."""
+        """Recorded missions, their awareness filled in."""
         return [entry.mission for entry in self.entries]
 
     @property
     def measured(self) -> list[Mission]:
-        """Missions as they were told."""
+        """Recorded missions as measured."""
         return [entry.measured for entry in self.entries]
 
     @property
@@ -112,7 +128,7 @@ class CampaignState:
         return [j for j, entry in enumerate(self.entries) if entry.state in states]
 
     def seed_of(self, stream: str) -> int:
-        """Seed of one stream of randomness ("policy", "fit", "mission") at this iteration."""
+        """Seed of one stream of randomness at this iteration."""
         n = len(self.entries)
         entropy = [self.seed, _STREAMS.index(stream), n]
         if n_failures := sum(failure.after == n for failure in self.failures):
@@ -128,16 +144,7 @@ class CampaignState:
         extra: dict[str, float],
         **seconds: float,
     ) -> Entry:
-        """Add a mission that was told, with its row of the history.
-
-        Args:
-            measured: Mission as it was told.
-            filled: The same mission, its awareness filled in.
-            plan: Plan that it was asked for with.
-            trust_map: Trust map that it was planned on.
-            extra: Numbers that it was told with.
-            **seconds: Seconds of planning and running.
-        """
+        """Add a mission, with its row of the history; see `Entry` for the arguments."""
         before = self.entries[-1].plan if self.entries else plan
         rates = measured.contact_rate
         row: dict[str, Any] = {
@@ -162,7 +169,7 @@ class CampaignState:
             "n_missions": len(self.entries),
             "plans": [plan_to_record(entry.plan) for entry in self.entries],
             "rows": [entry.row for entry in self.entries],
-            "posterior_after": [e.posterior and e.posterior.after for e in self.entries],
+            "posterior_after": self.posteriors.after,
             "failures": self.failures,
             "notes": self.notes,
             "stop_reason": self.stop_reason,
@@ -171,23 +178,9 @@ class CampaignState:
 
     @classmethod
     def from_record(
-        cls,
-        record: dict[str, Any],
-        measured: list[Mission],
-        extras: list[dict[str, float]],
-        kept: Kept | None,
-        workspace: Workspace,
+        cls, record: dict[str, Any], entries: list[Entry], workspace: Workspace
     ) -> Self:
-        """State of a record, of its missions as they were told, and of a saved result."""
-        entries: list[Entry] = []
-        if kept is not None:
-            n = record["n_missions"]
-            maps = [kept.history["trust_map"].isel(iteration=i, drop=True) for i in range(n)]
-            plans = [plan_from_record(plan, workspace) for plan in record["plans"]]
-            columns = (
-                kept.missions, measured, plans, maps, record["rows"], kept.posteriors.kept, extras
-            )  # fmt: skip
-            entries = [Entry(*values) for values in zip(*columns, strict=True)]
+        """State of a record and of its missions."""
         suggested = record.get("suggested")
         return cls(
             record["options"]["seed"],

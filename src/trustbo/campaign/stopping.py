@@ -3,17 +3,18 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from trustbo.campaign.campaign import Campaign
-from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_positive, require_whole
 from trustbo.inference import params_of
 from trustbo.workspace.moves import bounds_along
 
-Stop = Callable[[Campaign], str | bool | None]
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+
+Stop = Callable[["Campaign"], str | bool | None]
 """Rule that is called between missions; a reason (or True) ends the campaign."""
 
 
@@ -55,17 +56,20 @@ class RegretBound:
         for name in ("patience", "min_missions", "n_draws"):
             require_whole(f"RegretBound.{name}", getattr(self, name), 1)
 
-    def __call__(self, campaign: Campaign) -> str | None:
+    def __call__(self, campaign: "Campaign") -> str | None:
         """Reason to stop, or None."""
         n = len(campaign.missions)
         if n < max(self.min_missions, self.patience):
             return None
         sure = [self.probability(campaign, n - i) for i in range(self.patience)]
-        if min(sure) < 1.0 - self.delta or not _is_driven(campaign, campaign.recommend().path):
+        if min(sure) < 1.0 - self.delta:
+            return None
+        risk, bounds = campaign.risk, tuple(bounds_along(np.array(campaign.recommend().path)).T)
+        if not (risk.exposures[bounds] > risk.failures[bounds]).all():  # some never completed
             return None
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 
-    def probability(self, campaign: Campaign, n_missions: int) -> float:
+    def probability(self, campaign: "Campaign", n_missions: int) -> float:
         """P(regret of the recommended path <= eps) after the first `n_missions`."""
         posterior = campaign.posteriors[n_missions - 1]
         if posterior is None:
@@ -76,14 +80,8 @@ class RegretBound:
         return float(np.mean(drawn.relative_regret(path) <= self.eps))
 
 
-def _is_driven(campaign: Campaign, path: Sequence[Cell]) -> bool:
-    """Whether robots have completed every bound of a path, in missions that were not set aside."""
-    risk, bounds = campaign.risk, tuple(bounds_along(np.array(path)).T)
-    return bool((risk.exposures[bounds] > risk.failures[bounds]).all())
-
-
 @dataclass(frozen=True)
-class Seconds:
+class TimeLimit:
     """Stop after a number of seconds from now, once the mission under way is done.
 
     Attributes:
@@ -97,14 +95,14 @@ class Seconds:
     _start: float = field(default_factory=time.monotonic, repr=False)
 
     def __post_init__(self) -> None:
-        require_positive("Seconds.limit", self.limit)
+        require_positive("TimeLimit.limit", self.limit)
 
-    def __call__(self, campaign: Campaign) -> str | None:
+    def __call__(self, campaign: "Campaign") -> str | None:
         """Reason to stop, or None."""
         return f"seconds: {self.limit:g}" if time.monotonic() - self._start > self.limit else None
 
 
-_OURS = (RegretBound, Seconds)
+_OURS = {"RegretBound": RegretBound, "TimeLimit": TimeLimit}
 
 
 def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
@@ -123,41 +121,42 @@ def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
 
 
 def rules_to_record(rules: Sequence[Stop]) -> list[dict[str, Any]]:
-    """Rules as JSON can hold them: ours by value, the user's own by name."""
+    """Rules as JSON can hold them: those of this module by value, custom ones by name."""
     record = []
     for rule in rules:
-        own, values = True, {}
-        if isinstance(rule, _OURS):
-            own, values = False, {f.name: getattr(rule, f.name) for f in fields(rule) if f.repr}
-        name = getattr(rule, "__name__", type(rule).__name__)
-        record.append({"rule": name, "own": own, **values})
+        custom, values = True, {}
+        if isinstance(rule, RegretBound | TimeLimit):
+            custom, values = False, {f.name: getattr(rule, f.name) for f in fields(rule) if f.repr}
+        record.append({"rule": _name(rule), "own": custom, **values})
     return record
 
 
 def rules_of(record: Sequence[Mapping[str, Any]]) -> list[Stop]:
-    """Rules of a record; `Seconds` count from now.
+    """Rules of a record; a `TimeLimit` counts from now.
 
     Raises:
-        TrustboError: A rule is the user's own, and has to be given again.
+        TrustboError: A rule is custom, and has to be given again.
     """
     rules: list[Stop] = []
-    for one in record:
-        values = dict(one)
-        name, own = values.pop("rule"), values.pop("own")
-        if own:
+    for rule in record:
+        values = dict(rule)
+        name, custom = values.pop("rule"), values.pop("own")
+        if custom:
             raise TrustboError(
                 f"the campaign's rule to stop, {name!r}, was your own; give all rules again with "
                 "stop=, or stop=[] to go on without."
             )
-        rules.append({kind.__name__: kind for kind in _OURS}[name](**values))
+        rules.append(_OURS[name](**values))
     return rules
 
 
-def reason_to_stop(rules: Sequence[Stop], campaign: Campaign) -> str | None:
+def reason_to_stop(rules: Sequence[Stop], campaign: "Campaign") -> str | None:
     """Reason of the first rule that ends the campaign, or None."""
     for rule in rules:
-        verdict = rule(campaign)
-        if verdict:
-            own = getattr(rule, "__name__", type(rule).__name__)
-            return verdict if isinstance(verdict, str) else own
+        if verdict := rule(campaign):
+            return verdict if isinstance(verdict, str) else _name(rule)
     return None
+
+
+def _name(rule: Stop) -> str:
+    return getattr(rule, "__name__", type(rule).__name__)

@@ -277,7 +277,7 @@ def _state(folder: Path) -> dict[str, Any]:
 def _simulator(folder: Path, notes: dict[str, Any]) -> "KinematicSimulator":
     """Make the simulator that the campaign was begun with."""
     from trustbo.campaign.replacing import STATE, current
-    from trustbo.campaign.result_files import read_workspace
+    from trustbo.campaign.storage import read_workspace
     from trustbo.files import interpreting
     from trustbo.simulation import KinematicSimulator
     from trustbo.workspace import Sight

@@ -22,7 +22,7 @@ def report(
     """
     with one_line_errors(debug):
         _require_result(folder)
-        from trustbo.campaign.result_files import load_result
+        from trustbo.campaign.storage import load_result
 
         result = load_result(folder)
         use_no_screen()
@@ -56,7 +56,7 @@ def export(
     """
     with one_line_errors(debug):
         _require_result(folder)
-        from trustbo.campaign.result_files import load_result
+        from trustbo.campaign.storage import load_result
         from trustbo.export import FORMATS, export_result
         from trustbo.export.everything import left_out
 

@@ -3,7 +3,6 @@
 from trustbo.models import backend as backend  # first: it loads numpyro
 
 # isort: split
-from trustbo.errors import old_names
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.hierarchical import HierarchicalTrust

@@ -12,8 +12,8 @@ from typing import Any, Self
 
 import xarray as xr
 
-from trustbo.campaign.loop import path_class
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
+from trustbo.campaign.planners import path_class
 from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
 from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler

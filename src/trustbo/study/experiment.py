@@ -20,7 +20,6 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.loop import missions
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
@@ -117,7 +116,7 @@ class Run:
         stop = self.case.options.get("stop")
         rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
         simulator = self.scene.simulator(workspace)
-        return campaign, missions(campaign, simulator, n_iterations=self.n_iterations, stop=rule)
+        return campaign, campaign.run(simulator, self.n_iterations, stop=rule)
 
     def __str__(self) -> str:
         return ", ".join(f"{name}={value}" for name, value in self.labels.items())

@@ -1,6 +1,7 @@
-"""Card of a campaign and of its result: the map of trust, and contact over missions."""
+"""Summary of a campaign or a result for display: map of trust, and contact over missions."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from trustbo.workspace import Workspace
 _DIAGNOSTICS = ("k_hat", "kish", "r_hat", "ess_bulk", "divergences")
 
 
-def campaign_card(
+def summary_of(
     title: str,
     rows: Sequence[tuple[str, str]],
     workspace: Workspace,
@@ -24,10 +25,10 @@ def campaign_card(
     trust_map: Callable[[], xr.DataArray] | None,
     path: Callable[[], Sequence[Cell]],
 ) -> Card:
-    """Card with the map of trust, if there is one, the path on it, and the contact of missions."""
-    grid, pictures = workspace.grid, []
+    """Summary with the map of trust, if there is one, the path on it, and contact of missions."""
+    pictures = []
     if trust_map is not None:
-        aspect = grid.cell_height / grid.cell_width
+        aspect = workspace.grid.cell_height / workspace.grid.cell_width
 
         def area() -> str:
             cells = path()
@@ -35,16 +36,16 @@ def campaign_card(
             label = "expected trust"
             return map_picture(trust, cells, aspect=aspect, label=label, apart=cells[0])
 
-        pictures.append(area)
         rates = history["contact_rate"].values
-        pictures.append(lambda: curve_picture(rates, label="contact rate", x_label="missions"))
+        curve = partial(curve_picture, rates, label="contact rate", x_label="missions")
+        pictures = [area, curve]
     rows = [*rows, *_evidence(history)]
     options = [(name, str(value)) for name, value in settings.items() if len(str(value)) < 200]
     return Card(title, rows, pictures, {"options": options})
 
 
 def _evidence(history: xr.Dataset) -> list[tuple[str, str]]:
-    """Row of the diagnostics that tell whether the last posterior is sound, if there is one."""
+    """Row of the diagnostics that show whether the last posterior is sound, if there is one."""
     last = {n: float(history[n].values[-1]) for n in _DIAGNOSTICS if n in history}
     if np.isfinite(last.get("k_hat", np.nan)):
         khat = f"k-hat {last['k_hat']:.2f} (good below {GOOD_KHAT:g})"

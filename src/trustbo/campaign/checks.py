@@ -1,14 +1,16 @@
-"""Checks of a mission that is told to a campaign, before anything is done with it."""
+"""Checks of a mission or failure that is passed to a campaign, before any work starts."""
 
+import difflib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from trustbo.data import Cell, Mission, path_text
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_pair
+from trustbo.hazard import CAUSES
 from trustbo.workspace import Workspace
 
 RESERVED = (
@@ -16,44 +18,43 @@ RESERVED = (
     "seconds_plan", "seconds_run", "seconds_fit", "n_bounds", "k_hat", "kish", "r_hat", "ess_bulk",
     "divergences", "iteration", "mission", "step", "axis", "robot", "row", "col", "x", "y",
 )  # fmt: skip
-"""Names of the history's own columns and axes."""
+"""Names of the history's columns and axes."""
 
 
 def require_mission(
-    workspace: Workspace, mission: Mission, path: Sequence[Cell], *, other_path: bool
+    mission: Mission,
+    workspace: Workspace,
+    asked: Sequence[Cell],
+    earlier: Iterable[Mission],
+    *,
+    other_path: bool,
 ) -> Mission:
     """Return a mission with its robots and features in the workspace's order.
 
     Args:
+        mission: Mission as measured.
         workspace: Workspace of the campaign.
-        mission: Mission as it was told.
-        path: Path that was asked for.
-        other_path: Whether the mission is known to have followed another path.
+        asked: Path that was asked for.
+        earlier: Missions that it must differ from.
+        other_path: Whether it really followed another path.
 
     Raises:
         ShapeError: Robots or features differ from the workspace's.
-        TrustboError: The path leaves the grid, jumps, or is not the one that was asked for.
+        TrustboError: The path leaves the grid, jumps, or is not the one that was asked for; or an
+            earlier mission is the same in every number.
     """
     if not isinstance(mission, Mission):
         kind = type(mission).__name__
         raise TrustboError(f"tell takes one Mission at a time; got {kind}.")
-    own = workspace.in_order(mission)
-    _require_path(own, list(path), workspace.grid.shape, other_path)
-    return own
-
-
-def require_new(mission: Mission, earlier: Sequence[Mission]) -> None:
-    """Refuse a mission that was told before.
-
-    Raises:
-        TrustboError: An earlier mission is the same in every number.
-    """
-    for j, other in enumerate(earlier):
+    mission = workspace.in_order(mission)
+    _require_path(mission, list(asked), workspace.grid.shape, other_path)
+    for number, other in enumerate(earlier, start=1):
         if mission is other or _is_same(mission, other):
             raise TrustboError(
-                f"this mission was told already: it is mission {j + 1}, number by number. If it "
+                f"this mission was told already: it is mission {number}, number by number. If it "
                 "really was run again, tell(mission, again=True)."
             )
+    return mission
 
 
 def require_extra(
@@ -66,8 +67,8 @@ def require_extra(
         reserved: Names that are taken; none for those of an older file.
 
     Raises:
-        TrustboError: Not a number, NaN for one that is not known; infinite; or a name that is no
-            identifier, which files could not keep, or one of the history's own.
+        TrustboError: Not a number, NaN for a missing one; infinite; or a name that is no
+            identifier, which files could not keep, or one of the history's columns.
     """
     checked = {}
     for name, value in extra.items():
@@ -100,12 +101,49 @@ def never_to_be_learned(filled: Mission) -> str:
     return ""
 
 
+def require_reason(reason: object, mission: Mission | None) -> None:
+    """Refuse a reason that is empty or a misspelt cause, or a cause of a mission that arrived.
+
+    Raises TrustboError.
+    """
+    if not isinstance(reason, str) or not reason.strip():
+        raise TrustboError(f"give a reason, such as one of {', '.join(CAUSES)}; got {reason!r}.")
+    if reason in CAUSES:
+        if mission is not None and mission.status == "ok":
+            raise TrustboError(
+                f"the mission reached the goal, its status is 'ok', and {reason!r} is a failure; "
+                "give the bounds that were run and their status, or tell the mission."
+            )
+        return
+    plain = reason.strip().lower().replace(" ", "_")
+    if near := difflib.get_close_matches(plain, CAUSES, n=1, cutoff=0.8):
+        raise TrustboError(
+            f"{reason!r} is no cause of failures, and teaches nothing; did you mean {near[0]!r}?"
+        )
+
+
+def require_where(where: Cell, reason: str, path: Sequence[Cell]) -> Cell:
+    """Return the cell that a mission failed to enter.
+
+    TrustboError: The path does not enter it, or the reason is none of `CAUSES`.
+    """
+    cell = require_pair("where", where)
+    if reason not in CAUSES:
+        raise TrustboError(
+            f"where = {cell} is for the reasons {', '.join(CAUSES)}, from which bounds are "
+            f"learned; got {reason!r}."
+        )
+    if cell not in path[1:]:
+        raise TrustboError(f"where must be a cell that the plan enters, {path}; got {cell}.")
+    return cell
+
+
 def _require_path(
     mission: Mission, asked: Sequence[Cell], shape: tuple[int, int], other_path: bool
 ) -> None:
     path, (rows, cols) = list(mission.path), shape
-    swapped = [(col, row) for row, col in path]
-    maybe = "; were row and col swapped?" if _starts(swapped, asked) else "."
+    swapped = [(col, row) for row, col in path] == asked[: len(path)]
+    maybe = "; were row and col swapped?" if swapped else "."
     for cell in path:
         if not (0 <= cell[0] < rows and 0 <= cell[1] < cols):
             raise TrustboError(
@@ -118,18 +156,14 @@ def _require_path(
                 f"the mission's path jumps from {before} to {after}, which are no neighbours; "
                 "cells are (row, col), and every cell entered counts."
             )
-    if path == asked or other_path or (mission.status != "ok" and _starts(path, asked)):
+    if path == asked or other_path or (mission.status != "ok" and path == asked[: len(path)]):
         return
-    if maybe == "." and path[0] != asked[0]:
+    if not swapped and path[0] != asked[0]:
         maybe = f": it starts at {path[0]}, not at {asked[0]}."
     raise TrustboError(
         f"the mission followed {path_text(path)}, but {path_text(asked)} was asked for{maybe} If "
         "it really went there, tell(mission, other_path=True)."
     )
-
-
-def _starts(path: Sequence[Cell], whole: Sequence[Cell]) -> bool:
-    return list(path) == list(whole[: len(path)])
 
 
 def _is_same(one: Mission, other: Mission) -> bool:

@@ -1,0 +1,94 @@
+"""Missions of a campaign, run one after the other by a simulator."""
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from trustbo.campaign.planners import path_class
+from trustbo.campaign.progress import Progress
+from trustbo.campaign.replanning import run_replanning
+from trustbo.campaign.stopping import Stop, reason_to_stop, require_stops, rules_to_record
+from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_whole
+from trustbo.files import to_json
+from trustbo.planning import Plan
+from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
+from trustbo.simulation.protocol import require_bounds, require_call, takes
+
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+
+
+def run_missions(
+    campaign: "Campaign",
+    simulator: Simulator | None,
+    n_iterations: int,
+    truth: Truth | None,
+    stop: Stop | Sequence[Stop] | None,
+    progress: bool | str,
+) -> Iterator[tuple[Plan, Mission]]:
+    """Check everything, then run the missions of a campaign, see `Campaign.run`."""
+    require_whole("n_iterations", n_iterations, 1)
+    runner: Any = KinematicSimulator(campaign.workspace) if simulator is None else simulator
+    if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
+        made = "; make one of the class" if isinstance(runner, type) else ""
+        raise TrustboError(
+            f"a simulator needs run(path, *, seed) -> Mission; got {runner!r}{made}."
+        )
+    if campaign.options.replan == "bound":
+        require_bounds(runner, 'replan="bound"')
+        require_call(runner, "reset", campaign.planner.start, seed=0)
+    else:
+        require_call(runner, "run", [], seed=0)
+    if truth is not None:
+        if not isinstance(truth, Truth):
+            raise TrustboError(f"truth must be Truth.of(simulator); got {truth!r}.")
+        truth.require_workspace(campaign.workspace)
+    rules = require_stops(stop)
+    describe = getattr(runner, "describe", lambda: {"simulator": type(runner).__name__})
+    # As a file gives them back: tuples are lists there, and arrays too.
+    simulated = json.loads(to_json(describe()))
+    asked = {"n_iterations": n_iterations, "stop": rules_to_record(rules)}
+    campaign.state.notes = {**simulated, **asked}
+    return _run_missions(campaign, runner, n_iterations, truth, rules, progress)
+
+
+def _run_missions(
+    campaign: "Campaign",
+    runner: Any,
+    n_iterations: int,
+    truth: Truth | None,
+    rules: list[Stop],
+    progress: bool | str,
+) -> Iterator[tuple[Plan, Mission]]:
+    replans = campaign.options.replan == "bound"
+    numbered = takes(runner.reset if replans else runner.run, "mission")
+    with Progress(campaign, n_iterations, progress) as shown:
+        while True:
+            n = len(campaign.missions)
+            # Before each mission: of a campaign that goes on, the rules may be satisfied already.
+            if n and (reason := reason_to_stop(rules, campaign)):
+                campaign.stop(reason)
+                return
+            if n >= n_iterations:
+                break
+            plan = campaign.ask()
+            settings: dict[str, Any] = {"seed": campaign.seed_of("mission")}
+            if numbered:  # its world changes
+                settings["mission"] = n
+            if replans:
+                mission = run_replanning(campaign, runner, plan, **settings)
+            else:
+                mission = runner.run(plan.path, **settings)
+            extra = {}
+            if truth is not None:
+                extra["regret"] = truth.at(n).regret(plan, **path_class(campaign.planner))
+            # Deviations from the plan, and repetitions, are expected here; only another start
+            # suggests that row and col are swapped.
+            other = mission.path[:1] == plan.path[:1] or isinstance(runner, ReplaySimulator)
+            campaign.tell(mission, other_path=other, again=True, **extra)
+            shown.step()
+            for callback in campaign.options.callbacks:
+                callback(campaign, mission)
+            yield plan, mission
+        campaign.stop("n_iterations")
