@@ -1,4 +1,4 @@
-"""A campaign: ask for a path, run it by any means, tell the mission."""
+"""A campaign: `ask` for a path, run it by any means, `tell` the mission."""
 
 import time
 import warnings
@@ -156,25 +156,25 @@ class Campaign(Displayed):
             self._save_to(Storage(directory, begun=False), keep=True)
 
     def _card(self) -> Card:
-        told, waiting = len(self.missions), len(self.state.numbers(TOLD))
+        n, waiting = len(self.missions), len(self.state.numbers(TOLD))
         settings = self.settings
         others = {
             "set aside": len(self.state.numbers(SET_ASIDE)),
             "given up": len(self.state.failures),
         }
-        also = "".join(f", {n} {what}" for what, n in others.items() if n)
+        also = "".join(f", {number} {what}" for what, number in others.items() if number)
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
             (
                 "missions",
-                f"{told} told, {waiting} not learned from yet{also}",
+                f"{n} told, {waiting} not learned from yet{also}",
             ),
             ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
         return summary_of(
-            f"Campaign: {told} missions", rows, self.workspace, settings, self.history,
-            self.trust_map if told else None, lambda: self.recommend().path,
+            f"Campaign: {n} missions", rows, self.workspace, settings, self.history,
+            self.trust_map if n else None, lambda: self.recommend().path,
         )  # fmt: skip
 
     # --- ask and tell ---
@@ -556,9 +556,9 @@ class Campaign(Displayed):
             if keep:
                 self.storage = storage
         finally:
-            for one in (before, storage):
-                if one is not None and one is not self.storage:
-                    one.release()
+            for other in (before, storage):
+                if other is not None and other is not self.storage:
+                    other.release()
 
     @classmethod
     def load(
@@ -577,8 +577,8 @@ class Campaign(Displayed):
             directory: Folder of its `directory`, or of `save`.
             model: The same model, if it or its priors are custom.
             policy: The same policy, if it is custom.
-            **custom: The same `callbacks`, and the same `awareness`, as it was before the first
-                mission, if it is custom.
+            **custom: The same `callbacks`, and the same `awareness`, if it is custom, without the
+                measurements of missions.
 
         Raises:
             TrustboError: There is no campaign; another process is at work on it; or a custom object

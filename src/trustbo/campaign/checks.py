@@ -31,17 +31,7 @@ def require_mission(
 ) -> Mission:
     """Return a mission with its robots and features in the workspace's order.
 
-    Args:
-        mission: Mission as measured.
-        workspace: Workspace of the campaign.
-        asked: Path that was asked for.
-        earlier: Missions that it must differ from.
-        other_path: Whether it really followed another path.
-
-    Raises:
-        ShapeError: Robots or features differ from the workspace's.
-        TrustboError: The path leaves the grid, jumps, or is not the one that was asked for; or an
-            earlier mission is the same in every number.
+    `asked` is the path that was asked for. See `Campaign.tell` for what is refused.
     """
     if not isinstance(mission, Mission):
         kind = type(mission).__name__
@@ -62,13 +52,8 @@ def require_extra(
 ) -> dict[str, float]:
     """Return more numbers of a mission as floats.
 
-    Args:
-        extra: Numbers by name.
-        reserved: Names that are taken; none for those of an older file.
-
-    Raises:
-        TrustboError: Not a number, NaN for a missing one; infinite; or a name that is no
-            identifier, which files could not keep, or one of the history's columns.
+    TrustboError: not a number, NaN for a missing one; infinite; or a name that is no identifier,
+    which files could not keep, or that is `reserved`.
     """
     checked = {}
     for name, value in extra.items():
@@ -102,10 +87,7 @@ def never_to_be_learned(filled: Mission) -> str:
 
 
 def require_reason(reason: object, mission: Mission | None) -> None:
-    """Refuse a reason that is empty or a misspelt cause, or a cause of a mission that arrived.
-
-    Raises TrustboError.
-    """
+    """Refuse a reason that is empty or a misspelt cause, or a cause of a mission that arrived."""
     if not isinstance(reason, str) or not reason.strip():
         raise TrustboError(f"give a reason, such as one of {', '.join(CAUSES)}; got {reason!r}.")
     if reason in CAUSES:

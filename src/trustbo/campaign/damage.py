@@ -76,10 +76,9 @@ _FIELDS: dict[str, dict[Any, Any]] = {
 
 
 def read_fields(file: Path) -> dict[str, Any]:
-    """Read `campaign.json` or `result.json`, those of older versions as this one writes them.
+    """Read `campaign.json` or `result.json`, converted from older versions.
 
-    Raises:
-        DamagedFileError: The file is missing or damaged, or a field is missing or no such value.
+    DamagedFileError: the file is missing or damaged, or a field is missing or no such value.
     """
     record = read_record(file)
 

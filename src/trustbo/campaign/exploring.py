@@ -24,21 +24,15 @@ _SIGN = "\N{PLUS-MINUS SIGN}"
 
 
 def scene_of(result: Result, maps: xr.Dataset) -> Scene:
-    """Lay out the page of a result.
-
-    Args:
-        result: Result with a posterior.
-        maps: Maps of the result, see `Result.maps`.
-    """
-    n = len(result.missions)
-    of_bounds = _bound_maps(result)
-    steps = [_mission_step(result, j, of_bounds) for j in range(n)]
+    """Lay out the page of a result with a posterior, and with `maps` of `Result.maps`."""
+    bound_maps = _bound_maps(result)
+    steps = [_mission_step(result, j, bound_maps) for j in range(len(result.missions))]
+    steps.append(_last_step(result, bound_maps))
     title = f"{_counted(result)}: trust, place by place"
-    layers = _layers(result, maps, of_bounds)
-    return Scene(title, result.workspace, layers, [*steps, _last_step(result, of_bounds)])
+    return Scene(title, result.workspace, _layers(result, maps, bound_maps), steps)
 
 
-def _layers(result: Result, maps: xr.Dataset, of_bounds: _Moments) -> list[Layer]:
+def _layers(result: Result, maps: xr.Dataset, bound_maps: _Moments) -> list[Layer]:
     """Layers by group, the most important first."""
     there = {str(name): maps[name].transpose("y", "x").values for name in maps.data_vars}
     learned = there["trust_mean"].copy()
@@ -62,18 +56,15 @@ def _layers(result: Result, maps: xr.Dataset, of_bounds: _Moments) -> list[Layer
             top = _top(np.abs(there[name]))
             layers.append(layer(name, label, group, (-top, top), colours=BETTER_WORSE, sd=sd))
             layers += [sd_layer(sd, label, group)] if sd else []
-    return [*layers, *_failure(of_bounds), *_awareness(result, there), *_as_planned(result)]
+    return [*layers, *_failure(bound_maps), *_awareness(result, there), *_as_planned(result)]
 
 
-def _failure(of_bounds: _Moments) -> list[Layer]:
+def _failure(bound_maps: _Moments) -> list[Layer]:
     """Chance to fail of the bound into a cell from its worst side, and the sd of that one."""
-    chances = of_bounds.get("chance to fail")
-    if chances is None:
+    if (chances := bound_maps.get("chance to fail")) is None:
         return []
-    mean, sd = (np.where(np.isnan(chances[0]), -np.inf, part) for part in chances)
-    worst = mean.argmax(0)[None]
-    mean, sd = (np.take_along_axis(part, worst, 0)[0] for part in (mean, sd))
-    mean, sd = (np.where(np.isfinite(part), part, np.nan) for part in (mean, sd))
+    worst = np.where(np.isnan(chances[0]), -np.inf, chances[0]).argmax(0)[None]
+    mean, sd = (np.take_along_axis(moment, worst, 0)[0] for moment in chances)
     label, group = "chance to fail, from the worst side", "Failure"
     return [
         Layer("p_fail", label, group, mean, (0.0, _top(mean)), sd="p_fail_sd"),
@@ -86,20 +77,17 @@ def _awareness(result: Result, there: Mapping[str, np.ndarray]) -> list[Layer]:
     believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
     layers = []
     for name in [str(feature) for feature in believed["feature"].values]:
-        own = believed.sel(feature=name).transpose("robot", "row", "col").values
+        by_robot = believed.sel(feature=name).transpose("robot", "row", "col").values
         text = name.replace("_", " ")
-        if np.allclose(own, own[:1], equal_nan=True):
-            layers.append(_index(name, text, own[0]))
+        if np.allclose(by_robot, by_robot[:1], equal_nan=True):
+            layers.append((name, text, by_robot[0]))
             continue
         mean = there[f"awareness_{name}" if f"awareness_{name}" in there else name]
-        layers.append(_index(name, f"{text}, mean of the robots", mean))
-        for robot, values in zip(result.workspace.team.names, own, strict=True):
-            layers.append(_index(f"{name} {robot}", f"{text}, {robot}", values))
-    return layers
-
-
-def _index(name: str, label: str, values: np.ndarray) -> Layer:
-    return Layer(name, label, "Awareness (0 worst, 1 best)", values, (0.0, 1.0))
+        layers.append((name, f"{text}, mean of the robots", mean))
+        for robot, values in zip(result.workspace.team.names, by_robot, strict=True):
+            layers.append((f"{name} {robot}", f"{text}, {robot}", values))
+    group = "Awareness (0 worst, 1 best)"
+    return [Layer(name, label, group, values, (0.0, 1.0)) for name, label, values in layers]
 
 
 def _as_planned(result: Result) -> list[Layer]:
@@ -112,32 +100,32 @@ def _as_planned(result: Result) -> list[Layer]:
     return [Layer("trust_planned", label, "Trust, mission by mission", every, _ends(learned))]
 
 
-def _mission_step(result: Result, j: int, of_bounds: _Moments) -> Step:
+def _mission_step(result: Result, j: int, bound_maps: _Moments) -> Step:
     """Path, posts, contact and trust of a mission."""
     mission, row = result.missions[j], result.history.isel(iteration=j)
     n = len(mission.path) - 1
     contact = mission.contact_rate
     mean = float(np.nanmean(contact)) if np.isfinite(contact).any() else np.nan
-    said = [f"Mission {j + 1} of {len(result.missions)}: {mission.status.replace('_', ' ')}"]
-    said.append(f"contact {mean:.3f}" if np.isfinite(mean) else "no contact rate measured")
+    facts = [f"Mission {j + 1} of {len(result.missions)}: {mission.status.replace('_', ' ')}"]
+    facts.append(f"contact {mean:.3f}" if np.isfinite(mean) else "no contact rate measured")
     if len(mission.bounds) < n:
-        said.append(f"ended in bound {len(mission.bounds)} of {n}")
-    said.append(f"{_worth(result, row['objective'].item())} when planned")
+        facts.append(f"ended in bound {len(mission.bounds)} of {n}")
+    facts.append(f"{_objective(result, row['objective'].item())} when planned")
     stops, posts = _recorded(mission, result.workspace)
     return Step(
         f"mission {j + 1}",
-        ", ".join(said) + ".",
+        ", ".join(facts) + ".",
         "Trust along the mission, given all missions",
         mission.path,
         stops,
         posts,
         contact,
         _latent_trust(result, j, n),
-        _numbers(result, mission.path, mission.awareness, of_bounds),
+        _numbers(result, mission.path, mission.awareness, bound_maps),
     )
 
 
-def _last_step(result: Result, of_bounds: _Moments) -> Step:
+def _last_step(result: Result, bound_maps: _Moments) -> Step:
     """Recommended path, with the trust expected along it."""
     path, planner = result.path, result.planner
     params, chosen = choose_draws(params_of(result.posterior), None, 0)
@@ -148,14 +136,14 @@ def _last_step(result: Result, of_bounds: _Moments) -> Step:
     return Step(
         "recommended",
         f"Recommended after {_counted(result)}: {len(path) - 1} bounds, "
-        f"{_worth(result, result.value)}.",
+        f"{_objective(result, result.value)}.",
         "Expected trust along the recommended path",
         path,
         stops,
         posts,
         np.full(result.trust.shape, np.nan),
         np.quantile(expected, _FIVE, axis=0),
-        _numbers(result, path, z.transpose(1, 0, 2), of_bounds),
+        _numbers(result, path, z.transpose(1, 0, 2), bound_maps),
     )
 
 
@@ -165,15 +153,15 @@ def _latent_trust(result: Result, j: int, n_bounds: int) -> np.ndarray:
     latent = result.posterior["latent"]["trust"]
     if j not in latent.indexes["mission"]:  # never learned from
         return along
-    of_team = latent.sel(mission=j).transpose("chain", "draw", "bound", "robot").values
-    team = of_team.min(-1) if result.settings.get("team") == "min" else of_team.mean(-1)
-    known = team.reshape(-1, team.shape[-1])[:, :n_bounds]
-    along[:, : known.shape[1]] = np.quantile(known, _FIVE, axis=0)
+    by_robot = latent.sel(mission=j).transpose("chain", "draw", "bound", "robot").values
+    team = by_robot.min(-1) if result.settings.get("team") == "min" else by_robot.mean(-1)
+    draws = team.reshape(-1, team.shape[-1])[:, :n_bounds]
+    along[:, : draws.shape[1]] = np.quantile(draws, _FIVE, axis=0)
     return along
 
 
 def _recorded(mission: Mission, workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
-    """Stops and posts as they were recorded; as planned for bounds without a record."""
+    """Recorded stops and posts; those planned for bounds without a record."""
     stops, posts = _planned(mission.path, workspace)
     n_robots = len(mission.robots)
     for k, bound in enumerate(mission.bounds):
@@ -197,22 +185,22 @@ def _planned(path: Sequence[Cell], workspace: Workspace) -> tuple[np.ndarray, np
 
 
 def _numbers(
-    result: Result, path: Sequence[Cell], awareness: np.ndarray, of_bounds: _Moments
+    result: Result, path: Sequence[Cell], awareness: np.ndarray, bound_maps: _Moments
 ) -> dict[str, list[str]]:
     """Further numbers of the bounds of a path, as text; `awareness` is (bound, robot, feature)."""
     where = tuple(bounds_along(path).T)
     numbers = {
         name: [_with_sd(*moments) for moments in zip(means[where], sds[where], strict=True)]
-        for name, (means, sds) in of_bounds.items()
+        for name, (means, sds) in bound_maps.items()
     }
     robots = result.workspace.team.names
     for m, feature in enumerate(result.workspace.features):
-        text, own = feature.replace("_", " "), awareness[..., m]
-        if np.allclose(own, own[:, :1], equal_nan=True):
-            own = own[:, :1]
+        text, values = feature.replace("_", " "), awareness[..., m]
+        if np.allclose(values, values[:, :1], equal_nan=True):
+            values = values[:, :1]
         elif len(robots) > 1:
             text += f" ({' / '.join(robots)})"
-        numbers[text] = [" / ".join(f"{z:.2f}" for z in row if np.isfinite(z)) for row in own]
+        numbers[text] = [" / ".join(f"{z:.2f}" for z in row if np.isfinite(z)) for row in values]
     return numbers
 
 
@@ -225,11 +213,11 @@ def _with_sd(mean: float, sd: float) -> str:
 
 
 def _bound_maps(result: Result) -> _Moments:
-    """Mean and sd of what is known of bounds, by its name, each (move, row, col)."""
-    found, children = {}, result.posterior.children
+    """Mean and sd of the quantities of bounds, by name, each (move, row, col)."""
+    moments, children = {}, result.posterior.children
     if "hazard" in children and "p_fail" in result.posterior["hazard"]:
         hazard = result.posterior["hazard"]
-        found["chance to fail"] = hazard["p_fail"].values, hazard["p_fail_sd"].values
+        moments["chance to fail"] = hazard["p_fail"].values, hazard["p_fail_sd"].values
     if "places" in children:
         effects = place_maps(result.posterior)
         if "place_bound_mean" in effects:
@@ -238,8 +226,8 @@ def _bound_maps(result: Result) -> _Moments:
             mean, sd = (
                 effects[f"place_bound_{n}"].transpose("move", "row", "col") for n in ("mean", "sd")
             )
-            found["effect of the bound"] = mean.values, sd.values
-    return found
+            moments["effect of the bound"] = mean.values, sd.values
+    return moments
 
 
 def _counted(result: Result) -> str:
@@ -247,7 +235,7 @@ def _counted(result: Result) -> str:
     return f"{n} mission{'s' if n > 1 else ''}"
 
 
-def _worth(result: Result, value: float) -> str:
+def _objective(result: Result, value: float) -> str:
     text = f"{value:.3g}".replace("-", "\N{MINUS SIGN}")
     return f"objective {text} ({result.settings['objective'].replace('_', ' ')})"
 

@@ -61,12 +61,7 @@ class Learner:
         sampler: str,
         seed: int,
     ) -> None:
-        """Begin with the prior, drawn by a seed.
-
-        Raises:
-            TrustboError: An unknown sampler; a sampler that does not suit the model; or a model
-                that cannot be updated so.
-        """
+        """Begin with the prior, drawn by a seed; see `Campaign` for what is refused."""
         if model is None:  # moments that are matched are those of the paper's parameters
             model = PooledTrust(place=PlaceEffect() if options.update == "refit" else None)
         _require_learnable(model, sampler, options)
@@ -80,12 +75,7 @@ class Learner:
         self._hazard: tuple[object, xr.Dataset, BoundRisk] | None = None
 
     def take(self, state: CampaignState, seed: int) -> None:
-        """Learn from the last mission of a state, or exclude it where nothing can be learned.
-
-        Args:
-            state: State whose last mission is new.
-            seed: Seed of the sampler.
-        """
+        """Learn from the last mission of a state, or exclude it where nothing can be learned."""
         entry = state.entries[-1]
         if reason := never_to_be_learned(entry.mission):
             entry.become(SET_ASIDE, reason)
@@ -130,11 +120,7 @@ class Learner:
         self._believe(tree)
 
     def restore(self, state: CampaignState) -> None:
-        """Restore the belief after the missions of a state that was read.
-
-        Raises:
-            DamagedFileError: The last posterior cannot be read.
-        """
+        """Restore the belief after the missions of a state that was read from files."""
         if self.awareness is not None:
             for mission in state.measured:
                 self.awareness.update(mission)
@@ -146,16 +132,14 @@ class Learner:
     def _believe(self, tree: xr.DataTree | None) -> None:
         """Take the belief from a posterior; from the prior if there is none."""
         self.belief = self._prior if tree is None else params_of(tree)
-        self.observation: str = (
-            self.model.family.name if tree is None else tree.attrs["observation"]
-        )
+        family = self.model.family.name
+        self.observation: str = family if tree is None else tree.attrs["observation"]
 
     def hazard(self, state: CampaignState) -> tuple[xr.Dataset, BoundRisk]:
-        """Fit the hazard of all missions of a state when it is first asked for.
+        """Fit the hazard to all missions of a state when it is first asked for, see `fit_hazard`.
 
-        Returns:
-            Group `hazard` of the posterior, see `hazard.fit_hazard`, of the prior at first; and the
-            chances of the bounds to fail under it.
+        Returns the group `hazard` of the posterior, of the prior at first; and the chances of the
+        bounds to fail under it.
         """
         key = len(state.entries), len(state.failures), tuple(state.numbers(SET_ASIDE))
         if self._hazard is None or self._hazard[0] != key:
@@ -173,25 +157,20 @@ class Learner:
         A mission excluded because it measured no contact rate still shows where it failed.
         None, with a warning, where the posterior is refused.
         """
-        entries = state.entries
+        n, lost = len(state.entries), [failure for failure in state.failures if failure.path]
         measured = {
             j: entry.measured
-            for j, entry in enumerate(entries)
+            for j, entry in enumerate(state.entries)
             if entry.state != SET_ASIDE or never_to_be_learned(entry.mission)
         }
-        lost = [failure for failure in state.failures if failure.path]
-        ages = [len(entries) - 1 - j for j in measured], [len(entries) - f.after for f in lost]
+        ages = [n - 1 - j for j in measured], [n - failure.after for failure in lost]
         weights = [self.options.forgetting ** np.array(age, dtype=float) for age in ages]
         try:
             return fit_hazard(
-                list(measured.values()),
-                self.workspace,
-                self.options.prior_hazard,
+                list(measured.values()), self.workspace, self.options.prior_hazard,
                 lost=[LostMission(f.path, f.reason, f.where) for f in lost],
-                weights=weights[0],
-                lost_weights=weights[1],
-                seed=state.seed_of("hazard"),
-            )
+                weights=weights[0], lost_weights=weights[1], seed=state.seed_of("hazard"),
+            )  # fmt: skip
         except PosteriorError as error:
             warnings.warn(f"{error} The campaign goes on with the hazard before.", stacklevel=5)
             return None
@@ -199,16 +178,9 @@ class Learner:
     def _fit(
         self, missions: list[Mission], new: int, last: xr.DataTree | None, seed: int
     ) -> xr.DataTree:
-        """Fit the posterior of missions; one that is refused is tried again in other ways.
+        """Fit the posterior of missions, of which the `new` last are not in the posterior `last`.
 
-        Args:
-            missions: Missions to learn from, in order.
-            new: Number of the last of them that are not in `last`.
-            last: Posterior of the others.
-            seed: Seed of the sampler.
-
-        Raises:
-            CannotLearnError: Every attempt failed.
+        One that is refused is tried again in other ways. CannotLearnError: every attempt failed.
         """
         model, weights, options = self.model, None, self.options
         if options.update == "moment_matched":
@@ -222,10 +194,8 @@ class Learner:
         for shift, (sampler, sampling) in enumerate(self._attempts()):
             if reason:
                 more = f'sampler "{sampler}" and {sampling["draws"]} draws a chain'
-                say(
-                    place_of(self.progress),
-                    f"another try, with {more}, as the last failed: {reason}.",
-                )
+                line = f"another try, with {more}, as the last failed: {reason}."
+                say(place_of(self.progress), line)
             try:
                 return fit(
                     missions, model, sampler, workspace=self.workspace, earlier=last,

@@ -117,7 +117,7 @@ def resume(
         directory: Folder of its checkpoint.
         simulator: The same simulator, unless it was the default.
         truth: Its truth, see `iterate`.
-        n_iterations: Number of missions in all; by default as many as it was begun for.
+        n_iterations: Number of missions in all; by default that of its beginning.
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
         stop: Rules in place of those that it was begun with; needed where one was custom.

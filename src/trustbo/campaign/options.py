@@ -115,12 +115,8 @@ class CampaignOptions:
     def of(cls, given: Mapping[str, Any], call: Callable[..., Any] | None = None) -> Self:
         """Options given one by one, or as one object by the name `options`.
 
-        Args:
-            given: Keywords of a call that are none of its parameters.
-            call: Function that was called; a misspelt option may mean a keyword of it.
-
-        Raises:
-            TrustboError: An unknown option, or some in addition to the object.
+        A misspelt option may mean a keyword of the function `call`. TrustboError: an unknown
+        option, or some in addition to the object.
         """
         if "options" not in given:
             names = [option.name for option in fields(cls)]
@@ -144,7 +140,7 @@ class CampaignOptions:
 
     @property
     def sampling(self) -> dict[str, Any]:
-        """Number and care of draws, as far as they are given, by the names of `tb.fit`."""
+        """Options of draws that are given, by the names of `tb.fit`."""
         names = ("n_chains", "warmup", "draws", "target_accept", "max_tree_depth")
         given = {name: getattr(self, name) for name in names}
         return {name: value for name, value in given.items() if value is not None}
@@ -191,13 +187,8 @@ def arguments_of(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Arguments of `Campaign` in the record of its state, and the record of its model.
 
-    Args:
-        record: Field `options` of `CampaignState`; an option that it lacks has its default.
-        policy: The same policy, if it is custom.
-        **custom: The same awareness, if it is custom, and callbacks.
-
-    Raises:
-        TrustboError: A custom object is missing, or given where there was none; another option.
+    `record` is the field `options` of `CampaignState`; an option that it lacks has its default. The
+    policy and the awareness are given again if they are custom, else refused; callbacks may be.
     """
     for name in custom:
         if name not in _CUSTOM:
@@ -214,11 +205,7 @@ def arguments_of(
 
 
 def _restored(name: str, stored: Any, given: Any, custom: bool) -> Any:
-    """Return the stored value, or the user's object where it could not be stored.
-
-    Raises:
-        TrustboError: The object is missing, or there was none.
-    """
+    """Return the stored value, or the custom object where it could not be stored."""
     if custom and given is None:
         raise TrustboError(
             f"the campaign's {name} was your own ({stored!r}); give it again with {name}=."

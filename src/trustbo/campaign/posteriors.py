@@ -36,8 +36,7 @@ class Posterior:
     def __call__(self) -> xr.DataTree:
         """Posterior as stored: parameters alone, unless its trust was sampled too.
 
-        Raises:
-            DamagedFileError: Its file is missing, damaged or replaced.
+        DamagedFileError: its file is missing, damaged or replaced.
         """
         if self._tree is None:
             file = Path(self.file or "")
@@ -70,7 +69,7 @@ class Posteriors(Sequence[xr.DataTree]):
     @property
     def after(self) -> list[int | None]:
         """Number of missions after which the posterior of each was fitted."""
-        return [one and one.after for one in self.stored]
+        return [posterior and posterior.after for posterior in self.stored]
 
     def __len__(self) -> int:
         return len(self.stored)
@@ -81,8 +80,8 @@ class Posteriors(Sequence[xr.DataTree]):
     def __getitem__(self, j: Any) -> Any:
         if isinstance(j, slice):
             return Posteriors(self.stored[j])
-        one = self.stored[j]
-        return None if one is None else one()
+        posterior = self.stored[j]
+        return None if posterior is None else posterior()
 
 
 def whole_posterior(
@@ -90,10 +89,8 @@ def whole_posterior(
 ) -> xr.DataTree:
     """Posterior with all groups, its missions labelled by their numbers in the campaign, from 0.
 
-    Args:
-        stored: Posterior as a campaign stores it.
-        missions: All missions recorded so far, their awareness filled in.
-        model: Model of the posterior, for `log_prior`; needed where its priors are not the default.
+    `missions` are all recorded so far. The model, for `log_prior`, is needed where its priors are
+    not the default.
     """
     if is_whole(stored):
         return stored

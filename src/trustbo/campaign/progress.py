@@ -16,27 +16,16 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 PAGE, PAGE_ALONE = "page", "page_alone"
 _KINDS = ("bar", PAGE, PAGE_ALONE)
+_PAGE_NAME = "report.html"
 _NOT_ENDED = b'<meta name="trustbo-campaign" content="not ended">'
 """Line in the head of the page of a campaign that did not end."""
-
-
-class _Nothing:
-    """Empty output of a cell."""
-
-    def __repr__(self) -> str:
-        return ""
-
-    def _repr_html_(self) -> str:
-        return ""
 
 
 class Progress:
     """Shows the missions of a campaign while they are run.
 
-    Under `progress=True` a notebook also shows the campaign itself, its map of trust and the
-    contact of its missions, renewed after each and gone at the end; `"bar"` leaves it out.
-    `"page"` keeps a page of it in the campaign's folder, which becomes the report, and
-    `"page_alone"` shows nothing else.
+    See `iterate` for `progress`. The campaign that a notebook shows is gone at the end; the page in
+    the campaign's folder becomes the report.
     """
 
     def __init__(self, campaign: "Campaign", total: int, progress: bool | str) -> None:
@@ -49,7 +38,12 @@ class Progress:
         self._page: Any = None
         if progress in (PAGE, PAGE_ALONE):
             live = import_module("trustbo.report.live")  # by name: it lies above
-            self._page = live.LivePage(_page_of(campaign), total)
+            if campaign.storage is None:
+                raise TrustboError(
+                    "a page is report.html in the campaign's folder; give directory=, or "
+                    "checkpoint= to iterate."
+                )
+            self._page = live.LivePage(campaign.storage.path / _PAGE_NAME, total)
         if self._place == NOTEBOOK and progress is True:
             from IPython.display import display
 
@@ -72,14 +66,14 @@ class Progress:
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
-        at: TracebackType | None,
+        traceback: TracebackType | None,
     ) -> None:
         self._bar.close()
         self._campaign.learner.progress = self._before
         if self._map is not None and kind is None:  # the result is what a cell shows afterwards
-            self._map.update(_Nothing())
+            self._map.update({"text/plain": "", "text/html": ""}, raw=True)
         if self._page is not None:
-            self._page.__exit__(kind, error, at)
+            self._page.__exit__(kind, error, traceback)
             if kind is None:
                 self._page.finish(self._campaign.result())
 
@@ -97,30 +91,14 @@ class Progress:
             self._page(self._campaign)
 
 
-def page_in(folder: Path) -> Path:
-    """Page of the campaign that is kept in a folder."""
-    return folder / "report.html"
-
-
-def _page_of(campaign: "Campaign") -> Path:
-    """Page in the folder that a campaign is kept in; TrustboError if there is none."""
-    if campaign.storage is None:
-        raise TrustboError(
-            "a page is report.html in the campaign's folder; give directory=, or checkpoint= to "
-            "iterate."
-        )
-    return page_in(campaign.storage.path)
-
-
 def continued(progress: bool | str, folder: Path) -> bool | str:
     """Progress of a campaign that goes on, with its page, if the run before left one not ended."""
-    page = page_in(folder)
-    if progress in (PAGE, PAGE_ALONE) or not page.is_file():
-        return progress
-    with page.open("rb") as file:
-        if _NOT_ENDED not in file.read(2000):
-            return progress
-    return PAGE if progress else PAGE_ALONE
+    page = folder / _PAGE_NAME
+    if progress not in (PAGE, PAGE_ALONE) and page.is_file():
+        with page.open("rb") as file:
+            if _NOT_ENDED in file.read(2000):
+                return PAGE if progress else PAGE_ALONE
+    return progress
 
 
 def report_of(campaign: "Campaign") -> str:

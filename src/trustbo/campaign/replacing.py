@@ -85,7 +85,7 @@ def hold(directory: FilePath, remedy: str = "") -> FileLock:
 def replacing(folder: Path) -> Iterator[Path]:
     """Give a new folder to write a campaign or result to, which then replaces that in `folder`.
 
-    `folder` must be held. Where writing fails, it is as it was.
+    `folder` must be held. Where writing fails, it is unchanged.
     """
     require_ours(folder)
     with naming_refusal(folder):
@@ -113,10 +113,8 @@ def finish_replacing(folder: Path) -> None:
 def require_ours(folder: Path, *others: str) -> None:
     """Refuse a folder in which a file of another program has the name of one of ours.
 
-    `others` are names of more files to be written.
-
-    Raises:
-        TrustboError: Such a file, or a link in place of a folder of ours.
+    `others` are names of more files to be written. A link in place of a folder of ours is refused
+    too.
     """
     if not folder.is_dir():
         return

@@ -20,25 +20,19 @@ THRESHOLD = 0.01
 """Least gain in the objective's value for which another continuation is taken."""
 
 
-def run_replanning(
-    campaign: "Campaign", simulator: Any, plan: Plan, *, threshold: float = THRESHOLD, **start: Any
-) -> Mission:
+def run_replanning(campaign: "Campaign", simulator: Any, plan: Plan, **start: Any) -> Mission:
     """Run a plan bound by bound; a continuation that has become better is taken.
 
     After each bound, a `TrustFilter` gives the current trust and a weight of each posterior draw.
     The rest of the path is planned again from there, among the admissible paths that are left, and
-    replaced if the value of the new rest is greater by the threshold.
+    replaced if the value of the new rest is greater by `THRESHOLD`.
+    Before the first mission there is no posterior, and the plan is run unchanged.
 
     Args:
-        campaign: Campaign with its posterior; before its first mission there is none, and the plan
-            is run unchanged.
+        campaign: Campaign with its posterior.
         simulator: Simulator with `reset`, `run_bound`, and maybe `close`.
         plan: Plan to begin with.
-        threshold: Difference of values, see `OBJECTIVES`.
         **start: Arguments of `reset`, such as the seed.
-
-    Returns:
-        Mission along the cells that were chosen.
     """
     path, bounds, live = list(plan.path), [], None
     names = [tuple(map(str, campaign.workspace.awareness[d].values)) for d in ("feature", "robot")]
@@ -58,17 +52,17 @@ def run_replanning(
         if live is not None and k + 1 < len(path):
             planner = campaign.planner_now().onward(path[: k + 1])
             crossed = path[k - 1], bound.cell
-            one = Mission(crossed, (bound,), bound.status)
-            filled = fill_awareness(one, campaign.known_along(crossed))
+            driven = Mission(crossed, (bound,), bound.status)
+            filled = fill_awareness(driven, campaign.known_along(crossed))
             live.update(filled.awareness[0], bound.contact_rate, crossed, n_ticks=bound.n_ticks)
-            path = [*path[:k], *better_rest(planner, live, path[k:], threshold)]
+            path = [*path[:k], *better_rest(planner, live, path[k:])]
         k += 1
     getattr(simulator, "close", lambda: None)()
     return Mission(tuple(path), tuple(bounds), bounds[-1].status, *names)
 
 
 def better_rest(
-    planner: Planner, live: TrustFilter, rest: Sequence[Cell], threshold: float
+    planner: Planner, live: TrustFilter, rest: Sequence[Cell], threshold: float = THRESHOLD
 ) -> tuple[Cell, ...]:
     """Plan the rest of a path from the current trust; the old rest if that is nearly as good.
 

@@ -46,9 +46,9 @@ class Result(Displayed):
         history: Dataset over `iteration` (1, 2, ...): the path that was planned (`path`, row and
             col of each step, -1 after the goal), its `objective` when it was planned, whether it
             differs from the plan before (`path_changed`), the `trust_map` it was planned on, the
-            mission's mean `contact_rate`, its `status`, and its `state` with the `reason` ("told":
-            to be learned from with a later mission; "learned"; "set aside": never), the posterior's
-            diagnostics (see `inference.diagnostics`), and the seconds of planning, running and
+            mission's mean `contact_rate`, its `status`, its `state` with the `reason` (`"told"`: to
+            be learned from later; `"learned"`; `"set aside"`: never), the diagnostics
+            of the posterior (see `inference.diagnostics`), and the seconds of planning, running and
             fitting.
         settings: Options of the campaign, and the settings of its model and simulator.
         stop_reason: Reason of the end.

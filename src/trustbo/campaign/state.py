@@ -31,7 +31,7 @@ class Failure(NamedTuple):
     where: Cell | None = None
     """Cell that it failed to enter, where that is recorded."""
     reported: bool = False
-    """Whether the bounds that were run were recorded, as a mission with a row of the history."""
+    """Whether the bounds that were run are a mission with a row in the history."""
 
     @classmethod
     def restore(cls, record: Sequence[Any]) -> Self:
@@ -68,7 +68,7 @@ class Entry:
 
     @property
     def state(self) -> str:
-        """State of the mission: told, learned or set aside."""
+        """State of the mission: `TOLD`, `LEARNED` or `SET_ASIDE`."""
         return self.row["state"]
 
     def become(self, state: str, reason: str = "") -> None:

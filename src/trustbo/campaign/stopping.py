@@ -106,11 +106,7 @@ _OURS = {"RegretBound": RegretBound, "TimeLimit": TimeLimit}
 
 
 def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
-    """List the rules.
-
-    Raises:
-        TrustboError: One of them is not callable.
-    """
+    """List the rules; TrustboError if one of them is not callable."""
     rules: list[Stop] = [] if stop is None else [stop] if callable(stop) else list(stop)
     for rule in rules:
         if not callable(rule):
@@ -132,11 +128,7 @@ def rules_to_record(rules: Sequence[Stop]) -> list[dict[str, Any]]:
 
 
 def rules_of(record: Sequence[Mapping[str, Any]]) -> list[Stop]:
-    """Rules of a record; a `TimeLimit` counts from now.
-
-    Raises:
-        TrustboError: A rule is custom, and has to be given again.
-    """
+    """Rules of a record, a `TimeLimit` from now; TrustboError if one is custom."""
     rules: list[Stop] = []
     for rule in record:
         values = dict(rule)

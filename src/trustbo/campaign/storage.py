@@ -113,8 +113,7 @@ class Storage:
     def replace(self, workspace: Workspace, state: CampaignState, result: Result | None) -> None:
         """Write a campaign, which takes the place of what the folder holds when it is whole.
 
-        Raises:
-            TrustboError: A file of another program would be replaced; see `require_ours`.
+        TrustboError: a file of another program would be replaced, see `require_ours`.
         """
         require_ours(self.path)
         warn_of_others(self.path)
@@ -141,13 +140,10 @@ class Storage:
     def write(
         self, state: CampaignState, result: Result | None, *, whole: bool = False, ended=False
     ) -> None:
-        """Write the result, then the state.
+        """Write the result, all of it or what the last mission added to it, then the state.
 
-        Args:
-            state: State that `read` returns.
-            result: Result so far; None leaves the one in the folder.
-            whole: Whether to write all of the result, or what the last mission added to it.
-            ended: Whether to write `posterior.nc` too, with all groups.
+        Without a `result`, that in the folder stays. With `ended`, `posterior.nc` with all groups
+        is written too.
         """
         finish_replacing(self.path)
         if result is not None:
@@ -159,14 +155,10 @@ class Storage:
         write_checked(self._target / STATE, to_json(state.to_record()).encode())
 
     def read(self) -> tuple[CampaignState, Workspace, list[tuple[Mission, dict[str, float]]]]:
-        """Read the state and the workspace.
+        """Read the state, the workspace, and missions that the state does not count yet.
 
-        Returns:
-            State; workspace; and the missions on disk that the state does not count, with their
-            extra numbers.
-
-        Raises:
-            DamagedFileError: A file is missing or damaged; the message names what can be read.
+        Those have their extra numbers with them. DamagedFileError: a file is missing or damaged;
+        the message names what can be read.
         """
         measured: list[Mission] = []
         extras: list[dict[str, float]] = []
@@ -273,13 +265,9 @@ def read_workspace(folder: Path) -> Workspace:
 def _write_result(result: Result, folder: Path, *, whole: bool, home: Path) -> None:
     """Write all but the workspace of a result.
 
-    Args:
-        result: Result of the missions so far.
-        folder: Folder to write to.
-        whole: Whether to write all missions, or only the last to a folder that has all before it:
-            earlier posteriors never change.
-        home: Folder that the files will be in; another where they replace what is there, and
-            `_mark_stored` is to be called once they did.
+    Not `whole`, only the last mission is written, to a folder that has all before it: earlier
+    posteriors never change. The files will be in `home`; where that is not the folder, they replace
+    what is there, and `_mark_stored` is to be called once they did.
     """
     stored = Posteriors.of(result.posteriors).stored
     files = list({posterior.after: posterior for posterior in stored if posterior}.values())
