@@ -11,7 +11,7 @@ from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
 from trustbo import simulation
-from trustbo.campaign.replanning import better_rest, weighted_mean
+from trustbo.campaign.running import better_rest, weighted_mean
 from trustbo.campaign.stopping import reason_to_stop
 from trustbo.data import Bound
 from trustbo.errors import TrustboError

@@ -107,8 +107,8 @@ class Campaign(Displayed):
             objective: Objective of the paths; see `Planner`.
             sampler: Sampler of the posterior; see `trustbo.fit`.
             seed: Seed of everything random.
-            directory: Folder that the campaign is kept in as it goes. No other process may use it
-                until the end of `with campaign:`, or of this one.
+            directory: Folder that is updated after each mission. It is locked until the end of
+                `with campaign:`, or of the process.
             **options: Fields of `CampaignOptions`, or a whole one as `options`.
 
         Raises:
@@ -241,7 +241,7 @@ class Campaign(Displayed):
         return self._accept(plan, started)
 
     def _accept(self, plan: Plan, started: float) -> Plan:
-        """Store a plan as the next to be run."""
+        """Store a plan as the next one to run."""
         bands = self.planner_now().bands(plan.path, self.belief)
         now = time.perf_counter()
         self._asked = now - started, now
@@ -302,7 +302,7 @@ class Campaign(Displayed):
         self._go_on()
 
     def _go_on(self) -> None:
-        """Drop the plan that was run or given up, and write what it added."""
+        """Drop the plan that was run or given up, and write the new state."""
         self.state.suggested = self._planner_now = None
         if self.storage is not None:
             self.storage.write(self.state, self._result_so_far())
@@ -414,8 +414,8 @@ class Campaign(Displayed):
     def known_along(self, path: Sequence[Cell]) -> np.ndarray:
         """Awareness expected in the bounds of a path, shape (bound, robot, feature).
 
-        That of the map, or of the belief after the missions so far; what `TrustFilter` and
-        missions take where robots do not measure it.
+        It is that of the map, or of the belief after the missions so far; `TrustFilter` and
+        missions use it where robots do not measure awareness.
 
         Args:
             path: Current cell of the team and the cells to be entered; need not begin at the start.
@@ -538,11 +538,11 @@ class Campaign(Displayed):
 
         Args:
             directory: Folder to write to.
-            keep: Whether to keep the campaign there from now on, as with a `directory`, until the
-                end of `with campaign:`.
+            keep: Whether to go on writing there after each mission, as with a `directory`, until
+                the end of `with campaign:`.
 
         Raises:
-            TrustboError: Another campaign holds the folder, or its name belongs to a file.
+            TrustboError: Another campaign has locked the folder, or its name belongs to a file.
         """
         storage, path = self.storage, as_path(directory).resolve()
         if storage is None or storage.path.resolve() != path:

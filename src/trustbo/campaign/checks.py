@@ -50,10 +50,10 @@ def require_mission(
 def require_extra(
     extra: Mapping[str, Any], reserved: Collection[str] = RESERVED
 ) -> dict[str, float]:
-    """Return more numbers of a mission as floats.
+    """Return extra numbers of a mission as floats; NaN stands for a missing one.
 
-    TrustboError: not a number, NaN for a missing one; infinite; or a name that is no identifier,
-    which files could not keep, or that is `reserved`.
+    TrustboError: a value that is infinite or not a number, or a name that is `reserved` or no
+    identifier, which files could not store.
     """
     checked = {}
     for name, value in extra.items():
@@ -74,7 +74,7 @@ def require_extra(
 
 
 def never_to_be_learned(filled: Mission) -> str:
-    """Reason that no later mission can help to learn from a mission, or an empty string."""
+    """Reason why nothing can ever be learned from a mission, or an empty string."""
     if not np.isfinite(filled.contact_rate).any():
         return "no contact rate was measured."
     if np.isnan(filled.awareness).any():
@@ -87,7 +87,7 @@ def never_to_be_learned(filled: Mission) -> str:
 
 
 def require_reason(reason: object, mission: Mission | None) -> None:
-    """Refuse a reason that is empty or a misspelt cause, or a cause of a mission that arrived."""
+    """Refuse a reason that is empty, a misspelt cause, or a cause for a mission that arrived."""
     if not isinstance(reason, str) or not reason.strip():
         raise TrustboError(f"give a reason, such as one of {', '.join(CAUSES)}; got {reason!r}.")
     if reason in CAUSES:
@@ -149,7 +149,7 @@ def _require_path(
 
 
 def _is_same(one: Mission, other: Mission) -> bool:
-    """Whether all numbers agree, and are such that two missions hardly share them."""
+    """Whether two missions agree in every number, not by chance."""
     if one.path != other.path or one.status != other.status:
         return False
     names = ("awareness", "contact_rate", "duration", "n_ticks")

@@ -34,7 +34,7 @@ _N_DRAWS = 1000
 
 
 class CannotLearnError(TrustboError):
-    """Missions that no sampler gives a posterior of."""
+    """Missions for which every sampler was refused."""
 
 
 class Learner:
@@ -130,7 +130,7 @@ class Learner:
                 self._believe(tree)
 
     def _believe(self, tree: xr.DataTree | None) -> None:
-        """Take the belief from a posterior; from the prior if there is none."""
+        """Set the belief to a posterior, or to the prior if there is none."""
         self.belief = self._prior if tree is None else params_of(tree)
         family = self.model.family.name
         self.observation: str = family if tree is None else tree.attrs["observation"]

@@ -113,10 +113,10 @@ class CampaignOptions:
 
     @classmethod
     def of(cls, given: Mapping[str, Any], call: Callable[..., Any] | None = None) -> Self:
-        """Options given one by one, or as one object by the name `options`.
+        """Make options from keywords, or return the object that is passed as `options`.
 
-        A misspelt option may mean a keyword of the function `call`. TrustboError: an unknown
-        option, or some in addition to the object.
+        TrustboError: an unknown option, with similar names, those of keywords of `call` included;
+        or options in addition to the object.
         """
         if "options" not in given:
             names = [option.name for option in fields(cls)]
@@ -155,7 +155,7 @@ class CampaignOptions:
         return isinstance(self.awareness, AwarenessBelief)
 
     def to_record(self) -> dict[str, Any]:
-        """Options as JSON can hold them, callbacks left out."""
+        """JSON-serialisable options, without callbacks."""
         record = {o.name: getattr(self, o.name) for o in fields(self) if o.name != "callbacks"}
         priors = asdict(self.prior_hazard).items()
         record["hazard"] = {n: list(v) if isinstance(v, tuple) else v for n, v in priors}

@@ -1,4 +1,4 @@
-"""Planner of a campaign: by its options, and under the chances of bounds to fail."""
+"""Planner of a campaign, from its options and the failure chances of bounds."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from trustbo.workspace.location import Location
 
 _N_DRAWS = 200
 _STOPPED, _RECOVERED = 2, 0.2
-"""Failures from which on a bound is avoided, and the chance to fail below which it no longer is."""
+"""Number of failures that makes a bound avoided, and the failure chance below which it is not."""
 
 
 def planner_of(
@@ -24,19 +24,19 @@ def planner_of(
     observation: str,
     response: str,
 ) -> Planner:
-    """Planner by the options of a campaign, for the observation and response of its model."""
+    """Planner from the options of a campaign, for the observation and response of its model."""
     chosen: dict[str, Any] = {name: getattr(options, name) for name in options_of(PLANNING)}
     chosen |= {"observation": observation, "response": response}
     return Planner(workspace, start, goal, objective, **chosen, infeasible="safest")
 
 
 def under_risk(planner: Planner, risk: BoundRisk) -> Planner:
-    """Planner under the chances of bounds to fail."""
+    """Planner that takes the failure chances of bounds into account."""
     return planner.with_risk(risk.mean, risk.draw(_N_DRAWS), risk.causes)
 
 
 def to_avoid(risk: BoundRisk) -> np.ndarray:
-    """Bounds that stopped robots twice, and whose posterior has not recovered, (move, row, col)."""
+    """Bounds with two failures whose failure chance has not recovered, (move, row, col)."""
     with np.errstate(invalid="ignore"):
         return (risk.stopped >= _STOPPED - 1e-9) & ~(risk.mean < _RECOVERED)
 

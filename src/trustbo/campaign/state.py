@@ -120,7 +120,7 @@ class CampaignState:
 
     @property
     def last_tree(self) -> xr.DataTree | None:
-        """The tree of `last`; None where nothing could be learned yet."""
+        """Tree of `last`; None where nothing could be learned yet."""
         return None if self.last is None else self.last()
 
     def numbers(self, *states: str) -> list[int]:
@@ -128,7 +128,7 @@ class CampaignState:
         return [j for j, entry in enumerate(self.entries) if entry.state in states]
 
     def seed_of(self, stream: str) -> int:
-        """Seed of one stream of randomness at this iteration."""
+        """Seed of one stream of randomness for the next mission."""
         n = len(self.entries)
         entropy = [self.seed, _STREAMS.index(stream), n]
         if n_failures := sum(failure.after == n for failure in self.failures):
@@ -162,7 +162,7 @@ class CampaignState:
         return entry
 
     def to_record(self) -> dict[str, Any]:
-        """Everything that no file of a `Result` holds, as JSON can hold it."""
+        """JSON-serialisable record of everything that no file of a `Result` holds."""
         return {
             "options": self.options,
             "suggested": None if self.suggested is None else plan_to_record(self.suggested),

@@ -117,7 +117,7 @@ def require_stops(stop: Stop | Sequence[Stop] | None) -> list[Stop]:
 
 
 def rules_to_record(rules: Sequence[Stop]) -> list[dict[str, Any]]:
-    """Rules as JSON can hold them: those of this module by value, custom ones by name."""
+    """JSON-serialisable rules: those of this module by value, custom ones by name."""
     record = []
     for rule in rules:
         custom, values = True, {}
@@ -128,7 +128,7 @@ def rules_to_record(rules: Sequence[Stop]) -> list[dict[str, Any]]:
 
 
 def rules_of(record: Sequence[Mapping[str, Any]]) -> list[Stop]:
-    """Rules of a record, a `TimeLimit` from now; TrustboError if one is custom."""
+    """Restore rules; a `TimeLimit` starts anew. TrustboError: a custom rule is missing."""
     rules: list[Stop] = []
     for rule in record:
         values = dict(rule)

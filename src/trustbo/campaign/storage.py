@@ -1,4 +1,4 @@
-"""Files of campaigns and results: one owner at a time, and every damage noticed."""
+"""Files of campaigns and results, written atomically with checksums, and read back."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -73,15 +73,15 @@ class Storage:
     """
 
     def __init__(self, directory: FilePath, *, begun: bool | None = None) -> None:
-        """Take hold of the folder, until `release` or the end of the process.
+        """Lock the folder, until `release` or the end of the process.
 
         Args:
             directory: Path of the folder.
-            begun: Whether it has to hold a campaign already, or must not; None for either.
+            begun: Whether it must hold a campaign already, or must not; None for either.
 
         Raises:
-            TrustboError: The folder holds no campaign and has to, or one and must not; another
-                process holds it; it may not be written to; or its name belongs to a file.
+            TrustboError: The folder holds no campaign and must, or one and must not; it is locked
+                by another process or not writable; or its name belongs to a file.
         """
         self.path = as_path(directory)
         if begun and not self._is_used:
@@ -107,11 +107,11 @@ class Storage:
         return (current(self.path) / STATE).exists()
 
     def release(self) -> None:
-        """Let go of the folder."""
+        """Release the lock of the folder."""
         self._lock.release()
 
     def replace(self, workspace: Workspace, state: CampaignState, result: Result | None) -> None:
-        """Write a campaign, which takes the place of what the folder holds when it is whole.
+        """Write a whole campaign, which then replaces the content of the folder at once.
 
         TrustboError: a file of another program would be replaced, see `require_ours`.
         """
@@ -131,7 +131,7 @@ class Storage:
             _mark_stored(result, self.path)
 
     def write_measured(self, missions: Sequence[Mission], extras: _Extras) -> None:
-        """Write missions as measured, before the last is in the state, and their extra numbers."""
+        """Write missions as measured, the new one included, and their extra numbers."""
         finish_replacing(self.path)
         since, self._n_ticks = min(self._n_ticks, len(missions) - 1), len(missions)
         notes = {"extra": json.dumps(list(extras))}
@@ -140,10 +140,10 @@ class Storage:
     def write(
         self, state: CampaignState, result: Result | None, *, whole: bool = False, ended=False
     ) -> None:
-        """Write the result, all of it or what the last mission added to it, then the state.
+        """Write the result and then the state.
 
-        Without a `result`, that in the folder stays. With `ended`, `posterior.nc` with all groups
-        is written too.
+        By default only what the last mission added to the result is written. Without a `result`,
+        that in the folder stays. With `ended`, `posterior.nc` with all groups is written too.
         """
         finish_replacing(self.path)
         if result is not None:

@@ -14,6 +14,7 @@ from trustbo.planning.posterior import choose_draws
 from trustbo.planning.values import team_trust
 from trustbo.plots.explorer import Layer, Scene, Step
 from trustbo.plots.places import BETTER_WORSE
+from trustbo.report.numbers import MINUS, counted
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import bounds_along
 
@@ -28,7 +29,7 @@ def scene_of(result: Result, maps: xr.Dataset) -> Scene:
     bound_maps = _bound_maps(result)
     steps = [_mission_step(result, j, bound_maps) for j in range(len(result.missions))]
     steps.append(_last_step(result, bound_maps))
-    title = f"{_counted(result)}: trust, place by place"
+    title = f"{counted(len(result.missions), 'mission')}: trust, place by place"
     return Scene(title, result.workspace, _layers(result, maps, bound_maps), steps)
 
 
@@ -135,7 +136,7 @@ def _last_step(result: Result, bound_maps: _Moments) -> Step:
     z = planner.mean_awareness[:, moves if planner.mean_awareness.shape[1] > 1 else 0, rows, cols]
     return Step(
         "recommended",
-        f"Recommended after {_counted(result)}: {len(path) - 1} bounds, "
+        f"Recommended after {counted(len(result.missions), 'mission')}: {len(path) - 1} bounds, "
         f"{_objective(result, result.value)}.",
         "Expected trust along the recommended path",
         path,
@@ -209,7 +210,7 @@ def _with_sd(mean: float, sd: float) -> str:
     if not np.isfinite(mean):
         return ""
     decimals = max(1 - int(np.floor(np.log10(sd))), 0) if sd > 0.0 else 3
-    return f"{mean:.{decimals}f} {_SIGN} {sd:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+    return f"{mean:.{decimals}f} {_SIGN} {sd:.{decimals}f}".replace("-", MINUS)
 
 
 def _bound_maps(result: Result) -> _Moments:
@@ -230,13 +231,8 @@ def _bound_maps(result: Result) -> _Moments:
     return moments
 
 
-def _counted(result: Result) -> str:
-    n = len(result.missions)
-    return f"{n} mission{'s' if n > 1 else ''}"
-
-
 def _objective(result: Result, value: float) -> str:
-    text = f"{value:.3g}".replace("-", "\N{MINUS SIGN}")
+    text = f"{value:.3g}".replace("-", MINUS)
     return f"objective {text} ({result.settings['objective'].replace('_', ' ')})"
 
 
