@@ -17,10 +17,11 @@ def __getattr__(name: str) -> object:
 
         return version("trustbo")
     if name in _RENAMED:
+        import importlib
         import operator
         import warnings
 
         message = f"trustbo.{name} is {_RENAMED[name]} since version 0.3; the old name will go."
         warnings.warn(message, FutureWarning, stacklevel=2)
-        return operator.attrgetter(_RENAMED[name])(_getattr("campaign"))
+        return operator.attrgetter(_RENAMED[name])(importlib.import_module("trustbo.campaign"))
     return _getattr(name)

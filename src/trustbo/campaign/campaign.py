@@ -188,7 +188,9 @@ class Campaign(Displayed):
         stop: Stop | Sequence[Stop] | None = None,
         progress: bool | str = False,
     ) -> Iterator[tuple[Plan, Mission]]:
-        """Run missions in a simulator, one for each step of this generator.
+        """Run missions in a simulator, one for each step of this iterator.
+
+        Nothing is run until it is iterated over: `for plan, mission in campaign.run(simulator, 8)`.
 
         Args:
             simulator: Simulator, as in `iterate`.
