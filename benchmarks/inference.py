@@ -472,7 +472,7 @@ FRESH = """
 import time
 import arviz, jax, numpy as np, numpyro, trustbo, trustbo.models
 from trustbo import Mission
-from trustbo.models import fit
+from trustbo.inference import fit
 rng = np.random.default_rng(0)
 path = [(0, k) for k in range(11)]
 missions = []

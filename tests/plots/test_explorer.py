@@ -11,10 +11,9 @@ import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 from scipy.spatial import cKDTree
-from trustbo.campaign.exploring import scene_of
 
 import trustbo as tb
-from trustbo.plots import DARK, LIGHT
+from trustbo.plots import DARK
 from trustbo.plots.explorer import Layer, Scene, Step, draw_explorer, scene
 from trustbo.plots.style import LIGHT
 from trustbo.report.exploring import scene_of

@@ -30,14 +30,16 @@ from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import FilePath, as_path, interpreting
-from trustbo.hazard import CAUSES, BoundRisk
+from trustbo.hazard.exposures import CAUSES
+from trustbo.hazard.risk import BoundRisk
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
-from trustbo.simulation import Simulator, Truth
+from trustbo.simulation import Truth
+from trustbo.simulation.protocol import Simulator
 from trustbo.stacking import fill_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
@@ -116,7 +118,7 @@ class Campaign(Displayed):
                 the model; or a model that cannot be updated so.
             NoPathError: The goal cannot be reached.
         """
-        self.options = CampaignOptions.of(options, Campaign.__init__)
+        self.options = CampaignOptions.from_keywords(options, Campaign.__init__)
         self.policy = resolve_policy(policy)
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace = workspace
@@ -130,13 +132,11 @@ class Campaign(Displayed):
         self._planner_now: Planner | None = None
         self._whole: tuple[Posterior, xr.DataTree] | None = None
         self._asked = (0.0, 0.0)  # seconds that planning took, and the time when it was done
-        custom_policy = not isinstance(policy, str)
+        name = getattr(policy, "__name__", type(policy).__name__)
         record = {
             "start": list(self.planner.start),
             "goal": list(self.planner.goal),
-            "policy": getattr(policy, "__name__", type(policy).__name__)
-            if custom_policy
-            else policy,
+            "policy": policy if isinstance(policy, str) else name,
             "objective": objective,
             "sampler": sampler,
             "seed": self.state.seed,
@@ -149,26 +149,20 @@ class Campaign(Displayed):
         }
         self.state.options = record | {
             "model": model_to_record(model),
-            "own_policy": custom_policy,
+            "own_policy": not isinstance(policy, str),
             "own_awareness": self.options.own_awareness,
         }
         if directory is not None:
             self._save_to(Storage(directory, begun=False), keep=True)
 
     def _card(self) -> Card:
-        n, waiting = len(self.missions), len(self.state.numbers(TOLD))
-        settings = self.settings
-        others = {
-            "set aside": len(self.state.numbers(SET_ASIDE)),
-            "given up": len(self.state.failures),
-        }
-        also = "".join(f", {number} {what}" for what, number in others.items() if number)
+        n, settings, state = len(self.missions), self.settings, self.state
+        numbers = f"{n} told, {len(state.numbers(TOLD))} not learned from yet"
+        others = {SET_ASIDE: len(state.numbers(SET_ASIDE)), "given up": len(state.failures)}
+        numbers += "".join(f", {number} {name}" for name, number in others.items() if number)
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
-            (
-                "missions",
-                f"{n} told, {waiting} not learned from yet{also}",
-            ),
+            ("missions", numbers),
             ("model", self.model.in_short()),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
@@ -220,13 +214,13 @@ class Campaign(Displayed):
         with jax.threefry_partitionable(True):  # else the caller's flag decides what is drawn
             key = random.key(self.seed_of("policy"), impl="threefry2x32")
             plan = self.policy(key, self.belief, planner)
-        name = self.settings["policy"]
+        name = f"the policy {self.settings['policy']!r}"
         if not isinstance(plan, Plan):
-            raise TrustboError(f"the policy {name!r} must return a Plan; got {plan!r}.")
+            raise TrustboError(f"{name} must return a Plan; got {plan!r}.")
         try:
             planner.require_path(plan.path)
         except TrustboError as error:
-            raise TrustboError(f"the policy {name!r}: {error}") from None
+            raise TrustboError(f"{name}: {error}") from None
         return self._accept(plan, started)
 
     def suggest(self, path: Sequence[Cell]) -> Plan:

@@ -10,7 +10,7 @@ import numpy as np
 
 from trustbo.data import Cell, Mission, path_text
 from trustbo.errors import TrustboError, require_pair
-from trustbo.hazard import CAUSES
+from trustbo.hazard.exposures import CAUSES
 from trustbo.workspace import Workspace
 
 RESERVED = (

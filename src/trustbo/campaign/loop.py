@@ -11,9 +11,10 @@ from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import Stop, require_stops, rules_of
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, as_path, to_json
-from trustbo.models import TrustModel
+from trustbo.models.model import TrustModel
 from trustbo.planning import Policy
-from trustbo.simulation import Simulator, Truth
+from trustbo.simulation import Truth
+from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
@@ -77,16 +78,9 @@ def iterate(
             f'progress="{progress}" writes report.html into the checkpoint; give one.'
         )
     campaign = Campaign(
-        workspace,
-        start,
-        goal,
-        model=model,
-        policy=policy,
-        objective=objective,
-        sampler=sampler,
-        seed=seed,
-        options=CampaignOptions.of(options, iterate),
-    )
+        workspace, start, goal, model=model, policy=policy, objective=objective, sampler=sampler,
+        seed=seed, options=CampaignOptions.from_keywords(options, iterate),
+    )  # fmt: skip
     steps = campaign.run(simulator, n_iterations, truth=truth, stop=stop, progress=progress)
     with campaign:
         if checkpoint is not None:

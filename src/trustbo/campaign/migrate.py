@@ -30,10 +30,13 @@ def migrate_state(record: dict[str, Any]) -> dict[str, Any]:
         options.setdefault("replan", notes["replan"])
     # Version 0.2 had a weight of the tilt, where there is a margin of the limit now.
     hazard = {n: v for n, v in options.get("hazard", {}).items() if n != "log_tilt"}
+    if "stop" in notes:
+        rules = [r | {"rule": _RULES.get(r["rule"], r["rule"])} for r in notes["stop"]]
+        notes = notes | {"stop": rules}
     return {
         **record,
         "options": options | {"hazard": hazard},
-        "notes": _notes(notes),
+        "notes": notes,
         "rows": [row if "state" in row else row | _LEARNED for row in record["rows"]],
         "posterior_after": posterior_after(record),
         "failures": _failures(record),
@@ -75,13 +78,6 @@ def migrate_notes(notes: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str,
         if isinstance(value, list) and before.get(name) == len(value):
             before[name] = value
     return before
-
-
-def _notes(notes: dict[str, Any]) -> dict[str, Any]:
-    """Notes whose rules to stop have their names of now."""
-    rules = notes.get("stop", [])
-    renamed = [rule | {"rule": _RULES.get(rule["rule"], rule["rule"])} for rule in rules]
-    return notes | {"stop": renamed} if rules else notes
 
 
 def is_whole(posterior: "xr.DataTree") -> bool:

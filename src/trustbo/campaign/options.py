@@ -25,8 +25,8 @@ _CUSTOM = ("awareness", "callbacks")
 """Options that may be objects which a folder cannot hold."""
 
 
-def _option(part: str, *choices: str) -> dict[str, Any]:
-    return {"part": part, "choices": choices}
+def _option(group: str, *choices: str) -> dict[str, Any]:
+    return {"part": group, "choices": choices}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,9 @@ class CampaignOptions:
                 raise TrustboError(f"callbacks must be callables; got {callback!r}.")
 
     @classmethod
-    def of(cls, given: Mapping[str, Any], call: Callable[..., Any] | None = None) -> Self:
+    def from_keywords(
+        cls, given: Mapping[str, Any], call: Callable[..., Any] | None = None
+    ) -> Self:
         """Make options from keywords, or return the object that is passed as `options`.
 
         TrustboError: an unknown option, with similar names, those of keywords of `call` included;
@@ -162,6 +164,9 @@ class CampaignOptions:
         return record | ({"awareness": "belief"} if self.own_awareness else {})
 
 
+PLANNING_OPTIONS = [o.name for o in fields(CampaignOptions) if o.metadata["part"] == PLANNING]
+
+
 def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
     """Priors of a hazard, given as such or by name; TrustboError: neither, or an unknown name."""
     from trustbo.hazard import Hazard
@@ -175,11 +180,6 @@ def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
         if name not in names:
             raise unknown("prior of the hazard", name, names)
     return Hazard(**given)
-
-
-def options_of(group: str) -> list[str]:
-    """Names of the options of planning, learning or running."""
-    return [o.name for o in fields(CampaignOptions) if o.metadata["part"] == group]
 
 
 def arguments_of(
@@ -201,7 +201,7 @@ def arguments_of(
     custom["awareness"] = _restored(
         "awareness", record["awareness"], custom.get("awareness"), custom_awareness
     )
-    return given | {"options": CampaignOptions.of({**record, **custom})}, model
+    return given | {"options": CampaignOptions.from_keywords({**record, **custom})}, model
 
 
 def _restored(name: str, stored: Any, given: Any, custom: bool) -> Any:

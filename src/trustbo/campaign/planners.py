@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
+from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
 from trustbo.hazard.risk import BoundRisk
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
@@ -25,7 +25,7 @@ def planner_of(
     response: str,
 ) -> Planner:
     """Planner from the options of a campaign, for the observation and response of its model."""
-    chosen: dict[str, Any] = {name: getattr(options, name) for name in options_of(PLANNING)}
+    chosen: dict[str, Any] = {name: getattr(options, name) for name in PLANNING_OPTIONS}
     chosen |= {"observation": observation, "response": response}
     return Planner(workspace, start, goal, objective, **chosen, infeasible="safest")
 

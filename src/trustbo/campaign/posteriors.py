@@ -60,7 +60,7 @@ class Posteriors(Sequence[xr.DataTree]):
         self.stored = list(stored)
 
     @classmethod
-    def of(cls, posteriors: Sequence[xr.DataTree | None]) -> "Posteriors":
+    def from_trees(cls, posteriors: Sequence[xr.DataTree | None]) -> "Posteriors":
         """Posteriors of a result, whose trees may be in a plain list."""
         if isinstance(posteriors, Posteriors):
             return posteriors

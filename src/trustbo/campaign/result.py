@@ -12,7 +12,7 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.history import table_of
-from trustbo.campaign.options import PLANNING, CampaignOptions, options_of
+from trustbo.campaign.options import PLANNING_OPTIONS, CampaignOptions
 from trustbo.campaign.planners import planner_of, under_risk
 from trustbo.campaign.posteriors import Posteriors, whole_posterior
 from trustbo.campaign.state import Failure
@@ -87,7 +87,10 @@ class Result(Displayed):
     @property
     def has_posterior(self) -> bool:
         """Whether anything could be learned yet."""
-        return len(self.posteriors) > 0 and Posteriors.of(self.posteriors).stored[-1] is not None
+        return (
+            len(self.posteriors) > 0
+            and Posteriors.from_trees(self.posteriors).stored[-1] is not None
+        )
 
     @cached_property
     def posterior(self) -> xr.DataTree:
@@ -121,24 +124,20 @@ class Result(Displayed):
     @cached_property
     def planner(self) -> Planner:
         """Planner as the campaign's, with the awareness believed in at the end."""
-        names = options_of(PLANNING)
-        missing = [n for n in ("start", "goal", "objective", *names) if n not in self.settings]
+        needed = ("start", "goal", "objective", *PLANNING_OPTIONS)
+        missing = [name for name in needed if name not in self.settings]
         if missing:
             raise TrustboError(
                 f"the result's settings lack {', '.join(missing)}: it was made by another version "
                 "or by hand; plan with a Planner of your own."
             )
-        options = CampaignOptions(**{name: self.settings[name] for name in names})
+        options = CampaignOptions(**{name: self.settings[name] for name in PLANNING_OPTIONS})
         start, goal = (require_pair(name, self.settings[name]) for name in ("start", "goal"))
+        observation = self.posterior.attrs.get("observation", "gaussian")
         planner = planner_of(
-            options,
-            self.workspace,
-            start,
-            goal,
-            self.settings["objective"],
-            self.posterior.attrs.get("observation", "gaussian"),
+            options, self.workspace, start, goal, self.settings["objective"], observation,
             self.settings.get("response", "level"),
-        )
+        )  # fmt: skip
         if "hazard" in self.posterior.children:
             hazard = self.posterior["hazard"].to_dataset()
             # The workspace has no measures where the terrain was taken away.

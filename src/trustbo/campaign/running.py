@@ -15,8 +15,8 @@ from trustbo.files import to_json
 from trustbo.inference import TrustFilter, params_of
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
-from trustbo.simulation import KinematicSimulator, ReplaySimulator, Simulator, Truth
-from trustbo.simulation.protocol import require_bounds, require_call, takes
+from trustbo.simulation import KinematicSimulator, ReplaySimulator, Truth
+from trustbo.simulation.protocol import Simulator, require_bounds, require_call, takes
 from trustbo.stacking import fill_awareness
 
 if TYPE_CHECKING:

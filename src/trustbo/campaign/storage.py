@@ -94,7 +94,7 @@ class Storage:
         remedy = " tb.load_result reads one that may not." if begun else ""
         self._lock = hold(directory, remedy)
         self._target = self.path  # or the folder that its successor is being written to
-        self._n_ticks = 0  # missions whose ticks are in files of their own
+        self._n_ticks = 0  # missions whose ticks are in separate files
         if begun is False and self._is_used:
             self.release()
             raise TrustboError(
@@ -269,7 +269,7 @@ def _write_result(result: Result, folder: Path, *, whole: bool, home: Path) -> N
     posteriors never change. The files will be in `home`; where that is not the folder, they replace
     what is there, and `_mark_stored` is to be called once they did.
     """
-    stored = Posteriors.of(result.posteriors).stored
+    stored = Posteriors.from_trees(result.posteriors).stored
     files = list({posterior.after: posterior for posterior in stored if posterior}.values())
     for posterior in files if whole else files[-2:]:  # the last but one may have shrunk
         name = _posterior_file(posterior.after)
@@ -290,7 +290,7 @@ def _write_result(result: Result, folder: Path, *, whole: bool, home: Path) -> N
 
 def _mark_stored(result: Result, home: Path) -> None:
     """Record that the posteriors are in a folder, all of them, from where they are read."""
-    for posterior in Posteriors.of(result.posteriors).stored:
+    for posterior in Posteriors.from_trees(result.posteriors).stored:
         if posterior:
             posterior.file = home / _posterior_file(posterior.after)
 
@@ -308,7 +308,7 @@ def _record_of(result: Result) -> dict[str, Any]:
         "value": result.value,
         "settings": result.settings,
         "stop_reason": result.stop_reason,
-        "posterior_after": Posteriors.of(result.posteriors).after,
+        "posterior_after": Posteriors.from_trees(result.posteriors).after,
         **({"failures": result.failures} if result.failures else {}),
     }
 
