@@ -230,18 +230,10 @@ def _require_sampling(options: CampaignOptions, model: "TrustModel", sampler: st
     NutsSettings.of(options.sampling).require_sampler(resolve_sampler(model, sampler)[0])
 
 
-def _models() -> dict[str, Any]:
-    from trustbo.study.methods import MODELS
-
-    return MODELS
-
-
 def _model(name: str, observation: str) -> "TrustModel":
-    from trustbo.study.calls import Call
-    from trustbo.study.methods import model_of
+    from trustbo.study.methods import MODELS, model_of
 
-    call = _models()[name]
-    return model_of(Call(call.kind, (*call.keywords, ("observation", observation))))
+    return model_of(MODELS[name] | {"observation": observation})
 
 
 def _require_same(file: Path, example: Path) -> None:

@@ -116,19 +116,16 @@ def run_worlds(
     for course in courses:
         require_choice("course", course, COURSES)
     cases = cases_of(models, policies, baselines, methods or {}, objective, max_bounds, sampler)
-    judged = objective, max_bounds
-    scenes = {
-        f"{world.name} {course}": Course(
-            world=world, course=course, judged=judged, simulate=simulator
-        )
+    scenes = [
+        Course(world=world, course=course, judged=(objective, max_bounds), simulate=simulator)
         for world in chosen
         for course in courses
-    }
+    ]
     n_seeds = require_whole("seeds", seeds, 1)
-    for world in chosen:
-        scenes[f"{world.name} {courses[0]}"].truth(progress=progress)
+    for scene in scenes[:: len(courses)]:  # one for each world
+        scene.truth(progress=progress)
     settings = {"worlds": [world.name for world in chosen]}
-    experiment = Experiment(cases, scenes, range(n_seeds), n_iterations, settings)
+    experiment = Experiment(list(cases.values()), scenes, range(n_seeds), n_iterations, settings)
     return experiment.run(directory, executor, n_workers=n_workers, progress=progress)
 
 

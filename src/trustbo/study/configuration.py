@@ -14,16 +14,16 @@ import xarray as xr
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
 from trustbo.campaign.planners import path_class
-from trustbo.errors import TrustboError, require_choice, require_pair, require_whole
+from trustbo.errors import TrustboError, require_choice, require_pair, require_whole, unknown
 from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
 from trustbo.models.model import TrustModel
 from trustbo.planning import OBJECTIVES, POLICIES, Planner
-from trustbo.simulation import ModelSimulator, Truth
+from trustbo.simulation import Simulator, Truth
 from trustbo.simulation.protocol import Simulator
-from trustbo.study.calls import FILES, Call, call_of, require_known, takes
+from trustbo.study.calls import FILES, call_of, identity, made, seeded, takes
 from trustbo.study.experiment import Experiment
-from trustbo.study.methods import Case, model_call, model_of
+from trustbo.study.methods import Case, Model, model_from, model_of
 from trustbo.team import Team
 from trustbo.workspace import Workspace, survey
 from trustbo.workspace.location import CELL, Location, named
@@ -39,78 +39,58 @@ MODEL_KINDS = ("PooledTrust", "HierarchicalTrust", "CoupledTrust")
 _GRID = tuple(inspect.signature(Workspace.from_terrain).parameters)[1:]
 """Keywords of the planning grid, which a terrain has in addition to those of its constructor."""
 _ENDS = ("start", "goal")
-type _Ends = tuple[Location | None, Location | None]
-_NOTHING = Call("", ())
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Place:
     """Terrain and simulator of a study, as a scene of an experiment.
 
     Attributes:
         labels: Names of the terrain and the simulator.
-        terrain: Call that makes a terrain or a workspace.
-        grid: Keywords of `Workspace.from_terrain`.
-        start: Start; by default bottom left.
-        goal: Goal; by default top right.
-        simulating: Call that makes the simulator.
-        known_truth: Whether the truth is found, for regret; that of a model costs nothing.
+        terrain: Settings of a terrain or a workspace, with those of the planning grid, `start` (by
+            default bottom left) and `goal` (top right).
+        simulating: Settings of the simulator, and `known_truth`: whether its truth is computed, for
+            regret; that of `ModelSimulator` costs nothing.
     """
 
-    labels: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    terrain: Call
-    grid: Call = _NOTHING
-    start: Location | None = None
-    goal: Location | None = None
-    simulating: Call = _NOTHING
-    known_truth: bool = False
-
-    def __post_init__(self) -> None:
-        for part in (self.terrain, self.grid):
-            if (shape := part.get("shape")) is not None:
-                require_pair("shape", shape)
-        for name in _ENDS:
-            if (given := getattr(self, name)) is not None:
-                end = named(name, given)
-                # As JSON and hashes can hold it.
-                object.__setattr__(self, name, end.values if end.names == CELL else end.text)
+    labels: Mapping[str, Any]
+    terrain: Mapping[str, Any]
+    simulating: Mapping[str, Any]
 
     @property
     def ends(self) -> tuple[Location, Location]:
         """Start and goal."""
-        return _ends((self.start, self.goal), self.workspace().passable.shape)
+        return _ends(self.terrain, self.workspace().passable.shape)
 
-    def at(self, seed: int) -> "Place":
+    def seeded(self, seed: int) -> "Place":
         """Place of the run with this seed."""
-        calls = {name: getattr(self, name).at(seed) for name in ("terrain", "grid", "simulating")}
-        return replace(self, **calls)
+        return replace(
+            self, terrain=seeded(self.terrain, seed), simulating=seeded(self.simulating, seed)
+        )
 
     def identity(self) -> dict[str, Any]:
         """Settings that the numbers depend on."""
+        terrain, grid = _of_grid(self.terrain)
+        simulator, asked = _of_truth(self.simulating)
         return {
-            "terrain": self.terrain.identity(),
-            "grid": self.grid.identity(),
-            "ends": (self.start, self.goal),
-            "simulator": self.simulating.identity(),
-            "known_truth": self.known_truth,
+            "terrain": identity(terrain),
+            "grid": identity(grid),
+            "ends": [self.terrain.get(name) for name in _ENDS],
+            "simulator": identity(simulator),
+            "known_truth": asked,
         }
-
-    def settings(self) -> dict[str, Any]:
-        """Settings of the terrain, as JSON can hold them."""
-        ends = {n: getattr(self, n) for n in _ENDS if getattr(self, n) is not None}
-        return self.terrain.settings() | self.grid.settings() | ends
 
     def workspace(self, *, bounds: bool = True) -> Workspace:
         """Workspace, which is made once per process, for a few terrains."""
-        return _workspace(self.terrain, self.grid, (self.start, self.goal))
+        return _workspace(json.dumps(self.terrain))
 
     def simulator(self, workspace: Workspace) -> Simulator:
         """Make the simulator."""
-        return self.simulating.make(workspace=workspace)
+        return made(_of_truth(self.simulating)[0], workspace=workspace)
 
     def truth(self) -> Truth | None:
         """Truth of the simulator; None where it is not asked for."""
-        asked = self.known_truth or self.simulating.kind == ModelSimulator.__name__
+        asked = _of_truth(self.simulating)[1] or self.simulating["kind"] == "ModelSimulator"
         return Truth.of(self.simulator(self.workspace())) if asked else None
 
     def judged_by(self, planner: Planner) -> dict[str, Any]:
@@ -118,31 +98,43 @@ class Place:
         return path_class(planner)
 
 
-def _ends(given: _Ends, shape: tuple[int, ...]) -> tuple[Location, Location]:
-    """Start and goal that were given, or the corners at the bottom left and the top right."""
-    start, goal = given
-    return (shape[0] - 1, 0) if start is None else start, (
-        0,
-        shape[1] - 1,
-    ) if goal is None else goal
+def _of_grid(terrain: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Settings of the terrain alone, and of its planning grid."""
+    kind = terrain["kind"]
+    alone = {n: v for n, v in terrain.items() if n == "kind" or takes(kind, n)}
+    return alone, {n: v for n, v in terrain.items() if n not in (*alone, *_ENDS)}
+
+
+def _of_truth(simulating: Mapping[str, Any]) -> tuple[dict[str, Any], bool]:
+    """Settings of the simulator alone, and whether its truth is asked for."""
+    alone = dict(simulating)
+    return alone, alone.pop("known_truth", False)
+
+
+def _ends(terrain: Mapping[str, Any], shape: tuple[int, ...]) -> tuple[Location, Location]:
+    """Start and goal, by default the corners at the bottom left and the top right."""
+    start, goal = (made(terrain.get(name)) for name in _ENDS)
+    return start or (shape[0] - 1, 0), goal or (0, shape[1] - 1)
 
 
 @lru_cache(maxsize=4)
-def _workspace(terrain: Call, grid: Call, ends: _Ends) -> Workspace:
-    made, keywords = terrain.make(), grid.make()
-    if isinstance(made, Workspace):
+def _workspace(settings: str) -> Workspace:
+    """Workspace of the settings of a terrain, in JSON."""
+    terrain = json.loads(settings)
+    alone, grid = _of_grid(terrain)
+    ground, keywords = made(alone), made(grid)
+    if isinstance(ground, Workspace):
         if keywords:
             raise TrustboError(
-                f"{terrain.kind} makes a workspace, which takes no {', '.join(keywords)}."
+                f"{terrain['kind']} makes a workspace, which takes no {', '.join(keywords)}."
             )
-        return made
-    if not isinstance(made, xr.Dataset):
-        raise TrustboError(f"{terrain.kind} must make a terrain or a Workspace; got {made!r}.")
-    team = keywords.get("team") or Team()
-    cells = survey(made, keywords.get("shape", (10, 10)), team)
-    for name, end in zip(_ENDS, _ends(ends, cells.grid.shape), strict=True):
+        return ground
+    if not isinstance(ground, xr.Dataset):
+        raise TrustboError(f"{terrain['kind']} must make a terrain or a Workspace; got {ground!r}.")
+    cells = survey(ground, keywords.get("shape", (10, 10)), keywords.get("team") or Team())
+    for name, end in zip(_ENDS, _ends(terrain, cells.grid.shape), strict=True):
         cells.require_cell(name, end)  # before awareness is computed
-    return Workspace.from_terrain(made, **keywords)
+    return Workspace.from_terrain(ground, **keywords)
 
 
 @dataclass(frozen=True)
@@ -181,8 +173,8 @@ class Study:
 
     def __post_init__(self) -> None:
         keep = object.__setattr__
-        for what, make in (("terrain", _place), ("simulator", _simulating), ("model", _model)):
-            keep(self, f"{what}s", _by_name(what, getattr(self, f"{what}s"), make))
+        for what, check in (("terrain", _terrain), ("simulator", _simulator), ("model", _model)):
+            keep(self, f"{what}s", _by_name(what, getattr(self, f"{what}s"), check))
         for what, plural, choices in (
             ("policy", "policies", POLICIES),
             ("objective", "objectives", OBJECTIVES),
@@ -216,20 +208,19 @@ class Study:
         if not isinstance(configuration, Mapping):
             raise TrustboError(f"a study is a Study or a mapping; got {configuration!r}.")
         for name in configuration:
-            require_known("setting of a study", name, [f.name for f in fields(cls)])
+            if name not in (names := [f.name for f in fields(cls)]):
+                raise unknown("setting of a study", str(name), names)
         if "terrains" not in configuration:
             raise TrustboError("a study needs terrains, e.g. terrains: [random_workspace].")
         return cls(**configuration)
 
     def experiment(self) -> Experiment:
         """Every case of a model and a policy on every terrain, with every simulator and seed."""
-        scenes = {
-            f"{terrain}, {simulator}": replace(
-                place, labels={"terrain": terrain, "simulator": simulator}, **simulating
-            )
-            for terrain, place in self.terrains.items()
+        scenes = [
+            Place({"terrain": terrain, "simulator": simulator}, ground, simulating)
+            for terrain, ground in self.terrains.items()
             for simulator, simulating in self.simulators.items()
-        }
+        ]
         axes: dict[str, Any] = {
             "model": self.models,
             "sampler": self.samplers,
@@ -237,27 +228,20 @@ class Study:
             **self.options,
             "policy": self.policies,
         }
-        cases = {}
+        cases = []
         for values in itertools.product(*axes.values()):
             labels = dict(zip(axes, values, strict=True))
-            cases[repr(values)] = Case(
+            cases.append(Case(
                 labels, self.models[labels["model"]], labels["policy"], labels["objective"],
                 labels["sampler"], {name: labels[name] for name in self.options},
-            )  # fmt: skip
+            ))  # fmt: skip
         return Experiment(cases, scenes, self.seeds, self.n_iterations, self.settings())
 
     def settings(self) -> dict[str, Any]:
-        """Settings as JSON can hold them; `Study.of` reads them."""
+        """JSON-serialisable settings, which `Study.of` reads."""
         settings = {f.name: getattr(self, f.name) for f in fields(self)}
-        settings["terrains"] = {name: place.settings() for name, place in self.terrains.items()}
-        settings["simulators"] = {
-            name: one["simulating"].settings() | {"known_truth": one["known_truth"]}
-            for name, one in self.simulators.items()
-        }
-        settings["models"] = {
-            name: model.settings() if isinstance(model, Call) else repr(model)
-            for name, model in self.models.items()
-        }
+        models = self.models.items()
+        settings["models"] = {n: repr(m) if isinstance(m, TrustModel) else m for n, m in models}
         return settings
 
 
@@ -312,6 +296,16 @@ def read_study(path: FilePath) -> Study:
         raise TrustboError(f"{file}: {error}") from None
 
 
+_OLD = {
+    "terrain": {"synthetic": "synthetic_terrain", "files": "read_terrain",
+                "random": "random_workspace"},
+    "simulator": {"kinematic": "KinematicSimulator", "model": "ModelSimulator"},
+    "model": {"pooled": "PooledTrust", "places": "PooledTrust", "hierarchical": "HierarchicalTrust",
+              "coupled": "CoupledTrust"},
+}  # fmt: skip
+"""Kinds of version 0.2, which models may still have, and the constructors that they mean."""
+
+
 def migrate(what: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of a terrain, simulator or model of version 0.2 as those of this one.
 
@@ -321,60 +315,43 @@ def migrate(what: str, settings: Mapping[str, Any]) -> dict[str, Any]:
     kind = new.pop("kind", None)
     if kind == "own" and what == "model":
         return {"kind": new.get("source")}
-    if kind not in _KINDS.get(what, {}):
+    if kind not in _OLD[what]:
         return dict(settings)
-    if what == "terrain" and kind != "random" and "n_robots" in new:
-        n_robots = new.pop("n_robots")
-        new |= {} if n_robots == 3 else {"team": {"kind": "Team", "n_robots": n_robots}}
-    if what == "model":
-        if new.get("priors") in ("default", "zheng2023"):
-            new |= (
-                {"priors": {"kind": "Priors.zheng2023"}} if new.pop("priors") != "default" else {}
-            )
-        if kind == "places":
-            names = [name for name in ("cells", "bounds") if name in new]
-            new["place"] = {"kind": "PlaceEffect", **{name: new.pop(name) for name in names}}
+    if kind in ("synthetic", "files") and (n_robots := new.pop("n_robots", 3)) != 3:
+        new["team"] = {"kind": "Team", "n_robots": n_robots}
+    if kind == "places":
+        names = [name for name in ("cells", "bounds") if name in new]
+        new["place"] = {"kind": "PlaceEffect", **{name: new.pop(name) for name in names}}
+    if what == "model" and (priors := new.get("priors")) in ("default", "zheng2023"):
+        del new["priors"]
+        new |= {"priors": {"kind": "Priors.zheng2023"}} if priors == "zheng2023" else {}
     if kind == "model":
         observation = new.pop("observation", "gaussian")
         n_ticks = {"n_ticks": new.pop("n_ticks")} if "n_ticks" in new else {}
         new = {"params": {"kind": "TrustParams", **new}, **n_ticks}
         if observation != "gaussian":
             new["model"] = {"kind": "PooledTrust", "observation": observation}
-    return {"kind": _KINDS[what][kind], **new}
+    return {"kind": _OLD[what][kind], **new}
 
 
-_KINDS = {
-    "terrain": {
-        "synthetic": "synthetic_terrain", "files": "read_terrain", "random": "random_workspace",
-    },
-    "simulator": {"kinematic": "KinematicSimulator", "model": "ModelSimulator"},
-    "model": {
-        "pooled": "PooledTrust", "places": "PooledTrust", "hierarchical": "HierarchicalTrust",
-        "coupled": "CoupledTrust",
-    },
-}  # fmt: skip
-"""Kinds of version 0.2 and the constructors that they meant."""
-
-
-def _by_name(what: str, given: object, make: Any) -> dict[str, Any]:
-    """Parts of a study by their names.
+def _by_name(what: str, given: object, check: Any) -> dict[str, Any]:
+    """Settings of terrains, simulators or models by their names.
 
     Given are names of kinds, or a mapping of names to settings, whose `kind` may be left out where
     the name is that of a kind. TrustboError: another type, or an unknown kind or setting.
     """
-    if isinstance(given, str):
-        given = (given,)
     if not isinstance(given, Mapping):
-        names = given if isinstance(given, list | tuple) else ()
-        given = {name: {} for name in names if isinstance(name, str)}
-        if not given or len(given) != len(names):
+        names = [given] if isinstance(given, str) else given
+        names = names if isinstance(names, list | tuple) else (names,)
+        given = {name: None for name in names if isinstance(name, str)}
+        if len(given) != len(names):
             raise TrustboError(
                 f"{what}s must be distinct names of kinds, or a mapping of names to settings; "
-                f"got {names or given!r}."
+                f"got {names!r}."
             )
     if not given:
         raise TrustboError(f"a study needs at least one {what}; got none.")
-    parts = {}
+    checked = {}
     for name, settings in given.items():
         noun = f"{what} {str(name)!r}"
         if isinstance(settings, Mapping | None):
@@ -382,70 +359,61 @@ def _by_name(what: str, given: object, make: Any) -> dict[str, Any]:
         elif not (what == "model" and isinstance(settings, TrustModel)):
             raise TrustboError(f"{noun} must be a mapping of settings; got {settings!r}.")
         try:
-            parts[str(name)] = make(noun, settings)
+            checked[str(name)] = check(noun, settings)
         except TrustboError as error:
-            message = str(error)
-            prefix = "" if repr(str(name)) in message else f"{noun}: "
-            raise TrustboError(prefix + message) from None
-    return parts
+            prefix = "" if repr(str(name)) in str(error) else f"{noun}: "
+            raise TrustboError(f"{prefix}{error}") from None
+    return checked
 
 
-def _place(noun: str, settings: dict[str, Any]) -> Place:
-    settings = dict(settings)
-    ends = {name: settings.pop(name) for name in _ENDS if name in settings}
-    whole = settings.get("kind") == "random_workspace"  # a workspace takes no keywords of a grid
-    more = () if whole else _GRID
-    call = call_of(noun, settings, TERRAINS, more=(*more, *_ENDS))
-    terrain, grid = (
-        tuple((n, value) for n, value in call.keywords if takes(call.kind, n) is of_terrain)
-        for of_terrain in (True, False)
+def _terrain(noun: str, settings: dict[str, Any]) -> dict[str, Any]:
+    whole = settings["kind"] == "random_workspace"  # a workspace takes no keywords of a grid
+    checked = call_of(noun, settings, TERRAINS, more=(*(() if whole else _GRID), *_ENDS))
+    if checked.get("shape") is not None:
+        require_pair("shape", checked["shape"])
+    for name in _ENDS:
+        if checked.get(name) is not None:
+            end = named(name, checked[name])
+            checked[name] = list(end.values) if end.names == CELL else end.text
+    return {name: value for name, value in checked.items() if name not in _ENDS or value}
+
+
+def _simulator(noun: str, settings: dict[str, Any]) -> dict[str, Any]:
+    more = ("known_truth",)
+    checked = {"known_truth": False} | call_of(
+        noun, settings, SIMULATORS, given=("workspace",), more=more
     )
-    return Place(terrain=Call(call.kind, terrain), grid=Call("", grid), **ends)
+    if not isinstance(checked["known_truth"], bool):
+        raise TrustboError(f"known_truth must be true or false; got {checked['known_truth']!r}.")
+    return checked
 
 
-def _simulating(noun: str, settings: dict[str, Any]) -> dict[str, Any]:
-    settings = dict(settings)
-    asked = settings.pop("known_truth", False)
-    if not isinstance(asked, bool):
-        raise TrustboError(f"known_truth must be true or false; got {asked!r}.")
-    given = ("workspace",)
-    call = call_of(noun, settings, SIMULATORS, given=given, more=("known_truth",))
-    return {"simulating": call, "known_truth": asked}
-
-
-def _model(noun: str, settings: dict[str, Any] | TrustModel) -> Call | TrustModel:
+def _model(noun: str, settings: dict[str, Any] | TrustModel) -> Model:
     if isinstance(settings, TrustModel):
         return settings
-    kind, more = settings["kind"], len(settings) > 1
-    if isinstance(kind, TrustModel):
-        return kind
-    if isinstance(kind, str) and ":" in kind and not more:
-        return model_call(noun, kind)
-    call = call_of(noun, settings, MODEL_KINDS)
-    model_of(call)
-    return call
+    kind = settings["kind"]
+    if len(settings) == 1 and (isinstance(kind, TrustModel) or ":" in str(kind)):
+        return model_from(kind)
+    checked = call_of(noun, settings, MODEL_KINDS)
+    model_of(checked)
+    return checked
 
 
 def _with_paths_from(folder: Path, configuration: Mapping[str, Any]) -> dict[str, Any]:
-    changed, terrains = dict(configuration), configuration.get("terrains")
-    if isinstance(terrains, Mapping):
-        changed["terrains"] = {
-            name: {
-                key: _from(folder, value) if key in FILES else value
-                for key, value in settings.items()
-            }
-            if isinstance(settings, Mapping)
-            else settings
-            for name, settings in terrains.items()
-        }
-    return changed
+    """Configuration with the files of its terrains relative to a folder."""
+    if not isinstance(terrains := configuration.get("terrains"), Mapping):
+        return dict(configuration)
 
+    def moved(files: Any) -> Any:
+        if isinstance(files, list):
+            return [moved(file) for file in files]
+        return str(folder / files) if isinstance(files, str) else files
 
-def _from(folder: Path, files: Any) -> Any:
-    """File or files, relative to a folder."""
-    if isinstance(files, list):
-        return [_from(folder, file) for file in files]
-    return str(folder / files) if isinstance(files, str) else files
+    return {**configuration, "terrains": {
+        name: {key: moved(value) if key in FILES else value for key, value in settings.items()}
+        if isinstance(settings, Mapping) else settings
+        for name, settings in terrains.items()
+    }}  # fmt: skip
 
 
 def _listed(what: str, values: object) -> Sequence[Any]:

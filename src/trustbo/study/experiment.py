@@ -45,7 +45,7 @@ class Scene(Protocol):
         """Name of the scene along each axis of the experiment."""
         ...
 
-    def at(self, seed: int) -> Self:
+    def seeded(self, seed: int) -> Self:
         """Scene of the run with this seed."""
         ...
 
@@ -127,15 +127,15 @@ class Experiment:
     """Every case on every scene with every seed.
 
     Attributes:
-        cases: Factories of campaigns by name.
-        scenes: Scenes by name.
+        cases: Factories of campaigns.
+        scenes: Workspaces and simulators.
         seeds: Seeds of the campaigns.
         n_iterations: Missions of a campaign.
         settings: Settings, as JSON can hold them, that are kept with the results.
     """
 
-    cases: Mapping[str, Case]
-    scenes: Mapping[str, Scene]
+    cases: Sequence[Case]
+    scenes: Sequence[Scene]
     seeds: Sequence[int]
     n_iterations: int
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -145,8 +145,8 @@ class Experiment:
         return [
             Run(case, scene, seed, self.n_iterations)
             for seed in self.seeds
-            for scene in (scene.at(seed) for scene in self.scenes.values())
-            for case in self.cases.values()
+            for scene in (scene.seeded(seed) for scene in self.scenes)
+            for case in self.cases
         ]
 
     def run(

@@ -20,18 +20,20 @@ from trustbo.planning import POLICIES, Plan, Planner
 from trustbo.planning.path_sampling import path_sampler
 from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.planning.policies import random, seed_of
-from trustbo.study.calls import Call, identity_of, imported
+from trustbo.study.calls import IMPORTED, identity_of, imported, made
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
-MODELS = {
-    "pooled": Call("PooledTrust", ()),
-    "places": Call("PooledTrust", (("place", Call("PlaceEffect", ())),)),
-    "hierarchical": Call("HierarchicalTrust", ()),
-    "coupled": Call("CoupledTrust", ()),
+MODELS: dict[str, dict[str, Any]] = {
+    "pooled": {"kind": "PooledTrust"},
+    "places": {"kind": "PooledTrust", "place": {"kind": "PlaceEffect"}},
+    "hierarchical": {"kind": "HierarchicalTrust"},
+    "coupled": {"kind": "CoupledTrust"},
 }
-"""Models by short names."""
-POOLED = MODELS["pooled"]
+"""Settings of models by short names."""
+
+type Model = Mapping[str, Any] | TrustModel
+"""Trust model, or the settings that make it."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Case:
 
     Attributes:
         labels: Name of the case along each axis of the experiment.
-        model: Trust model, or the call that makes it.
+        model: Trust model, or the settings that make it.
         policy: Name of a policy, a policy, or `"module:name"` of one.
         objective: Objective of the policy.
         sampler: Sampler of the posterior.
@@ -50,7 +52,7 @@ class Case:
     """
 
     labels: Mapping[str, Any]
-    model: Call | TrustModel
+    model: Model
     policy: Any
     objective: str
     sampler: str = SAMPLER
@@ -149,53 +151,54 @@ def cases_of(
     Raises:
         TrustboError: An unknown name, or two methods of one name.
     """
-    kinds, named = _models_of(models), _by_name("policies", _listed(policies))
+    kinds = {name: model_from(given) for name, given in _by_name("models", models).items()}
+    named = _by_name("policies", policies)
     for policy in named.values():
         if not callable(resolved("policy", policy, POLICIES)):
             raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
-    options = {"max_bounds": max_bounds}
     rows: dict[str, dict[str, Any]] = {
         name if len(kinds) == 1 else f"{label} {name}": {"model": model, "policy": policy}
         for label, model in kinds.items()
         for name, policy in named.items()
     }
-    paper = {"objective": "terminal", "bounds": False}
+    paper = {"objective": "terminal", "bounds": False, "policy": "greedy"}
     paper["options"] = {"initial": "prior_draw", "max_bounds": "shortest+2"}
     ours = {
         "random": {"random path": {"policy": random_path, "factory": True}},
         "shortest": {"shortest path": {"policy": shortest_path, "factory": True}},
-        "paper": {"paper": {"policy": "greedy", **paper}},
+        "paper": {"paper": paper},
     }
     for name in baselines:
         if ":" in name:
-            row = {_name(name): {"policy": name, "factory": True}}
+            rows[_name(name)] = {"policy": name, "factory": True}
         else:
-            row = ours[require_choice('baseline (or give "module:name")', name, BASELINES)]
-        rows |= row
+            rows |= ours[require_choice(f"baseline {IMPORTED}", name, BASELINES)]
     rows |= {name: {"policy": make, "factory": True} for name, make in methods.items()}
-    cases = {}
-    for name, row in rows.items():
-        settings = {"model": POOLED, "objective": objective, "options": options, **row}
-        labels = {"method": name, "policy": name}
-        able = _able(model_of(settings["model"]), sampler)
-        cases[name] = Case(labels, **settings, sampler=able)
-    return cases
+    usual = {"model": MODELS["pooled"], "objective": objective}
+    usual["options"] = {"max_bounds": max_bounds}
+    return {
+        name: Case({"method": name, "policy": name}, **usual | row,
+                   sampler=_able(row.get("model", usual["model"]), sampler))
+        for name, row in rows.items()
+    }  # fmt: skip
 
 
-def model_of(given: Call | TrustModel) -> TrustModel:
+def model_of(given: Model) -> TrustModel:
     """Make a trust model; TrustboError: it is none."""
-    made = given.make() if isinstance(given, Call) else given
-    require_model(made)
-    return made
+    model = made(given)
+    require_model(model)
+    return model
 
 
-def model_call(name: str, source: str) -> Call | TrustModel:
-    """Model of a `"module:name"`: that object, or the one that it makes when called."""
-    found = imported("model", source)
-    if callable(found) and not isinstance(found, TrustModel):
-        found = Call(source, ())
-    model_of(found)
-    return found
+def model_from(given: Any) -> Model:
+    """Model from a short name, a `"module:name"` of one or of its factory, or as it was given."""
+    if isinstance(given, str) and ":" not in given:
+        return MODELS[require_choice("model", given, MODELS)]
+    model: Any = imported("model", given) if isinstance(given, str) else given
+    if callable(model) and not isinstance(model, TrustModel):
+        model = {"kind": given} if isinstance(given, str) else model()
+    model_of(model)
+    return model
 
 
 def resolved(what: str, given: Any, named: Mapping[str, Any]) -> Any:
@@ -206,46 +209,30 @@ def resolved(what: str, given: Any, named: Mapping[str, Any]) -> Any:
     if not isinstance(given, str):
         return given
     if ":" not in given:
-        return named[require_choice(f'{what} (or give "module:name")', given, named)]
+        return named[require_choice(f"{what} {IMPORTED}", given, named)]
     return imported(what, given)
 
 
-def _able(model: TrustModel, sampler: str) -> str:
+def _able(model: Model, sampler: str) -> str:
     """Sampler, or the default one where the model does not take it."""
     try:
-        resolve_sampler(model, sampler)
+        resolve_sampler(model_of(model), sampler)
     except TrustboError:
         return SAMPLER
     return sampler
 
 
-def _models_of(models: Any) -> dict[str, Call | TrustModel]:
-    """Models by name."""
-    found: dict[str, Call | TrustModel] = {}
-    for name, given in _by_name("models", _listed(models)).items():
-        if not isinstance(given, str):
-            found[name] = given if isinstance(given, TrustModel) else model_of(given())
-        elif ":" in given:
-            found[name] = model_call(name, given)
-        else:
-            found[name] = MODELS[require_choice("model", given, MODELS)]
-    return found
-
-
-def _listed(given: Any) -> list[Any]:
-    return list(given) if isinstance(given, list | tuple) else [given]
-
-
-def _by_name(what: str, given: Sequence[Any]) -> dict[str, Any]:
-    """Objects by the names of their rows; TrustboError: two have the same."""
-    names = [_name(one) for one in given]
+def _by_name(what: str, given: Any) -> dict[str, Any]:
+    """Objects, or one, by the names of their rows; TrustboError: two have the same."""
+    listed = list(given) if isinstance(given, list | tuple) else [given]
+    names = [_name(one) for one in listed]
     for name in names:
         if names.count(name) > 1:
             raise TrustboError(
                 f"two {what} have the name {name!r}, and each row of the table needs another: "
                 'give functions of other names, or "module:name" of each.'
             )
-    return dict(zip(names, given, strict=True))
+    return dict(zip(names, listed, strict=True))
 
 
 def _name(given: Any) -> str:

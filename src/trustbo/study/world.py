@@ -169,7 +169,7 @@ class Course:
         """Start and goal."""
         return self.world.ends(self.course)
 
-    def at(self, seed: int) -> "Course":
+    def seeded(self, seed: int) -> "Course":
         """Scene of any run: a world has no seed."""
         return self
 
