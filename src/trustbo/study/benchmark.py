@@ -9,9 +9,9 @@ import xarray as xr
 from trustbo.campaign.options import OBJECTIVE, POLICY
 from trustbo.errors import require_choice, require_whole
 from trustbo.files import FilePath
-from trustbo.study.experiment import Experiment
+from trustbo.study.experiment import Experiment, Scene
 from trustbo.study.methods import BASELINES, cases_of
-from trustbo.study.world import COURSES, REAL, Course, Simulate, World
+from trustbo.study.world import COURSES, REAL, Simulate, World, scene_of
 from trustbo.workspace.sight import Sight
 
 _WALL, _BARE = Sight("wall"), Sight("bare")
@@ -116,27 +116,27 @@ def run_worlds(
     for course in courses:
         require_choice("course", course, COURSES)
     cases = cases_of(models, policies, baselines, methods or {}, objective, max_bounds, sampler)
-    scenes = [
-        Course(world=world, course=course, judged=(objective, max_bounds), simulate=simulator)
-        for world in chosen
-        for course in courses
-    ]
     n_seeds = require_whole("seeds", seeds, 1)
-    for scene in scenes[:: len(courses)]:  # one for each world
-        scene.truth(progress=progress)
+    scenes: list[Scene] = []
+    for world in chosen:
+        for course in courses:
+            scenes.append(scene_of(world, course, (objective, max_bounds), simulator))
+        scenes[-1].truth(progress=progress)
     settings = {"worlds": [world.name for world in chosen]}
-    experiment = Experiment(list(cases.values()), scenes, range(n_seeds), n_iterations, settings)
+    experiment = Experiment(
+        list(cases.values()), lambda seed: scenes, range(n_seeds), n_iterations, settings
+    )
     return experiment.run(directory, executor, n_workers=n_workers, progress=progress)
 
 
 def _chosen(
-    known: Mapping[str, World], data: FilePath | None, only: Sequence[str] | None
+    listed: Mapping[str, World], data: FilePath | None, only: Sequence[str] | None
 ) -> list[World]:
     """Worlds to run; TrustboError: an unknown name, or absent files."""
     if only is None:
-        chosen = [world for world in known.values() if world.is_packaged or data is not None]
+        chosen = [world for world in listed.values() if world.is_packaged or data is not None]
     else:
-        chosen = [known[require_choice("world", name, known)] for name in only]
+        chosen = [listed[require_choice("world", name, listed)] for name in only]
     for world in chosen:
         if not world.is_made:
             world.files()
@@ -145,6 +145,5 @@ def _chosen(
 
 def _quick(chosen: Iterable[World]) -> list[World]:
     """One synthetic world of each of three kinds."""
-    made = [world for world in chosen if world.is_made]
-    first = {kind: [w for w in made if w.kind == kind][:1] for kind in ("right", "aged", "canopy")}
-    return [world for found in first.values() for world in found]
+    made = {world.kind: world for world in reversed(list(chosen)) if world.is_made}
+    return [made[kind] for kind in ("right", "aged", "canopy") if kind in made]

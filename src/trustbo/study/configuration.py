@@ -4,8 +4,8 @@ import inspect
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from dataclasses import dataclass, field, fields
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Self
@@ -13,20 +13,19 @@ from typing import Any, Self
 import xarray as xr
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.campaign.planners import path_class
 from trustbo.errors import TrustboError, require_choice, require_pair, require_whole, unknown
 from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
 from trustbo.models.model import TrustModel
-from trustbo.planning import OBJECTIVES, POLICIES, Planner
-from trustbo.simulation import Simulator, Truth
+from trustbo.planning import OBJECTIVES, POLICIES
+from trustbo.simulation import ModelSimulator, Simulator
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import FILES, call_of, identity, made, seeded, takes
-from trustbo.study.experiment import Experiment
+from trustbo.study.experiment import Experiment, Scene, corners
 from trustbo.study.methods import Case, Model, model_from, model_of
 from trustbo.team import Team
 from trustbo.workspace import Workspace, survey
-from trustbo.workspace.location import CELL, Location, named
+from trustbo.workspace.location import CELL, named
 
 OPTIONS = (
     *(option.name for option in fields(CampaignOptions) if option.name != "callbacks"),
@@ -41,61 +40,23 @@ _GRID = tuple(inspect.signature(Workspace.from_terrain).parameters)[1:]
 _ENDS = ("start", "goal")
 
 
-@dataclass(frozen=True)
-class Place:
-    """Terrain and simulator of a study, as a scene of an experiment.
+def _scene(
+    labels: Mapping[str, Any], terrain: Mapping[str, Any], simulating: Mapping[str, Any], seed: int
+) -> Scene:
+    """Scene of the run with this seed, from settings of a terrain and a simulator."""
+    terrain, simulator = seeded(terrain, seed), seeded(simulating, seed)
+    known_truth = simulator.pop("known_truth")
+    alone, grid = _of_grid(terrain)
+    ends = tuple(terrain.get(name) for name in _ENDS)
+    settings = {"terrain": identity(alone), "grid": identity(grid), "ends": ends,
+                "simulator": identity(simulator), "known_truth": known_truth}  # fmt: skip
+    has_truth = known_truth or simulator["kind"] == ModelSimulator.__name__  # which costs nothing
+    workspace = partial(_workspace, json.dumps(terrain))
+    return Scene(labels, settings, workspace, made(ends), partial(_simulate, simulator), has_truth)
 
-    Attributes:
-        labels: Names of the terrain and the simulator.
-        terrain: Settings of a terrain or a workspace, with those of the planning grid, `start` (by
-            default bottom left) and `goal` (top right).
-        simulating: Settings of the simulator, and `known_truth`: whether its truth is computed, for
-            regret; that of `ModelSimulator` costs nothing.
-    """
 
-    labels: Mapping[str, Any]
-    terrain: Mapping[str, Any]
-    simulating: Mapping[str, Any]
-
-    @property
-    def ends(self) -> tuple[Location, Location]:
-        """Start and goal."""
-        return _ends(self.terrain, self.workspace().passable.shape)
-
-    def seeded(self, seed: int) -> "Place":
-        """Place of the run with this seed."""
-        return replace(
-            self, terrain=seeded(self.terrain, seed), simulating=seeded(self.simulating, seed)
-        )
-
-    def identity(self) -> dict[str, Any]:
-        """Settings that the numbers depend on."""
-        terrain, grid = _of_grid(self.terrain)
-        simulator, asked = _of_truth(self.simulating)
-        return {
-            "terrain": identity(terrain),
-            "grid": identity(grid),
-            "ends": [self.terrain.get(name) for name in _ENDS],
-            "simulator": identity(simulator),
-            "known_truth": asked,
-        }
-
-    def workspace(self, *, bounds: bool = True) -> Workspace:
-        """Workspace, which is made once per process, for a few terrains."""
-        return _workspace(json.dumps(self.terrain))
-
-    def simulator(self, workspace: Workspace) -> Simulator:
-        """Make the simulator."""
-        return made(_of_truth(self.simulating)[0], workspace=workspace)
-
-    def truth(self) -> Truth | None:
-        """Truth of the simulator; None where it is not asked for."""
-        asked = _of_truth(self.simulating)[1] or self.simulating["kind"] == "ModelSimulator"
-        return Truth.of(self.simulator(self.workspace())) if asked else None
-
-    def judged_by(self, planner: Planner) -> dict[str, Any]:
-        """Paths that regret is held against, see `path_class`."""
-        return path_class(planner)
+def _simulate(settings: Mapping[str, Any], workspace: Workspace) -> Simulator:
+    return made(settings, workspace=workspace)
 
 
 def _of_grid(terrain: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -105,21 +66,9 @@ def _of_grid(terrain: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]
     return alone, {n: v for n, v in terrain.items() if n not in (*alone, *_ENDS)}
 
 
-def _of_truth(simulating: Mapping[str, Any]) -> tuple[dict[str, Any], bool]:
-    """Settings of the simulator alone, and whether its truth is asked for."""
-    alone = dict(simulating)
-    return alone, alone.pop("known_truth", False)
-
-
-def _ends(terrain: Mapping[str, Any], shape: tuple[int, ...]) -> tuple[Location, Location]:
-    """Start and goal, by default the corners at the bottom left and the top right."""
-    start, goal = (made(terrain.get(name)) for name in _ENDS)
-    return start or (shape[0] - 1, 0), goal or (0, shape[1] - 1)
-
-
 @lru_cache(maxsize=4)
-def _workspace(settings: str) -> Workspace:
-    """Workspace of the settings of a terrain, in JSON."""
+def _workspace(settings: str, *, bounds: bool) -> Workspace:
+    """Workspace of a terrain's settings in JSON, made once per process, for a few terrains."""
     terrain = json.loads(settings)
     alone, grid = _of_grid(terrain)
     ground, keywords = made(alone), made(grid)
@@ -132,9 +81,10 @@ def _workspace(settings: str) -> Workspace:
     if not isinstance(ground, xr.Dataset):
         raise TrustboError(f"{terrain['kind']} must make a terrain or a Workspace; got {ground!r}.")
     cells = survey(ground, keywords.get("shape", (10, 10)), keywords.get("team") or Team())
-    for name, end in zip(_ENDS, _ends(terrain, cells.grid.shape), strict=True):
+    start, goal = (made(terrain.get(name)) for name in _ENDS)
+    for name, end in zip(_ENDS, corners((start, goal), cells.grid.shape), strict=True):
         cells.require_cell(name, end)  # before awareness is computed
-    return Workspace.from_terrain(ground, **keywords)
+    return Workspace.from_terrain(ground, **{"bounds": bounds} | keywords)
 
 
 @dataclass(frozen=True)
@@ -216,11 +166,6 @@ class Study:
 
     def experiment(self) -> Experiment:
         """Every case of a model and a policy on every terrain, with every simulator and seed."""
-        scenes = [
-            Place({"terrain": terrain, "simulator": simulator}, ground, simulating)
-            for terrain, ground in self.terrains.items()
-            for simulator, simulating in self.simulators.items()
-        ]
         axes: dict[str, Any] = {
             "model": self.models,
             "sampler": self.samplers,
@@ -235,7 +180,14 @@ class Study:
                 labels, self.models[labels["model"]], labels["policy"], labels["objective"],
                 labels["sampler"], {name: labels[name] for name in self.options},
             ))  # fmt: skip
-        return Experiment(cases, scenes, self.seeds, self.n_iterations, self.settings())
+        return Experiment(cases, self._scenes, self.seeds, self.n_iterations, self.settings())
+
+    def _scenes(self, seed: int) -> list[Scene]:
+        return [
+            _scene({"terrain": ground, "simulator": name}, terrain, simulator, seed)
+            for ground, terrain in self.terrains.items()
+            for name, simulator in self.simulators.items()
+        ]
 
     def settings(self) -> dict[str, Any]:
         """JSON-serialisable settings, which `Study.of` reads."""

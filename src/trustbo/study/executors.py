@@ -179,10 +179,10 @@ def prepare(caller: tuple[str, int]) -> None:
 def pin_to_core() -> int | None:
     """Pin this process to a core that no other worker on this machine has taken, and return it.
 
-    XLA's pool has as many threads as the process may use cores when it starts, whatever the usual
-    flags say; two workers of two threads each slow each other down. The core is taken by a lock on
-    a file that stays open, which the system releases when the process ends, however it ends. None
-    if all are taken, or where there is no affinity: nothing is pinned then.
+    XLA's pool has as many threads as the process may use cores when it starts, for any of the usual
+    flags; two workers of two threads each slow each other down. The core is taken by a lock on a
+    file that stays open, which the system releases when the process ends, also if it is killed.
+    None if all are taken, or where there is no affinity: nothing is pinned then.
     """
     if not hasattr(os, "sched_setaffinity"):
         return None
@@ -219,7 +219,7 @@ def keep_freed_memory() -> None:
 
 
 def keep_compiled_code() -> None:
-    """Share compiled code with the workers before and beside this one, on disk.
+    """Share compiled code with all workers of this user, on disk.
 
     The folder is in the user's cache, `$XDG_CACHE_HOME/trustbo/jax`, and not in the study's folder:
     anyone who can write to it can run code here. A folder that the user has set, e.g. by

@@ -8,10 +8,10 @@ import socket
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.loop import path_class
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission
@@ -37,42 +38,42 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
 
-class Scene(Protocol):
-    """Workspace with start and goal, and a simulator: where cases are run."""
+@dataclass(frozen=True)
+class Scene:
+    """Workspace with start and goal, and a simulator: where cases are run.
 
-    @property
-    def labels(self) -> Mapping[str, Any]:
-        """Name of the scene along each axis of the experiment."""
-        ...
+    Attributes:
+        labels: Name of the scene along each axis of the experiment.
+        identity: Settings that the numbers depend on.
+        make_workspace: Function `(*, bounds)`; without awareness of bounds for a case that has
+            none.
+        ends: Start and goal; None for the corners at the bottom left and the top right.
+        simulator: Function that makes the simulator of a workspace.
+        has_truth: Whether regret is held against the truth of the simulator.
+        judged: Objective and admissible paths of the best path, see `path_class`; by default those
+            of the campaign.
+    """
 
-    def seeded(self, seed: int) -> Self:
-        """Scene of the run with this seed."""
-        ...
+    labels: Mapping[str, Any]
+    identity: Mapping[str, Any]
+    make_workspace: Callable[..., Workspace]
+    ends: tuple[Location | None, Location | None]
+    simulator: Callable[[Workspace], Simulator]
+    has_truth: bool = True
+    judged: Mapping[str, Any] = field(default_factory=dict)
 
-    def identity(self) -> dict[str, Any]:
-        """Settings that the numbers depend on."""
-        ...
+    def truth(self, *, progress: bool = False) -> Truth | None:
+        """Truth of the simulator, for any awareness in the workspace; None without."""
+        if not self.has_truth:
+            return None
+        return Truth.of(self.simulator(self.make_workspace(bounds=True)), progress=progress)
 
-    def workspace(self, *, bounds: bool = True) -> Workspace:
-        """Workspace of the campaign; without awareness of bounds for a case that has none."""
-        ...
 
-    @property
-    def ends(self) -> tuple[Location, Location]:
-        """Start and goal."""
-        ...
-
-    def simulator(self, workspace: Workspace) -> Simulator:
-        """Make the simulator that runs paths of the workspace."""
-        ...
-
-    def truth(self) -> Truth | None:
-        """Truth of the simulator; None where it is not asked for."""
-        ...
-
-    def judged_by(self, planner: Planner) -> dict[str, Any]:
-        """Paths that regret is held against, see `path_class`."""
-        ...
+def corners(
+    ends: tuple[Location | None, Location | None], shape: tuple[int, ...]
+) -> tuple[Location, Location]:
+    """Start and goal, by default the corners at the bottom left and the top right."""
+    return ends[0] or (shape[0] - 1, 0), ends[1] or (0, shape[1] - 1)
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ class Run:
         """Everything that its numbers depend on; names that the user gives to parts are not."""
         return {
             "case": self.case.identity(),
-            "scene": self.scene.identity(),
+            "scene": self.scene.identity,
             "seed": self.seed,
             "n_iterations": self.n_iterations,
             "trustbo": version("trustbo"),
@@ -111,8 +112,9 @@ class Run:
 
         TrustboError: impossible settings.
         """
-        workspace = self.scene.workspace(bounds=self.case.bounds)
-        campaign = self.case.campaign(workspace, self.scene.ends, self.seed, callbacks)
+        workspace = self.scene.make_workspace(bounds=self.case.bounds)
+        ends = corners(self.scene.ends, workspace.passable.shape)
+        campaign = self.case.campaign(workspace, ends, self.seed, callbacks)
         stop = self.case.options.get("stop")
         rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
         simulator = self.scene.simulator(workspace)
@@ -128,14 +130,14 @@ class Experiment:
 
     Attributes:
         cases: Factories of campaigns.
-        scenes: Workspaces and simulators.
+        scenes: Function of a seed: scenes of the runs with it.
         seeds: Seeds of the campaigns.
         n_iterations: Missions of a campaign.
         settings: Settings, as JSON can hold them, that are kept with the results.
     """
 
     cases: Sequence[Case]
-    scenes: Sequence[Scene]
+    scenes: Callable[[int], Sequence[Scene]]
     seeds: Sequence[int]
     n_iterations: int
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -145,7 +147,7 @@ class Experiment:
         return [
             Run(case, scene, seed, self.n_iterations)
             for seed in self.seeds
-            for scene in (scene.seeded(seed) for scene in self.scenes)
+            for scene in self.scenes(seed)
             for case in self.cases
         ]
 
@@ -169,7 +171,12 @@ class Experiment:
         with tqdm(total=total, initial=done, desc="runs", disable=not progress) as bar:
             ended = executors.completed(pending, execute, executor, n_workers=n_workers)
             for run, record in ended:
-                _require_version(record)
+                theirs = record.get("versions", VERSIONS)["trustbo"]
+                if theirs != VERSIONS["trustbo"]:  # the key has ours
+                    message = (
+                        f"the worker has trustbo {theirs}, and the study {VERSIONS['trustbo']}"
+                    )
+                    record["error"] = message
                 store.write(run.key, {"labels": run.labels, "identity": run.identity, **record})
                 if "error" in record:
                     failed.append(f"{run}: {record['error']}")
@@ -284,19 +291,23 @@ class _Referee:
 
     def judge(self, campaign: Campaign, path: tuple[Cell, ...]) -> dict[str, float]:
         """Regret in % and contact lost in bounds; NaN if it does not lead from start to goal."""
-        ends = campaign.planner.start, campaign.planner.goal
-        if self.truth is None or (path[0], path[-1]) != ends:
+        planner = campaign.planner
+        if self.truth is None or (path[0], path[-1]) != (planner.start, planner.goal):
             return {"regret": math.nan, "lost": math.nan, "p_arrive": math.nan}
         value = self.truth.value(path)
-        regret = self.truth.regret(path, **self.scene.judged_by(campaign.planner))
+        regret = self.truth.regret(path, **self.class_of(planner))
         return {"regret": regret, "lost": value.lost, "p_arrive": value.p_arrive}
 
-    def oracle(self, campaign: Campaign) -> float:
+    def oracle(self, planner: Planner) -> float:
         """Contact lost on the best path, in bounds; NaN where the truth is not known."""
         if self.truth is None:
             return math.nan
-        judged_by = self.scene.judged_by(campaign.planner)
-        return self.truth.value(self.truth.best(*self.scene.ends, **judged_by)).lost
+        best = self.truth.best(planner.start, planner.goal, **self.class_of(planner))
+        return self.truth.value(best).lost
+
+    def class_of(self, planner: Planner) -> dict[str, Any]:
+        """Paths that regret is held against."""
+        return {**path_class(planner), **self.scene.judged}
 
 
 def _record(run: Run) -> dict[str, Any]:
@@ -308,7 +319,7 @@ def _record(run: Run) -> dict[str, Any]:
     result = campaign.result()
     return {
         "missions": _rows(result, referee.rows),
-        "oracle": referee.oracle(campaign),
+        "oracle": referee.oracle(campaign.planner),
         **{f"{name}_before": before[name] for name in ("regret", "lost", "p_arrive")},
         "stop_reason": result.stop_reason,
     }
@@ -336,13 +347,6 @@ def _canonical(value: Any) -> Any:
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value
-
-
-def _require_version(record: dict[str, Any]) -> None:
-    """Make a record by another version of trustbo an error: the key has ours."""
-    ours, theirs = VERSIONS["trustbo"], record.get("versions", {}).get("trustbo")
-    if theirs not in (None, ours):
-        record["error"] = f"the worker has trustbo {theirs}, and the study {ours}"
 
 
 def _rehearse(runs: Sequence[Run]) -> None:

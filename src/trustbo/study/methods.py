@@ -191,7 +191,7 @@ def model_of(given: Model) -> TrustModel:
 
 
 def model_from(given: Any) -> Model:
-    """Model from a short name, a `"module:name"` of one or of its factory, or as it was given."""
+    """Model from a short name, a `"module:name"` of one or of a factory, or the model itself."""
     if isinstance(given, str) and ":" not in given:
         return MODELS[require_choice("model", given, MODELS)]
     model: Any = imported("model", given) if isinstance(given, str) else given

@@ -59,11 +59,15 @@ def to_dataset(
 
 def axes_of(dataset: xr.Dataset) -> list[str]:
     """Names of the coordinates along which the runs of a study differ, but for seeds."""
-    return [
-        str(name)
-        for name, values in dataset.coords.items()
-        if values.dims == ("run",) and name not in _NOT_AXES and len(np.unique(values)) > 1
-    ]
+    names = _of_run(dataset)
+    return [n for n in names if n not in _NOT_AXES and len(np.unique(dataset[n])) > 1]
+
+
+def _of_run(dataset: xr.Dataset, by: str | Sequence[str] = ()) -> list[str]:
+    """Coordinates `by`, by default all that runs have; TrustboError: an unknown one."""
+    names = [str(name) for name, values in dataset.coords.items() if values.dims == ("run",)]
+    chosen = [by] if isinstance(by, str) else list(by)
+    return [require_choice("coordinate", name, names) for name in chosen] or names
 
 
 def summary(
@@ -84,14 +88,11 @@ def summary(
     Raises:
         TrustboError: An unknown coordinate or variable.
     """
-    of_run = [str(n) for n, c in dataset.coords.items() if c.dims == ("run",)]
     numeric = [str(n) for n, v in dataset.data_vars.items() if v.dims == ("run", "mission")]
     require_choice("variable", variable, [n for n in numeric if n not in _TEXT])
     if by is None:
         by = ["policy", *(name for name in axes_of(dataset) if name != "policy")]
-    by = [by] if isinstance(by, str) else list(by)
-    for name in by:
-        require_choice("coordinate", name, of_run)
+    by = _of_run(dataset, by)
     table = dataset[[variable]].to_dataframe().reset_index()
     groups = table.groupby([*by, "mission"], sort=True)[variable]
     return pd.DataFrame(
@@ -126,10 +127,7 @@ def worlds_table(dataset: xr.Dataset, by: str | Sequence[str] = "method") -> pd.
         path, `lost while learning` (the mean of that over the missions driven), the share of
         missions that `arrive`, and of campaigns still `far` off, by more than 5 %, in the end.
     """
-    by = [by] if isinstance(by, str) else list(by)
-    known = {str(n) for n, c in dataset.coords.items() if c.dims == ("run",)}
-    for name in by:
-        require_choice("coordinate", name, sorted(known))
+    by = _of_run(dataset, by)
     numbers = _numbers(dataset)
     pairs = dataset["world"].values + "/" + dataset["course"].values
     keys = list(zip(*(dataset[name].values for name in by), strict=True))

@@ -1,8 +1,8 @@
 """A world: a true terrain, sight and team, what is assumed of them, and courses through it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,10 +13,10 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
-from trustbo.planning import Planner
-from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.simulation import KinematicSimulator, Simulator, Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import digest, identity_of, imported
+from trustbo.study.experiment import Scene
 from trustbo.team import Robot, Team
 from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.workspace import Workspace
@@ -90,17 +90,17 @@ class World:
                 f"world {self.name!r} needs {' and '.join(names)}: name the folder that holds "
                 f"{self.ground}/ by data=, or leave the world out."
             )
-        found = [Path(self.data).absolute() / name for name in names]
-        absent = [str(file) for file in found if not file.is_file()]
+        files = [Path(self.data).absolute() / name for name in names]
+        absent = [str(file) for file in files if not file.is_file()]
         if absent:
             raise TrustboError(
                 f"world {self.name!r} lacks {' and '.join(absent)}: put a DEM and a DSM there, or "
                 "name another folder by data=."
             )
-        return [str(file) for file in found]
+        return [str(file) for file in files]
 
     def true_terrain(self) -> xr.Dataset:
-        """DEM and DSM as they are."""
+        """True DEM and DSM."""
         if self.is_made:
             return _made(int(self.ground.partition("-")[2]), self.side)
         return _read(*self.files())
@@ -121,9 +121,9 @@ class World:
         true = {"terrain": self.true_terrain(), "sight": self.sight, "team": self.team()}
         return (KinematicSimulator if simulate is None else simulate)(workspace, **true)
 
-    def truth(self, simulate: Simulate | None = None, *, progress: bool = False) -> Truth:
-        """Truth of the simulator, from disk if it is known."""
-        return Truth.of(self.simulator(self.workspace(), simulate), progress=progress)
+    def truth(self) -> Truth:
+        """Truth of the simulator, from disk where it has been computed before."""
+        return Truth.of(self.simulator(self.workspace()))
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
         """Start and goal of a course: the nearest cells from which most others can be reached."""
@@ -143,75 +143,51 @@ class World:
         return (int(a), int(b)), (int(c), int(d))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Course:
+def scene_of(
+    world: World,
+    course: str,
+    judged: tuple[str, int | str] = ("lost_contact", "shortest+4"),
+    simulate: Simulate | str | None = None,
+) -> Scene:
     """Course through a world as a scene of an experiment.
 
-    Attributes:
+    Args:
         world: World.
         course: Name in `COURSES`.
-        judged: Objective and admissible paths that regret is held against.
+        judged: Objective and admissible paths that regret is held against, for all methods.
         simulate: Function of the user that makes the simulator, or `"module:name"` of one.
     """
-
-    world: World
-    course: str
-    judged: tuple[str, int | str] = ("lost_contact", "shortest+4")
-    simulate: Simulate | str | None = None
-
-    @property
-    def labels(self) -> Mapping[str, Any]:
-        """World, its kind and course."""
-        return {"world": self.world.name, "kind": self.world.kind, "course": self.course}
-
-    @property
-    def ends(self) -> tuple[Cell, Cell]:
-        """Start and goal."""
-        return self.world.ends(self.course)
-
-    def seeded(self, seed: int) -> "Course":
-        """Scene of any run: a world has no seed."""
-        return self
-
-    def identity(self) -> dict[str, Any]:
-        """Settings that the numbers depend on."""
-        return {
-            "world": self.world.identity(),
-            "course": self.course,
-            "judged": self.judged,
-            "simulator": identity_of(self.simulate),
-        }
-
-    def workspace(self, *, bounds: bool = True) -> Workspace:
-        """Workspace of the world, which all its courses share."""
-        return self.world.workspace(bounds=bounds)
-
-    def simulator(self, workspace: Workspace) -> Simulator:
-        """Make the simulator of the world."""
-        simulate: Any = self.simulate
-        if isinstance(simulate, str):
-            simulate = imported("simulator", simulate)
-        usable = simulate is None or callable(simulate)
-        made: Any = self.world.simulator(workspace, cast(Any, simulate)) if usable else None
-        if not callable(getattr(made, "run", None)):
-            raise TrustboError(
-                f"simulator {self.simulate!r} must be a function that makes a simulator from a "
-                "workspace and the true terrain, sight and team."
-            )
-        return made
-
-    def truth(self, *, progress: bool = False) -> Truth:
-        """Truth of the world, for any awareness in the workspace."""
-        return Truth.of(self.simulator(self.workspace()), progress=progress)
-
-    def judged_by(self, planner: Planner) -> dict[str, Any]:
-        """Paths that regret is held against, the same for all methods."""
-        objective, max_bounds = self.judged
-        return {
+    objective, max_bounds = judged
+    return Scene(
+        labels={"world": world.name, "kind": world.kind, "course": course},
+        identity={
+            "world": world.identity(),
+            "course": course,
+            "judged": judged,
+            "simulator": identity_of(simulate),
+        },
+        make_workspace=world.workspace,
+        ends=world.ends(course),
+        simulator=partial(_simulator, world, simulate),
+        judged={
             "objective": "mean" if objective == "mean" else "lost_contact",
             "max_bounds": max_bounds,
-            "connectivity": planner.connectivity,
-        }
+        },
+    )
+
+
+def _simulator(world: World, simulate: Simulate | str | None, workspace: Workspace) -> Simulator:
+    """Make the simulator of a world; TrustboError: the user's function makes none."""
+    make: Any = imported("simulator", simulate) if isinstance(simulate, str) else simulate
+    simulator: Any = None
+    if make is None or callable(make):
+        simulator = world.simulator(workspace, cast(Any, make))
+    if not callable(getattr(simulator, "run", None)):
+        raise TrustboError(
+            f"simulator {simulate!r} must be a function that makes a simulator from a "
+            "workspace and the true terrain, sight and team."
+        )
+    return simulator
 
 
 def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
@@ -255,6 +231,6 @@ def _read(dem: str, dsm: str) -> xr.Dataset:
     n_rows = round(_STRIP / step)
     if whole.sizes["y"] <= 2 * n_rows:
         return whole
-    known = np.isfinite(whole["dem"].values).sum(1)
-    first = int(np.convolve(known, np.ones(n_rows), "valid").argmax())
+    with_data = np.isfinite(whole["dem"].values).sum(1)
+    first = int(np.convolve(with_data, np.ones(n_rows), "valid").argmax())
     return whole.isel(y=slice(first, first + n_rows))
