@@ -1,4 +1,4 @@
-"""`trustbo run`, `demo` and `resume`: campaigns on your own or a real terrain of ours."""
+"""`trustbo run`, `demo` and `resume`: campaigns on a terrain of the user or of the package."""
 
 from functools import partial
 from pathlib import Path
@@ -6,10 +6,9 @@ from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 from trustbo.campaign.options import OBJECTIVE, POLICY, SAMPLER, CampaignOptions
-from trustbo.cli.errors import one_line_errors
 from trustbo.cli.options import choices_of
 from trustbo.cli.outputs import require_outputs, write_outputs
-from trustbo.cli.terrains import Rasters, pair, team_of
+from trustbo.cli.terrains import pair, reader_of, team_of, terrain_with
 from trustbo.errors import TrustboError, require_choice, require_whole
 
 if TYPE_CHECKING:
@@ -43,10 +42,9 @@ def run(
     page: bool = False,
     overwrite: bool = False,
     quiet: bool = False,
-    debug: bool = False,
     **options: Any,
 ) -> None:
-    """Run a campaign on your own terrain: plan, simulate, learn, and plan again.
+    """Run a campaign on a terrain of yours: plan, simulate, learn, and plan again.
 
     Example: trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
     The same, with flags in a file: trustbo run --config mission.yaml --seed 2 --out out/second
@@ -59,39 +57,30 @@ def run(
     a power cut, trustbo resume goes on. A campaign in the folder is not replaced:
     give another --out, or --overwrite.
     """
-    with one_line_errors(debug, campaign=out):
-        _require_names(policy, objective, model, sampler, sight, iterations=iterations, seed=seed)
-        require_choice("observation", observation, choices_of("observation"))
-        cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
-        chosen = CampaignOptions(**options)
-        require_outputs(out, overwrite=overwrite)
-        trust_model = _model(model, observation)
-        _require_sampling(chosen, trust_model, sampler)
-        from trustbo import simulation
-        from trustbo.campaign.loop import iterate
-        from trustbo.campaign.stopping import RegretBound
-        from trustbo.workspace import Workspace
+    _require_flags(
+        iterations, seed, policy=policy, objective=objective, model=model, sampler=sampler,
+        sight=sight, observation=observation,
+    )  # fmt: skip
+    cells, team = pair("shape", shape), team_of(max_slope, robots, lidar_range)
+    chosen = CampaignOptions(**options)
+    require_outputs(out, overwrite=overwrite)
+    trust_model = _model(model, observation)
+    _require_sampling(chosen, trust_model, sampler)
+    from trustbo import simulation
+    from trustbo.campaign.loop import iterate
+    from trustbo.campaign.stopping import RegretBound
+    from trustbo.workspace import Workspace
 
-        stop = None if stop_regret is None else RegretBound(eps=stop_regret)
-        rasters = Rasters(dem, dsm, crs, resolution, nodata)
-        found = rasters.found((start, goal), cells, team, progress=not quiet)
-        workspace = Workspace.from_terrain(found.ground, found.grid.shape, team, sight=sight)
-        result = iterate(
-            workspace,
-            *found.ends,
-            n_iterations=iterations,
-            model=trust_model,
-            policy=policy,
-            objective=objective,
-            sampler=sampler,
-            simulator=simulation.KinematicSimulator(workspace),
-            stop=stop,
-            checkpoint=out,
-            seed=seed,
-            progress=_progress(page, quiet),
-            options=chosen,
-        )
-        write_outputs(result, out, table=not quiet, report=not page)
+    stop = None if stop_regret is None else RegretBound(eps=stop_regret)
+    read = reader_of(dem, dsm, crs, resolution, nodata)
+    terrain, ends = terrain_with(start, goal, read, cells, team, progress=not quiet)
+    workspace = Workspace.from_terrain(terrain, cells, team, sight=sight)
+    result = iterate(
+        workspace, *ends, n_iterations=iterations, model=trust_model, policy=policy,
+        objective=objective, sampler=sampler, simulator=simulation.KinematicSimulator(workspace),
+        stop=stop, checkpoint=out, seed=seed, progress=_progress(page, quiet), options=chosen,
+    )  # fmt: skip
+    write_outputs(result, out, table=not quiet, report=not page)
 
 
 def demo(
@@ -105,7 +94,6 @@ def demo(
     out: Path = Path("out/demo"),
     overwrite: bool = False,
     quiet: bool = False,
-    debug: bool = False,
 ) -> None:
     """Run a campaign on a real hillside, 195 m x 278 m, and write its DEM and DSM too.
 
@@ -115,31 +103,18 @@ def demo(
     objective is the contact lost on the way, which every bound changes; the
     paper's, terminal, is trust at the goal, which depends on the last few bounds.
     """
+    given = dict(locals())
     from trustbo.files import write_file
     from trustbo.terrain.example import example_files
 
-    with one_line_errors(debug, campaign=out):
-        _require_names(policy, objective, model, sampler, iterations=iterations, seed=seed)
-        require_outputs(out, "dem.tif", "dsm.tif", overwrite=overwrite)
-        for file in map(Path, example_files("wellington")):
-            _require_same(out / file.name, file)
-            write_file(out / file.name, partial(copyfile, file))
-    run(
-        dem=out / "dem.tif",
-        dsm=out / "dsm.tif",
-        start="9,0",
-        goal="0,9",
-        policy=policy,
-        objective=objective,
-        model=model,
-        sampler=sampler,
-        iterations=iterations,
-        seed=seed,
-        out=out,
-        overwrite=overwrite,
-        quiet=quiet,
-        debug=debug,
+    _require_flags(
+        iterations, seed, policy=policy, objective=objective, model=model, sampler=sampler
     )
+    require_outputs(out, "dem.tif", "dsm.tif", overwrite=overwrite)
+    for file in map(Path, example_files("wellington")):
+        _require_same(out / file.name, file)
+        write_file(out / file.name, partial(copyfile, file))
+    run(dem=out / "dem.tif", dsm=out / "dsm.tif", start="9,0", goal="0,9", **given)
 
 
 def resume(
@@ -148,7 +123,6 @@ def resume(
     stop_regret: float | None = None,
     page: bool = False,
     quiet: bool = False,
-    debug: bool = False,
 ) -> None:
     """Go on with a campaign that was interrupted, or with more missions.
 
@@ -160,56 +134,40 @@ def resume(
     A campaign that --stop-regret has ended goes on with another --stop-regret, which is asked
     before anything is driven.
     """
-    with one_line_errors(debug, campaign=folder):
-        if iterations is not None:
-            require_whole("n_iterations", iterations, 1)
-        state = _state(folder)
-        require_outputs(folder, overwrite=True)
-        from trustbo.campaign.loop import resume as go_on
-        from trustbo.campaign.progress import PAGE, PAGE_ALONE, continued
-        from trustbo.campaign.stopping import RegretBound
+    if iterations is not None:
+        require_whole("n_iterations", iterations, 1)
+    state = _state(folder)
+    require_outputs(folder, overwrite=True)
+    from trustbo.campaign.loop import resume as go_on
+    from trustbo.campaign.progress import PAGE, PAGE_ALONE, continued
+    from trustbo.campaign.stopping import RegretBound
 
-        stop = None if stop_regret is None else RegretBound(eps=stop_regret)
-        total = iterations or state["notes"]["n_iterations"]
-        if state["n_missions"] >= total and not quiet:
-            n = state["n_missions"]
-            done = f"all {n} missions are" if n > 1 else "the one mission is"
-            print(
-                f"{done} done; for more, give --iterations. Figures and report are drawn again.",
-                flush=True,
-            )
-        progress = continued(_progress(page, quiet), folder)
-        result = go_on(
-            folder,
-            simulator=_simulator(folder, state["notes"]),
-            n_iterations=iterations,
-            stop=stop,
-            progress=progress,
+    stop = None if stop_regret is None else RegretBound(eps=stop_regret)
+    total = iterations or state["notes"]["n_iterations"]
+    if state["n_missions"] >= total and not quiet:
+        n = state["n_missions"]
+        done = f"all {n} missions are" if n > 1 else "the one mission is"
+        print(
+            f"{done} done; for more, give --iterations. Figures and report are drawn again.",
+            flush=True,
         )
-        # A campaign that its rule had ended need not have gone on, and then made no page.
-        went_on = state["stop_reason"] in ("interrupted", "n_iterations")
-        made = went_on and progress in (PAGE, PAGE_ALONE)
-        write_outputs(result, folder, table=not quiet, report=not made)
+    progress = continued(_progress(page, quiet), folder)
+    result = go_on(
+        folder,
+        simulator=_simulator(folder, state["notes"]),
+        n_iterations=iterations,
+        stop=stop,
+        progress=progress,
+    )
+    # A campaign that its rule had ended need not have gone on, and then made no page.
+    went_on = state["stop_reason"] in ("interrupted", "n_iterations")
+    made = went_on and progress in (PAGE, PAGE_ALONE)
+    write_outputs(result, folder, table=not quiet, report=not made)
 
 
-def _require_names(
-    policy: str,
-    objective: str,
-    model: str,
-    sampler: str,
-    sight: str = "bare",
-    *,
-    iterations: int,
-    seed: int,
-) -> None:
+def _require_flags(iterations: int, seed: int, **names: str) -> None:
     """Refuse unknown names and numbers out of range (TrustboError) before heavy imports."""
-    for flag, name in (
-        ("policy", policy),
-        ("objective", objective),
-        ("model", model),
-        ("sampler", sampler),
-        ("sight", sight),
-    ):
+    for flag, name in names.items():
         require_choice("sight mode" if flag == "sight" else flag, name, choices_of(flag))
     require_whole("n_iterations", iterations, 1)
     require_whole("seed", seed, 0)
@@ -237,7 +195,7 @@ def _model(name: str, observation: str) -> "TrustModel":
 
 
 def _require_same(file: Path, example: Path) -> None:
-    """Refuse to replace a raster of the user's own: TrustboError."""
+    """Refuse to replace a raster of the user: TrustboError."""
     from trustbo.files import read_file
 
     if file.exists() and read_file(file) != example.read_bytes():

@@ -13,31 +13,30 @@ _FILES = ("dem", "dsm")
 """Flags whose paths are relative to the file, not to the working directory."""
 _LOCATIONS = ("start", "goal")
 """Flags that may be mappings such as {lon: 174.7, lat: -41.3}."""
-_NOT_IN_FILE = ("config",)
 
 
 def read_config(context: typer.Context, path: Path | None) -> Path | None:
     """Make a file's flags the command's defaults, before its other flags are read."""
     if path is not None:
-        known = [str(p.name) for p in context.command.params if p.name not in _NOT_IN_FILE]
+        names = [str(p.name) for p in context.command.params if p.name != "config"]
         try:
-            context.default_map = flags_of(path, known)
+            context.default_map = flags_of(path, names)
         except TrustboError as error:
             fail(error, 2)
     return path
 
 
-def flags_of(path: Path, known: Collection[str]) -> dict[str, str]:
+def flags_of(path: Path, names: Collection[str]) -> dict[str, str]:
     """Read flags by name, as they would be typed, from a YAML file with a mapping of long flags.
 
-    Dashes or underscores; `known` are the names of all flags, with underscores. TrustboError: no
+    Dashes or underscores; `names` are those of all flags, with underscores. TrustboError: no
     such file, no YAML, an unknown flag, or a value of another type.
     """
     flags: dict[str, str] = {}
     for key, value in _read(path).items():
         name = str(key).replace("-", "_")
-        if name not in known:
-            error = unknown("flag", _flag(name), map(_flag, known))
+        if name not in names:
+            error = unknown("flag", _flag(name), map(_flag, names))
             raise TrustboError(f"{path}: {error}")
         if name in flags:
             raise TrustboError(f"{path}: {_flag(name)} is given twice; leave one out.")

@@ -26,8 +26,8 @@ _ALIASES = {"n_iterations": "iterations", "n_robots": "robots", "RegretBound.eps
 def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]:
     """Print an error in one line (with `debug`, its traceback), and each warning in a line.
 
-    An error says the way on, too, if the folder of the `campaign` at work is given. SIGTERM ends a
-    command as Ctrl-C does.
+    After an interrupt or a refused posterior, the way to resume the `campaign` is printed, by its
+    folder. SIGTERM ends a command as Ctrl-C does.
     """
     main = threading.current_thread() is threading.main_thread()  # others cannot set handlers
     before = signal.signal(signal.SIGTERM, signal.default_int_handler) if main else None
@@ -40,11 +40,8 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
         warnings.simplefilter("default", UserWarning)
         try:
             yield
-        except (KeyboardInterrupt, SystemError) as error:
-            if not isinstance(error, KeyboardInterrupt) and not isinstance(
-                error.__cause__,
-                KeyboardInterrupt,  # which numba makes a SystemError
-            ):
+        except (KeyboardInterrupt, SystemError) as error:  # numba makes the former the latter
+            if not isinstance(error.__cause__ or error, KeyboardInterrupt):
                 raise
             print(f"\ninterrupted; {_way_on(campaign)}", file=sys.stderr)
             raise typer.Exit(INTERRUPTED) from None

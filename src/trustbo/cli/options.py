@@ -5,17 +5,19 @@ import re
 from collections.abc import Callable
 from copy import copy
 from dataclasses import fields
+from functools import wraps
 from typing import Annotated, Any
 
 import typer
 
 from trustbo.campaign.options import LEARNING, PLANNING, RUNNING, CampaignOptions
 from trustbo.cli.config import read_config
+from trustbo.cli.errors import one_line_errors
 
 _HELP = """
 Terrain and grid
   dem FILE: Heights of the ground (DEM), e.g. a GeoTIFF.
-  dsm FILE: Heights of the canopy (DSM) of the same place; without one, no canopy is known.
+  dsm FILE: Heights of the canopy (DSM) of the same place; without one, none is assumed.
   start PLACE: First cell, as row,col with row 0 in the north; or a position in it, as
     x=1748000,y=5427000 in metres of the terrain's CRS, or lon=174.7,lat=-41.3.
   goal PLACE: Last cell, or a position in it.
@@ -48,13 +50,13 @@ Learning
 Benchmark
   data FOLDER: Folder of the real terrains, tahoe/dem.tif and so on; without it, synthetic ones and
     wellington.
-  world NAME: World, given once for each; by default all.
-  worlds.policy NAME: Policy, given once for each: a name as for [b]trustbo run[/b], or module:name;
+  world NAME: World, may be repeated; by default all.
+  worlds.policy NAME: Policy, may be repeated: a name as for [b]trustbo run[/b], or module:name;
     by default optimistic.
-  worlds.model NAME: Model, given once for each: places (the default), pooled, hierarchical,
+  worlds.model NAME: Model, may be repeated: places (the default), pooled, hierarchical,
     coupled, or module:name.
-  simulator NAME: Your own simulator of a world, module:name.
-  baseline NAME: Baseline, given once for each: random, shortest, paper, none, or module:name; by
+  simulator NAME: Simulator of a world, module:name.
+  baseline NAME: Baseline, may be repeated: random, shortest, paper, none, or module:name; by
     default the first three.
   max_bounds NAME: Admissible paths: shortest, shortest+4, or the most bounds allowed.
   by NAME: Rows of the table: method, kind, world or course.
@@ -75,18 +77,19 @@ Program
   export.out FOLDER: Folder for the files; by default the result's.
   info.out FILE: Picture of the grid, a .png.
   page: Keep report.html up to date while the campaign runs; it reloads itself in a browser.
-  overwrite: Replace the campaign that the folder holds; files of your own in it are kept.
+  overwrite: Replace the campaign that the folder holds; other files in it are kept.
   quiet: Show no progress bar and no table.
   debug: Show the whole traceback of an error.
   title TEXT: Title of the page.
 Options
-  formats NAME: Format, given once for each: geotiff, cog, netcdf (maps); geojson, gpx, geopackage
+  formats NAME: Format, may be repeated: geotiff, cog, netcdf (maps); geojson, gpx, geopackage
     (the path); csv (path and missions); ros_map, ros1_bag, ros2_bag (cost and path); or all that
     can be written.
   export.resolution M: Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side
     where cells are not square.
   origin PLACE: Position in the terrain's CRS that is 0,0 of maps and bags for ROS, as x,y in metres
-    or lon=174.7,lat=-41.3; or auto, the start of the path. A file that ends in _frame.yaml says it.
+    or lon=174.7,lat=-41.3; or auto, the start of the path. It is kept in a file that ends in
+    _frame.yaml.
   rotation DEG: Angle from east to the x axis of their frame, anticlockwise.
   frame NAME: Name of their frame.
   executor NAME: Executor of the runs: serial, loky, dask, or a scheduler's address,
@@ -95,7 +98,7 @@ Options
 Arguments
   folder FOLDER: Folder of the campaign's results.
   info.dem DEM: Heights of the ground (DEM), e.g. a GeoTIFF.
-  info.dsm DSM: Heights of the canopy (DSM) of the same place, if known.
+  info.dsm DSM: Heights of the canopy (DSM) of the same place.
   study.config CONFIG: Study in YAML; see docs/studies.md.
 """
 """Flags by panel: name, placeholder and help; `command.name` where it differs by command."""
@@ -108,6 +111,7 @@ _NAMES = {
     "formats": ("--format",),
 }
 _PANELS = {PLANNING: "Paths", LEARNING: "Learning", RUNNING: "Missions"}
+_ALONE = inspect.Parameter.KEYWORD_ONLY
 _METAVARS = {int: "N", float: "X", str: "NAME", type(None): "VALUE"}
 
 
@@ -149,11 +153,15 @@ def choices_of(flag: str) -> list[str]:
     return _FLAGS[flag].autocompletion("")
 
 
-def with_flags[Command: Callable[..., None]](command: Command) -> Command:
-    """Give a command's parameters their flags, and `**options` those of `CampaignOptions`."""
+def with_flags(command: Callable[..., None], campaign: str = "") -> Callable[..., None]:
+    """Give a command's parameters their flags, `**options` those of `CampaignOptions`, and --debug.
+
+    `campaign` is the parameter with the folder of the campaign at work, see `one_line_errors`.
+    """
     signature = inspect.signature(command, eval_str=True)
+    debug = inspect.Parameter("debug", _ALONE, default=False, annotation=bool)
     parameters = []
-    for p in signature.parameters.values():
+    for p in (*signature.parameters.values(), debug):
         if p.kind is p.VAR_KEYWORD:
             parameters += _campaign_flags()
         else:
@@ -161,9 +169,15 @@ def with_flags[Command: Callable[..., None]](command: Command) -> Command:
             if p.annotation in _PARSERS:
                 flag = copy(flag)
                 flag.parser = _PARSERS[p.annotation]
-            parameters.append(p.replace(annotation=Annotated[p.annotation, flag]))
-    command.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
-    return command
+            parameters.append(p.replace(annotation=Annotated[p.annotation, flag], kind=_ALONE))
+
+    @wraps(command)
+    def run(*, debug: bool, **given: Any) -> None:
+        with one_line_errors(debug, campaign=given.get(campaign)):
+            command(**given)
+
+    run.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
+    return run
 
 
 def _campaign_flags() -> list[inspect.Parameter]:
@@ -185,7 +199,7 @@ def _campaign_flags() -> list[inspect.Parameter]:
             parser=parser,
         )
         of_flag: Any = {"default": option.default, "annotation": Annotated[kind, flag]}
-        parameters.append(inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, **of_flag))
+        parameters.append(inspect.Parameter(option.name, _ALONE, **of_flag))
     return parameters
 
 

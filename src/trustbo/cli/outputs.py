@@ -1,4 +1,4 @@
-"""Figures, report and maps in the folder of a campaign that is done."""
+"""Figures, report and maps in the folder of a finished campaign."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ _FILES = (
 def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
     """Refuse a folder that cannot take the results, before any work.
 
-    It need not exist yet; `others` are files written there beside those of `write_outputs`.
+    It need not exist yet; `others` are files written there in addition to those of `write_outputs`.
     TrustboError: it holds a campaign or a result, unless `overwrite`; its name belongs to a file,
     or the name of a file to a folder, or to a file that trustbo did not write.
     """
@@ -44,7 +44,7 @@ def require_outputs(out: Path, *others: str, overwrite: bool) -> None:
 
 
 def write_outputs(result: "Result", out: Path, *, table: bool, report: bool = True) -> None:
-    """Write figures, report and maps to the folder of a result, and print their names.
+    """Write figures, report and maps to the folder `out` of a result, and print their names.
 
     With `table`, a row for each mission is printed too; `report` is False where the page of the
     campaign has become its report. TrustboError: the folder's name belongs to a file.
@@ -99,8 +99,8 @@ def _print_table(result: "Result") -> None:
     print(f"mission  status  contact  objective  {label}  path")
     for i, lost, row in zip(table.index, table.index.isna(), table.to_dict("records"), strict=True):
         if lost:
-            at = f" at {row['where']}" if row["where"] else ""
-            print(f"      -  given up: {row['reason']}{at}")
+            where = f" at {row['where']}" if row["where"] else ""
+            print(f"      -  given up: {row['reason']}{where}")
             continue
         change = "first" if i == 1 else "changed" if row["path_changed"] else "same"
         print(

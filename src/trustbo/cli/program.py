@@ -12,9 +12,8 @@ from trustbo.cli.campaigns import demo, resume, run
 from trustbo.cli.errors import BAD_INPUT, complain
 from trustbo.cli.options import with_flags
 from trustbo.cli.results import export, report
-from trustbo.cli.study import study
+from trustbo.cli.studies import study, worlds
 from trustbo.cli.terrains import info
-from trustbo.cli.worlds import worlds
 
 EPILOG = """
 Exit codes: 0 done; 1 done, but some of a study's runs failed, or an
@@ -22,11 +21,12 @@ unforeseen error (with a traceback); 2 bad input; 3 a posterior was refused,
 measured missions are kept; 130 interrupted.
 """
 _UsageError: Any = typer.BadParameter.__mro__[1]  # click's, wherever typer keeps it
-_PANELS = (
-    ("Campaigns", (demo, info, run, resume)),
-    ("Results", (report, export)),
-    ("Studies", (study, worlds)),
-)
+_PANELS = {
+    "Campaigns": {demo: "out", info: "", run: "out", resume: "folder"},
+    "Results": {report: "", export: ""},
+    "Studies": {study: "", worlds: ""},
+}
+"""Commands by panel, and the parameter with the folder of the campaign that a command works on."""
 
 
 class _PlainFlags:
@@ -56,10 +56,10 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
     epilog=EPILOG.strip(),
 )
-for panel, commands in _PANELS:
-    for command in commands:
+for panel, commands in _PANELS.items():
+    for command, folder in commands.items():
         kept = {"cls": _Command, "rich_help_panel": panel, "epilog": EPILOG.strip()}
-        app.command(**kept)(with_flags(command))
+        app.command(**kept)(with_flags(command, folder))
 
 
 def _show_version(asked: bool) -> None:
@@ -79,9 +79,9 @@ def _program(
 ) -> None:
     """Learn the trust in robots on a terrain, and plan the most trustworthy path.
 
-    On a real hillside:  trustbo demo
-    The grid of your own:    trustbo info dem.tif dsm.tif
-    On your own:             trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
+    On a real hillside:      trustbo demo
+    The grid of a terrain:   trustbo info dem.tif dsm.tif
+    On a terrain of yours:   trustbo run --dem dem.tif --dsm dsm.tif --start 9,0 --goal 0,9
     All flags:               trustbo run --help
     """
 
@@ -98,8 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except _UsageError as error:
         where = getattr(error, "ctx", None)
         name = where.command_path if where else "trustbo"
-        said = _missing(error) or _of_file(error) or _unknown_option(error) or _no_number(error)
-        complain(said or str(error.format_message()), f"{name} --help lists commands and flags.")
+        reason = _missing(error) or _of_file(error) or _unknown_option(error) or _no_number(error)
+        complain(reason or str(error.format_message()), f"{name} --help lists commands and flags.")
         sys.exit(BAD_INPUT)
     sys.exit(code or 0)
 
@@ -151,5 +151,5 @@ def _of_file(error: Any) -> str:
         return ""
     flag, value = param.name.replace("_", "-"), context.default_map[param.name]
     message = str(error.message)
-    said = message if message.startswith("must be ") else f"cannot be {value!r}: {message}"
-    return f"{context.params['config']}: {flag} {said}"
+    reason = message if message.startswith("must be ") else f"cannot be {value!r}: {message}"
+    return f"{context.params['config']}: {flag} {reason}"

@@ -4,34 +4,30 @@ import sys
 from math import radians
 from pathlib import Path
 
-from trustbo.cli.errors import one_line_errors
 from trustbo.cli.outputs import use_no_screen
 from trustbo.errors import TrustboError, require_choice
 
 
-def report(
-    folder: Path, out: Path | None = None, title: str | None = None, debug: bool = False
-) -> None:
+def report(folder: Path, out: Path | None = None, title: str | None = None) -> None:
     """Write a result as one HTML page, with all its figures and tables.
 
     Example: trustbo report out/demo --out demo.html
 
     The page needs no network and no other file. For a campaign that was
     interrupted, it shows the missions learned from until then. It links to an
-    interactive page beside it, explore.html (demo-explore.html for demo.html).
+    interactive page in the same folder, explore.html (demo-explore.html for demo.html).
     """
-    with one_line_errors(debug):
-        _require_result(folder)
-        from trustbo.campaign.storage import load_result
+    _require_result(folder)
+    from trustbo.campaign.storage import load_result
 
-        result = load_result(folder)
-        use_no_screen()
-        from trustbo.report import write_report
+    result = load_result(folder)
+    use_no_screen()
+    from trustbo.report import write_report
 
-        file = folder / "report.html" if out is None else Path(out)
-        _, explorer = write_report(file, result, title=title)
-        print(f"the report is {file}")
-        print(f"the interactive page is {explorer}")
+    file = folder / "report.html" if out is None else Path(out)
+    _, explorer = write_report(file, result, title=title)
+    print(f"the report is {file}")
+    print(f"the interactive page is {explorer}")
 
 
 def export(
@@ -42,7 +38,6 @@ def export(
     origin: str | None = None,
     rotation: float = 0.0,
     frame: str = "map",
-    debug: bool = False,
 ) -> None:
     """Write a result's maps and path for GIS, GPS units and robots.
 
@@ -51,31 +46,30 @@ def export(
     For a robot, from its start: trustbo export out/demo --format ros2_bag --origin auto
 
     With all, formats that cannot be written (a place on Earth without a terrain, a
-    bag that exists already) are left out with a line that says so; a format asked
-    for by name is an error then.
+    bag that exists already) are left out, each with a line that gives the reason; a
+    format asked for by name is an error then.
     """
-    with one_line_errors(debug):
-        _require_result(folder)
-        from trustbo.campaign.storage import load_result
-        from trustbo.export import FORMATS, export_result
-        from trustbo.export.everything import left_out
+    _require_result(folder)
+    from trustbo.campaign.storage import load_result
+    from trustbo.export import FORMATS, export_result
+    from trustbo.export.everything import left_out
 
-        for name in formats:
-            require_choice("format", name, (*FORMATS, "all"))
-        result, target = load_result(folder), out or folder
-        chosen, absent = formats, {}
-        if "all" in formats:
-            reasons = left_out(result, target)
-            absent = {name: why for name, why in reasons.items() if name not in formats}
-            chosen = [name for name in FORMATS if name not in absent]
-        files = export_result(
-            result, target, chosen, resolution=resolution, origin=origin,
-            rotation=radians(rotation), frame=frame,
-        )  # fmt: skip
-        for name, why in absent.items():
-            print(f"left out {name}: {why}", file=sys.stderr)
-        for file in files:
-            print(file)
+    for name in formats:
+        require_choice("format", name, (*FORMATS, "all"))
+    result, target = load_result(folder), out or folder
+    chosen, absent = formats, {}
+    if "all" in formats:
+        reasons = left_out(result, target)
+        absent = {name: why for name, why in reasons.items() if name not in formats}
+        chosen = [name for name in FORMATS if name not in absent]
+    files = export_result(
+        result, target, chosen, resolution=resolution, origin=origin,
+        rotation=radians(rotation), frame=frame,
+    )  # fmt: skip
+    for name, why in absent.items():
+        print(f"left out {name}: {why}", file=sys.stderr)
+    for file in files:
+        print(file)
 
 
 def _require_result(folder: Path) -> None:

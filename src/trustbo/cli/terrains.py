@@ -1,19 +1,20 @@
 """`trustbo info`, and rasters with a start and a goal on them, checked before awareness."""
 
 import warnings
+from functools import partial
 from math import radians
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from trustbo.cli.errors import one_line_errors
 from trustbo.errors import TrustboError, require_whole
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import xarray as xr
 
     from trustbo.data import Cell
     from trustbo.team import Team
-    from trustbo.workspace.grid import Grid
 
 _MOST_PIXELS = 9e6
 """Most pixels of a raster that is not averaged: a campaign on it takes some 2 GB."""
@@ -28,7 +29,6 @@ def info(
     nodata: float | None = None,
     max_slope: float = 45.0,
     out: Path = Path("out/grid.png"),
-    debug: bool = False,
 ) -> None:
     """Print and draw the planning grid of a terrain, before anything is computed on it.
 
@@ -38,86 +38,63 @@ def info(
     extent, pixels and cells, heights, the share without data and of impassable
     cells, and a start and a goal in each spelling of --start and --goal.
     """
-    with one_line_errors(debug):
-        cells, team = pair("shape", shape), team_of(max_slope)
-        from trustbo.cli.outputs import use_no_screen, write_figure
-        from trustbo.files import require_file
-        from trustbo.workspace import survey
+    cells, team = pair("shape", shape), team_of(max_slope)
+    from trustbo.cli.outputs import use_no_screen, write_figure
+    from trustbo.files import require_file
+    from trustbo.workspace import survey
 
-        require_file(out, ".png")
-        ground = Rasters(dem, dsm, crs, resolution, nodata).read(lazy=True)
-        found = survey(ground, cells, team)
-        ground.close()
-        print(found)
-        use_no_screen()
-        from trustbo.plots.grid import grid_map
+    require_file(out, ".png")
+    with reader_of(dem, dsm, crs, resolution, nodata)(lazy=True) as headers:
+        surveyed = survey(headers, cells, team)
+    print(surveyed)
+    use_no_screen()
+    from trustbo.plots.grid import grid_map
 
-        write_figure(out, [grid_map(found)])
-        print(f"the grid, with the names of its cells, is drawn in {out}")
+    write_figure(out, [grid_map(surveyed)])
+    print(f"the grid, with the names of its cells, is drawn in {out}")
 
 
-class Ends(NamedTuple):
-    """Terrain in memory, its grid, and the cells of start and goal."""
+def reader_of(
+    dem: Path, dsm: Path | None, crs: str | None, resolution: float | None, nodata: float | None
+) -> "Callable[..., xr.Dataset]":
+    """Make `read_terrain` of the rasters that flags name."""
+    from trustbo.terrain import read_terrain
 
-    ground: "xr.Dataset"
-    grid: "Grid"
-    ends: "tuple[Cell, Cell]"
+    return partial(read_terrain, dem, dsm, crs=crs, resolution=resolution, nodata=nodata)
 
 
-class Rasters(NamedTuple):
-    """Rasters of a terrain, as flags give them."""
+def terrain_with(
+    start: str,
+    goal: str,
+    read: "Callable[..., xr.Dataset]",
+    shape: tuple[int, int],
+    team: "Team",
+    *,
+    progress: bool,
+) -> "tuple[xr.Dataset, tuple[Cell, Cell]]":
+    """Read a terrain, and locate start and goal: by the headers, then by the heights.
 
-    dem: Path
-    dsm: Path | None
-    crs: str | None
-    resolution: float | None
-    nodata: float | None
+    TrustboError: one is off the grid, without data or too steep; no awareness was computed.
+    """
+    from trustbo.workspace import Grid, survey
+    from trustbo.workspace.location import cell_of
 
-    def read(
-        self, *, lazy: bool = False, max_pixels: float | None = None, progress: bool = False
-    ) -> "xr.Dataset":
-        """Read the terrain, or its headers alone."""
-        from trustbo.terrain import read_terrain
-
-        return read_terrain(
-            self.dem, self.dsm, crs=self.crs, resolution=self.resolution, nodata=self.nodata,
-            lazy=lazy, max_pixels=max_pixels, progress=progress,
-        )  # fmt: skip
-
-    def found(
-        self,
-        ends: tuple[str, str],
-        shape: tuple[int, int],
-        team: "Team",
-        *,
-        progress: bool,
-    ) -> Ends:
-        """Read the terrain, and find start and goal: by the headers, then by the heights.
-
-        TrustboError: one is off the grid, without data or too steep; no awareness was computed.
-        """
-        from trustbo.workspace import survey
-        from trustbo.workspace.grid import Grid
-        from trustbo.workspace.location import cell_of
-
-        named = dict(zip(("start", "goal"), ends, strict=True))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they come again with the heights
-            headers = self.read(lazy=True, max_pixels=_MOST_PIXELS)
-        with headers:
-            grid = Grid.over(headers, shape)
-            for name, end in named.items():
-                cell_of(name, end, grid)
-        ground = self.read(max_pixels=_MOST_PIXELS, progress=progress)
-        known = survey(ground, shape, team)
-        start, goal = (known.require_cell(name, end) for name, end in named.items())
-        return Ends(ground, grid, (start, goal))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they come again with the heights
+        headers = read(lazy=True, max_pixels=_MOST_PIXELS)
+    with headers:
+        grid = Grid.over(headers, shape)
+        for name, end in (("start", start), ("goal", goal)):
+            cell_of(name, end, grid)
+    terrain = read(max_pixels=_MOST_PIXELS, progress=progress)
+    cells = survey(terrain, shape, team)
+    return terrain, (cells.require_cell("start", start), cells.require_cell("goal", goal))
 
 
 def pair(what: str, text: str) -> tuple[int, int]:
     """Two whole numbers of a flag; TrustboError: the text is none."""
     try:
-        first, second = (int(part) for part in text.split(","))
+        first, second = (int(number) for number in text.split(","))
     except ValueError:
         raise TrustboError(
             f"--{what} must be rows and columns, such as 10,12; got {text!r}."
