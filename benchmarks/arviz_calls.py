@@ -15,7 +15,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
-from common import arguments, parsed
+from common import Table, arguments, parsed
 
 import trustbo as tb
 
@@ -138,15 +138,15 @@ def subjects(quick: bool) -> tuple[dict[str, xr.DataTree], dict[str, xr.DataTree
     for _ in campaign.run(robots, n_iterations=25):
         pass
     missions = campaign.missions
-    found = {"exact": tb.fit(missions, model, sampler="exact")}
+    results = {"exact": tb.fit(missions, model, sampler="exact")}
     if not quick:
-        found["NUTS"] = tb.fit(missions, model, sampler="nuts")
+        results["NUTS"] = tb.fit(missions, model, sampler="nuts")
     weights = 0.9 ** np.arange(len(missions))[::-1]
-    found["weighted"] = tb.fit(missions, model, sampler="exact", weights=weights)
-    found["by rate"] = tb.inference.by_rate(found["exact"])
+    results["weighted"] = tb.fit(missions, model, sampler="exact", weights=weights)
+    results["by rate"] = tb.inference.by_rate(results["exact"])
     half = tb.fit(missions[::2], model, sampler="exact")
     other = tb.fit(missions, tb.models.CoupledTrust(inter_robot="none"))
-    return found, {"half": half, "other": other}
+    return results, {"half": half, "other": other}
 
 
 def written(dt: xr.DataTree) -> Path:
@@ -178,17 +178,17 @@ def failure(call: str, names: dict) -> str:
 def main() -> None:
     """Print a row for each call that fails."""
     given = parsed(arguments(__doc__, quick="without NUTS"))
-    found, others = subjects(given.quick)
+    results, others = subjects(given.quick)
     calls = CALLS.split("\n")[1:-1]
-    failures = 0
-    for subject, dt in found.items():
+    table, failures = Table("posterior", "call", "error"), 0
+    for subject, dt in results.items():
         names = {"az": az, "np": np, "tb": tb, "written": written, "density": density}
         names |= {"dt": dt, **others, "names": ["beta0", "beta", "b"]}
         for call in calls:
-            if said := failure(call, names):
+            if error := failure(call, names):
                 failures += 1
-                print(f"| {subject} | `{call}` | {said} |", flush=True)
-    print(f"{len(calls)} calls on {len(found)} posteriors, {failures} failed")
+                table.row(subject, f"`{call}`", error)
+    print(f"{len(calls)} calls on {len(results)} posteriors, {failures} failed")
 
 
 if __name__ == "__main__":

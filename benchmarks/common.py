@@ -37,7 +37,7 @@ def arguments(
     )
     if names := list(names):
         parser.add_argument("names", nargs="*", metavar="name", help=f"some of {', '.join(names)}")
-        parser.set_defaults(known=names)
+        parser.set_defaults(choices=names)
     if n is not None:
         parser.add_argument("-n", type=int, default=n, help=f"number of cases, default {n}")
     if seeds is not None:
@@ -55,11 +55,11 @@ def arguments(
 def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """Arguments of this call, with the chosen names checked and the data as a folder."""
     given = parser.parse_args()
-    if known := getattr(given, "known", None):
+    if choices := getattr(given, "choices", None):
         for name in given.names:
-            if name not in known:
-                parser.error(f"unknown name {name!r}; choose some of {', '.join(known)}")
-        given.names = given.names or known
+            if name not in choices:
+                parser.error(f"unknown name {name!r}; choose some of {', '.join(choices)}")
+        given.names = given.names or choices
     if getattr(given, "data", None) is not None:
         given.data = Path(given.data)
     return given

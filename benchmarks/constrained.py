@@ -46,10 +46,10 @@ def main():
     table = Table("cells", "objective", "without risk", "within .1", "ratio", "exact")
     for n in (10,) if given.quick else (10, 50):
         for objective, observation in CASES:
-            found = [case(n, objective, observation, seed) for seed in range(N_MAPS)]
-            free, within = (1e3 * statistics.median(row[i] for row in found) for i in (0, 1))
-            ratio = statistics.median(row[1] / row[0] for row in found)
-            exact = sum(row[2] for row in found)
+            results = [case(n, objective, observation, seed) for seed in range(N_MAPS)]
+            free, within = (1e3 * statistics.median(row[i] for row in results) for i in (0, 1))
+            ratio = statistics.median(row[1] / row[0] for row in results)
+            exact = sum(row[2] for row in results)
             name = objective if observation == "gaussian" else f"{objective}, {observation}"
             table.row(
                 f"{n} x {n}", name, f"{free:.2f} ms", f"{within:.2f} ms", f"{ratio:.1f}",

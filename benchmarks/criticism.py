@@ -110,9 +110,9 @@ def main():
                 continue
             rng = np.random.default_rng([sorted(FAULTS).index(fault), seed])
             posterior = fit(draw_missions(fault, rng), PooledTrust(), "exact", whole=False)
-            seconds, found = timed(lambda dt=posterior: criticise(dt, compare=False))
-            done[fault, seed] = found.fault, seconds
-            add_record(given.out, (fault, seed, found.fault, seconds))
+            seconds, criticism = timed(lambda dt=posterior: criticise(dt, compare=False))
+            done[fault, seed] = criticism.fault, seconds
+            add_record(given.out, (fault, seed, criticism.fault, seconds))
     print(f"{n} data sets of each fault, level .05; kept in {given.out}\n")
     table = Table("fault", "found", "named", "seconds", "names", first=18)
     for fault, right in FAULTS.items():

@@ -88,30 +88,30 @@ def skill(predicted, happened):
 
 def learn(world, simulator, given):
     """Random missions: skill by bound, and reliability by bin, after 15 and 60 of them."""
-    workspace, found = simulator.workspace, {"failed": [], "15": [], "60": [], "bins": {}}
+    workspace, gathered = simulator.workspace, {"failed": [], "15": [], "60": [], "bins": {}}
     n_unseen, n_sets = given.unseen // len(given.courses), 1 if given.quick else 3
     bins = {n: np.zeros((2, 10, 3)) for n in (15, 60)}  # (mean of draws or chances, bin, sum)
     for c, course in enumerate(given.courses):
         ends = world.ends(course)
         unseen = random_missions(workspace, simulator, ends, n_unseen, seed=1000 + c)
         bounds, failed, arrived = outcomes(unseen)
-        found["failed"].append(1.0 - float(arrived.mean()))
+        gathered["failed"].append(1.0 - float(arrived.mean()))
         for j in range(n_sets):
             seen = random_missions(workspace, simulator, ends, 60, seed=100 * c + j)
             for n in (15, 60):
                 risk = BoundRisk.of(fit_hazard(seen[:n], workspace), workspace)
-                found[str(n)].append((c, skill(risk.mean[*bounds.T], failed)))
+                gathered[str(n)].append((c, skill(risk.mean[*bounds.T], failed)))
                 drawn = p_arrive(risk.draw(200, seed=1), unseen).mean(0)
                 for i, chance in enumerate((drawn, p_arrive(risk.mean, unseen))):
                     which = np.minimum((10.0 * chance).astype(int), 9)
                     for k, values in enumerate((np.ones(n_unseen), chance, arrived)):
                         bins[n][i, :, k] += np.bincount(which, values, minlength=10) / n_sets
-    return found | {"bins": {str(n): bins[n].tolist() for n in bins}}
+    return gathered | {"bins": {str(n): bins[n].tolist() for n in bins}}
 
 
 def safe_paths(world, simulator, given):
     """Share of 100 missions that arrive on the safest path, by course and by its class."""
-    truth, found = Truth.of(simulator, standard_error=0.05), {}
+    truth, gathered = Truth.of(simulator, standard_error=0.05), {}
     data = truth.bounds.data
     fails = np.clip(1.0 - data["outcome"].sel(status="ok").values, 0.0, 1.0 - 1e-9)
     # The best path by this contact has the least sum of -log(1 - p).
@@ -124,8 +124,8 @@ def safe_paths(world, simulator, given):
             path = table.best(planner.paths, "lost_contact")
             runs = [simulator.run(path, seed=seed) for seed in range(100)]
             shares.append(float(np.mean([run.status == "ok" for run in runs])))
-        found[course] = shares
-    return found
+        gathered[course] = shares
+    return gathered
 
 
 def one_campaign(world, simulator, course, n_missions, options, n_after=0):
@@ -146,13 +146,13 @@ def one_campaign(world, simulator, course, n_missions, options, n_after=0):
         if not ok[-1]:
             k = len(mission.bounds)
             stopped.add((plan.path[k - 1], plan.path[k]))
-    found = {"ok": ok, "again": again, "seconds": max(seconds)}
+    gathered = {"ok": ok, "again": again, "seconds": max(seconds)}
     if n_after:
         plan = campaign.ask()
         runs = [simulator.run(plan.path, seed=10_000 + seed) for seed in range(n_after)]
         failed = float(np.mean([run.status != "ok" for run in runs]))
-        found |= {"p_arrive": plan.p_arrive, "failed": failed}
-    return found
+        gathered |= {"p_arrive": plan.p_arrive, "failed": failed}
+    return gathered
 
 
 def campaigns(world, simulator, given):
@@ -177,14 +177,14 @@ def limits(world, simulator, given):
 
 def judged_plans(world, simulator, course, seed, given):
     """Chance to arrive of a campaign's plans, and the share of runs of each that arrive."""
-    campaign, found = tb.Campaign(
+    campaign, gathered = tb.Campaign(
         simulator.workspace, *world.ends(course), sampler="exact", seed=seed
     ), []  # fmt: skip
     for number in range(1, max(ASKED) + 1):
         plan = campaign.ask()
         if number in ASKED:
             runs = [simulator.run(plan.path, seed=20_000 + run) for run in range(given.runs)]
-            found.append(
+            gathered.append(
                 {
                     "mission": number,
                     "p_arrive": plan.p_arrive,
@@ -197,13 +197,13 @@ def judged_plans(world, simulator, course, seed, given):
         if number < max(ASKED):
             mission = simulator.run(plan.path, seed=campaign.seed_of("mission"))
             campaign.tell(mission, again=True)
-    return found
+    return gathered
 
 
 def judge_course(name, course, given):
     """Campaigns of a course, those that the folder lacks run now, by seed."""
     warnings.simplefilter("ignore")
-    folder, found, built = Path(given.out) / "reliability", {}, None
+    folder, gathered, built = Path(given.out) / "reliability", {}, None
     folder.mkdir(parents=True, exist_ok=True)
     for seed in range(given.seeds):
         file = folder / f"{name.replace(':', '_')}_{course}_{seed}.json"
@@ -211,8 +211,8 @@ def judge_course(name, course, given):
             built = built or world_of(name, given.data)
             rows = judged_plans(*built, course, seed, given)
             file.write_text(json.dumps(rows) + "\n")
-        found[seed] = json.loads(file.read_text())
-    return found
+        gathered[seed] = json.loads(file.read_text())
+    return gathered
 
 
 def reliability(names, given):
@@ -232,15 +232,15 @@ PARTS = {"safe": safe_paths, "campaigns": campaigns, "learn": learn, "limits": l
 def measure(name, given):
     """Results of a world by part, those that the folder lacks found now."""
     file = Path(given.out) / f"{name.replace(':', '_')}.json"
-    known = json.loads(file.read_text()) if file.exists() else {}
-    if missing := [part for part in given.parts if part not in known]:
+    kept = json.loads(file.read_text()) if file.exists() else {}
+    if missing := [part for part in given.parts if part not in kept]:
         simulate = MujocoSimulator if given.simulator == "mujoco" else KinematicSimulator
         world, simulator = world_of(name, given.data, simulate)
         for part in missing:
-            seconds, known[part] = timed(lambda p=part: PARTS[p](world, simulator, given))
+            seconds, kept[part] = timed(lambda p=part: PARTS[p](world, simulator, given))
             print(f"{name} {part}: {seconds:.0f} s", flush=True)
-            file.write_text(json.dumps(known) + "\n")
-    return known
+            file.write_text(json.dumps(kept) + "\n")
+    return kept
 
 
 def shown(values):
@@ -253,17 +253,17 @@ def print_campaigns(results):
         "world", "safe path", "first 3", "all 15", "last 5", "entered again", "slowest fit, s"
     )
     whole = []
-    for name, found in results.items():
-        safe = found.get("safe", {course: (1.0, 1.0) for course in found["campaigns"]})
-        kept = [c for c in found["campaigns"] if safe[c][0] >= SAFE]
+    for name, gathered in results.items():
+        safe = gathered.get("safe", {course: (1.0, 1.0) for course in gathered["campaigns"]})
+        kept = [c for c in gathered["campaigns"] if safe[c][0] >= SAFE]
         far = sum(safe[c][1] >= SAFE for c in safe) - len(kept)
-        runs = [found["campaigns"][c] for c in kept]
+        runs = [gathered["campaigns"][c] for c in kept]
         ok = np.array([run["ok"] for run in runs]).reshape(len(runs), -1)
         again = [entered for run in runs for entered in run["again"]]
         whole += [(ok, again)] if kept else []
         longer = f" (+{far})" if far else ""
         parts = [shown(part.ravel()) for part in (ok[:, :3], ok, ok[:, -5:])]
-        slowest = max(run["seconds"] for run in found["campaigns"].values())
+        slowest = max(run["seconds"] for run in gathered["campaigns"].values())
         safe_of = f"{len(kept)} of {len(safe)}{longer}"
         table.row(name, safe_of, *parts, shown(again), f"{slowest:.2f}")
     ok = np.concatenate([ok for ok, _ in whole])
@@ -277,8 +277,8 @@ def print_learning(results, csv):
     head = "world", "missions fail", "skill after 15", "after 60", "error after 15", "after 60"
     table = Table(*head)
     lines, total = ["world,missions,bin,n,predicted,arrived"], {}
-    for name, found in results.items():
-        learnt = found["learn"]
+    for name, gathered in results.items():
+        learnt = gathered["learn"]
         often = [c for c, share in enumerate(learnt["failed"]) if share > 0.2]
         # No skill is defined on a course all of whose missions fail at the first bound.
         cells = [shown([s for c, s in learnt[n] if c in often and s == s]) for n in ("15", "60")]
@@ -316,10 +316,10 @@ def print_limits(results):
         table.row(most, f"{len(held)} of {len(runs)}", *cells, shown(other))
 
 
-def print_reliability(found):
+def print_reliability(gathered):
     """Means by mission and excess; intervals, 95 %, are bootstraps over courses of worlds."""
     rng, judged = np.random.default_rng(0), []
-    for (name, _), campaigns in found.items():
+    for (name, _), campaigns in gathered.items():
         rows = np.array(
             [
                 [[row[k] for k in ("p_arrive", "product", "arrived")] for row in one]
@@ -344,7 +344,7 @@ def print_reliability(found):
                 f"{own.mean(0)[i, k]:.3f} ({low[i, k]:.3f} to {high[i, k]:.3f})" for i in range(5)
             ]
             table.row(excess, mission, *cells)
-    rows = [row for seeds in found.values() for one in seeds.values() for row in one]
+    rows = [row for seeds in gathered.values() for one in seeds.values() for row in one]
     k_hat, seconds = (max(row[name] for row in rows) for name in ("k_hat", "seconds"))
     refused = np.mean([row["k_hat"] > 0.7 for row in rows])
     print(f"\nlargest k-hat {k_hat:.2f}, refused {refused:.1%}; slowest fit {seconds:.2f} s")

@@ -66,10 +66,10 @@ def loo(given):
         missions = driven(worlds(given.data)[name])
         rates = np.concatenate([m.contact_rate.ravel() for m in missions])
         piled = np.mean((rates[~np.isnan(rates)] % 1.0) == 0.0)
-        found = {family: density(missions, family) for family in families}
-        best = max(found.values())
-        total = {family: total[family] + found[family] - best for family in families}
-        table.row(name, f"{piled:.0%}", *(f"{found[family] - best:.0f}" for family in families))
+        outcomes = {family: density(missions, family) for family in families}
+        best = max(outcomes.values())
+        total = {family: total[family] + outcomes[family] - best for family in families}
+        table.row(name, f"{piled:.0%}", *(f"{outcomes[family] - best:.0f}" for family in families))
     table.row("all", "", *(f"{total[family]:.0f}" for family in families))
 
 

@@ -311,26 +311,26 @@ class Problem:
         flat = [row * self.case.passable.shape[1] + col for row, col in plan.path]
         score, sums, admissible = along(world, flat)
         cost = world.failure_cost * -np.expm1(-sums[0]) if len(sums) else 0.0
-        got, tolerance, found = score - cost, self.tolerance(), []
+        got, tolerance, faults = score - cost, self.tolerance(), []
         if not admissible:
-            found.append("inadmissible")
+            faults.append("inadmissible")
         if len(sums):
             slack = 1e-9 * np.maximum(1.0, world.limits)
             kept = (sums <= world.limits + slack).sum() >= world.needed
             if not kept and (not plan.infeasible or sums[0] > self.least + slack[-1]):
-                found.append("risk")
+                faults.append("risk")
         if got > self.best + tolerance:
-            found.append("better than the best")
+            faults.append("better than the best")
         if plan.exact and got < self.best - tolerance:
-            found.append("worse")
+            faults.append("worse")
         sure = {"terminal": expit, "success": np.exp, "stationary": np.exp}
         to_value = sure.get(world.objective, float)
         if not plan.exact and plan.bound < to_value(self.best) * (1.0 - 1e-9) - tolerance:
-            found.append("bound")
+            faults.append("bound")
         value = to_value(score) - cost
         if abs(plan.value - value) > 10.0 * tolerance * max(1.0, abs(value)):
-            found.append("value")
-        return found, plan.exact
+            faults.append("value")
+        return faults, plan.exact
 
     def tolerance(self):
         """Rounding of a score: small beside it, and beside the sums that it comes from."""
@@ -426,22 +426,22 @@ def main():
         work(*given.work)
         return 0
     kept = read_records(given.out) if given.out else []
-    known = {tuple(record["chunk"]): record for record in kept}
+    done = {tuple(record["chunk"]): record for record in kept}
     environment, end = environment_of(given.checked), given.first + given.n
     chunks = [(given.seed, i, min(i + _CHUNK, end)) for i in range(given.first, end, _CHUNK)]
     total, wrong = Counter(), []
 
     def run(chunk):
         key = *chunk, int(given.checked)
-        return key, known.get(key) or run_chunk(*chunk, environment)
+        return key, done.get(key) or run_chunk(*chunk, environment)
 
     with ThreadPoolExecutor(given.jobs) as pool:
-        for i, (key, found) in enumerate(pool.map(run, chunks)):
-            if given.out and key not in known:
-                add_record(given.out, {"chunk": key, **found})
-            total.update(found["outcome"])
-            wrong += found["wrong"]
-            for line in found["wrong"]:
+        for i, (key, results) in enumerate(pool.map(run, chunks)):
+            if given.out and key not in done:
+                add_record(given.out, {"chunk": key, **results})
+            total.update(results["outcome"])
+            wrong += results["wrong"]
+            for line in results["wrong"]:
                 print("WRONG", line)
             print(f"{i + 1}/{len(chunks)}", ", ".join(f"{v} {k}" for k, v in total.items()))
             sys.stdout.flush()

@@ -115,12 +115,12 @@ def trustbo_exact(missions):
     model = PooledTrust()
 
     def sampler(seed):
-        found = sample_statistics(
+        drawn = sample_statistics(
             model, update_statistics(model, None, missions), n_draws=4000, seed=seed
         )
         names = model.dims
-        sites = {name: np.asarray(getattr(found.params, name))[None] for name in names}
-        return Exact(sites, min(found.kish, 4000.0), found.k_hat)
+        sites = {name: np.asarray(getattr(drawn.params, name))[None] for name in names}
+        return Exact(sites, min(drawn.kish, 4000.0), drawn.k_hat)
 
     return sampler
 
@@ -201,9 +201,9 @@ def print_ratios(ratios):
         speeds = [row.speeds for row in theirs]
         if not speeds:
             continue
-        found = np.array(ours.speeds) / np.max(speeds, axis=0)
-        judged = found[0] if when == "warm" else found[1:].min()
-        cells = (f"{ratio:.1f} x" for ratio in found)
+        ratios = np.array(ours.speeds) / np.max(speeds, axis=0)
+        judged = ratios[0] if when == "warm" else ratios[1:].min()
+        cells = (f"{ratio:.1f} x" for ratio in ratios)
         table.row(what, *cells, f"{target} x", f"{verdict(judged >= target)} ({when})")
     print()
 
@@ -335,9 +335,9 @@ def moments(draws):
 def cold_seconds(name, sampler, settings):
     """Seconds of the first draws of a fresh process."""
     code = f"import inference; inference.print_cold({name!r}, {sampler!r}, {tuple(settings)})"
-    found = subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, text=True,
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, text=True,
                            capture_output=True, cwd=Path(__file__).parent)  # fmt: skip
-    return float(found.stdout.split()[-1])
+    return float(done.stdout.split()[-1])
 
 
 def print_cold(name, sampler, settings):
@@ -531,7 +531,7 @@ def latency_row(table, name, seconds, target=None):
 
 
 def print_machine():
-    def found(name):
+    def version_of(name):
         try:
             return version(name)
         except PackageNotFoundError:
@@ -541,7 +541,7 @@ def print_machine():
     cores = len(os.sched_getaffinity(0))
     print(f"{platform.machine()}, {cores} core(s) for this process, {os.cpu_count()} in all; "
           f"Python {platform.python_version()}")  # fmt: skip
-    print(", ".join(f"{name} {found(name)}" for name in tools))
+    print(", ".join(f"{name} {version_of(name)}" for name in tools))
     print(f"nutpie runs {min(2, cores)} chain(s) at once, every other tool one after the other.")
 
 

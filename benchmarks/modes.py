@@ -65,9 +65,9 @@ def marginal(missions: list[Mission], priors: str, n: int = 36, step: float = 0.
     w, s = (a.ravel() for a in np.meshgrid(np.exp(logs), np.exp(logs), indexing="ij"))
     v = np.hypot(FLOOR, s)
     log_measure = of_noise(w) + of_noise(v) + np.log(w) + 2.0 * np.log(s) - np.log(v)
-    found = np.array([_log_density(missions, a, w**2, v**2, precision, log_measure) for a in beta0])
-    found += of_beta0(beta0)
-    return Marginal(beta0, np.exp(found - found.max()))
+    log_p = np.array([_log_density(missions, a, w**2, v**2, precision, log_measure) for a in beta0])
+    log_p += of_beta0(beta0)
+    return Marginal(beta0, np.exp(log_p - log_p.max()))
 
 
 def _log_density(
@@ -128,7 +128,7 @@ def share_of_modes(n_wanted: int, sampler: str, n_tried: int = 3000) -> None:
         if marginal(missions, priors, n=12, step=0.02).valley(1e-4) is None:
             continue
         truth = marginal(missions, priors)
-        if (at := truth.valley()) is None:
+        if (valley := truth.valley()) is None:
             continue
         model = PooledTrust(REAL if priors == "real" else Priors.zheng2023())
         try:
@@ -141,12 +141,12 @@ def share_of_modes(n_wanted: int, sampler: str, n_tried: int = 3000) -> None:
                 break
             continue
         attrs = posterior.attrs
-        found = float((posterior["posterior"]["beta0"] < at).mean())
-        worst = max(worst, abs(found - truth.below(at)))
+        share = float((posterior["posterior"]["beta0"] < valley).mean())
+        worst = max(worst, abs(share - truth.below(valley)))
         done += 1
         print(
-            f"{seed:4d} {kind:9s} P(beta0 < {at:6.3f}) = {truth.below(at):.3f}, {attrs['sampler']} "
-            f"{found:.3f}",
+            f"{seed:4d} {kind:9s} P(beta0 < {valley:6.3f}) = {truth.below(valley):.3f}, "
+            f"{attrs['sampler']} {share:.3f}",
             flush=True,
         )
         if done == n_wanted:

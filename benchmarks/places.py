@@ -74,16 +74,16 @@ def driven(side, n_missions, random_ends, missing=0.0):
 
 def campaign(world, workspace, course, n, seed, **options):
     """Result of a campaign on a world, and the regret of what is recommended after each mission."""
-    truth, found = world.truth(), []
+    truth, results = world.truth(), []
 
     def judge(campaign, mission):
-        found.append(truth.regret(campaign.recommend(), **TARGETS))
+        results.append(truth.regret(campaign.recommend(), **TARGETS))
 
     result = tb.iterate(
         workspace, *world.ends(course), n_iterations=n, simulator=world.simulator(workspace),
         seed=seed, progress=False, callbacks=[judge], **TARGETS, **options,
     )  # fmt: skip
-    return result, np.array(found)
+    return result, np.array(results)
 
 
 def times(given):
@@ -119,7 +119,7 @@ def absent(given):
     """Campaigns on truths that have no effects of places."""
     n = 2 if given.quick else 24
     kinds = {"places": PLACES, "none": PooledTrust()}
-    found = {name: {"lost": [], "learning": [], "tau": []} for name in kinds}
+    results = {name: {"lost": [], "learning": [], "tau": []} for name in kinds}
     for seed in range(n):
         ground = synthetic_terrain((500.0, 500.0), seed=seed % 6, relief=30.0)
         workspace = tb.Workspace.from_terrain(ground, (10, 10))
@@ -135,21 +135,21 @@ def absent(given):
                 workspace, *ends, n_iterations=15, simulator=simulator, model=model, seed=seed,
                 sampler="exact", progress=False, truth=truth,
             )  # fmt: skip
-            found[name]["lost"].append(truth.value(result.plan).lost)
+            results[name]["lost"].append(truth.value(result.plan).lost)
             driven_on = [truth.value(m.path).lost for m in result.missions]
-            found[name]["learning"].append(np.mean(driven_on) - best)
+            results[name]["learning"].append(np.mean(driven_on) - best)
             if name == "places":
                 sites = result.posterior["posterior"]
-                found[name]["tau"].append(
+                results[name]["tau"].append(
                     [float(sites[t].quantile(0.5)) for t in ("tau_s", "tau_e")]
                 )
-    lost = {name: np.array(each["lost"]) for name, each in found.items()}
+    lost = {name: np.array(each["lost"]) for name, each in results.items()}
     print(f"{n} campaigns of 15 missions; contact lost in bounds, expected on the path recommended")
     for name in kinds:
-        learning = np.mean(found[name]["learning"])
+        learning = np.mean(results[name]["learning"])
         print(f"  {name:7s} lost {lost[name].mean():.3f}, lost while learning {learning:.3f}")
     print(f"  ratio of lost, places to none: {lost['places'].sum() / lost['none'].sum():.3f}")
-    print(f"  median of tau_s, tau_e: {np.median(found['places']['tau'], axis=0).round(3)} "
+    print(f"  median of tau_s, tau_e: {np.median(results['places']['tau'], axis=0).round(3)} "
           f"(prior {PlaceEffect().tau_s * 0.674:.3f})")  # fmt: skip
 
 
@@ -181,7 +181,7 @@ def terrains(given):
 def sights(given):
     """Wrong canopy: one assumption of sight, and three that bracket the truth."""
     three = [Sight(extinction=0.3), Sight(extinction=0.1 / 3.0), Sight(crown_base=0.0)]
-    found = {}
+    results = {}
     for world in of_synthetic_or_given(given.data):
         if world.kind != "canopy":
             continue
@@ -191,10 +191,10 @@ def sights(given):
             )
             for course in COURSES:
                 _, regret = campaign(world, workspace, course, 15, seed=0)
-                found.setdefault(name, []).append(regret[[0, 2, 7, 14]])
-        print(world.name, {n: np.median(v[-4:], axis=0).round(2) for n, v in found.items()},
+                results.setdefault(name, []).append(regret[[0, 2, 7, 14]])
+        print(world.name, {n: np.median(v[-4:], axis=0).round(2) for n, v in results.items()},
               flush=True)  # fmt: skip
-    for name, values in found.items():
+    for name, values in results.items():
         middle, n = np.median(values, axis=0).round(2), len(values)
         print(f"{name}: regret after 1, 3, 8, 15 missions, medians of {n}: {middle}")
 
@@ -245,12 +245,12 @@ def nuts(given):
 
 def moments(posterior):
     """Mean and mean square of every parameter and every effect of a place."""
-    found, axes = {}, ("chain", "draw")
+    results, axes = {}, ("chain", "draw")
     for group in ("posterior", "places"):
         for name, draws in posterior[group].data_vars.items():
             if set(axes) <= set(draws.dims):
-                found[name] = np.ravel(draws.mean(axes)), np.ravel((draws**2).mean(axes))
-    return found
+                results[name] = np.ravel(draws.mean(axes)), np.ravel((draws**2).mean(axes))
+    return results
 
 
 def main():

@@ -188,7 +188,7 @@ def results(todo, workers):
 
 def table(regrets, options):
     """Print a table for each scenario; the runs' regret by scenario and policy."""
-    found = {}
+    outcomes = {}
     for name in options.scenarios:
         print(f"{name}, objective {options.objective}: regret, median / 90 % quantile\n")
         shown = [f"after {k}" for k in SHOWN]
@@ -199,14 +199,14 @@ def table(regrets, options):
             r = np.array([row for row in rows if row is not None])
             if not len(r):
                 continue
-            found[name, policy] = r
+            outcomes[name, policy] = r
             cells = [
                 f"{np.median(r[:, k - 1]):.1%} / {np.quantile(r[:, k - 1], 0.9):.1%}" for k in SHOWN
             ]
             cells += [share(r[:, k - 1] <= FOUND) for k in (1, 10)] + [share(r[:, -1] > FOUND)]
             lines.row(f"`{policy}`", len(r), *cells)
         print()
-    return found
+    return outcomes
 
 
 SUMMARY = (
@@ -220,14 +220,14 @@ SUMMARY = (
 )
 
 
-def summary(found, options):
+def summary(outcomes, options):
     """One table of all scenarios."""
     columns = [column for column in SUMMARY if column[0] in options.scenarios]
     lines = Table("policy", *(f"{s}: {what} after {k}" for s, k, what in columns))
     for policy in options.policies:
         cells = []
         for name, k, what in columns:
-            regret = found.get((name, policy))
+            regret = outcomes.get((name, policy))
             if regret is None:
                 cells.append("")
                 continue
@@ -246,13 +246,13 @@ TARGETS = (
 )
 
 
-def targets(found):
+def targets(outcomes):
     """What issue 6 asks for; of known maps it names no policy, so the default one counts."""
     for name, k, policies, what, limit in TARGETS:
         for policy in policies:
-            if (name, policy) not in found:
+            if (name, policy) not in outcomes:
                 continue
-            hits = found[name, policy][:, k - 1] <= FOUND
+            hits = outcomes[name, policy][:, k - 1] <= FOUND
             hits = hits if what == "found" else ~hits
             met = hits.mean() >= limit if what == "found" else hits.mean() <= limit
             sign = ">=" if what == "found" else "<="
@@ -272,9 +272,9 @@ def main():
     if options.quick:
         options.seeds = min(options.seeds, 3)
     study(options)
-    found = table(read(options.out, options.objective), options)
-    summary(found, options)
-    targets(found)
+    outcomes = table(read(options.out, options.objective), options)
+    summary(outcomes, options)
+    targets(outcomes)
 
 
 if __name__ == "__main__":

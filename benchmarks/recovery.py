@@ -45,9 +45,9 @@ def main():
     for campaign in range(n_campaigns):
         truth, missions = simulate_campaign(rng, model)
         posterior = fit(missions, model, "nuts", seed=campaign)
-        found = diagnostics(posterior)
-        worst["r_hat"] = max(worst["r_hat"], found["r_hat"])
-        worst["ess_bulk"] = min(worst["ess_bulk"], found["ess_bulk"])
+        results = diagnostics(posterior)
+        worst["r_hat"] = max(worst["r_hat"], results["r_hat"])
+        worst["ess_bulk"] = min(worst["ess_bulk"], results["ess_bulk"])
         draws = params_of(posterior)
         pairs = {
             "beta0": (draws.beta0, truth.beta0),

@@ -76,14 +76,14 @@ class Walks(NamedTuple):
     def _ranked(
         self, place: np.ndarray | None, place_bound: np.ndarray | None, draws: tuple[int, ...]
     ) -> dict[str, np.ndarray]:
-        found: dict[str, np.ndarray] = {}
+        results: dict[str, np.ndarray] = {}
         if place is not None:
-            found["place[first]"] = place[:, 0, *self.bounds[0, 0, 1:]]
-            found["place[last]"] = place[:, 0, -1, -1]
+            results["place[first]"] = place[:, 0, *self.bounds[0, 0, 1:]]
+            results["place[last]"] = place[:, 0, -1, -1]
         if place_bound is not None:
-            found["place_bound[first]"] = place_bound[:, 0, *self.bounds[0, 0]]
-            found["place_bound[second]"] = place_bound[:, 0, *self.bounds[0, 1]]
-        return {name: value.reshape(draws) for name, value in found.items()}
+            results["place_bound[first]"] = place_bound[:, 0, *self.bounds[0, 0]]
+            results["place_bound[second]"] = place_bound[:, 0, *self.bounds[0, 1]]
+        return {name: value.reshape(draws) for name, value in results.items()}
 
 
 _EFFECTS = ("place", "place_bound")

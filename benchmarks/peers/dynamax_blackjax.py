@@ -22,8 +22,8 @@ def pooled(awareness, rates, *, warmup, draws, chains):
         with jax.enable_x64(True):
             keys = jax.random.split(jax.random.key(seed), chains)
             theta = run(keys, z, y, warmup, draws)
-            found = jax.vmap(jax.vmap(constrain))(theta)
-            return {name: np.asarray(a) for name, a in found.items()}
+            results = jax.vmap(jax.vmap(constrain))(theta)
+            return {name: np.asarray(a) for name, a in results.items()}
 
     return sampler
 
@@ -39,8 +39,8 @@ def run(keys, z, y, warmup, draws):
         adaptation = blackjax.window_adaptation(
             blackjax.nuts, density, is_mass_matrix_diagonal=False
         )
-        (state, found), _ = adaptation.run(key_warmup, start, warmup)
-        kernel = blackjax.nuts(density, **found)
+        (state, tuned), _ = adaptation.run(key_warmup, start, warmup)
+        kernel = blackjax.nuts(density, **tuned)
 
         def advance(state, key):
             state, _ = kernel.step(key, state)

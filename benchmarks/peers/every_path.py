@@ -141,10 +141,10 @@ def along(world, path):
     admissible &= world.goal not in path[:-1] and len(path) - 1 <= world.longest
     admissible &= not world.simple or len(set(path)) == len(path)
     for a, c in pairwise(path):
-        found = np.flatnonzero(world.into[:, a] == c)
-        if not len(found) or (not world.u_turns and came != NONE and found[0] == 7 - came):
+        entering = np.flatnonzero(world.into[:, a] == c)
+        if not len(entering) or (not world.u_turns and came != NONE and entering[0] == 7 - came):
             return -np.inf, risk, False
-        came, before = found[0], world.trust(x)
+        came, before = entering[0], world.trust(x)
         x = world.B0 @ x + world.u[:, came, c]
         t = world.trust(x) - world.lag * before if settled is None else settled[came, c]
         costs.append(-t if world.objective in ("terminal", "mean") else world.loss(t))
@@ -232,9 +232,9 @@ def dense_table(world):
         constant = 0.0 if weights is None else weights[1][k]
         score = (constant - final) / (k if world.objective == "mean" else 1) + failures
         by_risk = np.maximum(by_risk, np.where(final < np.inf, score, -np.inf))
-    found = by_risk > -np.inf
-    safest = spent[found][0] * world.unit if found.any() else np.inf
-    within = spent * world.unit <= world.limits[0] if len(world.limits) else found
+    reached = by_risk > -np.inf
+    safest = spent[reached][0] * world.unit if reached.any() else np.inf
+    within = spent * world.unit <= world.limits[0] if len(world.limits) else reached
     return safest, by_risk[within].max(initial=-np.inf)
 
 

@@ -40,8 +40,8 @@ def _sampler(model, dense_mass, names, args, warmup, draws, chains):
     def sampler(seed):
         with jax.enable_x64(True), contextlib.redirect_stderr(io.StringIO()):
             mcmc.run(jax.random.key(seed), *args)
-            found = mcmc.get_samples(group_by_chain=True)
-            return {name: np.asarray(found[name]) for name in names}
+            results = mcmc.get_samples(group_by_chain=True)
+            return {name: np.asarray(results[name]) for name in names}
 
     return sampler
 

@@ -35,8 +35,8 @@ def sampler_of(compiled, names=None, *, draws, chains, tune=None, low_rank=False
             progress_bar=False,
         )
         posterior = trace["posterior"]
-        found = {name: posterior[name].values for name in names or posterior.data_vars}
-        return found if finish is None else finish(found)
+        results = {name: posterior[name].values for name in names or posterior.data_vars}
+        return results if finish is None else finish(results)
 
     return sampler
 
@@ -132,21 +132,21 @@ def covariance(name, n):
     return factor @ factor.T
 
 
-def coupled_matrices(found):
+def coupled_matrices(results):
     """Sites of the coupled model as its parameters."""
-    n = found["b"].shape[-1]
+    n = results["b"].shape[-1]
     diagonal, off, lower = np.arange(n), np.nonzero(~np.eye(n, dtype=bool)), np.tril_indices(n)
 
     def matrix(name):
-        own, others = found[f"{name}_diagonal"], found[f"{name}_coupling"]
+        own, others = results[f"{name}_diagonal"], results[f"{name}_coupling"]
         full = np.zeros((*own.shape, n))
         full[..., diagonal, diagonal] = own
         full[..., off[0], off[1]] = others
         return full
 
-    params = {"B0": matrix("B0"), "B": matrix("B"), "b": found["b"]}
+    params = {"B0": matrix("B0"), "B": matrix("B"), "b": results["b"]}
     for name in ("Delta_w", "Delta_v"):
-        factor = np.zeros((*found[name].shape[:-1], n, n))
-        factor[..., lower[0], lower[1]] = found[name]
+        factor = np.zeros((*results[name].shape[:-1], n, n))
+        factor[..., lower[0], lower[1]] = results[name]
         params[name] = factor @ np.swapaxes(factor, -1, -2)
     return params
