@@ -70,8 +70,8 @@ def serial(folder):
 @pytest.fixture(scope="module")
 def client(tmp_path_factory):
     # Locks of cores of their own, and sets of names in another order than here.
-    own = {"TMPDIR": str(tmp_path_factory.mktemp("locks")), "PYTHONHASHSEED": "7"}
-    options = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "env": own}
+    environment = {"TMPDIR": str(tmp_path_factory.mktemp("locks")), "PYTHONHASHSEED": "7"}
+    options = {"n_workers": 2, "threads_per_worker": 1, "memory_limit": 0, "env": environment}
     with LocalCluster(dashboard_address=None, **options) as cluster, Client(cluster) as client:
         yield client
 
@@ -242,8 +242,8 @@ def no_cache():
 
 @pytest.mark.usefixtures("no_cache")
 def test_workers_keep_compiled_code_in_the_user_s_cache_unless_told_where(monkeypatch, tmp_path):
-    for own in ("a", "b"):  # the second finds what the first set
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / own))
+    for name in ("a", "b"):  # the second finds what the first set
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / name))
         executors.keep_compiled_code()
         assert jax.config.jax_compilation_cache_dir == str(tmp_path / "a" / "trustbo" / "jax")
 
@@ -509,6 +509,7 @@ def test_regret_curves_show_each_policy_s_median(serial):
         ({"terrains": {"random": {"seed": "each"}}}, "seed .* must be a whole number; got 'each'"),
         ({"terrains": {"read_terrain": {}}}, r"terrain 'read_terrain' \(read_terrain\) needs dem"),
         ({"terrains": {"files": {"dem": "x", "dsm": "y"}}}, "dem: there is no file '.*x'"),
+        ({"terrains": {"read_lidar": {"points": ["x.laz"]}}}, "points: there is no file '.*x.laz'"),
         ({"terrains": {"random": {"shape": [5, 5], "goal": [0, 9]}}}, r"goal \(0, 9\) is outside"),
         ({"simulators": {"model": {"beta0": 0.5}}}, "needs beta, b, delta_w, delta_v; got"),
         ({"simulators": {"model": TRUTH | {"beta": [1]}}}, "the run seed=0, terrain=.*feature"),

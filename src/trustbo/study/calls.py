@@ -65,7 +65,7 @@ def call_of(
     if kinds and ":" not in kind and kind not in kinds:
         raise unknown(f"kind of {what.partition(' ')[0]} {IMPORTED}", kind, kinds)
     keywords = {name: value for name, value in settings.items() if name != "kind"}
-    parameters = {n: p for n, p in _parameters(kind).items() if n not in given}
+    parameters = {n: p for n, p in parameters_of(kind).items() if n not in given}
     variable = [n for n, p in parameters.items() if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL)]
     for name in () if variable else keywords:
         if name not in (names := (*parameters, *more)):
@@ -129,7 +129,7 @@ def identity(settings: Any) -> Any:
     if not isinstance(settings, Mapping):
         return settings
     kind = settings.get("kind", "")
-    parameters = _parameters(kind) if kind else {}
+    parameters = parameters_of(kind) if kind else {}
     kept = {"kind": kind}
     for name, value in settings.items():
         default = parameters[name].default if name in parameters else inspect.Parameter.empty
@@ -137,11 +137,6 @@ def identity(settings: Any) -> Any:
         if name != "kind" and not (plain and default == made(value)):
             kept[name] = _digests(value) if name in FILES else identity(value)
     return kept
-
-
-def takes(kind: str, name: str) -> bool:
-    """Whether a constructor takes a keyword."""
-    return name in _parameters(kind)
 
 
 def constructor(kind: str) -> Callable[..., Any]:
@@ -162,7 +157,8 @@ def constructor(kind: str) -> Callable[..., Any]:
     return public
 
 
-def _parameters(kind: str) -> Mapping[str, inspect.Parameter]:
+def parameters_of(kind: str) -> Mapping[str, inspect.Parameter]:
+    """Parameters of a constructor by name."""
     return inspect.signature(constructor(kind)).parameters
 
 

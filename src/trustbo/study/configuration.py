@@ -20,7 +20,7 @@ from trustbo.models.model import TrustModel
 from trustbo.planning import OBJECTIVES, POLICIES
 from trustbo.simulation import ModelSimulator, Simulator
 from trustbo.simulation.protocol import Simulator
-from trustbo.study.calls import FILES, call_of, identity, made, seeded, takes
+from trustbo.study.calls import FILES, call_of, identity, made, parameters_of, seeded
 from trustbo.study.experiment import Experiment, Scene, corners
 from trustbo.study.methods import Case, Model, model_from, model_of
 from trustbo.team import Team
@@ -61,8 +61,8 @@ def _simulate(settings: Mapping[str, Any], workspace: Workspace) -> Simulator:
 
 def _of_grid(terrain: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Settings of the terrain alone, and of its planning grid."""
-    kind = terrain["kind"]
-    alone = {n: v for n, v in terrain.items() if n == "kind" or takes(kind, n)}
+    names = "kind", *parameters_of(terrain["kind"])
+    alone = {n: v for n, v in terrain.items() if n in names}
     return alone, {n: v for n, v in terrain.items() if n not in (*alone, *_ENDS)}
 
 
@@ -241,9 +241,7 @@ def read_study(path: FilePath) -> Study:
     file = Path(path)
     configuration = read_yaml(file)
     try:
-        if isinstance(configuration, Mapping):
-            configuration = _with_paths_from(file.parent, configuration)
-        return Study.of(configuration)
+        return Study.of(_from_folder(file.parent, configuration))
     except TrustboError as error:
         raise TrustboError(f"{file}: {error}") from None
 
@@ -351,21 +349,13 @@ def _model(noun: str, settings: dict[str, Any] | TrustModel) -> Model:
     return checked
 
 
-def _with_paths_from(folder: Path, configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """Configuration with the files of its terrains relative to a folder."""
-    if not isinstance(terrains := configuration.get("terrains"), Mapping):
-        return dict(configuration)
-
-    def moved(files: Any) -> Any:
-        if isinstance(files, list):
-            return [moved(file) for file in files]
-        return str(folder / files) if isinstance(files, str) else files
-
-    return {**configuration, "terrains": {
-        name: {key: moved(value) if key in FILES else value for key, value in settings.items()}
-        if isinstance(settings, Mapping) else settings
-        for name, settings in terrains.items()
-    }}  # fmt: skip
+def _from_folder(folder: Path, settings: Any, name: str = "") -> Any:
+    """Settings with the names of files relative to a folder."""
+    if isinstance(settings, Mapping):
+        return {n: _from_folder(folder, value, n) for n, value in settings.items()}
+    if isinstance(settings, list):
+        return [_from_folder(folder, one, name) for one in settings]
+    return str(folder / settings) if name in FILES and isinstance(settings, str) else settings
 
 
 def _listed(what: str, values: object) -> Sequence[Any]:

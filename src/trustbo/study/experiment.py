@@ -92,7 +92,7 @@ class Run:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Everything that its numbers depend on; names that the user gives to parts are not."""
+        """Settings that the numbers depend on: all but the names that the user gives."""
         return {
             "case": self.case.identity(),
             "scene": self.scene.identity,
@@ -173,10 +173,8 @@ class Experiment:
             for run, record in ended:
                 theirs = record.get("versions", VERSIONS)["trustbo"]
                 if theirs != VERSIONS["trustbo"]:  # the key has ours
-                    message = (
-                        f"the worker has trustbo {theirs}, and the study {VERSIONS['trustbo']}"
-                    )
-                    record["error"] = message
+                    ours = VERSIONS["trustbo"]
+                    record["error"] = f"the worker has trustbo {theirs}, and the study {ours}"
                 store.write(run.key, {"labels": run.labels, "identity": run.identity, **record})
                 if "error" in record:
                     failed.append(f"{run}: {record['error']}")
@@ -284,7 +282,7 @@ class _Referee:
         self.rows.append(row | {f"{name}_followed": value for name, value in followed.items()})
 
     def recommended(self, campaign: Campaign) -> dict[str, Any]:
-        """Path that the model recommends or, where it has its choice, the policy; and its value."""
+        """Path recommended by the model, or by a policy with `recommend`, and its value."""
         choose = getattr(campaign.policy, "recommend", None)
         path = campaign.recommend().path if choose is None else choose(campaign)
         return {"recommended": [list(cell) for cell in path], **self.judge(campaign, path)}

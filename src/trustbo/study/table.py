@@ -37,16 +37,12 @@ def to_dataset(
             for i, j, row in cells:
                 steps[i, j, : len(row[name])] = row[name]
             variables[name] = ((*dims, "step", "axis"), steps)
-        elif name in _TEXT:
-            words = np.full(shape, "", dtype=object)
-            for i, j, row in cells:
-                words[i, j] = row.get(name, "")
-            variables[name] = (dims, words.astype(str))
         else:
-            numbers = np.full(shape, np.nan)
+            missing, kind = ("", object) if name in _TEXT else (np.nan, float)
+            values = np.full(shape, missing, dtype=kind)
             for i, j, row in cells:
-                numbers[i, j] = np.nan if row.get(name) is None else row[name]
-            variables[name] = (dims, numbers)
+                values[i, j] = missing if row.get(name) is None else row[name]
+            variables[name] = (dims, values.astype(str if name in _TEXT else float))
     for name in ("oracle", *BEFORE, "seconds", "seconds_cpu"):
         values = [np.nan if run.get(name) is None else run[name] for run in runs]
         variables[name] = ("run", np.array(values, dtype=float))

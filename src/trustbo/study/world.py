@@ -121,9 +121,9 @@ class World:
         true = {"terrain": self.true_terrain(), "sight": self.sight, "team": self.team()}
         return (KinematicSimulator if simulate is None else simulate)(workspace, **true)
 
-    def truth(self) -> Truth:
+    def truth(self, simulate: Simulate | None = None, *, progress: bool = False) -> Truth:
         """Truth of the simulator, from disk where it has been computed before."""
-        return Truth.of(self.simulator(self.workspace()))
+        return Truth.of(self.simulator(self.workspace(), simulate), progress=progress)
 
     def ends(self, course: str) -> tuple[Cell, Cell]:
         """Start and goal of a course: the nearest cells from which most others can be reached."""
