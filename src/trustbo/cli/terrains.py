@@ -76,7 +76,8 @@ def terrain_with(
 
     TrustboError: one is off the grid, without data or too steep; no awareness was computed.
     """
-    from trustbo.workspace import Grid, survey
+    from trustbo.workspace import survey
+    from trustbo.workspace.grid import Grid
     from trustbo.workspace.location import cell_of
 
     with warnings.catch_warnings():

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.campaign.loop import path_class
+from trustbo.campaign.planners import path_class
 from trustbo.campaign.result import Result
 from trustbo.campaign.stopping import RegretBound
 from trustbo.data import Cell, Mission

@@ -13,11 +13,12 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
-from trustbo.simulation import KinematicSimulator, Simulator, Truth
+from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import digest, identity_of, imported
 from trustbo.study.experiment import Scene
 from trustbo.team import Robot, Team
+from trustbo.terrain.dataset import assemble_terrain
 from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
@@ -208,7 +209,7 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
     ground = dem + 0.3 * noise()
     canopy = np.where(clearings, 0.0, 0.7 * (dsm - dem))
     old = now["dem"].copy(data=ground), now["dsm"].copy(data=ground + canopy)
-    return terrain.assemble_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
+    return assemble_terrain(*(heights.rio.write_crs(now.rio.crs) for heights in old))
 
 
 @lru_cache(maxsize=4)

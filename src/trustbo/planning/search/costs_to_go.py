@@ -24,6 +24,7 @@ from trustbo.planning.search.losses import LEAST, NONE, least_slope, loss_of
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
+_leaf = njit(nogil=True, error_model="numpy", _nrt=False, **PART)
 _inlined = njit(nogil=True, error_model="numpy", inline="always")  # no counts of references
 
 
@@ -98,21 +99,35 @@ def look_ahead(graph: Graph, costs: Costs, by_edge: bool) -> Ahead:
     n_nodes, loss = len(graph.rank), costs.loss
     hi, lo = filled(n_nodes, -np.inf), filled(n_nodes, np.inf)
     own, fall, slope = filled(n_nodes, 0.0), filled(n_nodes, 0.0), filled(n_nodes, 0.0)
-    of_edge = filled(len(graph.head) if by_edge and loss != NONE else 0, 0.0)
     if loss == NONE and not graph.layered:
-        return Ahead(own, own, fall, slope, of_edge)
+        return Ahead(own, own, fall, slope, filled(0, 0.0))
+    of_edge = filled(len(graph.head) if by_edge and loss != NONE else 0, 0.0)
+    ahead = Ahead(hi, own, fall, slope, of_edge)
+    _fill_ahead(graph, costs, lo, ahead)
+    return ahead
+
+
+@_leaf
+def _fill_ahead(graph, costs, lo, ahead):
+    first, head, cell, bound = graph.first, graph.head, graph.cell, graph.bound
+    hi, own, fall, slope, of_edge = ahead
+    drift, beta0, by_bound, sd, loss = (
+        costs.drift,
+        costs.beta0,
+        costs.by_bound,
+        costs.noise_sd,
+        costs.loss,
+    )
+    n_nodes, by_edge = len(hi), len(of_edge) > 0
     for length in range(len(graph.starts)):
         node = graph.starts[length]
         if node >= 0 and costs.start_cost[length] < np.inf:
             hi[node] = lo[node] = costs.x0
-    # Arrays of records by names of their own: a loop counts the references of a record's.
-    first, head, cell, bound, drift = graph.first, graph.head, graph.cell, graph.bound, costs.drift
-    beta0, by_bound, sd = costs.beta0, costs.by_bound, costs.noise_sd
     for node in range(n_nodes - 1, -1, -1):  # from the start: a layered graph's tails come first
         if hi[node] == -np.inf:
             continue
         for e in range(first[node], first[node + 1]):
-            h = head[e]
+            h = np.uint64(head[e])  # unsigned: no test for a negative index
             if loss == NONE:
                 hi[h] = 0.0
                 continue
@@ -131,16 +146,24 @@ def look_ahead(graph: Graph, costs: Costs, by_edge: bool) -> Ahead:
             continue
         least = 0.0 if node == 0 else np.inf
         for e in range(first[node], first[node + 1]):
-            least = min(least, fall[head[e]] + slope[head[e]])
+            h = np.uint64(head[e])
+            least = min(least, fall[h] + slope[h])
         slope[node] = beta0 * least if least < np.inf else 0.0
-    return Ahead(hi, own, fall, slope, of_edge)
 
 
 @_part
 def pass_back(graph: Graph, costs: Costs, ahead: Ahead, toll: np.ndarray) -> ToGo:
     """Compute the least cost to go of every node with some tolls."""
-    n_nodes, loss = len(graph.rank), costs.loss
-    best, second, by = filled(n_nodes, np.inf), filled(n_nodes, np.inf), np.empty(n_nodes, np.int8)
+    n_nodes = len(graph.rank)
+    to_go = ToGo(toll, filled(n_nodes, np.inf), filled(n_nodes, np.inf), np.empty(n_nodes, np.int8))
+    _settle(graph, costs, ahead, to_go)
+    return to_go
+
+
+@_leaf
+def _settle(graph, costs, ahead, to_go):
+    toll, best, second, by = to_go
+    n_nodes, loss = len(best), costs.loss
     for node in range(n_nodes):
         by[node] = -1
     best[0] = second[0] = -np.inf if loss == LEAST else 0.0
@@ -155,9 +178,9 @@ def pass_back(graph: Graph, costs: Costs, ahead: Ahead, toll: np.ndarray) -> ToG
             node = n_nodes - i if backwards else i
             if hi[node] == -np.inf:
                 continue
-            least, next_least, chosen = np.inf, np.inf, np.int8(-1)
+            least, next_least, chosen = np.inf, np.inf, -1
             for e in range(first[node], first[node + 1]):
-                h, m = head[e], move[e]
+                h, m = np.uint64(head[e]), move[e]  # unsigned: no test for a negative index
                 total = best[h] if u_turns or by[h] != last - m else second[h]
                 if loss != NONE:
                     after = beta0 * hi[node] + (drift[bound[e]] if by_bound else drift[cell[h]])
@@ -166,14 +189,13 @@ def pass_back(graph: Graph, costs: Costs, ahead: Ahead, toll: np.ndarray) -> ToG
                     total += slope[h] * lack
                     total = max(enters, total) if loss == LEAST else enters + total
                 total += toll[e]
-                if total < least:
-                    least, next_least, chosen = total, least, m
-                elif total < next_least:
-                    next_least = total
+                # Without branches: they would be mispredicted at every other edge.
+                next_least = min(next_least, max(total, least))
+                chosen = m if total < least else chosen
+                least = min(total, least)
             changed = changed or (least < best[node] and not graph.layered)
             best[node], second[node], by[node] = least, next_least, chosen
         backwards = not backwards
-    return ToGo(toll, best, second, by)
 
 
 @_part

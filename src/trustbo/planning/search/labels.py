@@ -45,6 +45,7 @@ from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
+_leaf = njit(nogil=True, error_model="numpy", _nrt=False, **PART)
 _inlined = njit(nogil=True, error_model="numpy", inline="always")  # see README
 MAX_LABELS = 300_000
 """Limit on the labels of a draw."""
@@ -202,26 +203,45 @@ def _by_rank(graph, costs, resources, ahead, need, dual, best, max_labels):
     inf where all was seen.
     """
     labels, heads, n = _first_labels(graph, costs, len(resources.limits))
-    F, goal = resources.failure_cost, np.int64(-1)
-    for node in range(len(heads) - 1, -1, -1):
-        label = heads[node]
-        while label >= 0:
-            if graph.rank[node] == 0:
-                first = labels.used[label, 0] if len(resources.limits) > 0 else 0.0
-                cost = labels.state[label, 0] + failure(F, first)
-                if cost < best:
-                    best, goal = cost, label
-            elif not _is_dominated(graph, resources, labels, heads[node], label, costs.loss):
-                most = n + graph.first[node + 1] - graph.first[node]
-                if most > len(labels.state):
-                    if n >= max_labels:
-                        return _found(graph, labels, goal, best), dual.root
-                    labels = _with_room(labels, most)
-                n = _extend(
-                    graph, costs, resources, ahead, need, dual, best, label, labels, heads, n
-                )
-            label = labels.link[label, 3]
-    return _found(graph, labels, goal, best), np.inf
+    node, label, goal = np.int64(len(heads)), np.int64(-1), np.int64(-1)
+    while True:
+        node, label, n, goal, best = _expand_by_rank(
+            graph, costs, resources, ahead, need, dual, best, labels, heads, node, label, n, goal
+        )
+        if node < 0:
+            return _found(graph, labels, goal, best), np.inf
+        if n >= max_labels:
+            return _found(graph, labels, goal, best), dual.root
+        labels = _with_room(labels, n + graph.first[node + 1] - graph.first[node])
+
+
+@_leaf
+def _expand_by_rank(
+    graph, costs, resources, ahead, need, dual, best, labels, heads, node, label, n, goal
+):
+    """Expand labels from one of a node on, until all are or there is no room for more.
+
+    Returns the node, -1 after the last, and its label to go on from, the number of labels, the best
+    one at the goal, and its cost.
+    """
+    F, rank, first = resources.failure_cost, graph.rank, graph.first
+    link, state, used = labels
+    while True:
+        while label < 0:
+            node -= 1
+            if node < 0:
+                return node, label, n, goal, best
+            label = heads[node]
+        if rank[node] == 0:
+            first_sum = used[label, 0] if len(resources.limits) > 0 else 0.0
+            cost = state[label, 0] + failure(F, first_sum)
+            if cost < best:
+                best, goal = cost, label
+        elif not _is_dominated(graph, resources, labels, heads[node], label, costs.loss):
+            if n + first[node + 1] - first[node] > len(state):
+                return node, label, n, goal, best
+            n = _extend(graph, costs, resources, ahead, need, dual, best, label, labels, heads, n)
+        label = link[label, 3]
 
 
 @_inlined
@@ -257,7 +277,7 @@ def _with_room(labels, n):
     return _Labels(with_room(labels.link, n), with_room(labels.state, n), with_room(labels.used, n))
 
 
-@_part
+@_leaf
 def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, heads, n):
     """Add the labels of one more edge that may lead to less than `best`; their number so far."""
     # Arrays of records by names of their own: a loop counts the references of a record's.
@@ -310,7 +330,7 @@ def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, hea
     return n
 
 
-@_part
+@_leaf
 def _is_dominated(graph, resources, labels, other, label, loss):
     """True if labels of the same node have all the completions of one, at no higher cost."""
     link, state, used = labels  # no call below: each would count the references of all arrays
