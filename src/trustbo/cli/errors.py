@@ -41,7 +41,7 @@ def one_line_errors(debug: bool, campaign: Path | None = None) -> Iterator[None]
         try:
             yield
         except (KeyboardInterrupt, SystemError) as error:  # numba makes the former the latter
-            if not isinstance(error.__cause__ or error, KeyboardInterrupt):
+            if KeyboardInterrupt not in (type(error), type(error.__cause__)):
                 raise
             print(f"\ninterrupted; {_way_on(campaign)}", file=sys.stderr)
             raise typer.Exit(INTERRUPTED) from None
