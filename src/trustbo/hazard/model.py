@@ -188,7 +188,7 @@ def _dataset(
     """The group without the maps of chances."""
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(systematic(points.weights, n_draws, rng))
-    weights, limit, strength = betas.parts(betas.values(points.z[chosen]))
+    weights, limit, strength = betas.split(betas.values(points.z[chosen]))
     degrees = {"units": "degrees"}  # absent without a limit
     of_limit = {n: ("draw", v, degrees) for n, v in zip(LIMIT_NAMES, limit.T, strict=False)}
     shape = difficulty_of(workspace).shape[:3]

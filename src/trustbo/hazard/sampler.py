@@ -72,9 +72,9 @@ class BetaPriors(NamedTuple):
 
     def __call__(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Alpha and beta of each Beta, each (point, bound)."""
-        return prior_betas(*self.parts(self.values(z)), self.difficulty, self.steepness)
+        return prior_betas(*self.split(self.values(z)), self.difficulty, self.steepness)
 
-    def parts(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def split(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Weights (point, 1 + measure), limit (point, 0 or 2) and strength (point,) of values."""
         n = 1 + self.difficulty.shape[1]
         return values[:, :n], values[:, n:-1], values[:, -1]
@@ -275,8 +275,8 @@ def _rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
         if len(columns):
             out[:, columns] += np.log((x[:, columns] if x.shape[1] > 1 else x) + i)
     if (columns := np.flatnonzero(~few)).size:
-        part = x[:, columns] if x.shape[1] > 1 else x
-        out[:, columns] = special.gammaln(part + k[columns]) - special.gammaln(part)
+        entries = x[:, columns] if x.shape[1] > 1 else x
+        out[:, columns] = special.gammaln(entries + k[columns]) - special.gammaln(entries)
     return out
 
 

@@ -81,11 +81,11 @@ class Planner(Displayed):
                 `"stationary"`; see `OBJECTIVES`.
             connectivity: 4, or 8 to allow diagonal bounds too.
             max_bounds: Limit on the number of bounds. `"shortest"`: the fewest possible;
-                `"shortest+n"`: up to n more, without U-turns, which keeps paths simple for n up to
-                2 (default for terminal and mean; 4 for lost_contact); `Plan.revisits` counts cells
-                entered again beyond. An int: walks of at most that many bounds (default for
-                success and bottleneck: shortest + 8). Without effect on stationary, whose
-                admissible paths are all simple paths.
+                `"shortest+n"`: up to n more, without U-turns (default: n = 2 for terminal and mean,
+                4 for lost_contact); paths are simple for n up to 2, and `Plan.revisits` counts
+                cells entered again for larger n. An int: walks of at most that many bounds
+                (default for success and bottleneck: shortest + 8). Without effect on stationary,
+                whose admissible paths are all simple paths.
             revisit: True if walks of success, bottleneck, and lost_contact of other than Gaussian
                 rates may enter a cell twice; without effect on the other objectives.
             team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
@@ -94,9 +94,9 @@ class Planner(Displayed):
             engine: `"numba"`, compiled, which `"auto"` takes; or `"networkx"`, the reference. Both
                 find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
-            observation: Family of the contact rates, and
-            response: quantity that they measure, both as of the trust model: for lost_contact,
-                and for the policy `information`.
+            observation: Family of the contact rates, that of the trust model; for lost_contact and
+                the policy `information`.
+            response: Quantity that rates measure, that of the trust model; likewise.
             max_failure: Largest chance that a path fails, in [0, 1), under the risk of `with_risk`;
                 by default no limit.
             confidence: Least share of the draws of the risk under which a path must respect
