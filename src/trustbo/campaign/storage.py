@@ -138,7 +138,12 @@ class Storage:
         write_missions(self._target / MEASURED, missions, since=since, notes=notes)
 
     def write(
-        self, state: CampaignState, result: Result | None, *, whole: bool = False, ended=False
+        self,
+        state: CampaignState,
+        result: Result | None,
+        *,
+        whole: bool = False,
+        ended: bool = False,
     ) -> None:
         """Write the result and then the state.
 
