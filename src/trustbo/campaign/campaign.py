@@ -570,14 +570,14 @@ class Campaign(Displayed):
         A mission that was recorded and not yet learned from is learned from now.
 
         Args:
-            directory: Folder of its `directory`, or of `save`.
+            directory: Folder that was passed as `directory`, or to `save`.
             model: The same model, if it or its priors are custom.
             policy: The same policy, if it is custom.
-            **custom: The same `callbacks`, and the same `awareness`, if it is custom, without the
-                measurements of missions.
+            **custom: The same `callbacks`, and the same `awareness` if it is custom, in its state
+                before the first mission.
 
         Raises:
-            TrustboError: There is no campaign; another process is at work on it; or a custom object
+            TrustboError: There is no campaign; another process has locked it; or a custom object
                 is missing.
         """
         storage = Storage(directory, begun=True)

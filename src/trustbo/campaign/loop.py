@@ -57,7 +57,7 @@ def iterate(
             goes into the history, in % of the contact that the best admissible path keeps.
         stop: Rules to end before `n_iterations`, asked between missions: a `RegretBound`,
             `TimeLimit`, a callable `stop(campaign) -> reason or None`, or several of them.
-        checkpoint: Folder in which everything is kept as it goes, replacing another campaign in it.
+        checkpoint: Folder that is updated after each mission; another campaign in it is replaced.
             If the process dies, `resume` goes on from it.
         seed: Seed of everything random.
         progress: Whether to show a progress bar, and in a notebook a map that follows the
@@ -104,23 +104,23 @@ def resume(
 ) -> Result:
     """Go on with a campaign that `iterate(checkpoint=directory)` began, with identical results.
 
-    One that its rule has ended gives back its result, unless `stop` or more missions are asked for;
-    the rules, new or those that it was begun with, are asked before anything is driven.
+    If a rule has ended the campaign, its result is returned, unless `stop` or more missions are
+    requested. Rules, new or restored, are evaluated before the first mission.
 
     Args:
         directory: Folder of its checkpoint.
         simulator: The same simulator, unless it was the default.
-        truth: Its truth, see `iterate`.
-        n_iterations: Number of missions in all; by default that of its beginning.
+        truth: Truth of the simulator, see `iterate`.
+        n_iterations: Number of missions in all; by default the number it was started with.
         model: The same model; see `Campaign.load`.
         policy: The same policy; see `Campaign.load`.
-        stop: Rules in place of those that it was begun with; needed where one was custom.
-        progress: Progress to show, as in `iterate`; a page that the run before left is renewed in
-            any case.
+        stop: Rules that replace those it was started with; required if one of them was custom.
+        progress: Progress to show, as in `iterate`; an unfinished page in the folder is always
+            continued.
         **custom: The same `awareness` and `callbacks`; see `Campaign.load`.
 
     Raises:
-        TrustboError: There is no campaign; another process is at work on it; or a custom object is
+        TrustboError: There is no campaign; another process has locked it; or a custom object is
             missing.
         DamagedFileError: A file of the folder is missing or damaged.
     """
@@ -142,7 +142,7 @@ def resume(
 
 
 def _require_same(before: dict[str, Any], now: dict[str, Any]) -> None:
-    """Refuse to go on with another simulator than the one begun with."""
+    """Refuse a simulator that differs from the one the campaign was started with."""
     before = migrate_notes(before, now)
     for name in now.keys() - {"n_iterations", "stop"}:
         if to_json(old := before.get(name)) != to_json(now[name]):  # as text: NaN equals itself

@@ -1,6 +1,6 @@
 """Options of a campaign: one frozen object, checked when it is made.
 
-Importing it loads nothing heavy, for `trustbo --help` is made from its fields.
+Its import is fast, as `trustbo --help` is made from its fields.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -185,10 +185,10 @@ def _hazard_of(given: "Hazard | Mapping[str, Any]") -> "Hazard":
 def arguments_of(
     record: Mapping[str, Any], policy: "Policy | None", **custom: Any
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Arguments of `Campaign` in the record of its state, and the record of its model.
+    """Restore the arguments of `Campaign`, and the record of its model.
 
-    `record` is the field `options` of `CampaignState`; an option that it lacks has its default. The
-    policy and the awareness are given again if they are custom, else refused; callbacks may be.
+    `record` is the field `options` of `CampaignState`; a missing option has its default. A custom
+    policy or awareness must be passed again, any other is refused; callbacks are optional.
     """
     for name in custom:
         if name not in _CUSTOM:

@@ -113,11 +113,11 @@ class Result(Displayed):
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, labelled by its number, from 1; also `history.csv`.
 
-        Columns are its `status`, `state` and the `reason` of that, or that it was given up for, the
-        cell `where` it failed, mean `contact_rate`, the plan's `objective`, `n_bounds` that were
-        run, the last of which failed, `path_changed` and the `path` as text, "9,0 8,1"; then the
-        posterior's diagnostics and seconds, as in `history`. A mission given up without a report,
-        see `Campaign.fail`, has a row without a number and the state "given up".
+        Columns are the `status`, the `state` with its `reason`, or the reason of a failure, the
+        cell `where` the mission failed, the mean `contact_rate`, the plan's `objective`, the number
+        `n_bounds` of bounds run, including a failed one, `path_changed` and the `path` as text,
+        "9,0 8,1"; then diagnostics of the posterior and seconds, as in `history`. A mission given
+        up without a report, see `Campaign.fail`, has no number and the state "given up".
         """
         return table_of(self.history, self.missions, self.failures)
 
@@ -220,11 +220,11 @@ class Result(Displayed):
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
 
     def explore(self) -> "Explorer":
-        """Draw an interactive page: layers of the map, missions on a slider, numbers of places.
+        """Draw an interactive page with layers of the map and the missions on a slider.
 
-        Layers are those of `maps`, the awareness of each robot, the chance to fail, and the trust
-        map that each mission was planned on. A notebook's cell shows the page; `.save(path)` writes
-        it as one HTML file that needs no network.
+        Layers are those of `maps`, the awareness of each robot, the failure chance, and the trust
+        map that each mission was planned on. A notebook shows the page; `.save(path)` writes it to
+        one HTML file that needs no network.
 
         Raises:
             TrustboError: Nothing could be learned yet.
@@ -239,12 +239,12 @@ class Result(Displayed):
 
         Each file is written whole or not at all: `posteriors/` (one per mission), `posterior.nc`
         (the last of them), `missions.nc`, `workspace.nc`, `history.nc`, `history.csv` and
-        `result.json`. Another result there is replaced, all at once; files that trustbo did not
-        write are left alone.
+        `result.json`. Another result in the folder is replaced as a whole; files of other programs
+        stay.
 
         Raises:
             TrustboError: The folder's name belongs to a file, a file in it that trustbo did not
-                write would be replaced, or it holds a campaign that this result is not of.
+                write would be replaced, or it holds another campaign.
         """
         from trustbo.campaign.storage import save_result  # it reads results too
 

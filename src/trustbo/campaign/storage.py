@@ -305,7 +305,7 @@ def _posterior_file(after: int) -> Path:
 
 
 def _record_of(result: Result) -> dict[str, Any]:
-    """Everything that no other file holds."""
+    """Record of everything that no other file holds."""
     return {
         "n_missions": len(result.missions),
         "path": result.path,
