@@ -157,7 +157,7 @@ def test_ways_lead_from_post_to_post(wooded):
     for way, start, end in zip(closing, wooded.posts(A, C), wooded.posts(C, NEXT), strict=True):
         np.testing.assert_array_equal(way[[0, -1]], [start, end])
     at_goal = wooded.ways(A, C)[1]
-    np.testing.assert_array_equal(at_goal[-1], ground.at(C, None)[0])
+    np.testing.assert_array_equal(at_goal[-1], ground.watching(C, None)[0])
 
 
 @pytest.mark.parametrize(("slip", "tolerance"), [(False, 1.0), (True, 1.5)])

@@ -178,7 +178,7 @@ def test_a_survey_knows_the_cells_that_are_impassable_before_awareness():
     assert found.heights == (np.nanmin(dem), np.nanmax(dem))
     assert found.ends[0] == (7, 0)
     with pytest.raises(TrustboError, match=r"\(0, 0\) is impassable: 100% of it has no data"):
-        found.locate((0, 0))
+        found.require_cell("location", (0, 0))
     assert "no data     9.4% of the area" in repr(found)
 
 

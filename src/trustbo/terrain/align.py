@@ -125,9 +125,9 @@ def _warped(raster: Raster, crs: CRS, transform: Affine, shape: tuple[int, int])
         heights = np.empty((rows.stop - rows.start, right - left))
         for r in range(0, len(heights), depth):
             for c in range(0, right - left, BLOCK):
-                part = heights[r : r + depth, c : c + BLOCK]
+                piece = heights[r : r + depth, c : c + BLOCK]
                 row, col = rows.start + r, left + c
-                part[:] = block(slice(row, row + part.shape[0]), slice(col, col + part.shape[1]))
+                piece[:] = block(slice(row, row + piece.shape[0]), slice(col, col + piece.shape[1]))
         return heights[:, cols.start - left : cols.stop - left]
 
     return Raster(raster.name, crs, transform, shape, read)

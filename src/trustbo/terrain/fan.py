@@ -124,21 +124,9 @@ def openness(
 ) -> np.ndarray:
     """Mean transmittance from each pixel to points `reach` metres away all around.
 
-    Args:
-        ground: DEM, shape (row, col), m.
-        surface: DSM, shape (row, col), m.
-        pixel: Pixel height and width, m.
-        reach: Length of the rays, m.
-        eye: Height of the sensor above ground, m.
-        target: Height of the targets above ground, m.
-        n_rays: Number of directions.
-        extinction: Extinction coefficient of the canopy, 1/m.
-        crown_base: Height of the canopy's lower edge as a share of its height.
-        rows: Rows of pixels to compute; the others are NaN.
-
-    Returns:
-        Shape (row, col), in [0, 1]; rays that end off the raster or without data do not count. NaN
-        where none counts.
+    Arguments are those of `features.openness`, on arrays (row, col). Returns shape (row, col), in
+    [0, 1]; rays that end off the raster or without data do not count. NaN where none counts, and in
+    other rows than `rows`.
     """
     valid = np.isfinite(ground)
     # From the middle of the heights: float32 is then good to a millimetre on any terrain.

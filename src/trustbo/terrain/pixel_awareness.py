@@ -55,7 +55,9 @@ class PixelAwareness:
         TrustboError: an unknown feature. TerrainError: an observer off the terrain, or too few
         pixels.
         """
-        self._features = {name: _spec(name, parts) for name, parts in _checked(features).items()}
+        remedy = "give definitions by name, e.g. {'slope': 'slope'}"
+        features = require_kind("features", features, Mapping, remedy)
+        self._features = {name: _spec(name, parts) for name, parts in features.items()}
         height, width = pixel_size(terrain)
         n_rows, n_cols = terrain["dem"].shape
         self._use_lidar(team, min(reach, 0.5 * min(n_rows * height, n_cols * width)))
@@ -84,7 +86,7 @@ class PixelAwareness:
                 chosen = whole or sample_strips(terrain, around[name], SAMPLE)
                 self._fit(name, f, scaling, chosen)
 
-    def of(self, strip: Strip) -> dict[str, np.ndarray]:
+    def features_of(self, strip: Strip) -> dict[str, np.ndarray]:
         """Features of a strip's pixels and "passable", valid until the thread's next strip.
 
         TrustboError: a feature that is no composite outside [0, 1].
@@ -189,11 +191,6 @@ class _LazyColumns(Mapping[str, np.ndarray]):
 
     def __len__(self) -> int:
         return len(self._parts)
-
-
-def _checked(features: Mapping[str, object]) -> Mapping[str, object]:
-    remedy = "give definitions by name, e.g. {'slope': 'slope'}"
-    return require_kind("features", features, Mapping, remedy)
 
 
 def _spec(name: str, parts: object) -> FeatureSpec:

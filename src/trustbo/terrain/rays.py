@@ -204,15 +204,9 @@ def exposure(
 ) -> np.ndarray:
     """Mean transmittance from observers to every pixel, shape (row, col); 0 beyond their reach.
 
-    Args:
-        ground: DEM, shape (row, col), m.
-        surface: DSM, shape (row, col), m.
-        pixel: Pixel height and width, m.
-        observers: Row and column, fractions of pixels, shape (observer, 2).
-        reach: Range of the observers, m.
-        heights: Heights of the observers and of their targets above ground, m.
-        canopy: Extinction (1/m) and crown base, see `ray_transmittance`.
-        rows: Rows of pixels to compute; the others are NaN.
+    Observers are (observer, 2), row and column in fractions of pixels; `heights` those of observers
+    and targets above ground, m; `canopy` its extinction, 1/m, and crown base. NaN in other rows
+    than `rows`.
     """
     result = np.full(ground.shape, np.nan)
     top, bottom, _ = rows.indices(len(ground))

@@ -55,7 +55,7 @@ def cell_maps(
     maps: dict[str, list[np.ndarray]] = {name: [] for name in kept}
 
     def work(strip: Strip) -> tuple[Strip, dict[str, np.ndarray], dict[str, Sums]]:
-        index = pixels.of(strip)
+        index = pixels.features_of(strip)
         copied = {name: index[name].copy() for name in kept}
         return strip, copied, cells.sums(index, strip.rows.start)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import LINE_OF_SIGHT, Cell, is_line_of_sight
+from trustbo.data import LINE_OF_SIGHT, is_line_of_sight
 from trustbo.errors import TerrainError, TrustboError
 from trustbo.parallel import in_order
 from trustbo.terrain.composite import MAX_PIXELS
@@ -88,39 +88,30 @@ def of_bounds(
     maps = np.full((n_robots, *exists.shape, n_features + len(sights)), np.nan)
     maps[..., :n_features] = np.where(exists[..., None], cells[:, None], np.nan)
     surface = ways.posts.surface
-    easy_pixels = (
-        np.full(surface.ground.shape, np.nan) if traversability is None else traversability
-    )
-    for cell in _cells(np.argwhere(passable)):
-        ways.posts.require_room(cell)
+    if traversability is None:
+        traversability = np.full(surface.ground.shape, np.nan)
+    for row, col in np.argwhere(passable).tolist():
+        ways.posts.require_room((row, col))
 
     def work(block: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        block_index = np.array(block)
-        pairs = list(
-            zip(
-                _cells(block_index[:, 1:] - steps[block_index[:, 0]]),
-                _cells(block_index[:, 1:]),
-                strict=True,
-            )
-        )
+        bounds = np.array(block)
+        entered = bounds[:, 1:]
+        left = (entered - steps[bounds[:, 0]]).tolist()
+        pairs = [((i, j), (k, n)) for (i, j), (k, n) in zip(left, entered.tolist(), strict=True)]
         given = geometry(ways, pairs, passable)
         features_of = partial(bound_features, surface, team=ways.posts.team, given=given)
-        both = [features_of(sight=sight, index=easy_pixels) for sight in sights]
-        return block_index, [los for los, _ in both], both[0][1]
+        both = [features_of(sight=sight, index=traversability) for sight in sights]
+        return bounds, [los for los, _ in both], both[0][1]
 
-    for block_index, seen, easy in in_order(work, batched(index, _BLOCK)):
+    for bounds, seen, easy in in_order(work, batched(index, _BLOCK)):
         for n, los in enumerate(seen):
-            maps[:, *block_index.T, n_features + n] = los.T
+            maps[:, *bounds.T, n_features + n] = los.T
         if TRAVERSABLE in features:
             m = list(features).index(TRAVERSABLE)
-            filled = np.where(np.isfinite(easy.T), easy.T, maps[:, *block_index.T, m])
-            maps[:, *block_index.T, m] = filled
+            filled = np.where(np.isfinite(easy.T), easy.T, maps[:, *bounds.T, m])
+            maps[:, *bounds.T, m] = filled
     maps = np.clip(maps, 0.0, 1.0)
     into = np.maximum(exists.sum(0), 1)[..., None]
     seen = np.nansum(maps[..., n_features:], axis=1) / into
-    block_index = np.concatenate([cells, np.where(passable[..., None], seen, np.nan)], axis=-1)
-    return BoundMaps(maps, block_index)
-
-
-def _cells(index: np.ndarray) -> list[Cell]:
-    return [(row, col) for row, col in index.tolist()]
+    seen = np.where(passable[..., None], seen, np.nan)
+    return BoundMaps(maps, np.concatenate([cells, seen], axis=-1))

@@ -110,7 +110,7 @@ def _seen(
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the known values, shape (bound,); NaN where none is."""
+    """Mean of the values that are not NaN, shape (bound,); NaN where none is."""
     finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         return np.where(finite, values, 0.0).sum(1) / finite.sum(1)
@@ -159,7 +159,7 @@ def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
             t = duration[b] * (s + 0.5) / n_samples
             while k < len(way) - 1 and clock[k] < t:
                 k += 1
-            part = (t - clock[k - 1]) / max(clock[k] - clock[k - 1], 1e-12)
+            share = (t - clock[k - 1]) / max(clock[k] - clock[k - 1], 1e-12)
             for axis in range(2):
-                points[b, s, axis] = way[k - 1, axis] + part * (way[k, axis] - way[k - 1, axis])
+                points[b, s, axis] = way[k - 1, axis] + share * (way[k, axis] - way[k - 1, axis])
     return points, duration

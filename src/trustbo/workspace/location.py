@@ -86,7 +86,7 @@ def cell_of(
     passable: np.ndarray | None = None,
     why: Callable[[int, int], str] = lambda row, col: "",
 ) -> Cell:
-    """Cell of a location on a grid; refused if it is impassable, where that is known.
+    """Cell of a location on a grid; refused if it is impassable, unless that is unknown.
 
     Args:
         what: Name of the location, for messages.
@@ -171,9 +171,7 @@ def spans(grid: "Grid") -> tuple[str, str, str, str]:
 
 def crs_name(grid: "Grid") -> str:
     """Short name of a grid's CRS, such as EPSG:2193."""
-    if grid.crs is None:
-        return "no CRS"
-    return name_of_crs(grid.crs)
+    return "no CRS" if grid.crs is None else name_of_crs(grid.crs)
 
 
 def name_of_crs(given: object) -> str:
@@ -185,12 +183,12 @@ def name_of_crs(given: object) -> str:
 
 def _of_text(text: str) -> object:
     """Mapping, or list, of the numbers of a text; the text itself where it is neither."""
-    parts = [part for part in re.split(r",\s*|\s+", text.strip()) if part]
-    if all("=" in part for part in parts):
-        named = [part.split("=", 1) for part in parts]
-        return dict(named) if len(dict(named)) == len(named) else text
+    words = [word for word in re.split(r",\s*|\s+", text.strip()) if word]
+    if all("=" in word for word in words):
+        pairs = [word.split("=", 1) for word in words]
+        return dict(pairs) if len(dict(pairs)) == len(pairs) else text
     try:
-        return [int(part) for part in parts]
+        return [int(word) for word in words]
     except ValueError:
         return text
 
@@ -260,11 +258,8 @@ def _understood(parsed: Named, grid: "Grid") -> str:
     """Text of a location in the user's spelling and as parsed."""
     (a, b), names = parsed.values, parsed.names
     if names == CELL:
-        return (
-            parsed.typed
-            if parsed.typed.startswith("(")
-            else f"{parsed.typed} (row {a}, column {b})"
-        )
+        is_pair = parsed.typed.startswith("(")
+        return parsed.typed if is_pair else f"{parsed.typed} (row {a}, column {b})"
     if names == METRES:
         return f"{parsed.typed} (x {a:.1f}, y {b:.1f} m in {crs_name(grid)})"
     position = position_of(grid, names, (a, b))
@@ -289,9 +284,9 @@ def _otherwise(parsed: Named, grid: "Grid") -> str:
 
 def _names_for(location: object, grid: "Grid") -> str:
     """Sentence that names the spelling under which a bare pair of numbers is on the grid."""
-    parts = re.split(r",\s*|\s+", location.strip()) if isinstance(location, str) else location
+    words = re.split(r",\s*|\s+", location.strip()) if isinstance(location, str) else location
     try:
-        a, b = (float(part) for part in parts)  # pyright: ignore[reportGeneralTypeIssues]
+        a, b = (float(word) for word in words)  # pyright: ignore[reportGeneralTypeIssues]
     except (TypeError, ValueError):
         return ""
     return _otherwise(Named(CELL, (a, b), ""), grid) if math.isfinite(a + b) else ""

@@ -80,7 +80,12 @@ class Posts:
     def waypoint(self, cell: Cell) -> np.ndarray:
         """Stop of the lead in a cell, shape (2,): a traversable pixel near the centre."""
         if cell not in self._waypoints:
-            self._waypoints[cell] = self._waypoint(cell)
+            row, col = self._pixels_of(cell)
+            position = self._position(row, col)
+            size = np.hypot(self.grid.cell_height, self.grid.cell_width)
+            off_center = np.linalg.norm(position - self.grid.center(cell), axis=1) / size
+            chosen = np.argmax(self._traversability[row, col] - off_center)
+            self._waypoints[cell] = position[chosen]
         return self._waypoints[cell]
 
     def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
@@ -88,26 +93,13 @@ class Posts:
 
         Without a next cell, around the lead at the goal.
         """
-        if cell not in self._cached:
-            self._cached[cell] = self._posts(cell)
-        if next_cell not in self._cached[cell]:  # no neighbour
-            self._cached[cell] |= self._aimed(cell, [next_cell])
-        return self._cached[cell][next_cell]
-
-    def _waypoint(self, cell: Cell) -> np.ndarray:
-        row, col = self._pixels_of(cell)
-        center = np.array(self.grid.center(cell))
-        position = self._position(row, col)
-        size = np.hypot(self.grid.cell_height, self.grid.cell_width)
-        off_center = np.linalg.norm(position - center, axis=1) / size
-        return position[np.argmax(self._traversability[row, col] - off_center)]
-
-    def _posts(self, cell: Cell) -> dict[Cell | None, np.ndarray]:
-        """Posts of T2 by the next cell, for all admissible next cells."""
-        rows, cols = self.grid.shape
-        near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
-        inside = [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
-        return self._aimed(cell, [None, *inside])
+        posts = self._cached.setdefault(cell, {})
+        if next_cell not in posts:  # those of all neighbours cost little more than one
+            rows, cols = self.grid.shape
+            near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
+            inside = [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
+            posts |= self._aimed(cell, list({None: 0} | dict.fromkeys([*inside, next_cell])))
+        return posts[next_cell]
 
     def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> dict[Cell | None, np.ndarray]:
         """Posts of T2 by the next cell, of equal sight the closer one, with a least distance."""
@@ -177,10 +169,8 @@ class Posts:
         Linked within half a cell around, which the window of every bound contains.
         """
         row, col = self._pixels_of(cell)
-        start, window = (
-            self.surface.pixel_at(*self.waypoint(cell).tolist()),
-            self.window(cell, cell),
-        )
+        start = self.surface.pixel_at(*self.waypoint(cell).tolist())
+        window = self.window(cell, cell)
         linked = linked_to(self.surface.passable, window, start)[row - window[0], col - window[2]]
         return (row[linked], col[linked]) if linked.any() else (row, col)
 

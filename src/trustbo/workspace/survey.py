@@ -76,14 +76,11 @@ class Survey(Displayed):
         Raises:
             TrustboError: It is no location, off the grid, without data, or too steep.
         """
-        return cell_of(what, location, self.grid, self.passable, self._why_impassable)
 
-    def locate(self, location: Location | None = None, **named: float) -> Cell:
-        """Cell of a location, see `Workspace.locate`."""
-        return self.require_cell("location", named if location is None else location)
+        def why(row: int, col: int) -> str:
+            return reason_impassable(float(self.cells["missing"][row, col]), self.team)
 
-    def _why_impassable(self, row: int, col: int) -> str:
-        return reason_impassable(float(self.cells["missing"][row, col]), self.team)
+        return cell_of(what, location, self.grid, self.passable, why)
 
     def _card(self) -> Card:
         grid, (low, high), free = self.grid, self.heights, self.passable

@@ -225,6 +225,7 @@ class Workspace(Displayed):
 
     def _card(self) -> Card:
         grid, free, team = self.grid, self.passable.values, self.team
+        n_pixels = [] if self.terrain is None else self.terrain["dem"].shape
         shown = self.awareness.mean("robot").where(self.passable)
         spread = [
             (name, f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
@@ -239,7 +240,7 @@ class Workspace(Displayed):
             ("awareness", "of each bound" if self.of_bounds is not None else "of cells"),
             *((f"  {name}", f"{values} (middle 80 % of cells)") for name, values in spread),
             ("sight", ", ".join(sight.mode for sight in self.sights) or "none assumed"),
-            ("terrain", "none" if self.terrain is None else _sizes(self.terrain)),
+            ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
         sections = {"grid": grid._card().rows, "team": team._card().rows}
         title = f"Workspace: {grid.shape[0]} x {grid.shape[1]} cells"
@@ -442,7 +443,3 @@ class Workspace(Displayed):
             return ""
         missing = 1.0 - self.grid.cell_share(self.terrain["dem"].notnull())[row, col]
         return reason_impassable(missing, self.team)
-
-
-def _sizes(terrain: xr.Dataset) -> str:
-    return f"{terrain.sizes['y']} x {terrain.sizes['x']} pixels"
