@@ -173,7 +173,7 @@ class KinematicSimulator(DescribedSimulator):
         Args:
             start: Start cell.
             seed: Seed of slip and detections in all bounds to come.
-            next_cell: Cell of the first bound, if known: T2 takes positions that see it.
+            next_cell: Cell of the first bound, if given: T2 takes positions that see it.
             mission: See `run`.
         """
         self._enter(mission)

@@ -132,7 +132,7 @@ class ReplaySimulator(DescribedSimulator):
         Args:
             k: Number of the bound, 1 for the first.
             cell: Cell to enter.
-            next_cell: Cell after it, if known; used with bound 1.
+            next_cell: Cell after it, if given; used with bound 1.
 
         Raises:
             TrustboError: `reset` was not called, a bound is out of order, no mission has that path,

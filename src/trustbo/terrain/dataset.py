@@ -95,7 +95,7 @@ def read_terrain(
 
 
 def _warn_of(rasters: list[Raster]) -> None:
-    """Warn of heights that are converted, and of a surface that is not known."""
+    """Warn of heights that are converted, and of a missing surface."""
     for raster in rasters:
         if raster.unit != METRE:
             warnings.warn(

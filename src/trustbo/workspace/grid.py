@@ -107,7 +107,7 @@ class Grid(Displayed):
         return self.top - (np.arange(self.shape[0]) + 0.5) * self.cell_height
 
     def locate(self, location: Location | None = None, **named: float) -> Cell:
-        """Cell of a location, known from the georeference alone; it may be impassable.
+        """Cell of a location, by the georeference alone; it may be impassable.
 
         Args:
             location: Cell (row, col), or a position with names: `"lon=174.7,lat=-41.3"`,

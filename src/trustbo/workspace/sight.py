@@ -49,17 +49,17 @@ class Sight:
 
 
 def sights_of(sight: object) -> tuple[Sight, ...]:
-    """Assumed sights, of which some may be given by their mode.
+    """Assumed models of sight from a model, a mode, or a list of both.
 
     TrustboError: an unknown mode, no sight, or something else.
     """
-    given = [sight] if isinstance(sight, str | Sight) else sight
-    if not isinstance(given, list | tuple) or not given:
+    sights = [sight] if isinstance(sight, str | Sight) else sight
+    if not isinstance(sights, list | tuple) or not sights:
         raise TrustboError(f"sight must be a mode's name or a Sight, or several; got {sight!r}.")
-    for one in given:
+    for one in sights:
         if not isinstance(one, str | Sight):
             raise TrustboError(f"sight must be a mode's name or a Sight; got {one!r}.")
-    return tuple(Sight(one) if isinstance(one, str) else one for one in given)
+    return tuple(Sight(one) if isinstance(one, str) else one for one in sights)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:

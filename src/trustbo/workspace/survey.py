@@ -169,7 +169,7 @@ def reason_impassable(missing: float, team: Team) -> str:
 
 
 def _strips(terrain: xr.Dataset, grid: Grid) -> Iterator[Strip]:
-    """Strips of the whole terrain, or bands of each row of cells where it is large and lazy."""
+    """Strips of the whole terrain; of a large one read lazily, bands of each row of cells."""
     n_rows, n_cols = terrain["dem"].shape
     edges = np.linspace(0, n_rows, _BANDS * grid.shape[0] + 1).astype(int)
     depth = max(1, _MOST_PIXELS // (n_cols * (len(edges) - 1)))
