@@ -240,11 +240,11 @@ def interpreting(path: FilePath) -> Iterator[None]:
         ) from error
 
 
-def not_ours(path: Path, remedy: str = "another folder") -> TrustboError:
+def not_ours(path: Path) -> TrustboError:
     """Error for a file of another program under one of our names."""
     return TrustboError(
         f"{str(path)!r} was not written by trustbo, and would be replaced; move it, or choose "
-        f"{remedy}."
+        "another folder."
     )
 
 

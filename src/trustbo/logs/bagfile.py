@@ -19,8 +19,9 @@ from trustbo.logs.recording import Series
 STORAGES = ("sqlite3", "mcap")
 
 
-def _no_rosbags() -> TrustboError:
-    return TrustboError(f"ROS bags need rosbags: {pip_install('rosbags')}")
+def _require_rosbags() -> None:
+    if importlib.util.find_spec("rosbags") is None:
+        raise TrustboError(f"ROS bags need rosbags: {pip_install('rosbags')}")
 
 
 class Record(NamedTuple):
@@ -106,11 +107,10 @@ class Bag:
 @contextmanager
 def opened(path: Path) -> Iterator[Bag]:
     """Open a bag for reading; TrustboError: no rosbags, no such file or folder, or not a bag."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise _no_rosbags() from None
+    _require_rosbags()
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     if not path.exists():
         raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
     if not path.is_dir():
@@ -132,8 +132,7 @@ def require_new_bag(path: Path, version: int | None) -> int:
 
     TrustboError: no rosbags; another version asked for; the path exists.
     """
-    if importlib.util.find_spec("rosbags") is None:
-        raise _no_rosbags()
+    _require_rosbags()
     of_path = 1 if path.suffix == ".bag" else 2
     if version not in (None, of_path):
         raise TrustboError(
@@ -156,17 +155,15 @@ def write_messages(
     latched: bool = False,
     frame: str = "map",
 ) -> None:
-    """Write a bag whole or not at all; TrustboError without rosbags.
+    """Write a bag, which `require_new_bag` allowed, whole or not at all.
 
-    The path, a file or folder, must not exist; its parent is made if need be. `version` of ROS is 1
+    The path is a file or folder; its parent is made if need be. `version` of ROS is 1
     or 2, `storage` of ROS 2 one of `STORAGES`. `records` makes records in order of time with the
     given `Messages`, in `frame`. If `latched`, late subscribers get the messages played before.
     """
-    try:
-        from rosbags import rosbag1, rosbag2
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise _no_rosbags() from None
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_typestore
+
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     serialize = store.serialize_ros1 if version == 1 else store.serialize_cdr
     with naming_refusal(path.parent):
