@@ -121,16 +121,19 @@ def test_a_long_run_and_its_retry_are_said_in_a_file_unless_progress_is_off(
 ):
     monkeypatch.setattr(watching, "LONG", 0.0)
     monkeypatch.setattr(watching, "_TRIAL_SECONDS", 0.0)
-    few = {"sampler": "nuts", "warmup": 20, "draws": 20, "whole": False}
+    few = NutsSettings(draws=30)  # of the program that is compiled already; so the longer run
+    monkeypatch.setattr(
+        run, "run_nuts", lambda _, *args, **options: run_nuts(few, *args, **options)
+    )
     for options in ({}, {"progress": False}):
         with pytest.raises(PosteriorError, match="refused after a longer retry"):
-            fit(missions, **few, **options)
+            fit(missions, sampler="nuts", whole=False, **options)
         said = capsys.readouterr().err
         if options:
             assert said == ""
         else:
-            assert said.startswith("NUTS: 4 chains of 20 + 20 draws, about ")
-            assert "\nNUTS again, for longer (4 chains of 40 + 40 draws" in said
+            assert said.startswith(f"NUTS: 4 chains of {few.warmup} + 30 draws, about ")
+            assert "\nNUTS again, for longer (4 chains of 600 + 2000 draws" in said
             assert "\r" not in said
 
 
@@ -142,7 +145,7 @@ def test_nuts_keeps_blas_to_one_thread(missions, monkeypatch):
 
     monkeypatch.setattr(watching.Watch, "compiled", look)
     with threadpool_limits(2, user_api="blas"):
-        fit(missions, sampler="nuts", n_chains=1, draws=5, check=False, whole=False)
+        fit(missions, sampler="nuts", draws=30, check=False, whole=False)
     assert set(seen) == {1}
 
 
