@@ -43,7 +43,7 @@ def planted():
 def with_places(planted):
     """Posterior and criticism of missions whose places matter, by a model without places."""
     posterior = fit(planted("place"), PooledTrust(), "exact", whole=False)
-    return posterior, criticise(posterior, compare=False)
+    return posterior, criticise(posterior, compare=False, n_replicates=200)
 
 
 def missions_of_shape(n_missions, n_bounds, n_robots=2, n_features=2, seed=0):
@@ -239,7 +239,8 @@ def test_what_cannot_be_criticised_says_why(with_places, planted):
 def test_the_missions_are_those_of_the_posterior(with_places, planted):
     posterior, found = with_places
     missions = planted("place")
-    given = criticise(posterior, missions, compare=False)
+    quick = {"compare": False, "n_replicates": 200}
+    given = criticise(posterior, missions, **quick)
     assert given.table.equals(found.table)
     with pytest.raises(TrustboError, match="is of 15 missions, and 14 are given"):
         criticise(posterior, missions[:14])
@@ -248,7 +249,7 @@ def test_the_missions_are_those_of_the_posterior(with_places, planted):
     # One of a campaign says which of its missions it learned from.
     later = posterior.copy()
     later.attrs = posterior.attrs | {"missions": np.arange(1, 16)}
-    assert criticise(later, [missions[3], *missions], compare=False).verdict == found.verdict
+    assert criticise(later, [missions[3], *missions], **quick).verdict == found.verdict
     del later["constant_data"]
     with pytest.raises(TrustboError, match="learned from mission 16, and 14 are given"):
         criticise(later, missions[:14])
