@@ -18,7 +18,7 @@ from trustbo.files import FilePath, read_yaml
 from trustbo.inference.samplers.choice import SAMPLERS, resolve_sampler
 from trustbo.models.model import TrustModel
 from trustbo.planning import OBJECTIVES, POLICIES
-from trustbo.simulation import ModelSimulator, Simulator
+from trustbo.simulation import ModelSimulator
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import FILES, call_of, identity, made, parameters_of, seeded
 from trustbo.study.experiment import Experiment, Scene, corners

@@ -139,7 +139,7 @@ def step_height(z, pixel, out):
 
 @_part
 def _extremes(up, mid, down, j):
-    """Highest and lowest height that is not missing; the centre first, as comparisons with NaN are false."""
+    """Highest and lowest height there is; the centre first, as comparisons with NaN are false."""
     here = mid[j + 1]
     top, bottom = _wider(here, here, up[j])
     top, bottom = _wider(top, bottom, up[j + 1])
