@@ -1,5 +1,7 @@
 """`fit`: the right posterior, laid out for ArviZ, refused when it is bad."""
 
+import re
+
 import arviz as az
 import jax
 import matplotlib.pyplot as plt
@@ -17,7 +19,7 @@ from trustbo.inference import diagnostics, fit, params_of
 from trustbo.inference.samplers import complaints, nuts, run, watching
 from trustbo.inference.samplers.nuts import _advance, run_nuts
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.models import PooledTrust, Priors
+from trustbo.models import HierarchicalTrust, PooledTrust, Priors
 from trustbo.stacking import stack_missions
 
 SITES = ["beta0", "beta", "b", "delta_w", "delta_v"]
@@ -137,6 +139,14 @@ def test_a_long_run_and_its_retry_are_said_in_a_file_unless_progress_is_off(
             assert "\r" not in said
 
 
+def test_a_long_fit_by_the_exact_sampler_is_said_in_a_file(missions, monkeypatch, capsys):
+    monkeypatch.setattr(watching, "LONG", -1.0)
+    fit(missions, HierarchicalTrust(), whole=False)
+    assert re.fullmatch(r"fit, after \d s: exact sampler seeks the mode\n", capsys.readouterr().err)
+    fit(missions, HierarchicalTrust(), whole=False, progress=False)
+    assert capsys.readouterr().err == ""
+
+
 def test_nuts_keeps_blas_to_one_thread(missions, monkeypatch):
     seen = []
 
@@ -150,9 +160,12 @@ def test_nuts_keeps_blas_to_one_thread(missions, monkeypatch):
 
 
 def test_a_setting_by_its_former_and_its_present_name_is_refused(missions):
-    expected = "n_warmup is the former name of warmup: give one of n_warmup=5 and warmup=700"
-    with pytest.raises(TrustboError, match=expected):
-        fit(missions, sampler="nuts", n_warmup=5, warmup=700)
+    for now in (700, 300):  # the default too
+        expected = f"n_warmup is the former name of warmup: give one of n_warmup=5 and warmup={now}"
+        with pytest.raises(TrustboError, match=expected):
+            fit(missions, sampler="nuts", n_warmup=5, warmup=now)
+    with pytest.raises(TrustboError, match="give one of n_draws=7 and draws=1000"):
+        fit(missions, n_draws=7, draws=1000)
 
 
 def test_settings_have_the_names_of_before_too_and_those_of_nuts_are_for_nuts(missions):

@@ -46,8 +46,8 @@ def fit(
     seed: int = 0,
     progress: bool = True,
     n_chains: int = 4,
-    warmup: int = 300,
-    draws: int = 1000,
+    warmup: int | None = None,
+    draws: int | None = None,
     target_accept: float = 0.9,
     max_tree_depth: int = 10,
     n_trajectories: int = 200,
@@ -77,11 +77,12 @@ def fit(
         weights: Weight of each mission, shape (mission,), in [0, 1]; 1 by default. For Gaussian
             observations.
         seed: Seed; the same seed gives the same posterior.
-        progress: Whether NUTS shows a progress bar, and first an estimate of a long run's time. A
-            file, which has no bar, gets the line about a long run, and one about a retry.
+        progress: Whether a slow fit shows its stages, and NUTS a progress bar and first an estimate
+            of a long run's time. A file, which has no bar, gets a line about a long fit, and one
+            about a retry.
         n_chains: Number of chains; the exact sampler's draws are divided among them.
-        warmup: Warm-up draws per chain of NUTS, not kept.
-        draws: Draws kept per chain.
+        warmup: Warm-up draws per chain of NUTS, not kept; 300 by default.
+        draws: Draws kept per chain; 1000 by default.
         target_accept: Acceptance rate that NUTS adapts its steps to: towards 1, steps are
             smaller, and divergences fewer.
         max_tree_depth: Doublings of a trajectory of NUTS at most: 10 allow 1023 steps for a draw.
@@ -129,6 +130,9 @@ def fit(
     ticks = _weigh_rates(batch, weight)
     started = time.perf_counter()
 
+    # Of a campaign, only the first fit warns.
+    watch = Watch(place_of(progress), estimates=earlier is None)
+
     def draw(model: TrustModel, *, fallback: bool) -> _Drawn:
         model = model.for_features(missions[0].features)
         chosen, reason = resolve_sampler(model, sampler)
@@ -138,20 +142,19 @@ def fit(
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
         start = _proposal(earlier)
-        faster = "" if chosen == "exact" else faster_than_nuts(model)
-        # Of a campaign, only the first fit warns.
-        watch = Watch(place_of(progress), faster, estimates=earlier is None)
+        watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
         drawn, complaints = draw_posterior(
             floored, chosen, settings, seed, batch, weight, places, start, check=check,
             fallback=fallback, watch=watch,
         )  # fmt: skip
         return _Drawn(model, prior, drawn, complaints, drawn.fallback or reason)
 
-    try:
-        drawn = draw(model, fallback=asked.observation != AUTO or model.family.integrates_out)
-    except UnevenWeightsError as error:
-        family_reason += f", but the {model.observation} ones' {error}: Gaussian ones instead"
-        drawn = draw(asked.observing("gaussian"), fallback=True)
+    with watch:
+        try:
+            drawn = draw(model, fallback=asked.observation != AUTO or model.family.integrates_out)
+        except UnevenWeightsError as error:
+            family_reason += f", but the {model.observation} ones' {error}: Gaussian ones instead"
+            drawn = draw(asked.observing("gaussian"), fallback=True)
     model, prior, sampled, complaints, reason = drawn
     groups = {
         "posterior": {name: sampled.params[name] for name in model.dims},
@@ -170,15 +173,22 @@ def fit(
         "seed": seed,
     }
     if weights is not None:
-        counted = xr.DataArray(weight[: len(missions)], dims="mission")
-        posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
-        posterior.attrs["weights"] = counted.values.tolist()
+        _add_weights(posterior, weight[: len(missions)])
     if whole or not Conditional.of(posterior).keeps_trust:
-        posterior = complete(
-            posterior, missions, model=model, n_trajectories=n_trajectories, latents=sampled.latents
-        )
+        with watch:
+            watch.stage("latent trust and predictions")
+            posterior = complete(
+                posterior, missions, model=model, n_trajectories=n_trajectories,
+                latents=sampled.latents,
+            )  # fmt: skip
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
+
+
+def _add_weights(posterior: xr.DataTree, weight: np.ndarray) -> None:
+    counted = xr.DataArray(weight, dims="mission")
+    posterior["constant_data"] = posterior["constant_data"].assign(weight=counted)
+    posterior.attrs["weights"] = weight.tolist()
 
 
 def _filled(missions: Sequence[Mission], workspace: Workspace | None) -> list[Mission]:

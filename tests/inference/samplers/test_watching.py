@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from trustbo.display.bars import FILE, NOWHERE, TERMINAL
+from trustbo.inference.samplers import watching
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.watching import Watch, about
 
@@ -73,3 +74,30 @@ def test_a_second_run_says_that_it_is_one_and_why(capsys):
 )
 def test_rough_times_are_round(seconds, text):
     assert about(seconds) == text
+
+
+def test_a_slow_stage_is_shown_at_once_and_others_from_the_first_second_on(monkeypatch, capsys):
+    with Watch(TERMINAL) as watch:
+        watch.stage("seeks the mode")
+        assert capsys.readouterr().err == ""
+        watch.stage("compiles", slow=True)
+        watch.stage("weighs points")
+    shown = capsys.readouterr().err
+    assert shown.index("fit, after 0 s: compiles") < shown.index("fit, after 0 s: weighs points")
+    assert shown.endswith("\r")  # gone
+    monkeypatch.setattr(watching, "_QUICK", -1.0)
+    with Watch(TERMINAL) as watch:
+        watch.stage("seeks the mode")
+    assert "seeks the mode" in capsys.readouterr().err
+
+
+def test_a_file_gets_one_line_of_the_stages_of_a_long_fit(monkeypatch, capsys):
+    for limit, expected in ((60.0, ""), (-1.0, "fit, after 0 s: compiles\n")):
+        monkeypatch.setattr(watching, "LONG", limit)
+        with Watch(FILE) as watch:
+            watch.stage("compiles", slow=True)
+            watch.stage("weighs points")
+        assert capsys.readouterr().err == expected
+    with Watch(NOWHERE) as watch:
+        watch.stage("compiles", slow=True)
+    assert capsys.readouterr().err == ""

@@ -28,6 +28,7 @@ import numpy as np
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT
 from trustbo.inference.samplers.exact import ExactDraws
 from trustbo.inference.samplers.student import Proposal, Student, log_mixture
+from trustbo.inference.samplers.watching import SILENT, Watch
 from trustbo.inference.samplers.weights import smoothed_weights, systematic
 from trustbo.parallel import one_blas_thread
 
@@ -112,7 +113,11 @@ class _Points(NamedTuple):
 
 
 def sample_scores(
-    target: ScoreTarget, n_draws: int, seed: int, start: Student | None = None
+    target: ScoreTarget,
+    n_draws: int,
+    seed: int,
+    start: Student | None = None,
+    watch: Watch = SILENT,
 ) -> ScoreDraws:
     """Draw from the posterior of a target; the same seed and start give the same draws.
 
@@ -121,10 +126,12 @@ def sample_scores(
         n_draws: Number of equally weighted draws.
         seed: Seed.
         start: Proposal of an earlier posterior to begin with.
+        watch: Observer of the stages.
     """
     # Matrices are small: a second BLAS thread costs more than it brings.
     with one_blas_thread():
-        points, proposal = _weigh(target, seed, start)
+        points, proposal = _weigh(target, seed, start, watch)
+        watch.stage("exact sampler draws")
         rng = np.random.default_rng(seed)
         n = min(n_draws, target.n_corrected or n_draws)
         chosen, params, smoothing = _draw(target, points, n, rng)
@@ -179,7 +186,9 @@ def _kish(log_w: np.ndarray) -> float:
     return float(np.exp(-np.logaddexp.reduce(2.0 * log_w)))
 
 
-def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Points, Student]:
+def _weigh(
+    target: ScoreTarget, seed: int, start: Student | None, watch: Watch
+) -> tuple[_Points, Student]:
     """Weighted points, and the Student-t with their moments."""
     cloud = _Cloud(target)
     proposal, warm = start, start is not None
@@ -188,6 +197,7 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
     else:
         target.recentre(proposal.center)
     for k in range(1, _MAX_ROUNDS + 1):
+        watch.stage(f"exact sampler weighs points, round {k} of {_MAX_ROUNDS} at most")
         cloud.add(proposal.widened(target.widths[0]), target.n_pilot // 2, seed + k)
         cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)
         points = cloud.points()
@@ -198,11 +208,13 @@ def _weigh(target: ScoreTarget, seed: int, start: Student | None) -> tuple[_Poin
             break
         elif k == 2 and points.kish < _LOST and warm:  # the posterior has moved far from the start
             cloud, proposal, warm = _Cloud(target), target.first(), False
+    watch.stage("exact sampler weighs the last points")
     cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77)
     points = cloud.points()
     for k in range(1, _MAX_LAST):
         if points.khat < (GOOD_KHAT if k < _MAX_FINAL else MAX_KHAT):
             break
+        watch.stage(f"exact sampler weighs more points, as k-hat is {points.khat:.2f}")
         proposal = _fitted(points)
         cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77 + k)
         points = cloud.points()

@@ -86,7 +86,7 @@ def draw_posterior(
             posterior.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
         fallback: Whether NUTS takes over, with a warning, where the exact sampler fails.
-        watch: Observer of the progress of NUTS.
+        watch: Observer of the progress.
 
     Raises:
         UnevenWeightsError: The exact sampler fails, and there is no fallback.
@@ -97,7 +97,7 @@ def draw_posterior(
         try:
             if places is None and model.family.integrates_out and model.robot_sets:
                 return _sample_exact(model, settings, seed, batch, weight), []
-            return _sample_scores(model, settings, seed, batch, weight, places, start), []
+            return _sample_scores(model, settings, seed, batch, weight, places, start, watch), []
         except UnevenWeightsError as error:
             if not fallback:
                 raise
@@ -162,6 +162,7 @@ def _sample_scores(
     weight: np.ndarray,
     places: Visited | None,
     start: Student | None,
+    watch: Watch,
 ) -> Draws:
     """Draws by importance sampling of scores: places, pooling, coupling, or rates not Gaussian."""
     shape = (settings.n_chains, settings.draws)
@@ -169,8 +170,12 @@ def _sample_scores(
     coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
     if start is not None and coupled and len(start.center) != coupled.n_scores:
         start = None  # of another team
+    compiles = isinstance(targets[0], CoupledTarget | DriftTarget)
+    watch.stage(
+        f"exact sampler {'compiles, and ' if compiles else ''}seeks the mode", slow=compiles
+    )
     sampled = [
-        sample_scores(t, shape[0] * shape[1], seed + i, start) for i, t in enumerate(targets)
+        sample_scores(t, shape[0] * shape[1], seed + i, start, watch) for i, t in enumerate(targets)
     ]
     posteriors = [one.draws for one in sampled]
     _require_even(posteriors)

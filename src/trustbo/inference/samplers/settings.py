@@ -42,7 +42,7 @@ class NutsSettings(NamedTuple):
         for name, value in (former or {}).items():
             if name not in _FORMER:
                 raise unknown("argument of fit", name, (*SETTINGS, *_OTHERS))
-            if values.get(now := _FORMER[name], _DEFAULTS[now]) != _DEFAULTS[now]:
+            if (now := _FORMER[name]) in values:
                 raise TrustboError(
                     f"{name} is the former name of {now}: give one of {name}={value!r} and "
                     f"{now}={values[now]!r}, not both."

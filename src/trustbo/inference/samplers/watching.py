@@ -1,4 +1,4 @@
-"""Progress of NUTS: a bar of its chains, and the time it will take, from its first draws.
+"""Progress of a fit: NUTS's chains in a bar with the time they will take, and stages of the rest.
 
 A separate trial run would be discarded, so the trial is the start of the first chain. Its very
 first draws, while the step size is still sought, may take a hundred times the usual number of
@@ -6,22 +6,26 @@ leapfrog steps: the time of a step is that of all, and their number a draw the m
 second half. The estimate is a rough one all the same, and the bar corrects it.
 """
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Self
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 
-from trustbo.display.bars import NOWHERE, bar_in, say
+from trustbo.display.bars import FILE, NOWHERE, bar_in, say
 from trustbo.inference.samplers.settings import NutsSettings
 
 LONG = 10.0
 """Estimated time of a run, s, from which the estimate is printed."""
 _TRIAL_DRAWS, _TRIAL_SECONDS = 30, 1.0
+_QUICK = 1.0
+"""Time, s, until which the stages of a fit are not shown, lest they flicker."""
 
 
 class Watch:
-    """Shows the runs of NUTS that a posterior takes."""
+    """Shows the stages of a fit, and the runs of NUTS that it takes."""
 
     def __init__(self, place: str = NOWHERE, faster: str = "", *, estimates: bool = True) -> None:
         """Show nothing yet.
@@ -31,12 +35,46 @@ class Watch:
             faster: Advice on faster alternatives to NUTS, for the estimate.
             estimates: Whether to print an estimate of the time.
         """
-        self._place, self._faster, self._estimates = place, faster, estimates
-        self._name = "NUTS"
+        self.faster, self._place, self._estimates = faster, place, estimates
+        self._name, self._stage = "NUTS", None
+        self._started, self._said = time.perf_counter(), False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._end_stages()
+
+    def stage(self, doing: str, *, slow: bool = False) -> None:
+        """Show what is being done: in a bar, and in a file once, where it takes long.
+
+        Args:
+            doing: Name of the stage.
+            slow: Whether it is known to take seconds; others are shown from the first second on.
+        """
+        seconds = time.perf_counter() - self._started
+        if self._stage is None and (slow or seconds > _QUICK):
+            self._stage: Any = bar_in(self._place, bar_format="{desc}", leave=False)
+        if self._stage is not None:
+            self._stage.set_description_str(f"fit, after {seconds:.0f} s: {doing}")
+        if self._place == FILE and seconds > LONG and not self._said:
+            self._said = True
+            self._print(f"fit, after {seconds:.0f} s: {doing}")
+
+    def _end_stages(self) -> None:
+        if self._stage is not None:
+            self._stage.close()
+            self._stage = None
 
     @contextmanager
     def running(self, settings: NutsSettings) -> Iterator[Self]:
         """Show the bar of a run while it lasts."""
+        self._end_stages()
         self._settings, self._draws, self._n_divergences = settings, 0, 0
         self._seconds, self._n_steps = 0.0, np.zeros(0)
         self._of_chain = settings.warmup + settings.draws
@@ -83,13 +121,13 @@ class Watch:
             f"{self._name} again, for longer ({settings}, target_accept "
             f"{settings.target_accept:g}): {complaints[0]}{more}."
         )
-        self._name, self._faster = "NUTS, second run", ""
+        self._name, self.faster = "NUTS, second run", ""
 
     def _estimate(self) -> None:
         usual = float(np.median(self._n_steps[self._draws // 2 :]))
         self._estimated, seconds = True, self._seconds / self._n_steps.sum() * usual * self._total
         if seconds > LONG:
-            faster = f" Faster: {self._faster}." if self._faster else ""
+            faster = f" Faster: {self.faster}." if self.faster else ""
             self._print(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
 
     def _print(self, line: str) -> None:
