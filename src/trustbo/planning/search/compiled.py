@@ -24,9 +24,11 @@ def plan_compiled(case: Case) -> Best | None:
     """Find the best path of every draw; None if none is feasible under a risk."""
     best = SEARCHES[case.kind, case.risk is not None](case)
     missing = best.paths[:, 0] < 0
+    if not missing.any():
+        return best
     if (missing & (best.lower < np.inf)).any():
         raise _too_many_labels(case)
-    return None if missing.any() else best
+    return None
 
 
 def _sums(case: Case) -> Best:
@@ -120,12 +122,11 @@ def _together(found: list[Best]) -> Best:
 def _history(case: Case) -> Best:
     layers, dynamics = case.admissible.layers, case.dynamics
     n_draws = len(dynamics.start)
-    start_cost = np.full((1, len(layers.starts)), np.inf)
-    start_cost[0, layers.starts >= 0] = 0.0
-    sd = np.maximum(dynamics.noise_sd, TINY_SD)
-    trust = np.stack([dynamics.transition[:, 0, 0], dynamics.start[:, 0], sd], axis=1)
+    start_cost, trust = np.zeros((1, len(layers.starts))), np.empty((n_draws, 3))
+    trust[:, 0], trust[:, 1] = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
+    trust[:, 2] = np.maximum(dynamics.noise_sd, TINY_SD)
     toll = np.zeros((1, len(layers.head)))
-    if case.length_cost.any():
+    if case.objective.length_weight > 0.0:
         toll = case.length_cost[layers.move][None]
     drift = plain(dynamics.drift[:, 0].reshape(n_draws, -1))
     return solve(
@@ -233,8 +234,7 @@ def safest_path(
 ) -> tuple[tuple[Cell, ...], float]:
     """Find the admissible path with the least sum of a risk (move, cell), and this sum."""
     graph = admissible.grid if objective == "stationary" else admissible.layers
-    start_cost = np.full((1, len(graph.starts)), np.inf)
-    start_cost[0, graph.starts >= 0] = 0.0
+    start_cost = np.zeros((1, len(graph.starts)))
     toll = of_bounds.ravel()[graph.bound][None]
     best = solve(_of_sums(graph, toll, start_cost, no_resources(graph, of_bounds.size)))
     path = admissible.cells(best.paths[0])

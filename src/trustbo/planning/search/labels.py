@@ -76,12 +76,14 @@ def solve(problem: SearchProblem, below: np.ndarray | None = None) -> Best:
             _solve(problem, below, _most_labels(problem), *options, *draws, part, *found)
 
         over_rows(work, len(part)) if len(part) > 1 else work(0, len(part))
-        parts.append(part[:, : max(1, (part >= 0).sum(1).max(initial=0))])
-    longest = max(part.shape[1] for part in parts)
-    parts = [
-        np.pad(part, ((0, 0), (0, longest - part.shape[1])), constant_values=-1) for part in parts
-    ]
-    return Best(np.concatenate(parts), *found)
+        parts.append(part[:, : max(1, (part >= 0).any(0).sum())])
+    if len(parts) == 1:
+        return Best(parts[0], *found)
+    paths, begin = np.full((n_draws, max(part.shape[1] for part in parts)), -1, np.int32), 0
+    for part in parts:
+        paths[begin : begin + len(part), : part.shape[1]] = part
+        begin += len(part)
+    return Best(paths, *found)
 
 
 def _most_labels(problem: SearchProblem) -> int:
@@ -339,11 +341,13 @@ def _is_dominated(graph, resources, labels, other, label, loss):
     cost, x = state[label, 0], state[label, 1]
     while other >= 0:
         # Whether the other is as good in all that matters, and if so, whether it is equal.
-        covers = loss == LEAST or state[other, 0] <= cost
-        covers = covers and other != label and (loss == NONE or state[other, 1] >= x)
+        costs_more = loss != LEAST and state[other, 0] > cost
+        if costs_more or (loss != NONE and state[other, 1] < x) or other == label:
+            other = link[other, 3]
+            continue
+        covers, k = True, 0
         equal = loss == LEAST or state[other, 0] == cost
         equal = equal and (loss == NONE or state[other, 1] == x)
-        k = 0
         while covers and k < len(limits):
             r_other, r = used[other, k], used[label, k]
             if limits[k] < np.inf:  # a limit that is exceeded anyway matters no more
