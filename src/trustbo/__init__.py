@@ -17,11 +17,7 @@ def __getattr__(name: str) -> object:
 
         return version("trustbo")
     if name in _RENAMED:
-        import importlib
-        import operator
-        import warnings
+        from trustbo.renamed import former
 
-        message = f"trustbo.{name} is {_RENAMED[name]} since version 0.3; the old name will go."
-        warnings.warn(message, FutureWarning, stacklevel=2)
-        return operator.attrgetter(_RENAMED[name])(importlib.import_module("trustbo.campaign"))
+        return former(f"trustbo.{name}", "trustbo", _RENAMED[name])
     return _getattr(name)

@@ -20,6 +20,8 @@ PART: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 They are not cached on disk; their compiled callers are.
 """
+LEAF: dict[str, Any] = PART | {"_nrt": False}
+"""Options of those that also neither allocate nor keep an array: they count no references."""
 
 
 def plain(values: np.ndarray) -> np.ndarray:

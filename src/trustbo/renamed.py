@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from operator import attrgetter
 from typing import Any
 
 
@@ -10,7 +11,7 @@ def former(old: str, module: str, name: str) -> Any:
     """Object that an earlier version had as `old`, from its module of today; FutureWarning."""
     message = f"{old} is {module}.{name} since version 0.3; the old name will go."
     warnings.warn(message, FutureWarning, stacklevel=3)
-    return getattr(import_module(module), name)
+    return attrgetter(name)(import_module(module))
 
 
 def moved(room: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], object]:

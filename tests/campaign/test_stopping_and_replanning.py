@@ -250,8 +250,8 @@ def test_no_mission_no_result(workspace):
 
 def test_missions_and_seconds_of_version_0_2_are_found_and_name_what_replaced_them(workspace):
     campaign = tb.Campaign(workspace, *ENDS, sampler="exact")
-    with pytest.warns(FutureWarning, match=r"trustbo\.missions is Campaign\.run since version 0.3"):
+    with pytest.warns(FutureWarning, match=r"trustbo\.missions is trustbo\.Campaign\.run since"):
         steps = tb.missions(campaign, ModelSimulator(workspace), n_iterations=1)
     assert [mission.path for _, mission in steps] == [campaign.missions[0].path]
-    with pytest.warns(FutureWarning, match=r"trustbo\.Seconds is TimeLimit since"):
+    with pytest.warns(FutureWarning, match=r"trustbo\.Seconds is trustbo\.TimeLimit since"):
         assert tb.Seconds(60.0).limit == 60.0

@@ -160,9 +160,9 @@ def test_a_position_survives_the_settings_of_a_study():
         }
     )
     again = tb.study.Study.of(json.loads(json.dumps(part.settings())))
-    terrain = again.terrains["cells"]
-    assert terrain.ends == ("x=25,y=30", (0, 3))
-    assert Planner(terrain.workspace(), *terrain.ends).start == (3, 0)
+    scene = again.experiment().runs()[0].scene
+    assert scene.ends == ("x=25,y=30", (0, 3))
+    assert Planner(scene.make_workspace(bounds=True), *scene.ends).start == (3, 0)
 
 
 def test_a_survey_knows_the_cells_that_are_impassable_before_awareness():

@@ -10,7 +10,6 @@ from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import CoupledParams, PooledTrust, RobotParams, TrustParams
 from trustbo.planning import Planner
-from trustbo.planning.search import labels_vector
 from trustbo.planning.search.buckets import best_stationary
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
@@ -128,41 +127,6 @@ def test_a_maze_s_path_is_found_by_many_draws_too():
     drawn = planner.plan_draws(sample_prior(PooledTrust(), 2, 3, seed=0))
     fewest = nx.shortest_path_length(planner.graph, (0, 0), (20, 0))
     assert [len(path) - 1 for path in drawn.candidates] == [fewest]
-
-
-def test_a_plan_that_may_not_be_exact_says_by_how_much(monkeypatch):
-    workspace = random_workspace(3, n=7, n_robots=3)
-    params = random_params("hierarchical", 3, 3)
-    ends = (workspace, (6, 0), (0, 6))
-    exact = Planner(*ends, "terminal", team="min", engine="numba").plan(params)
-    assert exact.exact
-    assert exact.bound == exact.value
-    # A coarse tolerance drops labels that might have been better.
-    monkeypatch.setattr(labels_vector, "_TOLERANCES", (0.5,))
-    rough = Planner(*ends, "terminal", team="min", engine="numba").plan(params)
-    assert rough.value <= exact.value + 1e-12 <= rough.bound + 2e-12
-    assert rough.exact == (rough.bound <= rough.value + 1e-12)
-    monkeypatch.setattr(labels_vector, "MAX_LABELS", 10)
-    with pytest.raises(TrustboError, match="more than 10 partial paths are worth keeping; lower"):
-        Planner(*ends, "terminal", team="min", engine="numba").plan(params)
-
-
-def test_the_bound_holds_over_many_maps(monkeypatch):
-    bounds = {}
-    for tolerances in ((0.0,), (0.1,)):
-        monkeypatch.setattr(labels_vector, "_TOLERANCES", tolerances)
-        for seed in range(12):
-            for objective in ("success", "bottleneck", "mean"):
-                workspace = random_workspace(seed, n=6, n_robots=3)
-                planner = Planner(
-                    workspace, (5, 0), (0, 5), objective, team="min", engine="numba",
-                    max_bounds=None if objective == "mean" else 8,
-                )  # fmt: skip
-                plan = planner.plan(random_params("coupled", seed, 3))
-                bounds.setdefault((seed, objective), []).append((plan.value, plan.bound))
-    for (best, _), (value, bound) in bounds.values():
-        assert value <= best + 1e-12
-        assert best <= bound + 1e-9
 
 
 def test_length_weights_are_for_additive_objectives_only():

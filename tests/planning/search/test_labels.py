@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from references import path_value, walks
 
-from trustbo.errors import TrustboError
 from trustbo.models import TrustParams
 from trustbo.planning import Planner
 from trustbo.planning.graph import NoPathError
@@ -133,15 +132,3 @@ def test_the_trust_map_is_the_best_terminal_trust_of_every_cell():
                     value = 1.0 / (1.0 + np.exp(-robots.values[0][goal]))
                     np.testing.assert_allclose(value, alone, rtol=1e-9)
         assert np.isnan(trust.values[~passable]).all()
-
-
-def test_success_and_bottleneck_refuse_a_negative_autoregression():
-    case = random_case(0)
-    with pytest.raises(TrustboError, match=r"needs beta0 >= 0; got -0.5"):
-        make_planner("success", 8, case).plan(make_params(-0.5, case))
-
-
-def test_stationary_refuses_an_autoregression_that_settles_nowhere():
-    case = random_case(0)
-    with pytest.raises(TrustboError, match=r"needs abs\(beta0\) < 1; got 1"):
-        make_planner("stationary", 8, case).plan(make_params(1.0, case))

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART
+from trustbo.parallel import LEAF, PART
 from trustbo.planning.search.graph import Costs, Graph, Resources, drift_of, filled
 from trustbo.planning.search.losses import LEAST, NONE, least_slope, loss_of
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
-_leaf = njit(nogil=True, error_model="numpy", _nrt=False, **PART)
+_leaf = njit(nogil=True, error_model="numpy", **LEAF)  # see README
 _inlined = njit(nogil=True, error_model="numpy", inline="always")  # no counts of references
 
 
@@ -109,6 +109,7 @@ def look_ahead(graph: Graph, costs: Costs, by_edge: bool) -> Ahead:
 
 @_leaf
 def _fill_ahead(graph, costs, lo, ahead):
+    """Write down hi, W, m and s of all nodes; see the head of this file."""
     first, head, cell, bound = graph.first, graph.head, graph.cell, graph.bound
     hi, own, fall, slope, of_edge = ahead
     drift, beta0, by_bound, sd, loss = (
@@ -162,6 +163,11 @@ def pass_back(graph: Graph, costs: Costs, ahead: Ahead, toll: np.ndarray) -> ToG
 
 @_leaf
 def _settle(graph, costs, ahead, to_go):
+    """Write down V of all nodes, as the best and second-best of their edges' W + V.
+
+    Invariant: in a layered graph V of all heads is final when a node is reached; else passes go on,
+    in alternate directions, until none changes anything.
+    """
     toll, best, second, by = to_go
     n_nodes, loss = len(best), costs.loss
     for node in range(n_nodes):

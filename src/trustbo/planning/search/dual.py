@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART
+from trustbo.parallel import LEAF, PART
 from trustbo.planning.search.costs_to_go import (
     Ahead,
     ToGo,
@@ -42,7 +42,7 @@ from trustbo.planning.search.graph import Costs, Graph, Resources, filled
 from trustbo.planning.search.losses import LEAST, NONE, joined, loss_of
 
 _part = njit(nogil=True, error_model="numpy", **PART)
-_leaf = njit(nogil=True, error_model="numpy", _nrt=False, **PART)  # see README
+_leaf = njit(nogil=True, error_model="numpy", **LEAF)  # see README
 _inlined = njit(nogil=True, error_model="numpy", inline="always")  # see README
 _PRICES = 12
 """Number of prices that are tried."""
@@ -173,12 +173,15 @@ def _raise_price(graph, costs, resources, ahead, dual, mu, base, path):
         if price > 0.0 or mu > 0.0:
             to_go = pass_back(graph, costs, ahead, _tolls(graph, costs, resources, price, mu))
         least, start = _root(graph, costs, to_go)
+        # root(lambda): of the least line of all paths, at this price; any price is a lower limit.
         added = base - price * limit if price > 0.0 else base
         if least + added > root:
             priced, offset, root = to_go, added, least + added
         known, tried = _try(graph, costs, resources, ahead, to_go, start, known, path)
         if root >= known.cost or (tried.feasible and price == 0.0):
             break
+        # The path is a line in lambda with slope r - limit: it falls where r is within the limit,
+        # rises beyond. The next price is where the last of both meet.
         line = tried.cost + mu * tried.first
         if tried.used <= limit and (len(resources.limits) == 1 or tried.feasible):
             if line == within and tried.used == within_used:

@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from trustbo.parallel import PART, over_rows
+from trustbo.parallel import LEAF, PART, over_rows
 from trustbo.planning.search.costs_to_go import (
     any_start,
     least_trust,
@@ -45,7 +45,7 @@ from trustbo.planning.search.room import with_room
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
-_leaf = njit(nogil=True, error_model="numpy", _nrt=False, **PART)
+_leaf = njit(nogil=True, error_model="numpy", **LEAF)  # see README
 _inlined = njit(nogil=True, error_model="numpy", inline="always")  # see README
 MAX_LABELS = 300_000
 """Limit on the labels of a draw."""
@@ -147,15 +147,16 @@ def _best_bottleneck(graph, costs, resources, ahead, dual, max_labels, aims):
     step = gap / 32.0  # the first aim is low, and cheap where it is in vain
     aim = root + step
     for _ in range(aims):
+        # Labels at a node n need x >= need[n], else some later loss is the aim or more.
         need = least_trust(graph, costs, aim)
         narrowed = with_safest(graph, costs, resources, need)
         found, lower = _by_rank(graph, costs, narrowed, ahead, need, dual, aim, max_labels)
-        complete = lower == np.inf
+        complete = lower == np.inf  # no label was left at the limit on their number
         if len(found.path) > 0:
             known = found
             aim, step = 0.5 * (root + known.cost), np.inf  # from now on halves
         elif not complete or aim == known.cost:
-            break
+            break  # nothing is proven, or nothing costs less than the best known
         else:
             # Steps grow by a tenth, as labels multiply with the aim; past a quarter of the gap the
             # next aim is the best cost known.
@@ -301,8 +302,9 @@ def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, hea
         for k in range(n_resources):
             used[n, k] = used[label, k] + of_bounds[b, k]
             within += used[n, k] + safest[h, k] <= limits[k]
-        if within < resources.needed:
+        if within < resources.needed:  # even the safest completions exceed too many limits
             continue
+        # x' = beta0 x + u at the head, where the costs to go are those of x = hi.
         after, lack = x, 0.0
         if loss != NONE:
             after = beta0 * x + (drift[b] if by_bound else drift[cell[h]])
@@ -315,6 +317,7 @@ def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, hea
             if cost + toll[e] + own[h] + fall[h] * lack + to_come >= best:
                 continue
         now = joined(loss, cost, loss_of(loss, after, sd)) + toll[e]
+        # `paid` sums lambda r + mu r_0 over the edges: what (b) counts beyond the cost so far.
         least, paid = joined(loss, now, to_come), prices + (paid_toll[e] - toll[e])
         if n_resources > 0:
             least += failure(F, used[n, 0] + safest[h, 0])  # (a)
