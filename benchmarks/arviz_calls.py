@@ -45,7 +45,7 @@ az.rhat(dt)
 az.rhat_nested(dt, superchain_ids=np.arange(dt["posterior"].sizes["chain"]) // 2)
 az.diagnose(dt, show_diagnostics=False)
 az.bfmi(dt)
-az.ecdf(dt, var_names=["beta0"])
+az.ecdf(dt["posterior"].dataset["beta0"])
 az.histogram(dt, var_names=names)
 az.kde(dt, var_names=names)
 az.qds(dt, var_names=["beta0"])
@@ -184,6 +184,8 @@ def main() -> None:
     for subject, dt in results.items():
         names = {"az": az, "np": np, "tb": tb, "written": written, "density": density}
         names |= {"dt": dt, **others, "names": ["beta0", "beta", "b"]}
+        if subject == "by rate":  # compared with a view too: ArviZ asks for the same observations
+            names["other"] = tb.inference.by_rate(others["other"])
         for call in calls:
             if error := failure(call, names):
                 failures += 1

@@ -181,6 +181,12 @@ def test_the_view_by_rate_has_the_priors_and_of_weighted_missions_no_likelihood_
         for tree in (tb.inference.by_rate(posterior), posterior)
     )
     np.testing.assert_allclose(factor, same)
+    view = tb.inference.by_rate(posterior)
+    measured = np.isfinite(posterior["observed_data"]["contact_rate"].values)
+    np.testing.assert_array_equal(
+        view["prior_predictive"]["contact_rate"],
+        posterior["prior_predictive"]["contact_rate"].values[..., measured],
+    )
     weighted = tb.fit(missions, PooledTrust(), weights=[0.5, 0.6, 0.7, 0.8, 0.9])
     view = tb.inference.by_rate(weighted)
     assert "log_likelihood" not in view.children

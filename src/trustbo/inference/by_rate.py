@@ -30,9 +30,10 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
 
     Returns:
         DataTree with `posterior`, `sample_stats`, `prior` and `log_prior` unchanged, and
-        `observed_data`, `posterior_predictive` and `log_likelihood` of `contact_rate`, over (chain,
-        draw, rate), with the mission, bound and robot of each rate as coordinates. Rates that were
-        not measured are left out. Where missions have weights, the last is called
+        `observed_data`, `posterior_predictive`, `prior_predictive` and `log_likelihood` of
+        `contact_rate`, over (chain, draw, rate), with the mission, bound and robot of each rate as
+        coordinates; predictions of the prior are of whole missions, as in `posterior`. Rates that
+        were not measured are left out. Where missions have weights, the last is called
         `rate_log_likelihood`, as `az.loo` would take it for that of an unweighted posterior.
 
     Raises:
@@ -72,11 +73,13 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
     }
     index = coords | {"chain": draws["chain"], "draw": draws["draw"]}
     dims = ("chain", "draw", "rate")
+    before = posterior["prior_predictive"]["contact_rate"].values[..., measured]
     likelihood = "rate_log_likelihood" if is_weighted(posterior) else "log_likelihood"
     kept = ("posterior", "sample_stats", "prior", "log_prior")
     groups = {name: posterior[name].to_dataset() for name in kept if name in posterior.children} | {
         "observed_data": xr.Dataset({"contact_rate": ("rate", y)}, coords),
         "posterior_predictive": xr.Dataset({"contact_rate": (dims, drawn.reshape(shape))}, index),
+        "prior_predictive": xr.Dataset({"contact_rate": (dims, before)}, coords),
         likelihood: xr.Dataset({"contact_rate": (dims, density.reshape(shape))}, index),
     }
     view = xr.DataTree.from_dict(groups)
