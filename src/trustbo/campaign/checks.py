@@ -149,7 +149,7 @@ def _require_path(
 
 
 def _is_same(one: Mission, other: Mission) -> bool:
-    """Whether two missions agree in every number, and hardly by chance."""
+    """Whether two missions agree in every number, with a rate between 0 and 1 among them."""
     if one.path != other.path or one.status != other.status:
         return False
     names = ("awareness", "contact_rate", "duration", "n_ticks")

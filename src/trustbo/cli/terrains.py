@@ -93,7 +93,7 @@ def terrain_with(
 
 
 def pair(what: str, text: str) -> tuple[int, int]:
-    """Two whole numbers of a flag; TrustboError: the text is none."""
+    """Read two whole numbers from the text of a flag; TrustboError: it has others, or none."""
     try:
         first, second = (int(number) for number in text.split(","))
     except ValueError:

@@ -196,7 +196,7 @@ class TrustFilter:
         return self.state
 
     def begin_bound(self, awareness: ArrayLike, bound: tuple[Cell, Cell] | None = None) -> None:
-        """Begin a bound whose ticks `update_tick` takes in; arguments as those of `update`."""
+        """Begin a bound, before its ticks (`update_tick`); arguments as those of `update`."""
         self._require_running(running=False)
         z, effect = self._bound(awareness, bound)
         self._running = _Running(z, effect, *np.zeros((2, self._n_robots)))

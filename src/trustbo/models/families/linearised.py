@@ -33,7 +33,7 @@ class Linearised(Family):
 
     @abstractmethod
     def derivatives(self, ssm: SSM, data: Data, trust: Array) -> tuple[Array, Array]:
-        """First and second derivative of `log_prob` in trust; approximations will do."""
+        """First and second derivative of `log_prob` in trust, exact or approximate."""
 
     @abstractmethod
     def start(self, observed: Observed) -> Array:

@@ -282,7 +282,7 @@ def _with_room(labels, n):
 
 @_leaf
 def _extend(graph, costs, resources, ahead, need, dual, best, label, labels, heads, n):
-    """Add the labels of one more edge that may lead to less than `best`; their number so far."""
+    """Add the labels of one more edge that may lead to less than `best`; their number."""
     # Arrays of records by names of their own: a loop counts the references of a record's.
     link, state, used = labels
     first, head, move, cell, bound = graph.first, graph.head, graph.move, graph.cell, graph.bound
