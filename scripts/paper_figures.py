@@ -62,7 +62,7 @@ def overwatch() -> Figure:
         )
     ax.plot(lead_x, lead_y, "*", color=theme().ink, markersize=17, markeredgecolor=theme().paper)
     ax.annotate("subteam T2 stands\nand watches", (own_x + 0.1, own_y + 0.42), (2.2, 5.0), **note())
-    ax.annotate("lead T1 bounds\nto the next cell", (lead_x + 0.2, lead_y), (5.3, 2.5), **note())
+    ax.annotate("lead T1 bounds\nto the next cell", (lead_x + 0.2, lead_y), (4.95, 2.5), **note())
     ax.text(x[0], y[0] + 0.32, "start", **WIDE)
     ax.text(x[-1], y[-1] - 0.3, "goal", **WIDE)
     ax.plot(x[[0, -1]], y[[0, -1]], "o", color=theme().quiet, markersize=7)

@@ -1,5 +1,6 @@
 """The figure of a criticism marks what lies outside its bands."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,15 @@ def found():
         rates = 0.3 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2)) + 0.1 * (j >= 4)
         missions.append(tb.Mission.from_arrays(path, z, rates))
     return tb.criticise(tb.fit(missions, whole=False), compare=False)
+
+
+def test_in_a_column_of_a_journal_panels_are_lower_and_labels_keep_apart(found):
+    axes = tb.plots.criticism(found, width=3.5)
+    figure = axes[0].figure
+    figure.canvas.draw()
+    assert figure.get_figheight() < 14.0
+    labels = [ax.yaxis.label.get_window_extent() for ax in axes if ax.get_ylabel()]
+    assert not any(a.overlaps(b) for a, b in itertools.pairwise(labels))
 
 
 def test_the_fault_is_in_bold_and_groups_outside_their_band_are_marked(found):

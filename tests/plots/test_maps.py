@@ -1,5 +1,6 @@
 """Figures of a result."""
 
+import dataclasses
 import warnings
 
 import matplotlib.pyplot as plt
@@ -90,6 +91,25 @@ def test_terrain_maps_show_surface_traversability_and_visibility(result):
     bare = tb.Workspace.from_awareness(np.full((1, 3, 3, 2), 0.5))
     with pytest.raises(tb.TrustboError, match=r"Workspace\.from_terrain"):
         tb.plots.terrain_maps(bare)
+
+
+def test_the_bar_of_a_row_of_axes_is_no_higher_than_their_maps(result):
+    for layout in (None, "constrained"):
+        figure, row = plt.subplots(1, 4, figsize=(12.0, 6.0), layout=layout)
+        axes = tb.plots.terrain_maps(result.workspace, ax=row)
+        figure.canvas.draw()
+        assert axes[-1].get_position().height < 3.0 / 6.0
+        bar = figure.axes[-1].get_position().height
+        assert 0.7 < bar / axes[-1].get_position().height < 1.25
+
+
+def test_a_height_just_below_0_is_0(result):
+    terrain = result.workspace.terrain
+    low = float(terrain["dsm"].min())
+    flat = dataclasses.replace(result.workspace, terrain=terrain - low - 0.3)
+    surface = tb.plots.terrain_maps(flat)[0]
+    texts = [text.get_text() for inset in surface.child_axes for text in inset.texts]
+    assert texts[0] == "0"
 
 
 def test_every_map_has_contour_lines_and_the_first_a_scale(result):

@@ -12,13 +12,15 @@ from matplotlib.ticker import MaxNLocator
 
 from trustbo.criticism.criticise import Criticism
 from trustbo.errors import require_kind
-from trustbo.plots.layout import Panels, as_text, plain, small_multiples
+from trustbo.plots.layout import PAGE, Panels, as_text, plain, small_multiples
 from trustbo.plots.places import BETTER_WORSE
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 _LEVEL = 0.05
 _LEAST_P = 1e-6
 """Lower limit of the axis of p."""
+_LEAST_WIDTH = 1.8
+"""Least width of a panel, inches."""
 _KINDS = ("mission", "bound", "robot", "contact")
 
 
@@ -39,7 +41,10 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
         Axes, shape (9,).
     """
     require_kind("plots.criticism", found, Criticism, "give a Criticism, from tb.criticise")
-    made = small_multiples(9, (2.5, 2.2), Style.from_options(style), least=1.8)
+    options = Style.from_options(style)
+    alone = options.ax is None and (options.width or PAGE) < 2.0 * _LEAST_WIDTH
+    height = 1.4 if alone else 2.2  # nine panels in a column are a page high
+    made = small_multiples(9, (2.5, height), options, least=_LEAST_WIDTH)
     tests, pit, cover, correlation, *groups, cells = made.panels
     _draw_tests(tests, found)
     _draw_curves(pit, cover, correlation, found.curves)
@@ -91,7 +96,7 @@ def _draw_curves(pit: Axes, cover: Axes, correlation: Axes, curves: xr.Dataset) 
     pit.plot(u, curves["pit"], color=theme().ink, linewidth=1.2)
     _mark(pit, u, curves, "pit")
     pit.set_xlabel("PIT of rates one bound ahead", fontsize=SMALL)
-    pit.set_ylabel("share below, less uniform", fontsize=SMALL)
+    pit.set_ylabel("share below,\nless uniform", fontsize=SMALL)
     if "coverage" in curves:
         level, low, high = (curves[n].values for n in ("level", "coverage_low", "coverage_high"))
         x = np.arange(len(level))
@@ -104,7 +109,7 @@ def _draw_curves(pit: Axes, cover: Axes, correlation: Axes, curves: xr.Dataset) 
         )
         cover.set_xticks(x, [f"{p:.0%}" for p in level])
     cover.set_xlabel("interval one mission ahead", fontsize=SMALL)
-    cover.set_ylabel("share inside, less nominal", fontsize=SMALL)
+    cover.set_ylabel("share inside,\nless nominal", fontsize=SMALL)
     ticks, lags = [], []
     for name, axis in (("autocorrelation", "lag"), ("autocorrelation_missions", "mission_lag")):
         if name not in curves:  # missions of one bound, or only one mission

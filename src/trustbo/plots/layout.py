@@ -91,7 +91,8 @@ class Panels:
             box = ax.get_position(original=True)
             row = round(box.y0 + box.y1, 2)
             rows[row] = max(rows.get(row, 0.0), box.height)
-        shape = {"aspect": 14 * min(len(rows), 3), "shrink": 0.95, "pad": 0.02}
+        shrink = 0.95 * (_share_filled(axes) if self.style.ax is not None else 1.0)
+        shape = {"aspect": 14 * min(len(rows), 3), "shrink": shrink, "pad": 0.02}
         bar = axes[0].figure.colorbar(image, ax=axes, **shape | options)
         if "location" in options:
             bar.ax.locator_params(axis="x", nbins=4)
@@ -139,6 +140,17 @@ class Panels:
         panels = Bbox.union([box for box in boxes if box is not None])
         title = (MEDIUM + 4.0) / 72.0 if figure.get_suptitle() else 0.0
         figure.set_figheight(panels.height / figure.dpi + 2.0 * _PAD + title)
+
+
+def _share_filled(axes: Sequence[Axes]) -> float:
+    """Share of the height of Axes that their maps, of fixed proportions, fill."""
+    for ax in axes:
+        ax.apply_aspect()
+    drawn, given = (
+        Bbox.union([ax.get_position(original=original) for ax in axes]).height
+        for original in (False, True)
+    )
+    return drawn / given
 
 
 def small_multiples(

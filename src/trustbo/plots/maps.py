@@ -378,12 +378,13 @@ def draw_scale(
     length = max(f * magnitude for f in (1, 2, 5) if f * magnitude <= 0.4 * width * (1 + 1e-9))
     share = length / width  # of the axes
     x, y = (0.96 - share if corner[0] else 0.04), (0.87 if corner[1] else 0.045)
-    (bar,) = ax.plot([x, x + share], [y, y], color="black", transform=ax.transAxes)
-    bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=outlined(4.0))
+    (bar,) = ax.plot([x, x + share], [y, y], color=theme().ink, transform=ax.transAxes)
+    halo = theme().paper
+    bar.set(linewidth=2.0, solid_capstyle="butt", path_effects=outlined(4.0, halo))
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     edge = ("left", x) if corner[0] == 0 else ("right", x + share)  # for a long text to stay inside
     text = ax.text(edge[1], y + 0.02, label, ha=edge[0], fontsize=SMALL, transform=ax.transAxes)
-    text.set(color="black", path_effects=outlined(2.5))
+    text.set(color=theme().ink, path_effects=outlined(2.5, halo))
 
 
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:

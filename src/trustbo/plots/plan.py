@@ -83,10 +83,11 @@ def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
         if way is not None:
             ax.plot(*way.T, color=theme().paper, linewidth=2.2, zorder=4)
             ax.plot(*way.T, color=colour, linewidth=1.4, linestyle=_DASHED, zorder=4)
-            ax.plot(*way[-1], marker, **_open(colour), zorder=6)
+            ax.plot(*way[-1], marker, **_open(colour), zorder=6, clip_on=False)
         ax.plot(*np.stack([post, stops[1]]).T, color=colour, linewidth=0.8, zorder=5)
-        ax.plot(*post, marker, **_filled(colour), zorder=7)
-    ax.plot(*stops.T, "*", **_filled(theme().ink, 11), linestyle="none", zorder=6)
+        # A post on the edge of the raster is drawn whole.
+        ax.plot(*post, marker, **_filled(colour), zorder=7, clip_on=False)
+    ax.plot(*stops.T, "*", **_filled(theme().ink, 11), linestyle="none", zorder=6, clip_on=False)
     low, high = (f(np.concatenate(seen), axis=0) for f in (np.min, np.max))
     half = 0.56 * float((high - low).max()) + 2.0
     left, right, bottom, top = extent_of(plan.workspace.grid)

@@ -79,7 +79,7 @@ def _draw_heights(ax: Axes, heights: Normalize) -> None:
     bar = ax.figure.colorbar(image, cax=inset, orientation="horizontal")
     bar.set_ticks([])
     digits = 0 if high - low >= 5.0 else 1
-    texts = (0.0, "left", f"{low:.{digits}f}"), (1.0, "right", f"{high:.{digits}f} m")
+    texts = (0.0, "left", f"{low:z.{digits}f}"), (1.0, "right", f"{high:z.{digits}f} m")
     for x, side, text in texts:
         drawn = inset.text(x, -0.4, text, ha=side, va="top", transform=inset.transAxes)
         drawn.set(fontsize=SMALL, path_effects=outlined(2.0), color="black")
