@@ -1,4 +1,4 @@
-"""Clean executed notebooks before they are committed: no run times, smaller figures.
+"""Clean executed notebooks before they are committed: no run times, no bars, smaller figures.
 
 Figures get a palette of 256 colours where hardly a pixel changes.
 
@@ -31,11 +31,18 @@ def smaller(png: str) -> str:
     return found if len(found) < len(png) else png
 
 
+def is_bar(output: dict) -> bool:
+    """Whether an output is a state of a progress bar of text, of which none is left at the end."""
+    return output.get("name") == "stderr" and "\r" in "".join(output["text"])
+
+
 def clean(path: Path) -> None:
     """Rewrite a notebook in place."""
     notebook = json.loads(path.read_text())
     for cell in notebook["cells"]:
         cell["metadata"].pop("execution", None)
+        if "outputs" in cell:
+            cell["outputs"] = [output for output in cell["outputs"] if not is_bar(output)]
         for output in cell.get("outputs", []):
             data = output.get("data", {})
             if "image/png" in data:
