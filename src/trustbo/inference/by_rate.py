@@ -73,7 +73,7 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
     }
     index = coords | {"chain": draws["chain"], "draw": draws["draw"]}
     dims = ("chain", "draw", "rate")
-    before = posterior["prior_predictive"]["contact_rate"].values[..., measured]
+    before = posterior["prior_predictive"].to_dataset()["contact_rate"].values[..., measured]
     likelihood = "rate_log_likelihood" if is_weighted(posterior) else "log_likelihood"
     kept = ("posterior", "sample_stats", "prior", "log_prior")
     groups = {name: posterior[name].to_dataset() for name in kept if name in posterior.children} | {

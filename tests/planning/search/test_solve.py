@@ -8,7 +8,7 @@ import pytest
 from trustbo.errors import TrustboError
 from trustbo.models import TrustParams
 from trustbo.planning import Planner
-from trustbo.planning.search.solve import value_bound
+from trustbo.planning.search.solve import value_limit
 from trustbo.workspace import Workspace
 
 
@@ -42,5 +42,5 @@ def test_stationary_refuses_an_autoregression_that_settles_nowhere():
 )
 def test_a_gap_in_trust_or_in_log_probability_is_an_upper_limit_on_values(objective, value, best):
     # terminal adds to the logit of .6, whose odds are 3 to 2; success multiplies.
-    np.testing.assert_allclose(value_bound(objective, value, 0.4), best, rtol=1e-12)
-    assert value_bound(objective, value, 1e-13) == value
+    np.testing.assert_allclose(value_limit(objective, value, 0.4), best, rtol=1e-12)
+    assert value_limit(objective, value, 1e-13) == value
