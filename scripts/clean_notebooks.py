@@ -8,6 +8,7 @@ python scripts/clean_notebooks.py notebooks/*.ipynb
 import base64
 import io
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -32,8 +33,9 @@ def smaller(png: str) -> str:
 
 
 def is_bar(output: dict) -> bool:
-    """Whether an output is a state of a progress bar of text, of which none is left at the end."""
-    return output.get("name") == "stderr" and "\r" in "".join(output["text"])
+    """Whether an output is of progress bars of text alone, of which none is left at the end."""
+    text = "".join(output.get("text", []))
+    return bool(re.fullmatch(r"(\r[^\n]*)+", text))
 
 
 def clean(path: Path) -> None:

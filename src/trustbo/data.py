@@ -191,7 +191,7 @@ class Mission(Displayed):
             team = np.where(measured.any(1), np.where(measured, rates, 0.0).sum(1), np.nan)
             curves = np.vstack([team / np.maximum(measured.sum(1), 1), rates.T])
             return curve_picture(
-                curves, label="contact rate of the team, and each", x_label="bounds"
+                curves, label="contact rate of the team, and each", x_label="bound"
             )
 
         sections = {

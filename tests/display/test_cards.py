@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 import trustbo as tb
+from trustbo.display.bars import NOTEBOOK, bar_in
 from trustbo.display.card import Card
 from trustbo.display.svg import curve_picture, map_picture
 from trustbo.models import (
@@ -130,6 +131,12 @@ def test_a_map_has_a_pixel_for_each_cell_and_grey_where_nothing_is_known():
     assert "trust: 0 to 1" in map_picture(values, label="trust")
 
 
+def test_a_cell_apart_is_grey_and_does_not_set_the_limits():
+    picture = map_picture(np.array([[0.5, 0.9], [1.0, 0.9]]), label="trust", apart=(0, 0))
+    assert (pixels_of(picture)[0, 0] == 128).all()
+    assert "trust: 0.9 to 1" in picture
+
+
 def test_a_path_goes_through_the_centres_of_its_cells():
     picture = map_picture(np.zeros((2, 4)), [(1, 0), (0, 1)], aspect=0.5)
     (line, _) = re.findall(r'<polyline points="([^"]+)"', picture)
@@ -143,6 +150,12 @@ def test_a_curve_breaks_where_a_number_is_missing():
     heights = [[float(point.split(",")[1]) for point in line] for line in lines]
     assert [len(line) for line in lines] == [2, 2]
     assert heights[0][0] > heights[0][1] > heights[1][0] > heights[1][1]  # upwards
+
+
+def test_the_axis_of_a_curve_names_its_first_and_last_point():
+    for values, texts in (([0.3], ["mission 1"]), ([0.3, 0.5], ["mission 1", "2"])):
+        picture = curve_picture(values, x_label="mission")
+        assert re.findall(r"<text[^>]*>([^<]*)</text>", picture)[2:] == texts
 
 
 @pytest.mark.parametrize("values", [[], [np.nan], [0.3], [0.3, 0.3]])
@@ -181,3 +194,19 @@ def test_a_notebook_shows_the_campaign_while_it_runs_and_the_result_alone_at_the
     for cell in notebook.cells:  # what is left of them
         html = ["".join(o.data.get("text/html", "")) for o in cell.outputs if "data" in o]
         assert sum("tb-card" in each for each in html) == 1
+
+
+def test_bars_of_text_in_a_notebook_share_a_line(capsys):
+    """A cell's output knows no way up: a second line would be printed anew at each refresh."""
+    with bar_in(NOTEBOOK, total=3, desc="missions") as outer:
+        with bar_in(NOTEBOOK, total=9, desc="draws", leave=False) as inner:
+            for _ in range(3):
+                inner.update()
+                inner.refresh()
+        outer.update(3)
+        outer.refresh()
+        said = capsys.readouterr().out
+    assert "draws:  33%" in said
+    assert "missions: 100%" in said
+    assert "\n" not in said
+    assert "\x1b" not in said

@@ -37,7 +37,7 @@ def summary_of(
             return map_picture(trust, cells, aspect=aspect, label=label, apart=cells[0])
 
         rates = history["contact_rate"].values
-        curve = partial(curve_picture, rates, label="contact rate", x_label="missions")
+        curve = partial(curve_picture, rates, label="contact rate", x_label="mission")
         pictures = [area, curve]
     rows = [*rows, *_evidence(history)]
     options = [(name, str(value)) for name, value in settings.items() if len(str(value)) < 200]

@@ -31,12 +31,17 @@ def in_notebook() -> bool:
 
 
 def bar_in(place: str, **options: Any) -> tqdm:
-    """Bar in a terminal or a notebook; in other places it is not shown."""
+    """Bar in a terminal or a notebook; in other places it is not shown.
+
+    In a notebook without ipywidgets bars are of text, and share a line: there is no way up. What
+    comes by stderr is set off there as if it were an error.
+    """
+    if place == NOTEBOOK:
+        options |= {"position": 0, "file": sys.stdout}
     return tqdm(disable=place not in (TERMINAL, NOTEBOOK), **options)
 
 
 def say(place: str, line: str) -> None:
     """Print a line above the bars."""
     if place:
-        # A notebook sets off what comes by stderr as if it were an error.
         tqdm.write(line, file=sys.stdout if place == NOTEBOOK else sys.stderr)

@@ -28,16 +28,15 @@ def map_picture(
         aspect: Height of a cell over its width.
         label: Name of the values, written below with the least and the largest.
         line: False for the ends of the path alone.
-        apart: Cell whose value does not set the limits of the colours.
+        apart: Cell that is drawn grey too, and does not set the limits of the colours.
     """
-    cells = np.asarray(values, dtype=float)
+    cells = np.array(values, dtype=float)
+    if apart is not None:
+        cells[apart] = np.nan
     rows, cols = cells.shape
     scale = min(_WIDTH / cols, _WIDTH / (rows * aspect))
     width, height = cols * scale, rows * aspect * scale
-    finite = np.isfinite(cells)
-    if apart is not None:
-        finite[apart] = False
-    limits = cells[finite]
+    limits = cells[np.isfinite(cells)]
     low, high = (float(limits.min()), float(limits.max())) if limits.size else (0.0, 0.0)
     parts = [
         f'<image width="{width:.0f}" height="{height:.0f}" preserveAspectRatio="none" '
@@ -89,9 +88,11 @@ def curve_picture(
             f'<text x="{left - 4}" y="{y + 4}" text-anchor="end">{value:.3g}</text>'
             for value, y in ((high, top), (low, top + tall))
         ),
-        f'<text x="{left}" y="{top + tall + 14}">1</text>',
-        f'<text x="{left + wide}" y="{top + tall + 14}" text-anchor="end">{n} {x_label}</text>',
+        f'<text x="{left}" y="{top + tall + 14}">{f"{x_label} 1".strip()}</text>',
     ]
+    if n > 1:
+        last = f'<text x="{left + wide}" y="{top + tall + 14}" text-anchor="end">{n}</text>'
+        parts.append(last)
     if band is not None:
         below, above = (np.ravel(np.asarray(edge, dtype=float)) for edge in band)
         there = [position(k, value) for k, value in enumerate(below)]

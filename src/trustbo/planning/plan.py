@@ -89,7 +89,7 @@ class Plan(Displayed):
         def along() -> str:
             curves = np.vstack([self.trust.mean(1), self.trust.T])
             band = self.bands[0].mean(1), self.bands[-1].mean(1)
-            return curve_picture(curves, band=band, label="trust along the path", x_label="bounds")
+            return curve_picture(curves, band=band, label="trust along the path", x_label="bound")
 
         return Card(
             f"Plan: {self.path[0]} to {self.path[-1]}", rows, [area, along],

@@ -91,10 +91,10 @@ def _sections(result: Result) -> list[Section]:
     area = map_picture(
         result.trust_map.values, result.path, aspect=aspect, label="expected trust", apart=start
     )
-    rates = curve_picture(contacts, label="contact rate", x_label="missions")
+    rates = curve_picture(contacts, label="contact rate", x_label="mission")
     path = (
-        "Expected trust now, and the path recommended now, from circle to star. Grey cells are "
-        "impassable, or the start, whose trust is assumed."
+        "Expected trust now, from dark to yellow, and the path recommended now, from circle to "
+        "star. Grey cells are impassable, or the start, whose trust is assumed."
     )
     contact = "Mean contact rate that each mission measured."
     table = tables.history_table(result)
