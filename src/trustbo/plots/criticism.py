@@ -21,6 +21,8 @@ _LEAST_P = 1e-6
 """Lower limit of the axis of p."""
 _LEAST_WIDTH = 1.8
 """Least width of a panel, inches."""
+_LETTERS = 20
+"""Letters that fit below a panel side by side."""
 _KINDS = ("mission", "bound", "robot", "contact")
 
 
@@ -143,7 +145,9 @@ def _draw_groups(ax: Axes, criticism: Criticism, kind: str) -> None:
     ax.plot(x[~odd], mean[~odd], "o", color=theme().ink, markersize=4)
     ax.plot(x[odd], mean[odd], "o", color=theme().odd, markersize=5)
     if kind in ("robot", "contact"):
-        ax.set_xticks(x, [as_text(str(label)) for label in labels])
+        texts = [as_text(str(label)) for label in labels]
+        crowded = sum(len(text) + 1 for text in texts) > _LETTERS
+        ax.set_xticks(x, texts, rotation=45.0 * crowded)
     else:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("expected contact rate" if kind == "contact" else kind, fontsize=SMALL)
