@@ -69,7 +69,7 @@ class Reparametrisation(NamedTuple):
     """
     frame: Frame
     draw_effects: Callable[[Array, Array], Sites]
-    """Effects of places, and collapsed sites, given such a vector: one draw by a key."""
+    """Effects of places, and integrated sites, given such a vector: one draw by a key."""
 
 
 def reparametrise(
@@ -110,7 +110,7 @@ def reparametrise(
 
     def profile(theta: Array) -> Array:
         energy = potential({"theta": theta, **zeros})
-        if space.collapsed or space.target.collapsed:
+        if space.collapsed or space.target.integrated:
             return energy
         total = target.unravel(theta)["delta_w"]  # t, the log of all noise
         of_places = sum(v.size for name, v in target.unravel(theta).items() if name in _OF_PLACES)
@@ -170,7 +170,7 @@ class Coordinates:
             return self._collapse(site)
         if robots is not None and (pooling := self.model.partial_pooling) is not None:
             return centre(self.target, pooling, site, robots)
-        if self.target.collapsed:
+        if self.target.integrated:
             return site, log_jacobian
         shifts = self.model.level(self.target.values(site), self.means.y, self.means.z)
         site = site | {name: site[name] - shift for name, shift in shifts.items()}

@@ -53,7 +53,7 @@ class Target:
         unravel: Sites by name from a flat vector.
         inverse: Transform from the real line to each site's support.
         linearisation: Linearisation point, once `linearise` was called.
-        collapsed: Names of sites that integrate out with the effects of places.
+        integrated: Sites that integrate out with the effects of places, at 0.
     """
 
     def __init__(self, model: TrustModel, data: NutsData, *, complete: bool) -> None:
@@ -69,12 +69,13 @@ class Target:
         self.linearisation: Array | None = None
         priors, pooled = model.priors, model.robot_sets == "all" and model.family.integrates_out
         normal = all(isinstance(prior, dist.Normal) for prior in (priors.beta, priors.b))
-        self.collapsed = {"beta", "b"} if data.places is not None and pooled and normal else set()
+        zeros = {"beta": jnp.zeros(self._sizes[1]), "b": jnp.zeros(())}
+        self.integrated = zeros if data.places is not None and pooled and normal else {}
         trace = handlers.trace(handlers.seed(self._sample, random.key(0))).get_trace()
         sites = {
             name: site["fn"]
             for name, site in trace.items()
-            if site["type"] == "sample" and name not in self.collapsed
+            if site["type"] == "sample" and name not in self.integrated
         }
         self.inverse = {name: biject_to(prior.support) for name, prior in sites.items()}
         start = {name: _start(self.inverse[name], prior) for name, prior in sites.items()}
@@ -93,7 +94,7 @@ class Target:
         return potential_energy(self._program, (), {}, site)  # pyright: ignore[reportReturnType]
 
     def constrain(self, site: Sites) -> Sites:
-        """The model's parameters, by name, but for collapsed ones."""
+        """The model's parameters, by name, but for integrated ones."""
         values = constrain_fn(self._sample, (), {}, site, return_deterministic=True)
         extra = ("place_unit",) if self._samples_effects else ()
         return {name: values[name] for name in (*self.model.dims, *extra) if name in values}
@@ -106,10 +107,9 @@ class Target:
     def _sample(self) -> tuple[Params, PlaceHyper | None]:
         """Sample statements; effects of places that are sampled are in the intercepts.
 
-        Collapsed sites are 0, and their priors are in the likelihood.
+        Integrated sites are 0, and their priors are in the likelihood.
         """
-        nothing = {"beta": jnp.zeros(self._sizes[1]), "b": jnp.zeros(())}
-        fixed = {name: nothing[name] for name in self.collapsed}
+        fixed = self.integrated
         with handlers.block(hide=list(fixed)), handlers.substitute(data=fixed):
             params = self.model.sample_params(*self._sizes)
         if self.data.places is None:
@@ -123,21 +123,21 @@ class Target:
         return params, hyper
 
     def draw_effects(self, values: Sites, key: Array) -> Sites:
-        """One exact draw of units' effects and collapsed sites, given parameters."""
+        """One exact draw of units' effects and integrated sites, given parameters."""
         params, hyper = handlers.substitute(self._sample, values)()  # pyright: ignore
         effects, c = place_marginal.draw_effects(
             *self._rates(params), hyper, self.data.places, key, self._linear(params)  # pyright: ignore
         )  # fmt: skip
-        collapsed = {"beta": c[:-1], "b": c[-1]} if self.collapsed else {}
-        return {"place_unit": effects, **collapsed}
+        integrated = {"beta": c[:-1], "b": c[-1]} if self.integrated else {}
+        return {"place_unit": effects, **integrated}
 
     def _rates(self, params: Params) -> tuple[ScalarSSM, Array, Array]:
         ssm = params.ssm(self.data.awareness, self.model.lag)  # pyright: ignore
         return ssm, self.data.contact_rate, self.data.weight  # pyright: ignore
 
     def _linear(self, params: Params) -> Linear | None:
-        """Features of the collapsed sites, and their priors."""
-        if not self.collapsed:
+        """Features of the integrated sites, and their priors."""
+        if not self.integrated:
             return None
         awareness, priors = self.data.awareness, self.model.priors
         columns = jnp.concatenate([awareness, jnp.ones((*awareness.shape[:3], 1))], 3)
