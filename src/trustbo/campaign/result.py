@@ -161,7 +161,7 @@ class Result(Displayed):
 
         Args:
             n_draws: Number of draws of the posterior; by default 1000, or 100 where each cell needs
-                a search of its own: `team="min"`, or robots that influence each other.
+                a separate search: `team="min"`, or robots that influence each other.
             seed: Seed of the choice of draws.
 
         Returns:
