@@ -61,7 +61,7 @@ def _layers(result: Result, maps: xr.Dataset, bound_maps: _Moments) -> list[Laye
 
 
 def _failure(bound_maps: _Moments) -> list[Layer]:
-    """Chance to fail of the bound into a cell from its worst side, and the sd of that one."""
+    """Probability of failure on entering a cell from its worst neighbour, and its sd."""
     if (chances := bound_maps.get("chance to fail")) is None:
         return []
     worst = np.where(np.isnan(chances[0]), -np.inf, chances[0]).argmax(0)[None]

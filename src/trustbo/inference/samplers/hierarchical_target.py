@@ -193,7 +193,7 @@ class HierarchicalTarget(HierarchicalScores):
     def draw(
         self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
     ) -> tuple[dict[str, np.ndarray], None]:
-        """Parameters at the points of indices; these draws need no weights."""
+        """Draw parameters at the chosen points; the draws are equally weighted."""
         theta, _ = self.constrain(z[chosen])
         _, (factor, half), robots = self._integrate(theta)
         mu = backward(factor, half + rng.standard_normal(half.shape))  # (coefficient, draw)

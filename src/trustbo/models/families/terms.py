@@ -83,7 +83,7 @@ def log_count(n, N, phi, x):
 
 @njit(**OPTIONS)
 def constants(counts, phi):
-    """Part of the log probabilities of counts (case, 2) that trust does not move, (case,)."""
+    """Terms of the log probabilities of counts (case, 2) that do not depend on trust, (case,)."""
     out = np.empty(len(counts))
     for i in range(len(counts)):
         n, N = counts[i]
