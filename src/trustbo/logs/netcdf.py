@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from xarray.backends import NetCDF4DataStore
+from xarray.conventions import encode_dataset_coordinates
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
@@ -65,7 +67,34 @@ def _require_size(content: bytes) -> None:
 def write_tree(path: FilePath, tree: xr.DataTree) -> None:
     """Write a netCDF file of groups, with its checksum."""
     with defer_interrupt():  # which could leave the netCDF library locked, in memory too
-        write_checked(path, bytes(tree.to_netcdf()))
+        write_checked(path, _encode(tree))
+
+
+def _encode(tree: xr.DataTree) -> bytes:
+    """Return a file with the content of `tree.to_netcdf()`, in half the time.
+
+    All variables are defined before the first is filled: the library flushes the file whenever
+    definitions follow data, which in xarray's order they do at every variable.
+    """
+    import netCDF4  # loaded only where netCDF is written
+
+    data, arrays = netCDF4.Dataset("a file", "w", memory=0), _Arrays()
+    root = NetCDF4DataStore(data)
+    for node in tree.subtree:
+        store = root if node is tree else root.get_child_store(node.path)
+        encoded = encode_dataset_coordinates(node.to_dataset(inherit=node is tree))
+        store.store(*encoded, writer=arrays)
+    for values, target in arrays:
+        target[...] = values
+    with root.lock:
+        return bytes(data.close())
+
+
+class _Arrays(list[tuple[Any, Any]]):
+    """Arrays to write and their targets, in place of xarray's writer, which writes at once."""
+
+    def add(self, source: Any, target: Any, region: None = None) -> None:
+        self.append((source, target))
 
 
 def write_missions(
