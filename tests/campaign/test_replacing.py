@@ -142,11 +142,11 @@ def test_a_folder_of_other_files_is_used_with_a_warning(workspace, tmp_path):
 @pytest.mark.parametrize(
     "name", ["history.csv", "result.json", "measured.nc", "posteriors/0001.nc", "ticks/0002.nc"]
 )
-def test_a_file_of_others_with_our_name_is_not_replaced(name, workspace, tmp_path):
+def test_a_file_of_others_with_our_name_is_not_replaced(name, workspace, kept, tmp_path):
     mine = tmp_path / "folder" / name
     mine.parent.mkdir(parents=True)
     mine.write_text('{"mine": 1}')
-    result = tb.load_result(run_once(workspace, tmp_path))
+    result = tb.load_result(kept)
     for replace in (
         lambda: tb.Campaign(workspace, *ENDS, directory=tmp_path / "folder"),
         lambda: run(workspace, tmp_path / "folder"),
@@ -157,11 +157,6 @@ def test_a_file_of_others_with_our_name_is_not_replaced(name, workspace, tmp_pat
     assert [f.read_text() for f in (tmp_path / "folder").rglob("*") if f.suffix == mine.suffix] == [
         '{"mine": 1}'
     ]
-
-
-def run_once(workspace, tmp_path):
-    run(workspace, tmp_path / "once", n=1)
-    return tmp_path / "once"
 
 
 def test_a_linked_folder_of_posteriors_is_not_written_to(workspace, folder, other):

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,20 @@ ENDS = ((3, 0), (0, 3))
 @pytest.fixture
 def workspace():
     return random_cells()
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """Result of a campaign of n missions, and a function that copies its folder; run once."""
+    kept = {}
+
+    def begun(n):
+        if n not in kept:
+            folder = tmp_path_factory.mktemp("begun") / "campaign"
+            kept[n] = begin(random_cells(), folder, n), partial(shutil.copytree, folder)
+        return kept[n]
+
+    return begun
 
 
 def same(a, b):
@@ -133,9 +148,9 @@ def _wait_for_work(process, folder):
         time.sleep(0.005)
 
 
-def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, tmp_path, monkeypatch):
+def test_a_mission_told_but_not_learned_from_is_not_lost(workspace, begun, tmp_path, monkeypatch):
     simulator = ModelSimulator(workspace, blind=True)
-    whole = begin(workspace, tmp_path / "whole", 2)
+    whole, _ = begun(2)
     campaign = tb.Campaign(
         workspace, *ENDS, sampler="exact", policy="thompson", awareness="belief",
         directory=tmp_path / "half",
@@ -224,32 +239,33 @@ def test_what_is_your_own_is_asked_for_again(workspace, tmp_path):
         assert again.ask().path == ((3, 0), (2, 1), (1, 2), (0, 3))
 
 
-def test_resuming_with_another_simulator_is_refused(workspace, tmp_path):
+def test_resuming_with_another_simulator_is_refused(workspace, begun, tmp_path):
     class Other(ModelSimulator):
         pass
 
-    begin(workspace, tmp_path, 2)
+    _, copy_to = begun(2)
+    folder = copy_to(tmp_path / "short")
     with pytest.raises(tb.TrustboError, match="begun with simulator = 'ModelSimulator', not 'Ot"):
-        tb.resume(tmp_path, simulator=Other(workspace), progress=False)
+        tb.resume(folder, simulator=Other(workspace), progress=False)
 
 
-def test_a_finished_campaign_goes_on_if_asked_to(workspace, tmp_path):
-    begin(workspace, tmp_path / "short", 2)
+def test_a_finished_campaign_goes_on_if_asked_to(workspace, begun, tmp_path):
+    (_, copy_to), (long, _) = begun(2), begun(3)
     simulator = ModelSimulator(workspace, blind=True)
-    longer = tb.resume(tmp_path / "short", simulator=simulator, n_iterations=3, progress=False)
-    same(longer, begin(workspace, tmp_path / "long", 3))
+    folder = copy_to(tmp_path / "short")
+    same(tb.resume(folder, simulator=simulator, n_iterations=3, progress=False), long)
 
 
-def test_nothing_half_written_is_read(workspace, tmp_path):
+def test_nothing_half_written_is_read(workspace, begun, tmp_path):
     """Whatever of the last mission's files is there already, the state decides."""
-    begin(workspace, tmp_path, 3)
+    whole, copy_to = begun(3)
+    copy_to(tmp_path, dirs_exist_ok=True)
     state = json.loads((tmp_path / "campaign.json").read_text())
     state["n_missions"] = 2
     for name in ("plans", "rows", "posterior_after"):
         state[name] = state[name][:2]
     (tmp_path / "campaign.json").write_text(json.dumps(state))
     (tmp_path / ".campaign.json.sha256").unlink()  # it was changed by hand, and that is noticed
-    whole = begin(workspace, tmp_path / "whole", 3)
     simulator = ModelSimulator(workspace, blind=True)
     again = tb.resume(tmp_path, simulator=simulator, n_iterations=3, progress=False)
     same(again, whole)

@@ -309,9 +309,13 @@ def test_a_drive_whose_physics_breaks_down_is_aborted(flat, monkeypatch, tmp_pat
 # ---------------------------------------------------------------- missions
 
 
-def test_a_mission_is_much_like_a_kinematic_one_on_easy_ground(wooded):
-    mission = MujocoSimulator(wooded).run(PATH, seed=3)
-    kinematic = KinematicSimulator(wooded).run(PATH, seed=3)
+@pytest.fixture(scope="module")
+def mission(wooded):
+    return MujocoSimulator(wooded, sight="bare").run(PATH, seed=3)
+
+
+def test_a_mission_is_much_like_a_kinematic_one_on_easy_ground(wooded, mission):
+    kinematic = KinematicSimulator(wooded, sight="bare").run(PATH, seed=3)
     assert mission.status == "ok"
     np.testing.assert_allclose(mission.duration, kinematic.duration, rtol=0.25)
     np.testing.assert_allclose(mission.awareness, kinematic.awareness, atol=0.05)
@@ -326,8 +330,7 @@ def test_a_mission_is_much_like_a_kinematic_one_on_easy_ground(wooded):
     assert (steps[-1, 1:] == 0.0).sum() >= 1
 
 
-def test_contact_is_what_sight_says_of_the_recorded_poses(wooded):
-    mission = MujocoSimulator(wooded, sight="bare").run(PATH, seed=3)
+def test_contact_is_what_sight_says_of_the_recorded_poses(wooded, mission):
     simulator, team = KinematicSimulator(wooded, sight="bare"), wooded.team
     for bound in mission.bounds:
         poses = bound.poses[..., :2]
@@ -381,15 +384,14 @@ def test_the_same_seed_gives_the_same_mission_even_in_a_fresh_process(wooded):
     ]
 
 
-def test_running_bound_by_bound_is_running_the_mission(wooded):
-    simulator = MujocoSimulator(wooded)
-    whole = simulator.run(PATH, seed=4)
-    simulator.reset(PATH[0], 4, next_cell=PATH[1])
+def test_running_bound_by_bound_is_running_the_mission(wooded, mission):
+    simulator = MujocoSimulator(wooded, sight="bare")
+    simulator.reset(PATH[0], 3, next_cell=PATH[1])
     first = simulator.run_bound(1, PATH[1], next_cell=PATH[2])
     second = simulator.run_bound(2, PATH[2])
     simulator.close()
-    np.testing.assert_array_equal(whole.bounds[0].poses, first.poses)
-    np.testing.assert_array_equal(whole.bounds[1].poses, second.poses)
+    np.testing.assert_array_equal(mission.bounds[0].poses, first.poses)
+    np.testing.assert_array_equal(mission.bounds[1].poses, second.poses)
     with pytest.raises(TrustboError, match=r"call reset"):
         simulator.run_bound(3, PATH[2])
 

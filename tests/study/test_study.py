@@ -396,6 +396,7 @@ def test_kinematic_runs_know_their_regret_if_asked_to(tmp_path, monkeypatch):
         simulators="KinematicSimulator",
         seeds=1,
         policies="greedy",
+        n_iterations=1,
     )
     assert result["regret"].isnull().all()
     assert result["simulator"].item() == "KinematicSimulator"
