@@ -102,7 +102,8 @@ def test_an_mp4_without_ffmpeg_says_what_to_do(result, mission, tmp_path, monkey
     message = r"an \.mp4 needs ffmpeg: .*-m pip install imageio-ffmpeg; a \.gif does not"
     with pytest.raises(tb.TrustboError, match=message):
         tb.plots.animate_mission(mission, result.workspace, tmp_path / "mission.mp4")
-    animation = tb.plots.animate_mission(mission, result.workspace, fps=1)
+    span = mission.bounds[-1].t1
+    animation = tb.plots.animate_mission(mission, result.workspace, speedup=span / 2, fps=1)
     with pytest.raises(tb.TrustboError, match=message):
         animation.save(tmp_path / "mission.mp4")
     with pytest.raises(tb.TrustboError, match=r"unknown suffix '.avi'; choose one of .gif, .mp4"):

@@ -57,6 +57,21 @@ def figures(result):
     return drawn
 
 
+@pytest.fixture(scope="module")
+def drawn(figures):
+    """The first Axes of a figure with options, to be read only: one figure for all tests."""
+    kept = {}
+
+    def drawn(name, **options):
+        key = name, *sorted((k, v) for k, v in options.items() if v is not None)
+        if key not in kept:
+            kept[key] = np.ravel(figures[name][0](**options))[0]
+            kept[key].figure.canvas.draw()
+        return kept[key]
+
+    return drawn
+
+
 NAMES = (
     "trust_maps", "robot_maps", "path_posterior", "hazard_map", "terrain_maps", "loadings",
     "place_map", "plan_map", "plan_trust", "mission_trust", "parameter_history",
@@ -90,8 +105,7 @@ def texts_of(artist):
 
 
 def complaints_of(figure):
-    """Sentences on what leaves the figure, and on pieces of text over others."""
-    figure.canvas.draw()
+    """Sentences on what leaves a figure that is drawn, and on pieces of text over others."""
     renderer, whole = figure.canvas.get_renderer(), figure.bbox
     box = figure.get_tightbbox(renderer).transformed(figure.dpi_scale_trans)
     said = []
@@ -107,9 +121,8 @@ def complaints_of(figure):
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("width", [None, 3.5])
-def test_all_of_a_figure_is_inside_it_and_no_text_is_over_other_text(figures, name, width):
-    figure = np.ravel(figures[name][0](width=width))[0].figure
-    assert complaints_of(figure) == []
+def test_all_of_a_figure_is_inside_it_and_no_text_is_over_other_text(drawn, name, width):
+    assert complaints_of(drawn(name, width=width).figure) == []
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -119,14 +132,14 @@ def test_legends_and_bars_have_room_on_the_user_s_axes(figures, name):
     size = 2.6 * columns, 2.4 * rows
     figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
     draw(ax=axes.ravel()[:n])
+    figure.canvas.draw()
     assert complaints_of(figure) == []
 
 
 @pytest.mark.parametrize("name", ["trust_maps", "robot_maps", "path_posterior", "terrain_maps"])
 @pytest.mark.parametrize("options", [{}, {"width": 3.5}, {"title": "all maps"}])
-def test_maps_leave_no_blank_strip_above_or_below(figures, name, options):
-    figure = np.ravel(figures[name][0](**options))[0].figure
-    figure.canvas.draw()
+def test_maps_leave_no_blank_strip_above_or_below(drawn, name, options):
+    figure = drawn(name, **options).figure
     content = figure.get_tightbbox()
     assert content.y0 < 0.1
     assert figure.get_figheight() - content.y1 < 0.1
@@ -166,10 +179,9 @@ def test_a_figure_is_drawn_on_the_axes_that_it_is_given(figures, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_legend_can_be_left_out_and_a_title_written(figures, name):
+def test_a_legend_can_be_left_out_and_a_title_written(figures, drawn, name):
     draw, n = figures[name]
-    with_keys = np.ravel(draw())[0].figure
-    assert keys_of(with_keys) or name == "loadings"  # whose bars all agree here
+    assert keys_of(drawn(name).figure) or name == "loadings"  # whose bars all agree here
     axes = np.ravel(draw(legend=False, title="costs $1"))
     assert keys_of(axes[0].figure) == []
     suptitle = axes[0].figure.get_suptitle()
@@ -185,8 +197,8 @@ def test_colours_of_maps_are_the_user_s(figures, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_text_can_be_read_in_a_column_of_3_5_inches(figures, name):
-    figure = np.ravel(figures[name][0](width=3.5))[0].figure
+def test_text_can_be_read_in_a_column_of_3_5_inches(drawn, name):
+    figure = drawn(name, width=3.5).figure
     assert figure.get_figwidth() == 3.5
     texts = [t for t in figure.findobj(Text) if t.get_text() and t.get_visible()]
     signs = {"+", "\N{MINUS SIGN}"}  # of places, as large as their cells
@@ -197,12 +209,11 @@ def test_text_can_be_read_in_a_column_of_3_5_inches(figures, name):
 def test_on_dark_paper_text_and_lines_are_light(figures, name):
     with plt.rc_context(plots.DARK.settings()):
         figure = np.ravel(figures[name][0]())[0].figure
-        figure.canvas.draw()
-    assert to_hex(figure.get_facecolor()) == plots.DARK.paper
-    for ax in figure.axes:
-        for text in (ax.title, ax.xaxis.label, ax.yaxis.label, *ax.get_xticklabels()):
-            if text.get_text() and not text.get_path_effects():
-                assert luminance(text.get_color()) > 0.5, text
+        assert to_hex(figure.get_facecolor()) == plots.DARK.paper
+        for ax in figure.axes:
+            for text in (ax.title, ax.xaxis.label, ax.yaxis.label, *ax.get_xticklabels()):
+                if text.get_text() and not text.get_path_effects():
+                    assert luminance(text.get_color()) > 0.5, text
 
 
 def test_the_theme_is_that_of_the_user_s_paper():
