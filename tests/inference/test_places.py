@@ -246,12 +246,19 @@ def test_nuts_integrates_weights_and_intercept_out_with_the_effects():
         target = Target(PooledTrust(priors=priors, place=place), data, complete=False)
         names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
         values = {name: jax.numpy.asarray(v) for name, v in zip(names, theta, strict=True)}
-        site = {name: target.inverse[name].inv(v) for name, v in values.items()}
-        base = {name: 1.1 * v for name, v in site.items()}
-        other = {name: float(v) for name, v in target.values(base).items()}
+
+        @jax.jit  # one program compiles faster than each operation by itself
+        def on_the_line(values):
+            site = {name: target.inverse[name].inv(v) for name, v in values.items()}
+            base = {name: 1.1 * v for name, v in site.items()}
+            return site, base, target.values(base)
+
+        site, base, at_base = on_the_line(values)
+        other = {name: float(v) for name, v in at_base.items()}
         keys = jax.random.split(jax.random.key(0), 20_000)
         drawn = jax.jit(jax.vmap(lambda key: target.draw_effects(values, key)))(keys)
-        jump = float(target.potential(base) - target.potential(site))
+        potential = jax.jit(target.potential)
+        jump = float(potential(base) - potential(site))
     # Of two points the difference: the priors' densities on the real line, by SciPy.
     again = Dense(missions, place, tuple(other[name] for name in names), priors)
     expected = dense.log_likelihood() - again.log_likelihood()
@@ -316,13 +323,16 @@ def test_gradient_that_nuts_takes_is_that_of_its_marginal(place):
             steps = 1e-5 * np.eye(len(at))
             by_steps = [(call(at + h, each)[0] - call(at - h, each)[0]) / 2e-5 for h in steps]
             np.testing.assert_allclose(found, by_steps, rtol=1e-5, atol=1e-5)
-        together = jax.jit(value)(at, 0.0)
-        shared = at[0] * np.ones(())
-        params = TrustParams(shared, at[6:8], at[8], at[1], at[2])
-        apart = place_marginal.log_likelihood(
-            params.ssm(batch.awareness), batch.contact_rate, weight,
-            place_marginal.PlaceHyper(*at[3:6]), index,
-        )  # fmt: skip
+        together = call(at, 0.0)[0]
+
+        @jax.jit  # one program compiles faster than each operation by itself
+        def of_one_autoregression(at):
+            params = TrustParams(at[0], at[6:8], at[8], at[1], at[2])
+            hyper = place_marginal.PlaceHyper(*at[3:6])
+            ssm = params.ssm(batch.awareness)
+            return place_marginal.log_likelihood(ssm, batch.contact_rate, weight, hyper, index)
+
+        apart = of_one_autoregression(at)
     assert float(together) == pytest.approx(float(apart), rel=1e-12)
 
 
