@@ -74,7 +74,8 @@ def test_what_nuts_sums_up_is_the_likelihood(response):
     p = TrustParams(0.55, np.array([0.2, 0.3]), 0.07, 0.06, 0.08, 0.5, 0.5)
     with jax.enable_x64(True):
         params = p.map(lambda value, _: jnp.asarray(value, dtype=float))
-        found = float(log_likelihood(params, jax.tree.map(jnp.asarray, sums), model.lag))
+        compiled = jax.jit(log_likelihood, static_argnums=2)
+        found = float(compiled(params, jax.tree.map(jnp.asarray, sums), model.lag))
     np.testing.assert_allclose(found, model.log_likelihood(p, missions).sum(), rtol=1e-10)
 
 

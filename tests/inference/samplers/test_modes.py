@@ -111,11 +111,14 @@ def test_modes_of_a_normal_mixture_are_found_with_their_mass():
         white = jnp.linalg.solve(jnp.asarray(SCALE), (x[None] - CENTERS).T)
         return logsumexp(jnp.log(SHARES) - 0.5 * (white**2).sum(0))
 
+    @jax.jit
+    def find(starts, longest):
+        found = find_modes(lambda x: -log_density(x), log_density, starts, longest)
+        return found, found.spread(3)[0]
+
     starts = np.array([[0.5, 0.0], [-0.55, 0.0], [0.1, 9.0], [-0.2, -9.0]])
     with own_settings():
-        find = jax.jit(lambda x, most: find_modes(lambda x: -log_density(x), log_density, x, most))
-        found = find(starts, np.array([0.05, np.inf]))
-        starts_of_chains, _ = found.spread(3)
+        found, starts_of_chains = find(starts, np.array([0.05, np.inf]))
     distinct = np.flatnonzero(found.share)
     assert len(distinct) == 2
     # The other mode is 10 sd away: it moves a mode by less than exp(-50).
