@@ -288,7 +288,7 @@ def pooled_posterior(missions, n_points=(60, 30), reach=0.12, floor=0.0, power=1
 def on_a_grid(family, p, z, y, n_points=1201, *, n_ticks=20, last_trust=False):
     """p(y) of one robot by filtering point masses of trust: the trapezoid rule, bound by bound.
 
-    Log p(y), or the mean and sd of trust at the last bound.
+    Log p(y); with `last_trust` also the mean and sd of trust at the last bound.
     """
     width = 9.0 if family == "beta_binomial" else 2.5
     x = np.linspace(0.5 - width, 0.5 + width, n_points)
@@ -322,7 +322,7 @@ def on_a_grid(family, p, z, y, n_points=1201, *, n_ticks=20, last_trust=False):
         weights /= weights.sum()
     if last_trust:
         mean = weights @ x
-        return mean, np.sqrt(weights @ (x - mean) ** 2)
+        return log_total, mean, np.sqrt(weights @ (x - mean) ** 2)
     return log_total
 
 
