@@ -20,6 +20,7 @@ from trustbo.models import PooledTrust
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, check_params
+from trustbo.simulation.model_contact import ModelContact
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, along, moves_along
@@ -122,6 +123,10 @@ class ModelSimulator(DescribedSimulator):
         if not len(failed):
             return n, "ok"
         return int(failed[0]) + 1, str(rng.choice(list(self.causes), p=list(self.causes.values())))
+
+    def expected_contact(self) -> ModelContact:
+        """Return the expected contact and failures of bounds, in closed form."""
+        return ModelContact(self.model, self.params, self.awareness, self.p_fail)
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""

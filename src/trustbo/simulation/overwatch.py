@@ -10,7 +10,7 @@ import xarray as xr
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
 from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
-from trustbo.simulation.events import Degradation, Threat
+from trustbo.simulation.events import Degradation, Event, Threat, require_events
 from trustbo.simulation.measure import Measure
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator
@@ -50,6 +50,7 @@ class KinematicSimulator(DescribedSimulator):
         bounding: str = "successive",
         threats: Sequence[Threat] = (),
         degradations: Sequence[Degradation] = (),
+        events: Sequence[Event] = (),
         realtime: Mapping[str, CompositeIndex] | None = None,
         record_states: bool = False,
     ) -> None:
@@ -72,6 +73,8 @@ class KinematicSimulator(DescribedSimulator):
                 bounds are those of successive bounding.
             threats: Regions that jam sight or forbid passage in some missions.
             degradations: Lidars of T2 that are worse in some missions.
+            events: Events of any kind, `Dust`, `Fouling`, `Vegetation` and `Season` too, which act
+                after threats and degradations, in this order.
             realtime: Fitted `CompositeIndex.realtime` by feature: measured awareness is then the
                 map's value fused with the robot's state. Samples to fit them on: `calibration`.
             record_states: Keep each robot's state at each tick, `Bound.states`.
@@ -98,8 +101,12 @@ class KinematicSimulator(DescribedSimulator):
         self.bounding = require_choice("bounding", bounding, BOUNDING)
         self.realtime, self.record_states = dict(realtime or {}), record_states
         self._wants_states = record_states or bool(self.realtime)
-        self._worlds = Worlds(workspace, self.sight, self.team, surface, threats, degradations)
+        require_events("threats", threats, Threat)
+        require_events("degradations", degradations, Degradation)
+        require_events("events", events, Event)
         self.threats, self.degradations = tuple(threats), tuple(degradations)
+        self.events = (*self.threats, *self.degradations, *events)
+        self._worlds = Worlds(workspace, self.sight, self.team, surface, self.events)
         self._measure = Measure(workspace, self.team, surface, self.sight, self.tick, self.realtime)
         self._watchers = self.team.robots, (self.team.lead,) * len(self.team.robots)
         self._state: State | None = None
@@ -108,6 +115,7 @@ class KinematicSimulator(DescribedSimulator):
     def describe(self) -> dict[str, object]:
         """Return the settings that decide what a mission measures."""
         same = self.team == self.workspace.team
+        n_older = len(self.threats) + len(self.degradations)
         return {
             "simulator": type(self).__name__,
             "sight": self.sight.mode,
@@ -120,16 +128,23 @@ class KinematicSimulator(DescribedSimulator):
             "lost_contact_after": self.lost_contact_after,
             "threats": [dataclasses.asdict(threat) for threat in self.threats],
             "degradations": [dataclasses.asdict(degradation) for degradation in self.degradations],
+            "events": [event.settings for event in self.events[n_older:]],
             "realtime": sorted(self.realtime),
             "true_team": None if same else dataclasses.asdict(self.team),
             "true_terrain": None if self.terrain is None else digest_of(self.terrain),
         }
 
+    def describe_mission(self, mission: int) -> dict[str, object]:
+        """Return the settings of the world of a mission, which are equal in equal worlds."""
+        every = ("threats", "degradations", "events")
+        settings = {name: value for name, value in self.describe().items() if name not in every}
+        return settings | {"acting": [e.effect for e in self.events if e.acts_in(mission)]}
+
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
         """Run a path from start to goal, or until it fails.
 
-        The seed is that of slip and detections: same seed, same mission, on any machine. Threats
-        and degradations go by the number of the mission, from 0. TrustboError: a cell that is off
+        The seed is that of slip and detections: same seed, same mission, on any machine. Events
+        go by the number of the mission, from 0. TrustboError: a cell that is off
         the grid or impassable, or fewer than two cells.
         """
         return self.run_batch(path, [seed], mission=mission)[0]
@@ -214,7 +229,8 @@ class KinematicSimulator(DescribedSimulator):
         The bound starts from a state of the team, by default at the planned posts. Returns for each
         the contact rate (robot,), the status and the state after it. The rate is the mean
         probability of contact over the ticks where scans are independent; where tracks outlast
-        misses, or lost contact ends a mission, that of simulated scans.
+        misses, or lost contact ends a mission, that of simulated scans. Fouling is as in the long
+        run.
         """
         max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
         state = self._start(way[0], 0, cell) if state is None else state
@@ -225,9 +241,13 @@ class KinematicSimulator(DescribedSimulator):
             t2, ended = self._phase(1, lead[-1], state.stops, way, next_cell, left, rng)
             stops = np.concatenate([self._goals(i, cell, next_cell) for i in (0, 1)])
             drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell), stops))
-        seen, *others = detections(self._now, self.sight, self.team, drives)
         lidars = self.team.lead, *self.team.robots
         independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
+        independent &= self.lost_contact_after is None
+        fouling = np.ones(len(self.team.robots))
+        for event in self._now.fouling:  # the probability of contact is linear in the factors
+            fouling *= event.mean if independent else event.draw(rng, len(fouling))
+        seen, *others = detections(self._now, self.team, drives, fouling)
         outcomes = []
         for closing, detected in zip(drives[1:], others, strict=True):
             after = dataclasses.replace(
@@ -235,7 +255,7 @@ class KinematicSimulator(DescribedSimulator):
             )
             after.tracks, status = state.tracks.copy(), closing.status
             probability = np.concatenate([seen, detected])
-            if not independent or self.lost_contact_after is not None:
+            if not independent:
                 moves = np.concatenate([drives[0].lead_moves, closing.lead_moves])
                 both = closing._replace(lead_moves=moves)
                 probability, status = self._contact(after, both, probability, rng)
@@ -274,7 +294,7 @@ class KinematicSimulator(DescribedSimulator):
     def _enter(self, mission: int) -> None:
         """Switch to the world of a mission."""
         self._now = self._worlds.of_mission(require_whole("mission", mission, 0))
-        self._surface, self._ways, *_ = self._now
+        self._mission, self._surface, self._ways = mission, self._now.surface, self._now.ways
 
     # --- one bound ---
 
@@ -295,7 +315,10 @@ class KinematicSimulator(DescribedSimulator):
             self._drive(state, k, cell, next_cell, rng)
             for state, rng in zip(states, rngs, strict=True)
         ]
-        probabilities = detections(self._now, self.sight, self.team, drives)
+        fouling = np.ones(len(self.team.robots))
+        for event in self._now.fouling:
+            fouling *= event.factors(self._mission, k, len(fouling))
+        probabilities = detections(self._now, self.team, drives, fouling)
         contacts = [
             self._contact(*one) for one in zip(states, drives, probabilities, rngs, strict=True)
         ]

@@ -12,9 +12,11 @@ from trustbo.errors import TrustboError
 class Simulator(Protocol):
     """Simulator that runs a path: one of this package, a custom one, or real robots.
 
-    One more method is optional: `describe() -> dict` returns settings that a campaign records. A
-    simulator whose world changes takes the number of the mission as a keyword `mission` of `run`
-    (and of `reset`).
+    Three more methods are optional: `describe() -> dict` returns settings that a campaign records;
+    `describe_mission(mission) -> dict` those of the world of a mission, equal in equal worlds; and
+    `expected_contact()` the contact and failures of bounds, as a `BoundTable` of
+    `simulation.bound_table`, which `Truth.of` takes instead of replicates. A simulator whose world
+    changes takes the number of the mission as a keyword `mission` of `run` (and of `reset`).
     """
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:

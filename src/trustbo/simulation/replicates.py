@@ -10,6 +10,7 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.parallel import in_order
 from trustbo.simulation.bounding import State
+from trustbo.simulation.events import Fouling
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import require_bounds, takes
 from trustbo.workspace import Workspace
@@ -102,8 +103,13 @@ class PlainReplicates:
     """Replicates of any simulator that runs bound by bound, each the first bound of a mission."""
 
     def __init__(self, simulator: Any, mission: int, seed: int) -> None:
-        """Take a simulator; TrustboError: it lacks `reset` or `run_bound`."""
+        """Take a simulator; TrustboError: it lacks `reset` or `run_bound`, or fouls."""
         require_bounds(simulator, "truth")
+        if any(isinstance(event, Fouling) for event in getattr(simulator, "events", ())):
+            raise TrustboError(
+                f"bounds of {type(simulator).__name__} are replicated one by one, which have no "
+                "long run of Fouling; use KinematicSimulator."
+            )
         self._simulator, self._seed, self.most = simulator, seed, 1000
         self._numbered = {"mission": mission} if takes(simulator.reset, "mission") else {}
 

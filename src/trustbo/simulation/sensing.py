@@ -11,11 +11,16 @@ from numba import njit
 from trustbo.simulation.bounding import Drive
 from trustbo.simulation.world import World
 from trustbo.team import Robot, Team
-from trustbo.workspace.sight import Sight, detection_probability, optics
+from trustbo.workspace.sight import detection_probability, optics
 
 
-def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) -> list[np.ndarray]:
-    """Probability that a scan detects its target, shape (tick, robot) for each bound."""
+def detections(
+    world: World, team: Team, drives: Sequence[Drive], fouling: float | np.ndarray = 1.0
+) -> list[np.ndarray]:
+    """Probability that a scan detects its target, shape (tick, robot) for each bound.
+
+    `fouling`, shape (robot,), are factors on the detection by T2's lidars.
+    """
     poses = np.concatenate([drive.poses[..., :2] for drive in drives])
     t2_scans = np.concatenate([drive.lead_moves for drive in drives])[:, None]  # else the lead does
     lead, t2 = np.repeat(poses[:, :1], len(team.robots), axis=1), poses[:, 1:]
@@ -25,13 +30,13 @@ def detections(world: World, sight: Sight, team: Team, drives: Sequence[Drive]) 
         np.where(t2_scans[..., None], a, b).reshape(-1, a.shape[-1])  # (tick * robot, ...)
         for a, b in ((t2, lead), (lead, t2), (by_t2, by_lead))
     )
-    probability = detection_probability(world.surface, sight, sensor, target, scanners)
+    probability = detection_probability(world.surface, world.sight, sensor, target, scanners)
     for mask, strength in world.jams:
         inside = mask[world.surface.nearest(sensor[:, 0], sensor[:, 1])]
         inside |= mask[world.surface.nearest(target[:, 0], target[:, 1])]
         probability[inside] *= 1.0 - strength
     probability = probability.reshape(-1, len(team.robots))
-    probability *= np.where(t2_scans, world.detection, team.lead.detection)
+    probability *= np.where(t2_scans, world.detection * fouling, world.lead_detection)
     return np.split(probability, np.cumsum([len(drive.poses) for drive in drives])[:-1])
 
 

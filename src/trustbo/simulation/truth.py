@@ -24,8 +24,6 @@ from trustbo.models.backend import VERSIONS
 from trustbo.planning import Plan
 from trustbo.planning.paths import AdmissiblePaths, PathClass
 from trustbo.simulation.bound_table import BoundTable, tabulate
-from trustbo.simulation.events import acts_in
-from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.model_contact import ModelContact
 from trustbo.simulation.overwatch import KinematicSimulator
 from trustbo.simulation.protocol import takes
@@ -93,9 +91,11 @@ class Truth(Displayed):
     ) -> Self:
         """Find the truth of a simulator.
 
-        That of a `ModelSimulator` has a closed form. Of another, every bound, followed by each
-        that can follow it, is replicated until the standard error is reached; the result is cached
-        on disk under a hash of the simulator's `describe()`, the workspace and the code.
+        A simulator with a method `expected_contact`, such as `ModelSimulator`, has it in closed
+        form. Of another, every bound, followed by each that can follow it, is replicated until the
+        standard error is reached; the result is cached on disk under a hash of the world's
+        settings (`describe_mission(mission)`, else `describe()`), the workspace and the code. Of
+        what varies within a mission (`Fouling`), contact is the expectation in the long run.
 
         Args:
             simulator: Simulator with a `workspace`, and with `reset` and `run_bound`.
@@ -115,19 +115,17 @@ class Truth(Displayed):
             raise TrustboError(
                 f"truth needs a simulator with a workspace; {type(simulator).__name__} has none."
             )
-        if isinstance(simulator, ModelSimulator):
-            true = simulator.params, simulator.awareness, simulator.p_fail
-            bounds = ModelContact(simulator.model, *true)
-            return cls(workspace, bounds)
+        if hasattr(simulator, "expected_contact"):
+            return cls(workspace, simulator.expected_contact())
         numbers = require_whole("seed", seed, 0), require_positive("standard_error", standard_error)
-        cached: dict[object, Self] = {}
+        cached: dict[str, Self] = {}
 
         def of_mission(number: int) -> Self:
             world = _world(simulator, require_whole("mission", number, 0))
-            if world not in cached:
+            if (key := to_json(world)) not in cached:
                 table = _table(simulator, number, world, *numbers, folder, progress)
-                cached[world] = cls(workspace, table, of_mission)
-            return cached[world]
+                cached[key] = cls(workspace, table, of_mission)
+            return cached[key]
 
         return of_mission(mission)
 
@@ -229,29 +227,28 @@ def _percent(lacking: float, whole: float) -> float:
     return 100.0 * lacking / whole if whole > 0.0 else np.nan
 
 
-def _world(simulator: Any, mission: int) -> object:
-    """Identity of the world of a mission: the events that act in it."""
-    if isinstance(simulator, KinematicSimulator):
-        events = (*simulator.threats, *simulator.degradations)
-        return tuple(i for i, event in enumerate(events) if acts_in(event, mission))
-    begin = getattr(simulator, "reset", None)
-    return mission if begin is not None and takes(begin, "mission") else 0
+def _world(simulator: Any, mission: int) -> tuple[object, int]:
+    """Settings of the world of a mission, None if unknown, and its number if they lack it."""
+    if hasattr(simulator, "describe_mission"):
+        return simulator.describe_mission(mission), 0
+    describe, begin = (getattr(simulator, name, None) for name in ("describe", "reset"))
+    numbered = begin is not None and takes(begin, "mission")
+    return None if describe is None else describe(), mission if numbered else 0
 
 
 def _table(
     simulator: Any,
     mission: int,
-    world: object,
+    world: tuple[object, int],
     seed: int,
     standard_error: float,
     folder: FilePath | None,
     progress: bool,
 ) -> BoundTable:
     """Table of a simulator, from the disk cache if present."""
-    describe = getattr(simulator, "describe", None)
     file = None
-    if describe is not None:  # else its identity is unknown
-        about = [describe(), world, seed, standard_error, VERSIONS["trustbo"], _code()]
+    if world[0] is not None:  # else its identity is unknown
+        about = [world, seed, standard_error, VERSIONS["trustbo"], _code()]
         kept = cache_folder("truth") if folder is None else require_folder(folder)
         digest = hashlib.sha256(to_json(about).encode())
         for content in _content(simulator):

@@ -1,4 +1,4 @@
-"""Terrain of a mission, with the threats and degradations that act in it."""
+"""World of a mission: terrain, sight and lidars, with the events that act in it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.errors import TerrainError, TrustboError, require_choice
-from trustbo.simulation.events import Degradation, Threat, acts_in, require_events
+from trustbo.errors import TerrainError, TrustboError
+from trustbo.files import to_json
+from trustbo.simulation.events import Event, Fouling, Threat
 from trustbo.team import Team
 from trustbo.terrain.dataset import is_lazy, require_terrain
 from trustbo.workspace import Workspace
@@ -17,16 +18,26 @@ from trustbo.workspace.ways import Ways
 
 
 class World(NamedTuple):
-    """Terrain, posts and ways of a mission, and what impairs its lidars."""
+    """Terrain, sight, posts and ways of a mission, and what impairs its lidars."""
 
     surface: Surface
     """True terrain, which decides contact, motion and failure."""
     ways: Ways
     """Posts and ways over the terrain of the workspace."""
-    jams: tuple[tuple[np.ndarray, float], ...]
-    """Mask of the pixels inside, shape (row, col), and strength of each jam."""
+    sight: Sight
+    """True model of sight."""
+    robots: tuple[str, ...]
+    """Names of T2's robots."""
     detection: np.ndarray
-    """Factor on the probability of detection by T2's lidars, shape (robot,)."""
+    """Probability of detection by T2's lidars in clear sight, shape (robot,)."""
+    lead_detection: float
+    """The same of the lead's lidar."""
+    jams: tuple[tuple[np.ndarray, float], ...] = ()
+    """Mask of the pixels inside, shape (row, col), and strength of each jam."""
+    closed: tuple[Threat, ...] = ()
+    """Regions that no route leads through."""
+    fouling: tuple[Fouling, ...] = ()
+    """Further factors on T2's detection, which vary within the mission."""
 
 
 class Worlds:
@@ -38,61 +49,50 @@ class Worlds:
         sight: Sight,
         team: Team,
         surface: Surface,
-        threats: Sequence[Threat] = (),
-        degradations: Sequence[Degradation] = (),
+        events: Sequence[Event] = (),
     ) -> None:
-        """Prepare the true `surface`; see `KinematicSimulator` for the arguments.
+        """Prepare the true `surface`, sight and team, and the events that change them.
 
-        TrustboError: a threat off the terrain, or a robot not in the team.
+        TrustboError: an event off the terrain, or of a robot not in the team.
         """
-        require_events("threats", threats, Threat)
-        require_events("degradations", degradations, Degradation)
-        for degradation in degradations:
-            require_choice("robot", degradation.robot, team.names)
+        ground = workspace.ground
+        assert ground is not None  # noqa: S101  # `true_surface` has refused others
+        for event in events:
+            event.check(team, surface)
         self.surface = surface
-        self._workspace, self._sight, self._team = workspace, sight, team
-        self._threats, self._degradations = tuple(threats), tuple(degradations)
-        for threat in threats:
-            if not threat.mask(surface).any():
-                left, bottom, right, top = surface.extent
-                raise TrustboError(
-                    f"{threat} has no pixel of the terrain, which is x from {left:.9g} to "
-                    f"{right:.9g} and y from {bottom:.9g} to {top:.9g}; give CRS metres, and a "
-                    "region of a pixel at least."
-                )
-        self._worlds: dict[object, World] = {}
-        self._ways: dict[object, Ways] = {}
+        self._workspace, self._events, self._planned = workspace, tuple(events), ground
+        detection = np.array([robot.detection for robot in team.robots])
+        self._usual = World(surface, ground, sight, team.names, detection, team.lead.detection)
+        self._worlds: dict[str, World] = {}
+        self._ways: dict[str, Ways] = {}
 
     def of_mission(self, mission: int) -> World:
         """World of a mission, counted from 0."""
-        threats = tuple(t for t in self._threats if acts_in(t, mission))
-        worse = tuple(d for d in self._degradations if acts_in(d, mission))
-        key = tuple(map(id, (*threats, *worse)))
+        acting = [event for event in self._events if event.acts_in(mission)]
+        key = _key(acting)
         if key not in self._worlds:
-            self._worlds[key] = self._make(threats, worse)
+            world = self._usual
+            for event in acting:
+                world = event.change(world)
+            self._worlds[key] = world._replace(ways=self._ways_around(world.closed))
         return self._worlds[key]
 
-    def _make(self, threats: Sequence[Threat], worse: Sequence[Degradation]) -> World:
-        detection = np.array([robot.detection for robot in self._team.robots])
-        for degradation in worse:
-            detection[self._team.names.index(degradation.robot)] *= degradation.detection
-        jams = tuple((t.mask(self.surface), t.strength) for t in threats if t.kind == "jam")
-        ways = self._planned([t for t in threats if t.kind == "forbid"])
-        return World(self.surface, ways, jams, detection)
-
-    def _planned(self, closing: Sequence[Threat]) -> Ways:
-        """Posts and routes, which avoid closed areas; jams and degraded lidars change neither."""
-        key = tuple(map(id, closing))
+    def _ways_around(self, closed: Sequence[Threat]) -> Ways:
+        """Posts and routes, which avoid closed areas; other events change neither."""
+        key = _key(closed)
         if key not in self._ways:
-            ground = self._workspace.ground
-            assert ground is not None  # noqa: S101  # `true_surface` has refused others
-            if closing:
-                surface = ground.posts.surface
-                for threat in closing:
+            ways = self._planned
+            if closed:
+                surface = ways.posts.surface
+                for threat in closed:
                     surface = surface._replace(passable=surface.passable & ~threat.mask(surface))
-                ground = self._workspace.ways_over(surface, self._sight)
-            self._ways[key] = ground
+                ways = self._workspace.ways_over(surface, self._usual.sight)
+            self._ways[key] = ways
         return self._ways[key]
+
+
+def _key(events: Sequence[Event]) -> str:
+    return to_json([event.effect for event in events])
 
 
 def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
