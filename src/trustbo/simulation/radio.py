@@ -5,6 +5,7 @@ model: neither does its truth.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -57,10 +58,8 @@ class RadioSimulator(DescribedSimulator):
                 "the radio simulator needs a terrain; make the workspace with "
                 "Workspace.from_terrain."
             )
-        self.workspace, self._terrain = workspace, terrain
-        digest = digest_of(terrain)
-        self.seed = int(digest[:8], 16) if seed is None else require_whole("seed", seed, 0)
-        self._digest = digest
+        self.workspace, self._terrain, self._digest = workspace, terrain, digest_of(terrain)
+        self.seed = int(self._digest[:8], 16) if seed is None else require_whole("seed", seed, 0)
         self.mean = self._mean_contact()
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
@@ -77,7 +76,7 @@ class RadioSimulator(DescribedSimulator):
 
     def expected_contact(self) -> BoundTable:
         """Return the expected contact of every bound, in closed form."""
-        contact = expected_rate(self.mean)[..., None]  # whatever comes next
+        contact = expected_rate(self.mean)[..., None]  # the same before any bound
         exists = self.workspace.passable_bounds.values
         contact = np.where(exists[..., None], np.repeat(contact, len(MOVES[8]) + 1, -1), np.nan)
         dims = ("move", "row", "col", "next_move")
@@ -104,13 +103,13 @@ class RadioSimulator(DescribedSimulator):
         }
 
     def _mean_contact(self) -> np.ndarray:
-        """Mean contact by the formula, shape (robot, move, row, col); of no meaning off the grid."""
+        """Mean contact by the formula, shape (robot, move, row, col), also of absent bounds."""
         terrain, grid = self._terrain, self.workspace.grid
         x, y = terrain["x"].values, terrain["y"].values
         step = abs(float(y[1] - y[0])), abs(float(x[1] - x[0]))
         ground = _filled(terrain["dem"].values)
         height = np.nan_to_num(terrain["dsm"].values - terrain["dem"].values)
-        window = [max(1, round(_WINDOW / one)) for one in step]
+        window: Any = [max(1, round(_WINDOW / one)) for one in step]
         cover = ndimage.uniform_filter((height > 1.5).astype(float), window)
         ground = ndimage.uniform_filter(ground, window)
         rng = np.random.default_rng(self.seed)

@@ -1,10 +1,11 @@
 """Studies: many campaigns as a table of runs, on as many cores as there are."""
 
 from trustbo.renamed import moved
-from trustbo.study.benchmark import run_worlds, worlds
+from trustbo.study.benchmark import run_worlds
 from trustbo.study.configuration import Study, run_study
 from trustbo.study.experiment import failures, load_study
 from trustbo.study.table import summary, worlds_table
+from trustbo.study.world_set import worlds
 
 __all__ = [
     "Study", "failures", "load_study", "run_study", "run_worlds", "summary", "worlds",

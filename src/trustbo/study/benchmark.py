@@ -1,4 +1,4 @@
-"""The open benchmark: the fixed set of worlds, and methods on them."""
+"""The open benchmark: methods on the fixed set of worlds."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -7,50 +7,12 @@ from typing import Any
 import xarray as xr
 
 from trustbo.campaign.options import OBJECTIVE, POLICY
-from trustbo.errors import require_choice, require_whole
+from trustbo.errors import TrustboError, require_choice, require_whole
 from trustbo.files import FilePath
 from trustbo.study.experiment import Experiment, Scene
 from trustbo.study.methods import BASELINES, cases_of
-from trustbo.study.world import COURSES, REAL, Simulate, World, scene_of
-from trustbo.workspace.sight import Sight
-
-_WALL, _BARE = Sight("wall"), Sight("bare")
-_DENSE, _THIN, _LOW = Sight(extinction=0.3), Sight(extinction=0.1 / 3.0), Sight(crown_base=0.0)
-_SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
-
-
-def _all() -> list[World]:
-    kinds: list[World] = [World(ground, "right", ground) for ground in (*_SYNTHETIC, *REAL)]
-    for name, sight, grounds in (
-        ("wall", _WALL, ("synthetic-0", "synthetic-1", "tahoe")),
-        ("bare", _BARE, ("synthetic-2", "wellington", "bcts")),
-    ):
-        kinds += [World(f"{ground}-{name}", name, ground, sight) for ground in grounds]
-    for ground in ("synthetic-0", "synthetic-1", *REAL):
-        kinds.append(World(f"{ground}-aged", "aged", ground))
-    for name, assumed, grounds in (
-        ("dense", _DENSE, ("synthetic-1", "wellington")),
-        ("thin", _THIN, ("synthetic-2", "tahoe")),
-        ("low", _LOW, ("synthetic-0", "topography", "bcts")),
-    ):
-        kinds += [World(f"{g}-{name}", "canopy", g, assumed=assumed) for g in grounds]
-    for ground, slope in (("synthetic-0", 14.0), ("tahoe", 18.0), ("topography", 18.0)):
-        kinds.append(World(f"{ground}-slopes", "slopes", ground, max_slope=slope))
-    return kinds
-
-
-def worlds(data: FilePath | None = None) -> dict[str, World]:
-    """Worlds of the benchmark by name; see docs/worlds.md.
-
-    Args:
-        data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, their worlds are
-            listed too, but those of wellington alone, which is in the package, can be used.
-
-    Returns:
-        29 worlds, of 3 synthetic terrains and 4 real ones.
-    """
-    folder = None if data is None else str(data)
-    return {world.name: replace(world, data=folder) for world in _all()}
+from trustbo.study.world import COURSES, Simulate, World, scene_of
+from trustbo.study.world_set import worlds
 
 
 def run_worlds(
@@ -58,6 +20,7 @@ def run_worlds(
     *,
     data: FilePath | None = None,
     only: Sequence[str] | None = None,
+    kinds: Sequence[str] | None = None,
     courses: Sequence[str] = COURSES,
     policies: Any = (POLICY,),
     models: Any = ("places",),
@@ -82,12 +45,13 @@ def run_worlds(
         directory: Folder of the results, as of `run_study`.
         data: Folder of the real terrains; without it, worlds of synthetic ones and of the real one
             that comes with the package are run.
-        only: Names of worlds; by default all that `data` allows.
+        only: Names of worlds; by default all of the kinds that `data` allows.
+        kinds: Kinds of worlds; by default all.
         courses: Names in `COURSES`.
         policies: Policies: names, callables, or `"module:name"` of one; or only one.
         models: Models: names, `TrustModel`s, or `"module:name"` of one; or only one.
-        simulator: Function `simulator(workspace, *, terrain, sight, team)` of a true world, or its
-            `"module:name"`.
+        simulator: Function `simulator(workspace, *, terrain, sight, team)` of a true world, and
+            with `events` of one where something happens, or its `"module:name"`.
         baselines: Baselines: `random`, `shortest`, `paper`, or the `"module:name"` of a factory.
         methods: Further methods by the names of their rows: factories without arguments of a
             policy, which may learn by a model of another kind.
@@ -97,7 +61,7 @@ def run_worlds(
         sampler: Sampler of the posteriors, where the model allows it; else the default.
         n_iterations: Missions of a campaign.
         seeds: Number of campaigns for each course.
-        quick: Only a small world of each of three kinds, one course and 3 missions.
+        quick: Only a small world of each of five kinds, one course and 3 missions.
         executor: See `run_study`.
         n_workers: See `run_study`.
         progress: Whether to show progress.
@@ -108,11 +72,13 @@ def run_worlds(
     Raises:
         TrustboError: An unknown name, or a world whose files are absent.
     """
-    chosen = _chosen(worlds(data), data, only)
+    chosen = _chosen(worlds(data), data, only, kinds)
     if quick:
-        small = [World(f"{w.name}-small", w.kind, w.ground, w.sight, w.assumed, w.max_slope,
-                       shape=(5, 5), side=200.0) for w in _quick(chosen)]  # fmt: skip
-        chosen, courses, n_iterations = small, courses[:1], min(n_iterations, 3)
+        chosen = [
+            replace(world, name=f"{world.name}-small", shape=(5, 5), cell=40.0)
+            for world in _quick(chosen)
+        ]
+        courses, n_iterations = courses[:1], min(n_iterations, 3)
     for course in courses:
         require_choice("course", course, COURSES)
     cases = cases_of(models, policies, baselines, methods or {}, objective, max_bounds, sampler)
@@ -121,7 +87,10 @@ def run_worlds(
     for world in chosen:
         for course in courses:
             scenes.append(scene_of(world, course, (objective, max_bounds), simulator))
-        scenes[-1].truth(progress=progress)
+        truth = scenes[-1].truth(progress=progress)
+        if truth is not None:
+            for mission in range(n_iterations + 1):
+                truth.at(mission)  # on disk before the runs
     settings = {"worlds": [world.name for world in chosen]}
     experiment = Experiment(
         list(cases.values()), lambda seed: scenes, range(n_seeds), n_iterations, settings
@@ -130,13 +99,21 @@ def run_worlds(
 
 
 def _chosen(
-    listed: Mapping[str, World], data: FilePath | None, only: Sequence[str] | None
+    listed: Mapping[str, World],
+    data: FilePath | None,
+    only: Sequence[str] | None,
+    kinds: Sequence[str] | None,
 ) -> list[World]:
-    """Worlds to run; TrustboError: an unknown name, or absent files."""
+    """Worlds to run; TrustboError: an unknown name or kind, none of both, or absent files."""
+    every = list(dict.fromkeys(world.kind for world in listed.values()))
+    allowed = [require_choice("kind of world", kind, every) for kind in kinds or every]
     if only is None:
         chosen = [world for world in listed.values() if world.is_packaged or data is not None]
     else:
         chosen = [listed[require_choice("world", name, listed)] for name in only]
+    chosen = [world for world in chosen if world.kind in allowed]
+    if not chosen:
+        raise TrustboError(f"no world of {', '.join(only or ())} is of kind {', '.join(allowed)}.")
     for world in chosen:
         if not world.is_made:
             world.files()
@@ -144,6 +121,6 @@ def _chosen(
 
 
 def _quick(chosen: Iterable[World]) -> list[World]:
-    """One synthetic world of each of three kinds."""
+    """One synthetic world of each of some kinds."""
     made = {world.kind: world for world in reversed(list(chosen)) if world.is_made}
-    return [made[kind] for kind in ("right", "aged", "canopy") if kind in made]
+    return [made[kind] for kind in ("right", "aged", "canopy", "days", "physics") if kind in made]

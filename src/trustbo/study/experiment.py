@@ -9,7 +9,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -52,6 +52,7 @@ class Scene:
         has_truth: Whether regret is held against the truth of the simulator.
         judged: Objective and admissible paths of the best path, see `path_class`; by default those
             of the campaign.
+        options: Options of the campaigns on it, such as the connectivity of paths.
     """
 
     labels: Mapping[str, Any]
@@ -61,6 +62,7 @@ class Scene:
     simulator: Callable[[Workspace], Simulator]
     has_truth: bool = True
     judged: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     def truth(self, *, progress: bool = False) -> Truth | None:
         """Truth of the simulator, for any awareness in the workspace; None without."""
@@ -114,7 +116,8 @@ class Run:
         """
         workspace = self.scene.make_workspace(bounds=self.case.bounds)
         ends = corners(self.scene.ends, workspace.passable.shape)
-        campaign = self.case.campaign(workspace, ends, self.seed, callbacks)
+        case = replace(self.case, options={**self.case.options, **self.scene.options})
+        campaign = case.campaign(workspace, ends, self.seed, callbacks)
         stop = self.case.options.get("stop")
         rule = RegretBound(**stop) if isinstance(stop, Mapping) else stop
         simulator = self.scene.simulator(workspace)
@@ -202,10 +205,12 @@ def load_study(directory: FilePath) -> xr.Dataset:
         of its plan), `path` and `recommended` (row and col of each step, -1 after the goal),
         `regret` (true regret of the path recommended after it, in % of the contact that the best
         path keeps, see `Truth.regret`), `lost` (contact that it loses, in bounds), `p_arrive` (its
-        probability to arrive), the same with `_followed` for the path it followed, `contact_rate`
-        (mean), `status`, diagnostics of the posterior (see `models.diagnostics`), and seconds. For
-        each run: `oracle` (contact lost on the best path), the three numbers with `_before` for the
-        path recommended before the first mission, `seconds` and `seconds_cpu` (of its process). NaN
+        probability to arrive) and `best` (contact lost on the best path), in the world of the next
+        mission, the same with `_followed` for the path it followed, in the world that it was driven
+        in, `contact_rate` (mean), `status`, diagnostics of the posterior (see
+        `models.diagnostics`), and seconds. For each run: `oracle` (contact lost on the best path
+        before the first mission), the first three numbers with `_before` for the path recommended
+        before the first mission, `seconds` and `seconds_cpu` (of its process). NaN
         where the truth is unknown, or where there is no such mission. Coordinates of run: its key,
         and its label along each axis of the study. Attributes: the study's number of runs,
         `n_runs`, and of failed ones, `n_failed`.
@@ -270,38 +275,42 @@ def execute(run: Run, caller: tuple[str, int]) -> dict[str, Any]:
 
 @dataclass
 class _Referee:
-    """Compares the path recommended after each mission, and its path, with the best one."""
+    """Compares the path recommended after each mission, and its path, with the best one.
+
+    A recommendation is judged in the world of the next mission, a path that was followed in the
+    world of its mission.
+    """
 
     scene: Scene
     truth: Truth | None
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def __call__(self, campaign: Campaign, mission: Mission) -> None:
-        followed = self.judge(campaign, mission.path)
-        row = self.recommended(campaign)
+        followed = self.judge(campaign, mission.path, len(self.rows))
+        row = self.recommended(campaign, len(self.rows) + 1)
         self.rows.append(row | {f"{name}_followed": value for name, value in followed.items()})
 
-    def recommended(self, campaign: Campaign) -> dict[str, Any]:
-        """Path recommended by the model, or by a policy with `recommend`, and its value."""
+    def recommended(self, campaign: Campaign, mission: int) -> dict[str, Any]:
+        """Path recommended for a mission by the model, or a policy with `recommend`, its value."""
         choose = getattr(campaign.policy, "recommend", None)
         path = campaign.recommend().path if choose is None else choose(campaign)
-        return {"recommended": [list(cell) for cell in path], **self.judge(campaign, path)}
+        judged = self.judge(campaign, path, mission)
+        return {"recommended": [list(cell) for cell in path], **judged}
 
-    def judge(self, campaign: Campaign, path: tuple[Cell, ...]) -> dict[str, float]:
-        """Regret in % and contact lost in bounds; NaN if it does not lead from start to goal."""
-        planner = campaign.planner
-        if self.truth is None or (path[0], path[-1]) != (planner.start, planner.goal):
-            return {"regret": math.nan, "lost": math.nan, "p_arrive": math.nan}
-        value = self.truth.value(path)
-        regret = self.truth.regret(path, **self.class_of(planner))
-        return {"regret": regret, "lost": value.lost, "p_arrive": value.p_arrive}
+    def judge(self, campaign: Campaign, path: tuple[Cell, ...], mission: int) -> dict[str, float]:
+        """Value of a path in the world of a mission, and that of the best one.
 
-    def oracle(self, planner: Planner) -> float:
-        """Contact lost on the best path, in bounds; NaN where the truth is not known."""
+        Regret in % and contact lost in bounds, NaN if it does not lead from start to goal.
+        """
+        planner, unknown = campaign.planner, dict.fromkeys(("regret", "lost", "p_arrive"), math.nan)
         if self.truth is None:
-            return math.nan
-        best = self.truth.best(planner.start, planner.goal, **self.class_of(planner))
-        return self.truth.value(best).lost
+            return unknown | {"best": math.nan}
+        truth, (start, goal) = self.truth.at(mission), (planner.start, planner.goal)
+        best = truth.value(truth.best(start, goal, **self.class_of(planner))).lost
+        if (path[0], path[-1]) != (start, goal):
+            return unknown | {"best": best}
+        value, regret = truth.value(path), truth.regret(path, **self.class_of(planner))
+        return {"regret": regret, "lost": value.lost, "p_arrive": value.p_arrive, "best": best}
 
     def class_of(self, planner: Planner) -> dict[str, Any]:
         """Paths that regret is held against."""
@@ -311,13 +320,13 @@ class _Referee:
 def _record(run: Run) -> dict[str, Any]:
     referee = _Referee(run.scene, run.scene.truth())
     campaign, steps = run.begin(referee)
-    before = referee.recommended(campaign)
+    before = referee.recommended(campaign, 0)
     for _ in steps:
         pass
     result = campaign.result()
     return {
         "missions": _rows(result, referee.rows),
-        "oracle": referee.oracle(campaign.planner),
+        "oracle": before["best"],
         **{f"{name}_before": before[name] for name in ("regret", "lost", "p_arrive")},
         "stop_reason": result.stop_reason,
     }

@@ -1,8 +1,10 @@
 """A world: a true terrain, sight and team, what is assumed of them, and courses through it."""
 
+import hashlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
+from inspect import signature
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,14 +15,16 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
-from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
+from trustbo.simulation.events import Event
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.calls import digest, identity_of, imported
 from trustbo.study.experiment import Scene
-from trustbo.team import Robot, Team
+from trustbo.team import Team
 from trustbo.terrain.dataset import assemble_terrain
 from trustbo.terrain.example import EXAMPLES, example_files
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVES
 from trustbo.workspace.sight import Sight
 
 REAL = ("wellington", "tahoe", "bcts", "topography")
@@ -29,27 +33,49 @@ COURSES = ("sw-ne", "nw-se", "n-s", "w-e")
 """Courses through a world: two diagonals, from north to south and from west to east."""
 _STRIP = 250
 """Rows of a real terrain that are used, those with most data: all but bcts have not many more."""
+_RELIEF = 0.06
+"""Relief of a synthetic terrain as a share of its longer side."""
 
 Simulate = Callable[..., Simulator]
-"""Function `simulator(workspace, *, terrain, sight, team)` of a true world."""
+"""Function `simulator(workspace, *, terrain, sight, team)` of a true world, and with `events` of
+one where something happens."""
+
+
+def _radio(workspace: Workspace, *, terrain: xr.Dataset, sight: Sight, team: Team) -> Simulator:
+    """Simulator by radio, to which sight and the robots' lidars are nothing."""
+    return RadioSimulator(workspace, terrain=terrain)
+
+
+SIMULATORS: dict[str, Simulate] = {"kinematic": KinematicSimulator, "radio": _radio}
+"""Simulators of worlds by name."""
+
+
+def drawn(ground: str, what: str) -> np.random.Generator:
+    """Random numbers by rule: seeded by the SHA-256 hash of a terrain's name and a purpose."""
+    return np.random.default_rng(list(hashlib.sha256(f"{ground} {what}".encode()).digest()))
 
 
 @dataclass(frozen=True)
 class World:
-    """A terrain with a true sight and team, and what is assumed of it.
+    """A terrain with a true sight and team, what is assumed of it, and what happens.
 
     Attributes:
-        name: Name of the world.
-        kind: `"right"`, the assumed is the true; `"wall"` or `"bare"`, so too, in another sight
-            mode; `"aged"`, an old DSM is assumed; `"canopy"`, a wrong model of the canopy is
-            assumed; `"slopes"`, robots that stand little slope.
-        ground: `"synthetic-N"`, the synthetic terrain of seed N, or a name in `REAL`.
+        name: Name of the world: that of its ground, and of its case.
+        kind: Name of the kind, for tables.
+        ground: `"synthetic-N"`, the synthetic terrain of seed N, or `"synthetic-NAME"`, of the seed
+            that is drawn from the name; or a name in `REAL`.
         sight: True model of sight.
         assumed: Assumed model of sight; None for the true one.
-        max_slope: Slope limit of all robots, degrees; None for the default.
-        data: Folder of the real terrains.
+        team: True lead and robots.
+        assumed_team: Assumed lead and robots; None for the true ones.
+        aged: Whether the assumed terrain is an old survey, see `aged`.
+        events: What happens, with the missions it happens in. Centres are shares of the terrain's
+            width and height from its lower left corner, in place of CRS metres.
         shape: Planning grid.
-        side: Side of a synthetic terrain, m; its relief is 6 % of it.
+        cell: Side of a cell of a synthetic terrain, m.
+        connectivity: Number of directions that a path may take, 8 or 4.
+        simulate: Name of the simulator, in `SIMULATORS`.
+        data: Folder of the real terrains.
     """
 
     name: str
@@ -57,10 +83,20 @@ class World:
     ground: str
     sight: Sight = field(default_factory=Sight)
     assumed: Sight | None = None
-    max_slope: float | None = None
-    data: str | None = None
+    team: Team = field(default_factory=Team)
+    assumed_team: Team | None = None
+    aged: bool = False
+    events: tuple[Event, ...] = ()
     shape: tuple[int, int] = (10, 10)
-    side: float = 500.0
+    cell: float = 50.0
+    connectivity: int = 8
+    simulate: str = "kinematic"
+    data: str | None = None
+
+    @property
+    def case(self) -> str:
+        """Name without the terrain's, by default the kind."""
+        return self.name.removeprefix(self.ground).removeprefix("-") or self.kind
 
     @property
     def is_made(self) -> bool:
@@ -74,7 +110,7 @@ class World:
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides its numbers; real terrains by their contents."""
-        settings = asdict(self)
+        settings = asdict(self) | {"events": [event.settings for event in self.events]}
         del settings["data"]
         return settings | ({} if self.is_made else {"files": [digest(f) for f in self.files()]})
 
@@ -102,25 +138,55 @@ class World:
 
     def true_terrain(self) -> xr.Dataset:
         """True DEM and DSM."""
-        if self.is_made:
-            return _made(int(self.ground.partition("-")[2]), self.side)
-        return _read(*self.files())
-
-    def team(self) -> Team:
-        """Lead and robots."""
-        if self.max_slope is None:
-            return Team()
-        robot = Robot(max_slope=float(np.deg2rad(self.max_slope)))
-        return Team(robots=(robot,) * 3, lead=robot)
+        if not self.is_made:
+            return _read(*self.files())
+        name = self.ground.partition("-")[2]
+        seed = int(name) if name.isdigit() else int(drawn(self.ground, "terrain").integers(2**31))
+        rows, cols = self.shape
+        return _made(seed, (rows * self.cell, cols * self.cell))
 
     def workspace(self, *, bounds: bool = True) -> Workspace:
         """Workspace on what is assumed; `bounds` as for `Workspace.from_terrain`."""
-        return _workspace(self, bounds)
+        assumed = replace(
+            self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
+            team=self.assumed_team or self.team, assumed_team=None, events=(),
+            connectivity=8, simulate="kinematic",
+        )  # fmt: skip
+        return _workspace(assumed, bounds)
+
+    def true_events(self) -> tuple[Event, ...]:
+        """Events with their centres in CRS metres."""
+        left, bottom, right, top = self.true_terrain().rio.bounds(recalc=True)
+        corner, size = np.array([left, bottom]), np.array([right - left, top - bottom])
+
+        def placed(event: Event) -> Event:
+            share = getattr(event, "center", None)
+            if share is None:
+                return event
+            x, y = corner + share * size
+            return replace(cast(Any, event), center=(float(x), float(y)))
+
+        return tuple(placed(event) for event in self.events)
 
     def simulator(self, workspace: Workspace, simulate: Simulate | None = None) -> Simulator:
-        """Simulator of the true world, with posts and ways of a workspace on the assumed one."""
-        true = {"terrain": self.true_terrain(), "sight": self.sight, "team": self.team()}
-        return (KinematicSimulator if simulate is None else simulate)(workspace, **true)
+        """Simulator of the true world, with posts and ways of a workspace on the assumed one.
+
+        TrustboError: the function does not take what is true of the world.
+        """
+        true: dict[str, Any] = {
+            "terrain": self.true_terrain(), "sight": self.sight, "team": self.team,
+        }  # fmt: skip
+        if self.events:
+            true["events"] = self.true_events()
+        make = SIMULATORS[self.simulate] if simulate is None else simulate
+        try:
+            signature(make).bind(workspace, **true)
+        except TypeError as error:
+            raise TrustboError(
+                f"world {self.name!r} has {', '.join(true)}, and the simulator {make!r} does not "
+                f"take them: {error}; leave the world out."
+            ) from None
+        return make(workspace, **true)
 
     def truth(self, simulate: Simulate | None = None, *, progress: bool = False) -> Truth:
         """Truth of the simulator, from disk where it has been computed before."""
@@ -135,7 +201,9 @@ class World:
             "n-s": ((0, cols // 2), (rows, cols - cols // 2)),
             "w-e": ((rows - rows // 2, 0), (rows // 2, cols)),
         }[require_choice("course", course, COURSES)]
-        regions: Any = ndimage.label(self.workspace().passable.values, np.ones((3, 3)))
+        steps = np.zeros((3, 3))
+        steps[*(np.array(MOVES[self.connectivity]).T + 1)] = 1
+        regions: Any = ndimage.label(self.workspace().passable.values, steps)
         labels = regions[0]
         largest = np.argmax(np.bincount(labels.ravel())[1:]) + 1
         free = np.argwhere(labels == largest)
@@ -160,7 +228,7 @@ def scene_of(
     """
     objective, max_bounds = judged
     return Scene(
-        labels={"world": world.name, "kind": world.kind, "course": course},
+        labels={"world": world.name, "kind": world.kind, "case": world.case, "course": course},
         identity={
             "world": world.identity(),
             "course": course,
@@ -174,6 +242,7 @@ def scene_of(
             "objective": "mean" if objective == "mean" else "lost_contact",
             "max_bounds": max_bounds,
         },
+        options={"connectivity": world.connectivity},
     )
 
 
@@ -213,16 +282,17 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
 
 
 @lru_cache(maxsize=4)
-def _workspace(world: World, bounds: bool) -> Workspace:
-    ground = world.true_terrain()
-    assumed = aged(ground) if world.kind == "aged" else ground
-    sight = world.sight if world.assumed is None else world.assumed
-    return Workspace.from_terrain(assumed, world.shape, world.team(), sight=sight, bounds=bounds)
+def _workspace(assumed: World, bounds: bool) -> Workspace:
+    """Workspace on the terrain, sight and team of a world."""
+    ground = assumed.true_terrain()
+    ground = aged(ground) if assumed.aged else ground
+    options: dict[str, Any] = {"sight": assumed.sight, "bounds": bounds}
+    return Workspace.from_terrain(ground, assumed.shape, assumed.team, **options)
 
 
 @lru_cache(maxsize=2)
-def _made(seed: int, side: float) -> xr.Dataset:
-    return terrain.synthetic_terrain((side, side), seed=seed, relief=0.06 * side)
+def _made(seed: int, size: tuple[float, float]) -> xr.Dataset:
+    return terrain.synthetic_terrain(size, seed=seed, relief=_RELIEF * max(size))
 
 
 @lru_cache(maxsize=2)

@@ -1,0 +1,161 @@
+"""The set of worlds of the benchmark, by kind."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from trustbo.files import FilePath
+from trustbo.simulation import Degradation, Dust, Fouling, Season, Threat, Vegetation
+from trustbo.study.world import REAL, World, drawn
+from trustbo.team import Robot, Team
+from trustbo.workspace.sight import Sight
+
+_SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
+_ALDER, _BIRCH, _CEDAR = (f"synthetic-{name}" for name in ("alder", "birch", "cedar"))
+_AFTER = 6
+"""First mission, counted from 0, after a change: the seventh to be driven."""
+_DAYS = (1, 3, 4, 7)
+"""Missions with bad weather, counted from 0."""
+
+type _Case = tuple[str, str, tuple[str, ...], Mapping[str, Any] | Callable[[str], dict[str, Any]]]
+"""Kind, case, names of the terrains, and settings of `World`, or a function of the terrain."""
+
+
+def _climbing(degrees: float) -> dict[str, Any]:
+    robot = Robot(max_slope=float(np.deg2rad(degrees)))
+    return {"team": Team(robots=(robot,) * 3, lead=robot)}
+
+
+def _is_drawn(ground: str) -> bool:
+    """Whether what happens on a terrain is drawn from its name; else it is fixed by hand."""
+    return ground not in _SYNTHETIC
+
+
+def _one_robot(ground: str) -> int:
+    return int(drawn(ground, "robot").integers(3)) if _is_drawn(ground) else 1
+
+
+def _days(ground: str) -> tuple[int, ...]:
+    """Missions with bad weather: four of the first nine."""
+    days = drawn(ground, "days").permutation(9)[:4] if _is_drawn(ground) else _DAYS
+    return tuple(sorted(int(day) for day in days))
+
+
+def _place(ground: str) -> tuple[float, float]:
+    """Centre of what happens, as shares of the terrain: in the middle, or within 20 % of it."""
+    x, y = drawn(ground, "place").uniform(0.3, 0.7, 2) if _is_drawn(ground) else (0.5, 0.5)
+    return float(x), float(y)
+
+
+def _one_poor(ground: str) -> dict[str, Any]:
+    robots = [Robot()] * 3
+    robots[_one_robot(ground)] = Robot(
+        detection=0.4, lidar_range=50.0, sensor_height=0.5, target_height=0.5
+    )
+    return {"team": Team(robots=tuple(robots)), "assumed_team": Team()}
+
+
+def _unlike(ground: str) -> dict[str, Any]:
+    robots = [
+        Robot(sensor_height=mast, target_height=mast, lidar_range=reach, detection=detection)
+        for mast, reach, detection in ((0.6, 60.0, 0.9), (1.0, 100.0, 1.0), (1.6, 80.0, 0.7))
+    ]
+    order = drawn(ground, "robots").permutation(3)
+    return {"team": Team(robots=tuple(robots[i] for i in order)), "assumed_team": Team()}
+
+
+def _rain(ground: str) -> dict[str, Any]:
+    robot = f"r{_one_robot(ground) + 1}"
+    return {"events": tuple(Degradation(robot, 0.3, day, day) for day in _days(ground))}
+
+
+def _dust(ground: str) -> dict[str, Any]:
+    return {"events": tuple(Dust(0.5, day, day) for day in _days(ground))}
+
+
+def _foul(ground: str) -> dict[str, Any]:
+    seed = drawn(ground, "fouling").integers(2**31) if _is_drawn(ground) else 0
+    return {"events": (Fouling(0.1, 0.95, seed=int(seed)),)}
+
+
+def _worn(detection: float) -> Callable[[str], dict[str, Any]]:
+    return lambda ground: {
+        "events": (Degradation(f"r{_one_robot(ground) + 1}", detection, _AFTER),)
+    }
+
+
+def _trees(height: float, radius: float) -> Callable[[str], dict[str, Any]]:
+    return lambda ground: {
+        "events": (Vegetation(height, _place(ground), radius, first_mission=_AFTER),)
+    }
+
+
+def _jam(first: int = 0, last: int | None = None) -> Callable[[str], dict[str, Any]]:
+    return lambda ground: {"events": (Threat("jam", _place(ground), 90.0, None, 0.8, first, last),)}
+
+
+def _season(factor: float) -> dict[str, Any]:
+    return {"events": (Season(factor, _AFTER),)}
+
+
+_CASES: tuple[_Case, ...] = (
+    ("right", "", (*_SYNTHETIC, *REAL), {}),
+    ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight("wall")}),
+    ("bare", "bare", ("synthetic-2", "wellington", "bcts"), {"sight": Sight("bare")}),
+    ("aged", "aged", ("synthetic-0", "synthetic-1", *REAL), {"aged": True}),
+    ("canopy", "dense", ("synthetic-1", "wellington"), {"assumed": Sight(extinction=0.3)}),
+    ("canopy", "thin", ("synthetic-2", "tahoe"), {"assumed": Sight(extinction=0.1 / 3.0)}),
+    ("canopy", "low", ("synthetic-0", "topography", "bcts"), {"assumed": Sight(crown_base=0.0)}),
+    ("slopes", "slopes", ("synthetic-0",), _climbing(14.0)),
+    ("slopes", "slopes", ("tahoe", "topography"), _climbing(18.0)),
+    ("canopy", "thin-canopy", (_ALDER, _CEDAR, "wellington"),
+     {"sight": Sight(extinction=0.06, crown_base=0.4),
+      "assumed": Sight(extinction=0.4, crown_base=0.0)}),
+    ("robots", "one-poor", ("synthetic-1", _ALDER, "wellington"), _one_poor),
+    ("robots", "unlike", ("tahoe",), _unlike),
+    ("days", "rain", ("synthetic-0", _BIRCH, "tahoe"), _rain),
+    ("days", "dust", ("synthetic-2", _CEDAR, "wellington"), _dust),
+    ("foul", "foul", ("synthetic-2", _ALDER, "topography"), _foul),
+    ("change", "dead-detector", ("synthetic-0", _CEDAR, "bcts"), _worn(0.0)),
+    ("change", "half-detector", (_BIRCH,), _worn(0.5)),
+    ("change", "felled", ("synthetic-1", "tahoe"), _trees(0.0, 40.0)),
+    ("change", "grown", (_ALDER,), _trees(12.0, 30.0)),
+    ("change", "leaves", (_BIRCH,), _season(3.0)),
+    ("change", "leaf-fall", ("wellington",), _season(1.0 / 3.0)),
+    ("jammer", "jammer", ("synthetic-2", _BIRCH), _jam()),
+    ("jammer", "jammer-appears", (_ALDER, "wellington"), _jam(_AFTER)),
+    ("jammer", "jammer-lifted", ("synthetic-0", _CEDAR, "tahoe"), _jam(last=_AFTER - 1)),
+    ("physics", "radio", ("synthetic-1", _BIRCH, "topography"), {"simulate": "radio"}),
+    ("shapes", "12x7", (_BIRCH, "tahoe"), {"shape": (12, 7)}),
+    ("shapes", "20x20", (_CEDAR,), {"shape": (20, 20), "cell": 25.0}),
+    ("teams", "team-of-2", ("synthetic-2", "bcts"), {"team": Team(2)}),
+    ("teams", "team-of-5", (_CEDAR,), {"team": Team(5)}),
+    ("four-ways", "four-ways", ("synthetic-1", _ALDER, "topography"), {"connectivity": 4}),
+)  # fmt: skip
+
+
+def _all() -> list[World]:
+    return [
+        World(
+            "-".join(filter(None, (ground, case))), kind, ground,
+            **(settings(ground) if callable(settings) else settings),
+        )
+        for kind, case, grounds, settings in _CASES
+        for ground in grounds
+    ]  # fmt: skip
+
+
+def worlds(data: FilePath | None = None) -> dict[str, World]:
+    """Worlds of the benchmark by name; see docs/worlds.md.
+
+    Args:
+        data: Folder with the real terrains, `tahoe/dem.tif` and so on. Without it, their worlds are
+            listed too, but those of wellington alone, which is in the package, can be used.
+
+    Returns:
+        Worlds of 6 synthetic terrains and 4 real ones.
+    """
+    folder = None if data is None else str(data)
+    return {world.name: replace(world, data=folder) for world in _all()}
