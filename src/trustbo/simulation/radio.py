@@ -131,6 +131,7 @@ class RadioSimulator(DescribedSimulator):
 
         shares = np.linspace(0.0, 1.0, _POINTS)
         c = np.mean([read(cover, a + share * (b - a)) for share in shares], axis=0)
+        c = np.clip(c, 0.0, 1.0)  # a running mean has errors of rounding
         way = (b - a) * np.array([grid.cell_height, grid.cell_width])
         d = np.hypot(way[..., 0], way[..., 1]) / _REACH
         h = np.maximum(read(ground, b) - read(ground, a), 0.0)
