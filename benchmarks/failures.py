@@ -48,10 +48,15 @@ def world_of(name, data, simulate=KinematicSimulator):
     """World with the assumed slope limit, and the simulator of the true one."""
     ground, limit, excess = name.split(":")
     kind, more = ("aged", 0.0) if excess == "aged" else ("slopes", float(excess))
-    world = World(name, kind, ground, max_slope=float(limit) + more, data=data)
-    robot = tb.Robot(max_slope=float(np.deg2rad(float(limit))))
-    team = tb.Team(robots=(robot,) * 3, lead=robot)
+    assumed, team = (climbing(float(limit) + excess) for excess in (more, 0.0))
+    world = World(name, kind, ground, team=assumed, aged=kind == "aged", data=data)
     return world, simulate(world.workspace(), terrain=world.true_terrain(), team=team)
+
+
+def climbing(degrees):
+    """Team of robots that stand a slope."""
+    robot = tb.Robot(max_slope=float(np.deg2rad(degrees)))
+    return tb.Team(robots=(robot,) * 3, lead=robot)
 
 
 def random_missions(workspace, simulator, ends, n, seed):

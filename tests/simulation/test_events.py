@@ -173,5 +173,5 @@ def test_events_that_a_simulator_cannot_have_are_refused(wooded):
     ):
         with pytest.raises(TrustboError, match=message):
             KinematicSimulator(wooded, events=events)
-    with pytest.raises(TrustboError, match="bounds of Own are replicated .* no long run of Foul"):
+    with pytest.raises(TrustboError, match=r"bounds of Own are replicated .* no long run of Foul"):
         Truth.of(Own(wooded, events=[Fouling(0.1)]))

@@ -17,14 +17,14 @@ from trustbo.cli import app
 from trustbo.errors import TrustboError
 from trustbo.models import PlaceEffect, PooledTrust
 from trustbo.planning.policies import ucb
-from trustbo.simulation import KinematicSimulator, Truth
-from trustbo.study import load_study, run_worlds, worlds, worlds_table
+from trustbo.simulation import Dust, KinematicSimulator, Threat, Truth
+from trustbo.study import load_study, run_worlds, worlds_table
 from trustbo.study.calls import identity_of
 from trustbo.study.methods import cases_of
-from trustbo.study.world import COURSES, REAL, World, aged
+from trustbo.study.world import COURSES, World, aged
 from trustbo.workspace.sight import Sight
 
-TINY = World("tiny", "aged", "synthetic-0", shape=(3, 3), side=60.0)
+TINY = World("tiny", "aged", "synthetic-0", aged=True, shape=(3, 3), cell=20.0)
 ROWS = ("corner", "random path", "shortest path", "paper")
 
 
@@ -39,7 +39,7 @@ def corner(key, posterior, planner):
 
 
 def blind(workspace, **true):
-    """Simulator of a user: looks detect half as often."""
+    """Simulator of a user: scans detect half as often."""
     team = true["team"]
     robots = tuple(dataclasses.replace(robot, detection=0.5) for robot in team.robots)
     lead = dataclasses.replace(team.lead, detection=0.5)
@@ -64,18 +64,6 @@ def run(folder, **changes):
     return run_worlds(folder, **options | changes)
 
 
-def test_there_are_enough_worlds_of_every_kind():
-    known = worlds()
-    assert len(known) == 29 >= 20
-    assert len(COURSES) == 4
-    kinds = {world.kind for world in known.values()}
-    assert kinds == {"right", "wall", "bare", "aged", "canopy", "slopes"}
-    assert {world.ground for world in known.values()} == {
-        *REAL, "synthetic-0", "synthetic-1", "synthetic-2",
-    }  # fmt: skip
-    assert all(name == world.name for name, world in known.items())
-
-
 def test_an_old_survey_has_lower_canopy_clearings_and_errors_of_the_ground():
     now = tb.terrain.synthetic_terrain((80.0, 80.0), seed=0)
     old = aged(now)
@@ -92,20 +80,47 @@ def test_an_old_survey_has_lower_canopy_clearings_and_errors_of_the_ground():
     assert old.rio.crs == now.rio.crs
 
 
-def test_the_true_world_differs_from_the_assumed_one_as_it_says():
+def test_the_true_world_differs_from_the_assumed_one_as_stated():
+    climbing, usual = tb.Robot(max_slope=0.3), tb.Team()
     world = World(
-        "w", "canopy", "synthetic-0", Sight("wall"), Sight(), 18.0, shape=(3, 3), side=60.0
-    )
+        "w", "canopy", "synthetic-0", Sight("wall"), Sight(),
+        tb.Team(robots=(climbing,) * 3), usual, shape=(3, 3), cell=20.0,
+    )  # fmt: skip
     workspace = world.workspace()
     simulator = world.simulator(workspace)
     assert (workspace.sights[0].mode, simulator.sight.mode) == ("transmittance", "wall")
-    assert np.rad2deg(workspace.team.max_slope) == pytest.approx(18.0)
-    assert simulator.team == workspace.team
+    assert workspace.team == usual
+    assert simulator.team == world.team
     np.testing.assert_array_equal(TINY.true_terrain()["dem"], simulator.terrain["dem"])
     assert not np.allclose(TINY.workspace().terrain["dem"], TINY.true_terrain()["dem"])
     for course in COURSES:
         start, goal = world.ends(course)
         assert max(abs(start[0] - goal[0]), abs(start[1] - goal[1])) == 2
+
+
+def test_worlds_that_differ_in_what_happens_alone_share_their_workspace():
+    one = dataclasses.replace(TINY, name="one", events=(Dust(0.5, 1),), connectivity=4)
+    assert one.workspace() is TINY.workspace()
+    assert one.identity() != TINY.identity()
+
+
+def test_centres_of_events_are_shares_of_the_terrain():
+    world = dataclasses.replace(TINY, events=(Threat("jam", (0.25, 0.75), 9.0), Dust(0.5)))
+    x, y = (world.true_terrain()[axis].values for axis in ("x", "y"))
+    jam, dust = world.true_events()
+    # Pixels of 1 m have centres half a metre inside.
+    assert jam.center == pytest.approx((x.min() - 0.5 + 15.0, y.min() - 0.5 + 45.0))
+    assert dust is world.events[1]
+    assert world.simulator(world.workspace()).events == (jam, dust)
+
+
+def test_a_simulator_that_takes_no_events_is_refused_where_something_happens(tiny, tmp_path):
+    world = dataclasses.replace(TINY, events=(Dust(0.5),))
+
+    def deaf(workspace, *, terrain, sight, team): ...
+
+    with pytest.raises(TrustboError, match=r"'tiny' has .*, events, and .* keyword argument 'ev"):
+        world.simulator(world.workspace(), deaf)
 
 
 def test_methods_run_on_worlds_and_their_recommendations_are_judged(tiny, tmp_path):
@@ -136,6 +151,60 @@ def test_methods_run_on_worlds_and_their_recommendations_are_judged(tiny, tmp_pa
     before = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "runs").iterdir()}
     run(tmp_path)
     assert {f.name: f.stat().st_mtime_ns for f in (tmp_path / "runs").iterdir()} == before
+
+
+def test_recommendations_are_judged_in_the_world_of_the_next_mission(tiny, tmp_path, monkeypatch):
+    """Mission 1 of 0, 1, 2 is in dust, and mission 2 with a jam in the middle."""
+    happens = Dust(0.7, 1, 1), Threat("jam", (0.5, 0.5), 12.0, first_mission=2)
+    world = dataclasses.replace(TINY, events=happens)
+    monkeypatch.setattr("trustbo.study.benchmark.worlds", lambda data=None: {"tiny": world})
+    results = run(tmp_path, baselines=["shortest"], n_iterations=3)
+    truth = Truth.of(world.simulator(world.workspace()))
+    at = [truth.at(mission) for mission in range(4)]
+    assert at[3] is at[2] is not at[1] is not at[0]
+    best = [one.value(one.best((2, 0), (0, 2))).lost for one in at]
+    assert len({*best[:3]}) == 3
+    for j in range(2):
+        one = results.isel(run=j)
+        np.testing.assert_allclose(one["best"], best[1:])
+        np.testing.assert_allclose(one["best_followed"], best[:3])
+        assert float(one["oracle"]) == pytest.approx(best[0])
+        paths = {
+            name: [[tuple(c) for c in path.tolist() if c[0] >= 0] for path in one[name].values]
+            for name in ("path", "recommended")
+        }
+        for name, first, suffix in (("path", 0, "_followed"), ("recommended", 1, "")):
+            for k, path in enumerate(paths[name]):
+                now, value = at[first + k], at[first + k].value(path)
+                assert float(one[f"lost{suffix}"][k]) == pytest.approx(value.lost)
+                assert float(one[f"regret{suffix}"][k]) == pytest.approx(now.regret(path))
+
+
+def test_a_world_of_four_ways_has_paths_and_an_oracle_of_four_ways(tiny, tmp_path, monkeypatch):
+    world = dataclasses.replace(TINY, connectivity=4)
+    monkeypatch.setattr("trustbo.study.benchmark.worlds", lambda data=None: {"tiny": world})
+    results = run(tmp_path, policies="greedy", baselines=["random"], n_iterations=1)
+    truth = Truth.of(world.simulator(world.workspace()))
+    best = truth.best((2, 0), (0, 2), connectivity=4)
+    np.testing.assert_allclose(results["oracle"], truth.value(best).lost)
+    paths = np.concatenate([results[name].values[:, 0] for name in ("path", "recommended")])
+    for path in paths:
+        steps = np.abs(np.diff(path[path[:, 0] >= 0], axis=0)).sum(1)
+        assert len(steps) >= 4
+        assert (steps == 1).all()
+
+
+def test_worlds_are_chosen_by_kind(tiny, tmp_path, monkeypatch):
+    other = dataclasses.replace(TINY, name="other", kind="days", events=(Dust(0.5, 1),))
+    both = {"tiny": TINY, "other": other}
+    monkeypatch.setattr("trustbo.study.benchmark.worlds", lambda data=None: both)
+    results = run(tmp_path, kinds=["days"], baselines=[], n_iterations=1)
+    assert np.unique(results["world"]).tolist() == ["other"]
+    assert np.unique(results["case"]).tolist() == ["other"]
+    with pytest.raises(TrustboError, match="unknown kind of world 'night'; choose one of aged"):
+        run(tmp_path, kinds=["night"])
+    with pytest.raises(TrustboError, match="no world of tiny is of kind days"):
+        run(tmp_path, only=["tiny"], kinds=["days"])
 
 
 def test_a_user_s_policy_model_and_simulator_enter_by_one_argument(tiny, tmp_path):

@@ -51,6 +51,8 @@ Benchmark
   data FOLDER: Folder of the real terrains, tahoe/dem.tif and so on; without it, synthetic ones and
     wellington.
   world NAME: World, may be repeated; by default all.
+  kind NAME: Kind of worlds, may be repeated, such as right, aged, days, change or physics; by
+    default all.
   worlds.policy NAME: Policy, may be repeated: a name as for [b]trustbo run[/b], or module:name;
     by default optimistic.
   worlds.model NAME: Model, may be repeated: places (the default), pooled, hierarchical,
@@ -59,8 +61,8 @@ Benchmark
   baseline NAME: Baseline, may be repeated: random, shortest, paper, none, or module:name; by
     default the first three.
   max_bounds NAME: Admissible paths: shortest, shortest+4, or the most bounds allowed.
-  by NAME: Rows of the table: method, kind, world or course.
-  quick: Run three small worlds, one course and three missions only.
+  by NAME: Rows of the table: method, kind, case, world or course.
+  quick: Run five small worlds, one course and three missions only.
   seeds N: Number of campaigns for each course.
 Missions
   iterations N: Number of missions to run and learn from.

@@ -57,6 +57,7 @@ def study(
 def worlds(
     data: Path | None = None,
     world: list[str] | None = None,
+    kind: list[str] | None = None,
     policy: list[str] | None = None,
     model: list[str] | None = None,
     simulator: str | None = None,
@@ -93,7 +94,7 @@ def worlds(
         "baselines": BASELINES if baseline is None else [b for b in baseline if b != "none"],
     }
     results = run_worlds(
-        out, data=data, only=world, simulator=simulator, objective=objective,
+        out, data=data, only=world, kinds=kind, simulator=simulator, objective=objective,
         max_bounds=int(max_bounds) if max_bounds.isdigit() else max_bounds,
         n_iterations=iterations, seeds=seeds, quick=quick,
         executor=executor or ("serial" if quick else _usual_executor()),

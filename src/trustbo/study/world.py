@@ -69,8 +69,8 @@ class World:
         team: True lead and robots.
         assumed_team: Assumed lead and robots; None for the true ones.
         aged: Whether the assumed terrain is an old survey, see `aged`.
-        events: What happens, with the missions it happens in. Centres are shares of the terrain's
-            width and height from its lower left corner, in place of CRS metres.
+        events: Events, with the missions they act in. Centres are shares of the terrain's width and
+            height from its lower left corner, in place of CRS metres.
         shape: Planning grid.
         cell: Side of a cell of a synthetic terrain, m.
         connectivity: Number of directions that a path may take, 8 or 4.
