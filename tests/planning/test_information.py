@@ -11,7 +11,6 @@ from trustbo.inference import sample_prior
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import CoupledParams
-from trustbo.planning.dynamics import transition
 from trustbo.planning.information import information_gain, rate_noise
 from trustbo.workspace.moves import along
 
@@ -35,7 +34,7 @@ def test_the_rates_noise_is_that_of_their_joint_normal(model):
     for _ in range(20):
         y = rng.standard_normal((n_bounds, n_robots))
         expected, _, _ = dense_coupled(
-            transition(params, n_robots), np.zeros_like(y), Q, R, 0.0, params.x0_sd, y
+            params.transition(n_robots), np.zeros_like(y), Q, R, 0.0, params.x0_sd, y
         )
         got = multivariate_normal.logpdf(y.ravel(), np.zeros(y.size), noise)
         np.testing.assert_allclose(got, expected, rtol=1e-9)

@@ -30,6 +30,10 @@ class ParameterDraws(Displayed):
     """Axes of each field behind the leading ones; none where not listed."""
     WEIGHTS: ClassVar[str] = "beta"
     """Name of the field with the weights of features."""
+    BY_ROBOT: ClassVar[bool] = False
+    """Whether coefficients differ by robot; b then has the axis (robot,)."""
+    LINEAR: ClassVar[bool] = True
+    """Whether drift is linear in awareness: the mean over robots alike then has their equation."""
     _fields: ClassVar[tuple[str, ...]]
 
     def _card(self) -> Card:
@@ -67,12 +71,28 @@ class ParameterDraws(Displayed):
     @property
     def n_robots(self) -> int | None:
         """Number of robots; None where all share their parameters."""
-        return self._size("b", "robot")
+        return np.shape(self.b)[-1] if self.BY_ROBOT else None  # pyright: ignore
 
     @property
     def n_features(self) -> int:
         """Number of features."""
-        return self._size(self.WEIGHTS, "feature") or 0
+        axes = self.AXES[self.WEIGHTS]
+        return np.shape(getattr(self, self.WEIGHTS))[axes.index("feature") - len(axes)]
+
+    def transition(self, n_robots: int) -> np.ndarray:
+        """B0 of equation (1), shape (..., robot, robot); diagonal where robots do not interact."""
+        beta0 = np.asarray(self.beta0, dtype=float)  # pyright: ignore
+        if not self.BY_ROBOT:
+            beta0 = beta0[..., None]
+        return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
+
+    def increments(self, awareness: np.ndarray) -> np.ndarray:
+        """Drift without intercept, (..., robot, move, row, col).
+
+        Awareness is (robot, move, row, col, feature), or has a leading axis (draw,) like the
+        parameters'.
+        """
+        raise NotImplementedError
 
     def alike(self, n_robots: int) -> list[list[int]]:
         """Groups of robots that share their parameters."""
@@ -136,7 +156,7 @@ class ParameterDraws(Displayed):
         effect = self.of_places(bounds.reshape(-1, 3))
         effect = effect.reshape(*effect.shape[:-2], *bounds.shape[:2], effect.shape[-1])
         b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
-        b = b[..., None, None, None] if self.n_robots is None else b[..., None, None, :]
+        b = b[..., None, None, :] if self.BY_ROBOT else b[..., None, None, None]
         return self._replace(b=b + effect, place=None, place_bound=None)  # pyright: ignore
 
     def with_drift(self, awareness: np.ndarray) -> "Params":
@@ -170,10 +190,6 @@ class ParameterDraws(Displayed):
             return full.reshape(int(np.prod(leading)), *core)
 
         return self.map(expand)
-
-    def _size(self, name: str, axis: str) -> int | None:
-        axes = self.AXES.get(name, ())
-        return np.shape(getattr(self, name))[axes.index(axis) - len(axes)] if axis in axes else None
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
         """Apply a function to each field and the number of its trailing axes."""

@@ -67,6 +67,13 @@ class TrustParams(_Apart, _Trust):
     def _drift(self, awareness: Array) -> Array:
         return awareness @ self.beta + self.b
 
+    def increments(self, awareness: np.ndarray) -> np.ndarray:
+        """See `ParameterDraws.increments`."""
+        beta = np.asarray(self.beta, dtype=float)
+        if awareness.ndim == 5:
+            return np.tensordot(beta, awareness, (-1, -1))
+        return np.einsum("nm,nidrcm->nidrc", beta, awareness)
+
 
 class RobotParams(_Apart, _Trust):
     """Parameters of robots with separate coefficients and no influence on each other.
@@ -76,6 +83,7 @@ class RobotParams(_Apart, _Trust):
     """
 
     __slots__ = ()
+    BY_ROBOT: ClassVar = True
     AXES: ClassVar = {
         "beta": ("robot", "feature"),
         "beta0": ("robot",),
@@ -87,6 +95,10 @@ class RobotParams(_Apart, _Trust):
 
     def _drift(self, awareness: Array) -> Array:
         return jnp.einsum("jkim,im->jki", awareness, self.beta) + self.b
+
+    def increments(self, awareness: np.ndarray) -> np.ndarray:
+        """See `ParameterDraws.increments`."""
+        return np.einsum("...im,...idrcm->...idrc", np.asarray(self.beta, dtype=float), awareness)
 
 
 class _Coupled(NamedTuple):
@@ -108,6 +120,7 @@ class CoupledParams(ParameterDraws, _Coupled):
 
     __slots__ = ()
     WEIGHTS: ClassVar = "B"
+    BY_ROBOT: ClassVar = True
     AXES: ClassVar = {
         "B": ("feature", "robot", "robot_"),
         "B0": ("robot", "robot_"),
@@ -115,6 +128,19 @@ class CoupledParams(ParameterDraws, _Coupled):
         "Delta_w": ("robot", "robot_"),
         "Delta_v": ("robot", "robot_"),
     }
+
+    @property
+    def delta_v(self) -> np.ndarray:
+        """Standard deviation of each robot's observation noise, (..., robot)."""
+        return np.sqrt(np.diagonal(self.Delta_v, axis1=-2, axis2=-1))
+
+    def transition(self, n_robots: int) -> np.ndarray:
+        """See `ParameterDraws.transition`."""
+        return np.asarray(self.B0, dtype=float)
+
+    def increments(self, awareness: np.ndarray) -> np.ndarray:
+        """See `ParameterDraws.increments`."""
+        return np.einsum("...mai,...idrcm->...adrc", np.asarray(self.B, dtype=float), awareness)
 
     def ssm(self, awareness: Array, lag: float = 0.0) -> VectorSSM:
         """The state space of missions with awareness (mission, bound, robot, feature)."""
@@ -143,6 +169,7 @@ class DriftParams(_Apart, _OwnDrift):
     """
 
     __slots__ = ()
+    LINEAR: ClassVar = False
     AXES: ClassVar = {"beta0": (), **PLACES}
 
     @property
@@ -152,6 +179,20 @@ class DriftParams(_Apart, _OwnDrift):
 
     def _drift(self, awareness: Array) -> Array:
         return self.drift.at(awareness) + self.b
+
+    def increments(self, awareness: np.ndarray) -> np.ndarray:
+        """See `ParameterDraws.increments`."""
+        leading, shape = self.leading, awareness.shape[-4:-1]
+
+        def flat(value: np.ndarray, n: int) -> np.ndarray:
+            core = np.shape(value)[np.ndim(value) - n :]
+            return np.broadcast_to(value, leading + core).reshape(-1, *core)
+
+        drift = self.drift.map(flat) if leading else self.drift
+        bounds = np.moveaxis(awareness, -5, -2)  # (..., move, row, col, robot, feature)
+        bounds = bounds.reshape(*awareness.shape[:-5], -1, *bounds.shape[-2:])
+        u = np.swapaxes(drift.values(bounds, many=bool(leading)), -1, -2)
+        return u.reshape(*leading, -1, *shape)
 
     def with_drift(self, awareness: np.ndarray) -> "TrustParams":
         """See `ParameterDraws.with_drift`: the drift of each bound is its intercept."""
@@ -233,7 +274,9 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
     ShapeError: another number of robots or features. TrustboError: a covariance that is not
     symmetric and positive definite.
     """
-    _check_places(params, n_robots)
+    for field, value in params.places.items():
+        if (n := value.shape[-len(PLACES[field])]) not in (1, n_robots or n):
+            raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
     if isinstance(params, DriftParams):
         params.drift.require(n_robots, n_features)
         return
@@ -247,9 +290,7 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
             f"params.{name} has {sizes['feature']} weights, but awareness has {n_features} "
             "features."
         )
-    if "robot" not in sizes:
-        return
-    if n_robots is not None and sizes["robot"] != n_robots:
+    if n_robots is not None and sizes.get("robot", n_robots) != n_robots:
         raise ShapeError(
             f"params.{name} is of {sizes['robot']} robots, but the missions have {n_robots}."
         )
@@ -263,12 +304,6 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
             )
         if field.startswith("Delta"):
             _require_covariance(f"params.{field}", value)
-
-
-def _check_places(params: Params, n_robots: int | None) -> None:
-    for field, value in params.places.items():
-        if (n := value.shape[-len(PLACES[field])]) not in (1, n_robots or n):
-            raise ShapeError(f"params.{field} is of {n} robots, but the missions have {n_robots}.")
 
 
 def _require_covariance(name: str, value: np.ndarray) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.errors import ShapeError
-from trustbo.models.params import CoupledParams, DriftParams, Params, RobotParams, check_params
+from trustbo.models.params import Params, check_params
 from trustbo.parallel import plain
 from trustbo.workspace.moves import move_indices, moves_along
 
@@ -96,35 +96,15 @@ def trust_dynamics(
     elif not start.ndim:
         start = start[None]
     start = np.broadcast_to(start, (*leading, n_robots))
-    sd = rate_noise_sd(params)
-    sd = np.broadcast_to(sd.mean(-1) if params.n_robots else sd, leading)
-    if isinstance(params, RobotParams | CoupledParams) or team == "min":
+    sd = np.asarray(params.delta_v, dtype=float)
+    sd = np.broadcast_to(sd.mean(-1) if params.BY_ROBOT else sd, leading)
+    if params.BY_ROBOT or team == "min":
         views = np.eye(n_robots) if team == "min" else np.full((1, n_robots), 1.0 / n_robots)
-        return Dynamics(transition(params, n_robots), drift(params, z, moves), start, views, sd)
-    beta0 = np.asarray(params.beta0, dtype=float)[..., None, None]
+        return Dynamics(params.transition(n_robots), drift(params, z, moves), start, views, sd)
     # The mean over robots obeys the same equation.
-    linear = not isinstance(params, DriftParams)
-    z = z.mean(-5, keepdims=True) if n_robots > 1 and linear else z
+    z = z.mean(-5, keepdims=True) if n_robots > 1 and params.LINEAR else z
     u = drift(params, z, moves).mean(-4, keepdims=True)  # robots may differ in effects of places
-    start = start.mean(-1, keepdims=True)
-    return Dynamics(np.broadcast_to(beta0, (*leading, 1, 1)), u, start, np.eye(1), sd)
-
-
-def rate_noise_sd(params: Params) -> np.ndarray:
-    """Standard deviation of the rates' noise, delta_v, shape (...,) or (..., robot)."""
-    if isinstance(params, CoupledParams):
-        return np.sqrt(np.diagonal(params.Delta_v, axis1=-2, axis2=-1))
-    return np.asarray(params.delta_v, dtype=float)
-
-
-def transition(params: Params, n_robots: int) -> np.ndarray:
-    """B0 of equation (1), shape (..., robot, robot); diagonal where robots do not interact."""
-    if isinstance(params, CoupledParams):
-        return np.asarray(params.B0, dtype=float)
-    beta0 = np.asarray(params.beta0, dtype=float)
-    if not isinstance(params, RobotParams):
-        beta0 = beta0[..., None]
-    return np.broadcast_to(beta0, (*params.leading, n_robots))[..., None] * np.eye(n_robots)
+    return Dynamics(params.transition(1), u, start.mean(-1, keepdims=True), np.eye(1), sd)
 
 
 def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None) -> np.ndarray:
@@ -144,46 +124,12 @@ def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None)
             f"{z.shape[0]} maps of awareness need as many draws of the parameters; got "
             f"{params.leading}."
         )
-    b = np.asarray(params.b, dtype=float)
-    if isinstance(params, CoupledParams):
-        u = np.einsum("...mai,...idrcm->...adrc", np.asarray(params.B, dtype=float), z)
-    elif isinstance(params, RobotParams):
-        u = np.einsum("...im,...idrcm->...idrc", np.asarray(params.beta, dtype=float), z)
-    elif isinstance(params, DriftParams):
-        u = _custom_drift(params, z)
-        b = b if b.ndim else np.broadcast_to(b, params.leading)
-        b = b[..., None] if b.ndim == len(params.leading) else b
-    else:
-        beta = np.asarray(params.beta, dtype=float)
-        u = (
-            np.tensordot(beta, z, (-1, -1))
-            if z.ndim == 5
-            else np.einsum("nm,nidrcm->nidrc", beta, z)
-        )
-        b = b[..., None] if b.ndim == len(params.leading) else b
+    u, b = params.increments(z), np.asarray(params.b, dtype=float)
+    if not params.BY_ROBOT and b.ndim <= len(params.leading):
+        b = b[..., None]
     if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot): of the bounds of a path
         return u + np.swapaxes(b[..., 0, :, :], -1, -2)[..., None, None, :]
     u += b[..., None, None, None]  # in place: over many draws and cells this is large
-    return _with_places(u, params, moves)
-
-
-def _custom_drift(params: DriftParams, z: np.ndarray) -> np.ndarray:
-    """Drift by a function that the user gave, (..., robot, move, row, col)."""
-    leading, shape = params.leading, z.shape[-4:-1]
-
-    def flat(value: np.ndarray, n: int) -> np.ndarray:
-        core = np.shape(value)[np.ndim(value) - n :]
-        return np.broadcast_to(value, leading + core).reshape(-1, *core)
-
-    drift = params.drift.map(flat) if leading else params.drift
-    bounds = np.moveaxis(z, -5, -2)  # (..., move, row, col, robot, feature)
-    bounds = bounds.reshape(*z.shape[:-5], -1, *bounds.shape[-2:])
-    u = np.swapaxes(drift.values(bounds, many=bool(leading)), -1, -2)
-    return u.reshape(*params.leading, -1, *shape)
-
-
-def _with_places(u: np.ndarray, params: Params, moves: np.ndarray | None) -> np.ndarray:
-    """Drift (..., robot, move, row, col) with the effects of places added."""
     for name, effect in params.places.items():
         if effect.shape[-2:] != u.shape[-2:]:
             raise ShapeError(

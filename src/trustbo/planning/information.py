@@ -7,7 +7,7 @@ import numpy as np
 from trustbo.data import Cell
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import CoupledParams, Params
-from trustbo.planning.dynamics import rate_noise_sd, roll_trust, transition
+from trustbo.planning.dynamics import roll_trust
 from trustbo.workspace.moves import along
 
 GAUSSIAN = FAMILIES["gaussian"]
@@ -66,7 +66,7 @@ def rate_noise(
 
 def trust_covariance(params: Params, n_bounds: int, n_robots: int) -> np.ndarray:
     """Covariance of trust before and after each bound given one draw, step by step and robots."""
-    B0 = transition(params, n_robots)
+    B0 = params.transition(n_robots)
     if isinstance(params, CoupledParams):
         Q = np.asarray(params.Delta_w)
     else:
@@ -94,5 +94,5 @@ def _levels(params: Params, trust: np.ndarray, lag: float) -> np.ndarray:
 
 def _noise_sd(params: Params) -> np.ndarray:
     """Standard deviation of the rates' noise, over (..., bound, robot)."""
-    sd = rate_noise_sd(params)
-    return sd[..., None, :] if params.n_robots else sd[..., None, None]
+    sd = np.asarray(params.delta_v, dtype=float)
+    return sd[..., None, :] if params.BY_ROBOT else sd[..., None, None]

@@ -20,7 +20,7 @@ from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.models.model import TrustModel
 from trustbo.models.params import CoupledParams, Params
-from trustbo.planning.dynamics import drift, roll_trust, transition
+from trustbo.planning.dynamics import drift, roll_trust
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.workspace.moves import MOVES, along, move_indices, moves_along
 
@@ -50,7 +50,7 @@ class ModelContact:
         self._p_fail = p_fail
         self._counts = model.family.needs_ticks
         self._awareness, self._params, n_robots = awareness, params, len(awareness)
-        self._transition = transition(params, n_robots)
+        self._transition = params.transition(n_robots)
         if isinstance(params, CoupledParams):
             process, observed = np.asarray(params.Delta_w), np.diagonal(params.Delta_v)
         else:
