@@ -14,7 +14,7 @@ from trustbo.planning.problem import PlanningProblem
 from trustbo.planning.search.case import Case
 from trustbo.planning.search.compiled import plan_compiled
 from trustbo.planning.search.reachable_trust import best_trust
-from trustbo.planning.values import team_trust
+from trustbo.planning.values import path_trust
 
 
 def trust_map(
@@ -84,8 +84,9 @@ def _trust_at(
     """Largest trust at one cell, by planning a path to it: vector trust has no scalar recursion."""
     if cell == admissible.start:
         return (dynamics.start @ dynamics.views.T).min(-1)
-    best = plan_compiled(Case(admissible.to(cell, extra), dynamics, Objective("terminal")))
+    objective = Objective("terminal")
+    best = plan_compiled(Case(admissible.to(cell, extra), dynamics, objective))
     assert best is not None  # as there is no risk  # noqa: S101
     paths = [admissible.cells(flat) for flat in best.paths]
     along = [dynamics.take(d).along(path) for d, path in enumerate(paths)]
-    return np.array([team_trust(one)[-1] for one in along])
+    return np.array([path_trust(one, objective, 0.0).trust[-1] for one in along])

@@ -30,7 +30,7 @@ def path_trust(
         cap: False to keep trust above 1 for `lost_contact`, see `Objective.capped`.
     """
     along = objective.capped(along) if cap else along
-    trust = team_trust(along)
+    trust = (roll(along) @ along.views.T).min(-1)
     steady_state = lost = np.full(trust.shape, np.nan)
     if objective.name == "stationary":
         steady_state = along.steady_state()[..., 0, 0, :]
@@ -38,11 +38,6 @@ def path_trust(
         before = (along.start @ along.views.T).min(-1)
         lost = objective.contact_lost(trust, before, along.noise_sd)
     return PathTrust(trust, steady_state, objective.length_weight * length, lost)
-
-
-def team_trust(along: Dynamics) -> np.ndarray:
-    """Expected trust of the team after each bound of a path, see `Dynamics.along`; (..., bound)."""
-    return (roll(along) @ along.views.T).min(-1)
 
 
 def path_length(admissible: AdmissiblePaths, path: Path) -> float:

@@ -11,7 +11,7 @@ from trustbo.data import Cell, Mission
 from trustbo.inference import params_of, place_maps
 from trustbo.planning.plan import QUANTILES
 from trustbo.planning.posterior import choose_draws
-from trustbo.planning.values import team_trust
+from trustbo.planning.values import path_trust
 from trustbo.plots.explorer import Layer, Scene, Step
 from trustbo.plots.places import BETTER_WORSE
 from trustbo.report.numbers import MINUS, counted
@@ -130,7 +130,8 @@ def _last_step(result: Result, bound_maps: _Moments) -> Step:
     """Recommended path, with the trust expected along it."""
     path, planner = result.path, result.planner
     params, chosen = choose_draws(params_of(result.posterior), None, 0)
-    expected = team_trust(planner.dynamics(params, draws=chosen).along(path))
+    along = planner.dynamics(params, draws=chosen).along(path)
+    expected = path_trust(along, planner.problem.objective, 0.0, cap=False).trust
     stops, posts = _planned(path, result.workspace)
     moves, rows, cols = bounds_along(path).T
     z = planner.mean_awareness[:, moves if planner.mean_awareness.shape[1] > 1 else 0, rows, cols]
