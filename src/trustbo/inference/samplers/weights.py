@@ -11,13 +11,13 @@ def smoothed_weights(raw: np.ndarray) -> tuple[np.ndarray, float, float]:
         Normalised log weights, k-hat, and the log mean of the raw weights (the evidence).
     """
     finite = np.isfinite(raw)
+    log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
+    if finite.all() and np.ptp(raw) < 1e-6:  # none is in a tail, and the fit of one fails
+        return raw - np.logaddexp.reduce(raw), -np.inf, log_evidence
     # Minus the log weights, points without density far below all others.
     smoothed, khat = array_stats.psislw(-np.where(finite, raw, raw[finite].min() - 100.0))
-    log_evidence = float(np.logaddexp.reduce(raw) - np.log(len(raw)))
     log_w = smoothed - np.logaddexp.reduce(smoothed)
-    # Of nearly equal weights none is in a tail, and the fit of one fails.
-    unknown = -np.inf if finite.all() and np.ptp(raw) < 1e-6 else np.inf
-    return log_w, float(np.nan_to_num(khat, nan=unknown)), log_evidence
+    return log_w, float(np.nan_to_num(khat, nan=np.inf)), log_evidence
 
 
 def systematic(weights: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
