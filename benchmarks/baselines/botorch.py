@@ -1,80 +1,66 @@
-"""BoTorch on paths, without bounds or trust.
+"""BoTorch on paths, without bounds or trust: log expected improvement, or Thompson sampling.
 
-A Gaussian process over path-averaged features predicts the contact lost on a path; the next path
-has the largest log expected improvement among 500 candidates, as many as are good and diverse.
+It knows the sums of every feature along a path, line of sight among them, and the value of each
+path driven; not which bound was good. Its advocates would run it as here: `SingleTaskGP` with its
+defaults, of the value less what line of sight predicts, and 200 candidates that are each the best
+under jittered line of sight, the first without jitter. So the path before any mission is that of
+line of sight, and the process learns how line of sight errs with the features. The next path has
+the largest log expected improvement (`expected_improvement`) or is the best under one joint draw
+(`thompson`); the recommended path has the largest posterior mean. SECONDS a mission.
 """
 
 import warnings
 from typing import Any
 
 import numpy as np
-from jax import Array
 
 from trustbo.campaign.campaign import Campaign
-from trustbo.data import Cell, Mission
-from trustbo.models.params import Params
-from trustbo.planning import Plan, Planner
-from trustbo.planning.path_sampling import path_sampler
-from trustbo.workspace.moves import along, moves_along
+from trustbo.data import Mission
+from trustbo.planning import Planner
 
-_N_DRAWN, _N_CANDIDATES = 3000, 500
-_OVERLAP = 0.7
-"""Share of its bounds that a candidate may have in common with another, as long as there are
-enough."""
+from .paths import Path, PathPolicy, candidates, features, measured, predicted
+
+_ACQUISITIONS = "EI", "Thompson"
 
 
-class PathBandit:
-    """Policy by BoTorch; it learns from the missions, and recommends by the mean of its process."""
+class PathProcess(PathPolicy):
+    """Policy by BoTorch's Gaussian process over paths, with one of two acquisitions."""
 
-    __name__ = "BoTorch"
-
-    def __init__(self) -> None:
+    def __init__(self, acquisition: str) -> None:
         """Begin without missions; ImportError: BoTorch is not installed."""
         import botorch  # noqa: F401
 
-        self._paths: list[tuple[Cell, ...]] = []
-        self._features = np.empty((0, 0))
-        self._inputs: list[np.ndarray] = []
-        self._values: list[float] = []
-
-    def __call__(self, key: Array, posterior: Params, planner: Planner) -> Plan:
-        """Choose the path of largest expected improvement."""
-        self._prepare(planner)
-        return planner.evaluate(self._paths[self._best(improve=True)], posterior.mean())
+        self._acquisition = acquisition
+        self._missions: list[tuple[Path, float]] = []
 
     def learn(self, campaign: Campaign, mission: Mission) -> None:
-        """Learn from a mission: contact lost, bounds that were not driven being like the others."""
-        rates = np.nanmean(mission.contact_rate)
-        if np.isfinite(rates):
-            self._inputs.append(_features(campaign.planner, mission.path))
-            self._values.append(-(len(mission.path) - 1) * (1.0 - float(rates)))
+        """Add the value of a mission."""
+        value = measured(campaign.planner, mission)
+        if value is not None:
+            self._missions.append((mission.path, value))
 
-    def recommend(self, campaign: Campaign) -> tuple[Cell, ...]:
-        """Path with the largest predicted mean."""
-        self._prepare(campaign.planner)
-        return self._paths[self._best(improve=False)]
+    def choose(self, planner: Planner, rng: np.random.Generator) -> Path:
+        """Path of the largest acquisition."""
+        return self._best(planner, self._acquisition, int(rng.integers(2**31)))
 
-    def _prepare(self, planner: Planner) -> None:
-        if self._paths:
-            return
-        sampler, rng = path_sampler(planner.paths), np.random.default_rng(0)
-        drawn = list(dict.fromkeys(sampler.draw(rng) for _ in range(_N_DRAWN)))
-        features = np.stack([_features(planner, path) for path in drawn])
-        # Before any mission: fewer bounds, and more of every feature.
-        order = np.argsort(-features.sum(1), kind="stable")
-        bounds = [_bounds(path) for path in drawn]
-        chosen: list[int] = []
-        for i in order:
-            others = (len(bounds[i] & bounds[j]) / len(bounds[i]) for j in chosen)
-            if len(chosen) < _N_CANDIDATES and max(others, default=0.0) <= _OVERLAP:
-                chosen.append(int(i))
-        rest = [int(i) for i in order if i not in set(chosen)]
-        chosen += rest[: _N_CANDIDATES - len(chosen)]
-        self._paths, self._features = [drawn[i] for i in chosen], features[chosen]
+    def best(self, planner: Planner) -> Path:
+        """Path of the largest posterior mean."""
+        return self._best(planner, "mean", 0)
 
-    def _best(self, *, improve: bool) -> int:
-        if len(self._values) < 2:
-            return 0 if not self._values or not improve else len(self._paths) // 2
+    def _best(self, planner: Planner, acquisition: str, seed: int) -> Path:
+        paths = candidates(planner)
+        if not self._missions:
+            return paths[0]
+        import torch
+
+        with warnings.catch_warnings(), torch.random.fork_rng():
+            warnings.simplefilter("ignore")
+            torch.manual_seed(seed)
+            score = self._score(planner, paths, acquisition)
+        return paths[int(score.argmax())]
+
+    def _score(self, planner: Planner, paths: list[Path], acquisition: str) -> Any:
+        """Acquisition of every candidate, by BoTorch."""
         import torch
         from botorch.acquisition import LogExpectedImprovement
         from botorch.fit import fit_gpytorch_mll
@@ -82,31 +68,36 @@ class PathBandit:
         from botorch.models.transforms import Normalize, Standardize
         from gpytorch.mlls import ExactMarginalLogLikelihood
 
-        x = torch.tensor(np.stack(self._inputs), dtype=torch.float64)
-        y = torch.tensor(self._values, dtype=torch.float64)[:, None]
-        n = x.shape[1]
-        transforms: dict[str, Any] = {
-            "input_transform": Normalize(n), "outcome_transform": Standardize(1),
-        }  # fmt: skip
-        with warnings.catch_warnings(), torch.random.fork_rng():
-            warnings.simplefilter("ignore")
-            torch.manual_seed(0)
-            process = SingleTaskGP(x, y, **transforms)
-            fit_gpytorch_mll(ExactMarginalLogLikelihood(process.likelihood, process))
-            at = torch.tensor(self._features, dtype=torch.float64)[:, None]
-            with torch.no_grad():
-                if improve:
-                    score = LogExpectedImprovement(process, best_f=y.max())(at)
-                else:
-                    score = process.posterior(at[:, 0]).mean[:, 0]
-        return int(score.argmax())
+        def tensor(values: Any) -> torch.Tensor:
+            return torch.tensor(np.asarray(values), dtype=torch.float64)
+
+        driven, values = zip(*self._missions, strict=True)
+        x, new = tensor(features(planner, driven)), tensor(features(planner, paths))
+        prior, prior_new = (
+            tensor([predicted(planner, p) for p in some]) for some in (driven, paths)
+        )
+        y = tensor(values)
+        both = torch.cat([x, new])
+        limits = torch.stack([both.amin(0), both.amax(0) + 1e-9])
+        process = SingleTaskGP(
+            x, (y - prior)[:, None], input_transform=Normalize(x.shape[1], bounds=limits),
+            outcome_transform=Standardize(1),
+        )  # fmt: skip
+        fit_gpytorch_mll(ExactMarginalLogLikelihood(process.likelihood, process))
+        with torch.no_grad():
+            if acquisition == "EI":  # of the value: the rest has to exceed the best less the prior
+                best = (y.max() - prior_new)[:, None]
+                return LogExpectedImprovement(process, best_f=best)(new[:, None])
+            posterior = process.posterior(new)
+            rest = posterior.rsample()[0] if acquisition == "Thompson" else posterior.mean
+            return prior_new + rest[:, 0]
 
 
-def _features(planner: Planner, path: tuple[Cell, ...]) -> np.ndarray:
-    """Mean awareness along a path, and minus its length relative to the shortest."""
-    z = along(planner.mean_awareness, path).mean((0, 1))
-    return np.append(z, -(len(path) - 1) / planner.shortest)
+def expected_improvement() -> PathProcess:
+    """Policy of the largest log expected improvement."""
+    return PathProcess("EI")
 
 
-def _bounds(path: tuple[Cell, ...]) -> set[tuple[int, Cell]]:
-    return set(zip(moves_along(path).tolist(), path[1:], strict=True))
+def thompson() -> PathProcess:
+    """Policy of the best path under one draw of the process."""
+    return PathProcess("Thompson")

@@ -344,9 +344,9 @@ if find_spec("botorch"):  # a peer, which only `make bench` installs
     def test_botorch_learns_and_recommends(tiny, tmp_path, monkeypatch):
         monkeypatch.chdir(Path(__file__).parents[2])
         monkeypatch.setattr("sys.path", list(sys.path))
-        baselines = ["benchmarks.baselines.botorch:PathBandit"]
+        baselines = ["benchmarks.baselines.botorch:expected_improvement"]
         results = run(tmp_path, policies="greedy", baselines=baselines, n_iterations=3)
-        row = results.sel(run=results["method"] == "PathBandit")
+        row = results.sel(run=results["method"] == "expected_improvement")
         assert np.isfinite(row["regret"]).all()
 
 

@@ -1,5 +1,6 @@
 """Methods that are compared: a model and a policy, or a baseline, ours or the user's."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -48,7 +49,8 @@ class Case:
         sampler: Sampler of the posterior.
         options: Options of the campaign, and `stop`.
         bounds: False for awareness of cells alone, as in the paper.
-        factory: Whether `policy` makes the policy of each campaign, which learns by itself.
+        factory: Whether `policy` makes the policy of each campaign, which learns by itself. It has
+            no arguments, or gets the scene's truth as one of the name `truth`.
     """
 
     labels: Mapping[str, Any]
@@ -73,7 +75,7 @@ class Case:
             TrustboError: Impossible settings.
         """
         policy = resolved("policy", self.policy, POLICIES)
-        policy = policy() if self.factory else policy
+        policy = _made(policy, callbacks) if self.factory else policy
         learn = getattr(policy, "learn", None)  # of one that learns by itself
         options = {name: value for name, value in self.options.items() if name != "stop"}
         return Campaign(
@@ -98,6 +100,14 @@ class Case:
             "options": dict(self.options),
             "bounds": self.bounds,
         }
+
+
+def _made(factory: Callable[..., Any], callbacks: Sequence[Any]) -> Any:
+    """Policy of a factory; the truth, where it takes one, is the one that a callback judges by."""
+    if "truth" not in inspect.signature(factory).parameters:
+        return factory()
+    truths = (callback.truth for callback in callbacks if hasattr(callback, "truth"))
+    return factory(truth=next(truths, None))
 
 
 class Unlearned:
@@ -133,54 +143,73 @@ def _random_shortest(key: Array, posterior: Params, planner: Planner) -> Plan:
     return planner.evaluate(path, posterior.mean())
 
 
-BASELINES = ("random", "shortest", "paper")
-"""Baselines: a random path, a random one of the shortest, and the paper's method."""
+BASELINES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "random": ("random path", {"policy": random_path, "factory": True}),
+    "shortest": ("shortest path", {"policy": shortest_path, "factory": True}),
+    "paper": ("paper", {
+        "policy": "greedy", "objective": "terminal", "bounds": False,
+        "options": {"initial": "prior_draw", "max_bounds": "shortest+2"},
+    }),
+}  # fmt: skip
+"""Baselines by name: a random path, a random one of the shortest, and the paper's method. Each is a
+name of its row, and settings of its `Case`."""
+_SETTINGS = ("model", "policy", "objective", "options", "bounds", "factory")
+"""Settings of a method, those of a `Case`."""
 
 
 def cases_of(
     models: Any,
     policies: Any,
     baselines: Sequence[str],
-    methods: Mapping[str, Callable[[], Any]],
+    methods: Mapping[str, Any],
     objective: str,
     max_bounds: int | str,
     sampler: str,
 ) -> dict[str, Case]:
-    """Every model with every policy, baselines, and further methods, by name.
+    """Methods by the names of their rows: every model with every policy, baselines, and others.
+
+    Each of `methods` has settings of a `Case`, by default those of the pooled model, or is the
+    factory of a policy.
 
     Raises:
         TrustboError: An unknown name, or two methods of one name.
     """
-    kinds = {name: model_from(given) for name, given in _by_name("models", models).items()}
-    named = _by_name("policies", policies)
-    for policy in named.values():
-        if not callable(resolved("policy", policy, POLICIES)):
-            raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
-    rows: dict[str, dict[str, Any]] = {
-        name if len(kinds) == 1 else f"{label} {name}": {"model": model, "policy": policy}
-        for label, model in kinds.items()
-        for name, policy in named.items()
-    }
-    paper = {"objective": "terminal", "bounds": False, "policy": "greedy"}
-    paper["options"] = {"initial": "prior_draw", "max_bounds": "shortest+2"}
-    ours = {
-        "random": {"random path": {"policy": random_path, "factory": True}},
-        "shortest": {"shortest path": {"policy": shortest_path, "factory": True}},
-        "paper": {"paper": paper},
-    }
+    rows = _of_models(models, policies)
     for name in baselines:
         if ":" in name:
             rows[_name(name)] = {"policy": name, "factory": True}
         else:
-            rows |= ours[require_choice(f"baseline {IMPORTED}", name, BASELINES)]
-    rows |= {name: {"policy": make, "factory": True} for name, make in methods.items()}
-    usual = {"model": MODELS["pooled"], "objective": objective}
+            row, settings = BASELINES[require_choice(f"baseline {IMPORTED}", name, BASELINES)]
+            rows[row] = settings
+    for name, given in methods.items():
+        rows[name] = given if isinstance(given, Mapping) else {"policy": given, "factory": True}
+    usual: dict[str, Any] = {"model": "pooled", "objective": objective}
     usual["options"] = {"max_bounds": max_bounds}
+    cases = {}
+    for name, row in rows.items():
+        for setting in row:
+            require_choice(f"setting of method {name!r}", setting, _SETTINGS)
+        settings = usual | row | {"options": usual["options"] | row.get("options", {})}
+        model = model_from(settings.pop("model"))
+        settings["sampler"] = _able(model, sampler)
+        cases[name] = Case({"method": name, "policy": name}, model, **settings)
+        _require_policy(cases[name].policy)
+    return cases
+
+
+def _of_models(models: Any, policies: Any) -> dict[str, Mapping[str, Any]]:
+    """Settings of every model with every policy, by name; the model's is left out if it is one."""
+    kinds = {name: model_from(given) for name, given in _by_name("models", models).items()}
     return {
-        name: Case({"method": name, "policy": name}, **usual | row,
-                   sampler=_able(row.get("model", usual["model"]), sampler))
-        for name, row in rows.items()
-    }  # fmt: skip
+        name if len(kinds) == 1 else f"{label} {name}": {"model": model, "policy": policy}
+        for label, model in kinds.items()
+        for name, policy in _by_name("policies", policies).items()
+    }
+
+
+def _require_policy(policy: Any) -> None:
+    if not callable(resolved("policy", policy, POLICIES)):
+        raise TrustboError(f"policy must be a name or a callable; got {policy!r}.")
 
 
 def model_of(given: Model) -> TrustModel:
@@ -191,7 +220,7 @@ def model_of(given: Model) -> TrustModel:
 
 
 def model_from(given: Any) -> Model:
-    """Model from a short name, a `"module:name"` of one or of a factory, or the model itself."""
+    """Model from a short name, a `"module:name"` of one or of a factory, settings, or the model."""
     if isinstance(given, str) and ":" not in given:
         return MODELS[require_choice("model", given, MODELS)]
     model: Any = imported("model", given) if isinstance(given, str) else given

@@ -1,13 +1,13 @@
 """Results of runs as one Dataset, and tables of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from trustbo.errors import require_choice
+from trustbo.errors import TrustboError, require_choice
 
 _TEXT = ("status", "state", "reason")
 _PATHS = ("path", "recommended")
@@ -16,8 +16,8 @@ BEFORE = ("regret_before", "lost_before", "p_arrive_before")
 _NOT_AXES = ("key", "seed")
 SHOWN = (0, 1, 3, 8, 15)
 """Numbers of missions after which regret is shown."""
-FAR = 5.0
-"""Regret in % beyond which a campaign is still far off."""
+FAR, NEAR = 5.0, 1.0
+"""Regret in % beyond which a campaign is far off, and within which it is near."""
 
 
 def to_dataset(
@@ -120,12 +120,15 @@ def worlds_table(dataset: xr.Dataset, by: str | Sequence[str] = "method") -> pd.
     Returns:
         Table with columns of two levels, the quantity and `value`, `low` and `high`: the median
         `regret after n` missions in %, the median `lost after n` in bounds more than on the best
-        path, `lost while learning` (the mean of that over the missions driven), the share of
-        missions that `arrive`, and of campaigns still `far` off, by more than 5 %, in the end.
+        path, both in the world of the next mission; means over campaigns of `regret now` (mean over
+        all missions, likewise), `lost while learning` (the same for paths driven, in bounds and in
+        the world they were driven in), `missions to 1 %` (after which the recommended path stays
+        within 1 %; one more than were driven if it does not), the share of missions that `arrive`,
+        and of campaigns still `far` off, by more than 5 %, in the end, and processor `seconds` of a
+        mission.
     """
     by = _of_run(dataset, by)
-    numbers = _numbers(dataset)
-    pairs = dataset["world"].values + "/" + dataset["course"].values
+    numbers, pairs = _numbers(dataset), _pairs(dataset)
     keys = list(zip(*(dataset[name].values for name in by), strict=True))
     rows = {}
     for key in dict.fromkeys(keys):
@@ -133,30 +136,119 @@ def worlds_table(dataset: xr.Dataset, by: str | Sequence[str] = "method") -> pd.
         rows[key if len(by) > 1 else key[0]] = _summary(
             {name: values[mine] for name, values in numbers.items()}, pairs[mine]
         )
+    return _table(rows, " and ".join(by))
+
+
+def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) -> pd.DataFrame:
+    """Compare a method with each other one on the same world, course and seed.
+
+    Args:
+        dataset: Results of `run_worlds`, or `load_study`.
+        ours: Method that others are subtracted from the results of.
+        by: Coordinates of the rows, in addition to the other method: `kind`, `world`, `course`.
+
+    Returns:
+        Table as of `worlds_table`: mean over campaigns of `regret after n`, `regret now`,
+        `lost while learning`, `missions to 1 %`, `arrive` and `seconds` of `ours` less those of
+        the other, with 95 % intervals of a bootstrap over pairs of world and course; and their
+        number, `pairs`. Less is better, but for `arrive`.
+
+    Raises:
+        TrustboError: An unknown method or coordinate, or no other method on the same worlds.
+    """
+    methods = list(dict.fromkeys(dataset["method"].values.tolist()))
+    require_choice("method", ours, methods)
+    by = _of_run(dataset, by) if by else []
+    numbers, pairs = _numbers(dataset), _pairs(dataset)
+    compared = [name for name in numbers if not name.startswith(("lost after", "far"))]
+    names = ["world", "course", "seed"]
+    cases = list(zip(*(dataset[name].values.tolist() for name in names), strict=True))
+    method = dataset["method"].values
+    reference = {cases[i]: i for i in np.flatnonzero(method == ours)}
+    rows: dict[tuple[Any, ...], list[tuple[int, int]]] = {}
+    for i, case in enumerate(cases):
+        if method[i] != ours and case in reference:
+            key = *(dataset[name].values[i] for name in by), method[i]
+            rows.setdefault(key, []).append((reference[case], i))
+    if not rows:
+        raise TrustboError(f"no other method was run on the worlds of {ours!r}.")
+    table = {}
+    for key, matched in sorted(rows.items(), key=lambda row: row[0][:-1]):
+        one, other = np.array(matched).T
+        less = {name: numbers[name][one] - numbers[name][other] for name in compared}
+        n_pairs = float(len(np.unique(pairs[one])))
+        table[key if by else key[0]] = {("pairs", "value"): n_pairs} | _summary(
+            less, pairs[one], middle=np.nanmean
+        )
+    return _table(table, " and ".join([*by, f"{ours} less"]))
+
+
+def worse_than(table: pd.DataFrame) -> list[str]:
+    """Rows and quantities of `differences` in which ours is worse for sure: as lines of text.
+
+    Those whose interval is above 0, or below it for `arrive`.
+    """
+    lines = []
+    for name in dict.fromkeys(str(name) for name, _ in table.columns):
+        if name == "pairs":
+            continue
+        limits = table[name]
+        worse = limits["high"] < 0.0 if name == "arrive" else limits["low"] > 0.0
+        rows = [_label(key) for key in table.index[worse]]
+        if rows:
+            lines.append(f"worse in {name} than: {'; '.join(rows)}")
+    return lines or ["worse than: none"]
+
+
+def _table(rows: Mapping[Any, Mapping[tuple[str, str], float]], index: str) -> pd.DataFrame:
     table = pd.DataFrame.from_dict(rows, orient="index")
     table.columns = pd.MultiIndex.from_tuples(table.columns)
-    table.index.name = " and ".join(by)
+    table.index.name = index
     return table
+
+
+def _pairs(dataset: xr.Dataset) -> np.ndarray:
+    """Pair of world and course of each run."""
+    return dataset["world"].values + "/" + dataset["course"].values
 
 
 def _numbers(dataset: xr.Dataset) -> dict[str, np.ndarray]:
     """Numbers of each run, shape (run,)."""
     n_missions = dataset.sizes["mission"]
-    best = dataset["oracle"].values
+    oracle, driven = dataset["oracle"].values, np.isfinite(dataset["lost_followed"].values)
+    # Least contact lost in the world of each mission; results of version 0.2 have one world.
+    best, best_followed = (
+        dataset[name].values if name in dataset else np.repeat(oracle[:, None], n_missions, 1)
+        for name in ("best", "best_followed")
+    )
     regret = np.concatenate([dataset["regret_before"].values[:, None], dataset["regret"]], axis=1)
     lost = np.concatenate([dataset["lost_before"].values[:, None], dataset["lost"]], axis=1)
+    lost -= np.concatenate([oracle[:, None], best], axis=1)
     after = [n for n in SHOWN if n <= n_missions]
     numbers = {f"regret after {n}": regret[:, n] for n in after}
-    numbers |= {f"lost after {n}": lost[:, n] - best for n in after}
-    driven = dataset["lost_followed"].values - best[:, None]
-    numbers["lost while learning"] = np.nanmean(driven, axis=1)
+    numbers |= {f"lost after {n}": lost[:, n] for n in after}
+    numbers["regret now"] = np.nanmean(regret, axis=1)
+    numbers["lost while learning"] = np.nanmean(dataset["lost_followed"] - best_followed, axis=1)
+    numbers[f"missions to {NEAR:g} %"] = _until_near(regret)
     ran = dataset["status"].values != ""
-    arrived = (dataset["status"].values == "ok").sum(1) / ran.sum(1)
-    return numbers | {"arrive": arrived, "far": np.where(regret[:, -1] > FAR, 1.0, 0.0)}
+    numbers["arrive"] = (dataset["status"].values == "ok").sum(1) / ran.sum(1)
+    numbers["far"] = np.where(regret[:, -1] > FAR, 1.0, 0.0)
+    return numbers | {"seconds": dataset["seconds_cpu"].values / driven.sum(1)}
 
 
-def _summary(numbers: Mapping[str, np.ndarray], pairs: np.ndarray) -> dict[tuple[str, str], float]:
-    """Value and interval of each quantity."""
+def _until_near(regret: np.ndarray) -> np.ndarray:
+    """Missions after which regret, (run, mission), stays near; one more than all if it does not."""
+    away = ~(regret <= NEAR)
+    last = regret.shape[1] - np.argmax(away[:, ::-1], axis=1)
+    return np.where(away.any(1), last, 0).astype(float)
+
+
+def _summary(
+    numbers: Mapping[str, np.ndarray],
+    pairs: np.ndarray,
+    middle: Callable[[np.ndarray], Any] | None = None,
+) -> dict[tuple[str, str], float]:
+    """Value and interval of each quantity, by default a median of those after n missions."""
     rng, (names, index) = np.random.default_rng(0), np.unique(pairs, return_inverse=True)
     members = [np.flatnonzero(index == i) for i in range(len(names))]
     drawn = [
@@ -165,26 +257,31 @@ def _summary(numbers: Mapping[str, np.ndarray], pairs: np.ndarray) -> dict[tuple
     ]
     row = {}
     for name, values in numbers.items():
-        shares = name in ("arrive", "far", "lost while learning")
-        middle = np.nanmean if shares else np.nanmedian
-        low, high = np.quantile([middle(values[chosen]) for chosen in drawn], [0.025, 0.975])
-        row |= {(name, "value"): float(middle(values)), (name, "low"): low, (name, "high"): high}
+        usual = middle or (np.nanmedian if " after " in name else np.nanmean)
+        low, high = np.quantile([usual(values[chosen]) for chosen in drawn], [0.025, 0.975])
+        row |= {(name, "value"): float(usual(values)), (name, "low"): low, (name, "high"): high}
     return row
 
 
 def as_text(table: pd.DataFrame) -> str:
-    """Table of `worlds_table` in Markdown, each value with its interval."""
+    """Table of `worlds_table` or `differences` in Markdown, each value with its interval."""
     names = list(dict.fromkeys(name for name, _ in table.columns))
     head = [str(table.index.name), *(f"{name} (%)" if "regret" in name else name for name in names)]
     lines = [" | ".join(head), " | ".join("---" for _ in head)]
     for key, row in table.iterrows():
-        label = ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)
         cells = []
         for name in names:
-            places = 1 if "regret" in name else 2
+            if name == "pairs":
+                cells.append(f"{row[name, 'value']:.0f}")
+                continue
+            places = 1 if "regret" in name or "missions" in name else 2
             value, low, high = (
                 f"{row[name, what]:.{places}f}" for what in ("value", "low", "high")
             )
             cells.append(f"{value} [{low}, {high}]")
-        lines.append(" | ".join([label, *cells]))
+        lines.append(" | ".join([_label(key), *cells]))
     return "\n".join(f"| {line} |" for line in lines)
+
+
+def _label(key: Any) -> str:
+    return ", ".join(map(str, key)) if isinstance(key, tuple) else str(key)

@@ -1,0 +1,157 @@
+"""Shared by the baselines: line of sight of bounds, best paths on a table of rates, candidates.
+
+Rates of bounds are tables (..., move, row, col) of the eight `MOVES`: the expected contact rate of
+the bound that enters a cell by a move, mean over robots; NaN where there is no bound.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jax import Array
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.data import LINE_OF_SIGHT, Cell, Mission
+from trustbo.models.params import Params
+from trustbo.planning import Plan, Planner
+from trustbo.planning.policies import seed_of
+from trustbo.planning.search.layers import Weights, best_additive
+from trustbo.workspace.moves import along, bounds_along, move_indices
+
+Path = tuple[Cell, ...]
+N_CANDIDATES = 200
+_JITTER = 0.3, 0.15
+"""Largest sd of the jitter of line of sight, multiplied by it and added to it."""
+_MOST_DRAWS = 10
+"""Draws for each candidate after which there are no more."""
+
+
+class PathPolicy:
+    """Policy that chooses paths by numbers of its own, not by the posterior.
+
+    A baseline has the methods `choose(planner, rng)`, the path of the next mission, and
+    `best(planner)`, the path that it recommends; and `learn`, which does nothing here.
+    """
+
+    def __call__(self, key: Array, posterior: Params, planner: Planner) -> Plan:
+        """Plan the next mission."""
+        path = self.choose(planner, np.random.default_rng(seed_of(key)))
+        return planner.evaluate(path, posterior.mean())
+
+    def recommend(self, campaign: Campaign) -> Path:
+        """Path that is recommended now."""
+        return self.best(campaign.planner_now())
+
+    def learn(self, campaign: Campaign, mission: Mission) -> None:
+        """Learn from a mission."""
+
+    def choose(self, planner: Planner, rng: np.random.Generator) -> Path:
+        """Path of the next mission, by default the recommended one."""
+        return self.best(planner)
+
+    def best(self, planner: Planner) -> Path:
+        """Path that is recommended."""
+        raise NotImplementedError
+
+
+def line_of_sight(planner: Planner) -> np.ndarray:
+    """Predicted rates of all bounds, mean over robots and assumed sights, (move, row, col)."""
+    names = planner.workspace.features
+    columns = [k for k, name in enumerate(names) if name.startswith(LINE_OF_SIGHT)]
+    rates = planner.mean_awareness[..., columns].mean((0, -1))
+    return np.broadcast_to(rates, (8, *rates.shape[1:]))
+
+
+def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
+    """Best admissible path under each table of rates, (draw, move, row, col), exactly.
+
+    Most contact less the number of bounds; or for the objective `mean`, the largest mean.
+    """
+    paths, n_draws = planner.paths, len(rates)
+    lengths = np.arange(paths.shortest, paths.longest + 1)
+    n_bounds = np.arange(paths.longest + 1.0)
+    is_mean = planner.objective == "mean"
+    weights = Weights(
+        np.ones((n_draws, paths.longest + 1, 1)),
+        np.tile(0.0 * n_bounds if is_mean else -n_bounds, (n_draws, 1)),
+        np.maximum(1.0, n_bounds) if is_mean else np.ones(len(n_bounds)),
+    )
+    gains = np.nan_to_num(rates[:, move_indices(paths.connectivity)])
+    gains = gains.reshape(n_draws, 1, gains.shape[1], -1)
+    no_cost = np.zeros(len(paths.steps))
+    _, found = best_additive(paths.layers, gains, weights, no_cost, lengths)
+    return [paths.cells(flat) for flat in found]
+
+
+def value(planner: Planner, rates: Sequence[float] | np.ndarray) -> float:
+    """Value of a path with these rates of its bounds: what `best_paths` makes large."""
+    rates = np.asarray(rates)
+    return float(rates.mean() if planner.objective == "mean" else rates.sum() - len(rates))
+
+
+def predicted(planner: Planner, path: Path) -> float:
+    """Value of a path by line of sight alone."""
+    return value(planner, line_of_sight(planner)[tuple(bounds_along(path).T)])
+
+
+def measured(planner: Planner, mission: Mission) -> float | None:
+    """Value of a mission; None where no rate was measured.
+
+    Bounds that were not driven, or failed, kept no contact; a rate that is missing is the mean.
+    """
+    rates = [rate for _, rate in rates_of(mission)]
+    if not rates:
+        return None
+    n = len(mission.path) - 1
+    driven = len(mission.bounds)
+    return value(
+        planner, [*rates, *[np.mean(rates)] * (driven - len(rates)), *[0.0] * (n - driven)]
+    )
+
+
+def rates_of(mission: Mission) -> list[tuple[tuple[int, int, int], float]]:
+    """Measured bounds of a mission, (move, row, col), each with its rate, mean over robots.
+
+    A bound that failed kept no contact.
+    """
+    bounds = bounds_along(mission.path).tolist()
+    rates = []
+    for where, bound in zip(bounds, mission.bounds, strict=False):
+        measured = np.isfinite(bound.contact_rate)
+        if bound.status != "ok":
+            rates.append((tuple(where), 0.0))
+        elif measured.any():
+            rates.append((tuple(where), float(bound.contact_rate[measured].mean())))
+    return rates
+
+
+def jittered(rates: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Tables of jittered rates, (draw, move, row, col): more and more of it, none in the first."""
+    factor, shift = (
+        most
+        * np.linspace(0.0, 1.0, n)[:, None, None, None]
+        * rng.standard_normal((n, *rates.shape))
+        for most in _JITTER
+    )
+    return np.clip(rates * (1.0 + factor) + shift, 0.0, 1.0)
+
+
+def candidates(planner: Planner, n: int = N_CANDIDATES, seed: int = 0) -> list[Path]:
+    """Draw n different admissible paths, each the best under jittered line of sight.
+
+    The first is the best by line of sight; there are fewer where the grid has not as many.
+    """
+    sight, rng = line_of_sight(planner), np.random.default_rng(seed)
+    paths: dict[Path, None] = {}
+    for _ in range(_MOST_DRAWS):
+        paths |= dict.fromkeys(best_paths(planner, jittered(sight, n, rng)))
+        if len(paths) >= n:
+            break
+    return list(paths)[:n]
+
+
+def features(planner: Planner, paths: Sequence[Path]) -> np.ndarray:
+    """Sums over bounds of each feature, mean over robots, and the number of bounds, (path, sum)."""
+    maps = planner.mean_awareness
+    return np.stack([
+        np.append(along(maps, path).mean(0).sum(0), len(path) - 1.0) for path in paths
+    ])  # fmt: skip

@@ -1,0 +1,91 @@
+"""Gaussian process over bounds of the error of line of sight, without a state space.
+
+It knows line of sight and the rates of the bounds that were driven, and that errors are alike where
+bounds are near and point the same way: the map is wrong in places. Its advocates would run it as
+geostatisticians do, as regression kriging: a squared exponential kernel over the middle and the
+direction of a bound, all hyperparameters at the maximum of the exact marginal likelihood after each
+mission; then the best path under the upper 90 % quantiles of all bounds. Trust, in it, has no
+memory. SECONDS a mission.
+"""
+
+import warnings
+
+import numpy as np
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from trustbo.campaign.campaign import Campaign
+from trustbo.data import Mission
+from trustbo.planning import Planner
+from trustbo.workspace.moves import MOVES
+
+from .paths import Path, PathPolicy, best_paths, line_of_sight, rates_of
+from .running_mean import UPPER
+
+_KERNEL = (
+    ConstantKernel(0.05**2, (1e-6, 1.0))
+    + ConstantKernel(0.1**2, (1e-5, 1.0)) * RBF([1.0, 1.0, 1.0, 1.0], (0.3, 30.0))
+    + WhiteKernel(0.05**2, (1e-5, 0.1))
+)
+"""Errors shared by all bounds, those of a place and direction (in cells), and of a visit."""
+_LEAST = 3
+"""Rates from which hyperparameters are estimated; before, they are those above."""
+
+
+class ResidualProcess(PathPolicy):
+    """Policy by a Gaussian process of the error of line of sight."""
+
+    __name__ = "residual process"
+
+    def __init__(self) -> None:
+        """Begin with line of sight."""
+        self.rates: list[tuple[tuple[int, int, int], float]] = []
+        self._fitted: tuple[int, GaussianProcessRegressor] | None = None
+
+    def learn(self, campaign: Campaign, mission: Mission) -> None:
+        """Add the rates of a mission."""
+        self.rates += rates_of(mission)
+
+    def choose(self, planner: Planner, rng: np.random.Generator) -> Path:
+        """Best path under upper quantiles."""
+        mean, sd = self.estimate(line_of_sight(planner))
+        return best_paths(planner, np.clip(mean + UPPER * sd, 0.0, 1.0)[None])[0]
+
+    def best(self, planner: Planner) -> Path:
+        """Best path under the mean of the process."""
+        mean, _ = self.estimate(line_of_sight(planner))
+        return best_paths(planner, np.clip(mean, 0.0, 1.0)[None])[0]
+
+    def estimate(self, sight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and sd of the rate of every bound, each (move, row, col), NaN without one."""
+        there = np.isfinite(sight)
+        mean, sd = np.full(sight.shape, np.nan), np.full(sight.shape, np.nan)
+        process = self.process(sight)
+        error, with_noise = process.predict(places(np.argwhere(there)), return_std=True)
+        noise = getattr(process, "kernel_", process.kernel).k2.noise_level
+        mean[there] = sight[there] + error
+        sd[there] = np.sqrt(np.maximum(0.0, with_noise**2 - noise))
+        return mean, sd
+
+    def process(self, sight: np.ndarray) -> GaussianProcessRegressor:
+        """Process given all missions; fitted once for each number of rates."""
+        n = len(self.rates)
+        if self._fitted is None or self._fitted[0] != n:
+            optimizer = "fmin_l_bfgs_b" if n >= _LEAST else None
+            process = GaussianProcessRegressor(
+                _KERNEL, optimizer=optimizer, n_restarts_optimizer=1, random_state=0
+            )
+            if n:
+                bounds = np.array([bound for bound, _ in self.rates])
+                errors = np.array([rate - sight[bound] for bound, rate in self.rates])
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of hyperparameters at their limits
+                    process.fit(places(bounds), errors)
+            self._fitted = n, process
+        return self._fitted[1]
+
+
+def places(bounds: np.ndarray) -> np.ndarray:
+    """Middle of bounds (bound, 3), in cells, and the sine and cosine of their direction."""
+    steps = np.array(MOVES[8])[bounds[:, 0]]
+    return np.hstack([bounds[:, 1:] - 0.5 * steps, steps / np.linalg.norm(steps, axis=1)[:, None]])
