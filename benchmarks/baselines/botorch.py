@@ -10,6 +10,7 @@ the largest log expected improvement (`expected_improvement`) or is the best und
 """
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,6 @@ from trustbo.data import Mission
 from trustbo.planning import Planner
 
 from .paths import Path, PathPolicy, candidates, features, measured, predicted
-
-_ACQUISITIONS = "EI", "Thompson"
 
 
 class PathProcess(PathPolicy):
@@ -32,6 +31,7 @@ class PathProcess(PathPolicy):
 
         self._acquisition = acquisition
         self._missions: list[tuple[Path, float]] = []
+        self._fitted: tuple[int, Any] | None = None
 
     def learn(self, campaign: Campaign, mission: Mission) -> None:
         """Add the value of a mission."""
@@ -63,34 +63,49 @@ class PathProcess(PathPolicy):
         """Acquisition of every candidate, by BoTorch."""
         import torch
         from botorch.acquisition import LogExpectedImprovement
+
+        new, prior = _tensor(features(planner, paths)), _tensor(_predicted(planner, paths))
+        process = self._process(planner, new)
+        with torch.no_grad():
+            if acquisition == "EI":  # of the value: the rest has to exceed the best less the prior
+                best = max(value for _, value in self._missions) - prior
+                return LogExpectedImprovement(process, best_f=best[:, None])(new[:, None])
+            posterior = process.posterior(new)
+            rest = posterior.rsample()[0] if acquisition == "Thompson" else posterior.mean
+            return prior + rest[:, 0]
+
+    def _process(self, planner: Planner, new: Any) -> Any:
+        """Process given all missions, fitted once after each."""
+        import torch
         from botorch.fit import fit_gpytorch_mll
         from botorch.models import SingleTaskGP
         from botorch.models.transforms import Normalize, Standardize
         from gpytorch.mlls import ExactMarginalLogLikelihood
 
-        def tensor(values: Any) -> torch.Tensor:
-            return torch.tensor(np.asarray(values), dtype=torch.float64)
+        n = len(self._missions)
+        if self._fitted is None or self._fitted[0] != n:
+            paths, values = zip(*self._missions, strict=True)
+            x, rest = _tensor(features(planner, paths)), np.array(values)
+            rest = _tensor(rest - _predicted(planner, paths))
+            both = torch.cat([x, new])
+            limits = torch.stack([both.amin(0), both.amax(0) + 1e-9])
+            process = SingleTaskGP(
+                x, rest[:, None], input_transform=Normalize(x.shape[1], bounds=limits),
+                outcome_transform=Standardize(1),
+            )  # fmt: skip
+            fit_gpytorch_mll(ExactMarginalLogLikelihood(process.likelihood, process))
+            self._fitted = n, process
+        return self._fitted[1]
 
-        driven, values = zip(*self._missions, strict=True)
-        x, new = tensor(features(planner, driven)), tensor(features(planner, paths))
-        prior, prior_new = (
-            tensor([predicted(planner, p) for p in some]) for some in (driven, paths)
-        )
-        y = tensor(values)
-        both = torch.cat([x, new])
-        limits = torch.stack([both.amin(0), both.amax(0) + 1e-9])
-        process = SingleTaskGP(
-            x, (y - prior)[:, None], input_transform=Normalize(x.shape[1], bounds=limits),
-            outcome_transform=Standardize(1),
-        )  # fmt: skip
-        fit_gpytorch_mll(ExactMarginalLogLikelihood(process.likelihood, process))
-        with torch.no_grad():
-            if acquisition == "EI":  # of the value: the rest has to exceed the best less the prior
-                best = (y.max() - prior_new)[:, None]
-                return LogExpectedImprovement(process, best_f=best)(new[:, None])
-            posterior = process.posterior(new)
-            rest = posterior.rsample()[0] if acquisition == "Thompson" else posterior.mean
-            return prior_new + rest[:, 0]
+
+def _predicted(planner: Planner, paths: Sequence[Path]) -> np.ndarray:
+    return np.array([predicted(planner, path) for path in paths])
+
+
+def _tensor(values: Any) -> Any:
+    import torch
+
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def expected_improvement() -> PathProcess:

@@ -189,7 +189,7 @@ def cases_of(
     for name, row in rows.items():
         for setting in row:
             require_choice(f"setting of method {name!r}", setting, _SETTINGS)
-        settings = usual | row | {"options": usual["options"] | row.get("options", {})}
+        settings = {**usual, **row, "options": {**usual["options"], **row.get("options", {})}}
         model = model_from(settings.pop("model"))
         settings["sampler"] = _able(model, sampler)
         cases[name] = Case({"method": name, "policy": name}, model, **settings)

@@ -164,7 +164,7 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
     names = ["world", "course", "seed"]
     cases = list(zip(*(dataset[name].values.tolist() for name in names), strict=True))
     method = dataset["method"].values
-    reference = {cases[i]: i for i in np.flatnonzero(method == ours)}
+    reference = {case: i for i, case in enumerate(cases) if method[i] == ours}
     rows: dict[tuple[Any, ...], list[tuple[int, int]]] = {}
     for i, case in enumerate(cases):
         if method[i] != ours and case in reference:
@@ -192,16 +192,15 @@ def worse_than(table: pd.DataFrame) -> list[str]:
     for name in dict.fromkeys(str(name) for name, _ in table.columns):
         if name == "pairs":
             continue
-        limits = table[name]
-        worse = limits["high"] < 0.0 if name == "arrive" else limits["low"] > 0.0
-        rows = [_label(key) for key in table.index[worse]]
+        worse = table[name, "high"] < 0.0 if name == "arrive" else table[name, "low"] > 0.0
+        rows = [_label(key) for key in table.index[worse.to_numpy()]]
         if rows:
             lines.append(f"worse in {name} than: {'; '.join(rows)}")
     return lines or ["worse than: none"]
 
 
 def _table(rows: Mapping[Any, Mapping[tuple[str, str], float]], index: str) -> pd.DataFrame:
-    table = pd.DataFrame.from_dict(rows, orient="index")
+    table = pd.DataFrame.from_dict(dict(rows), orient="index")
     table.columns = pd.MultiIndex.from_tuples(table.columns)
     table.index.name = index
     return table

@@ -1,0 +1,258 @@
+"""Baselines of the benchmark: each against enumeration, a hand formula or a closed form."""
+
+import dataclasses
+import itertools
+from importlib.util import find_spec
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from baselines import (
+    ax_default,
+    botorch,
+    line_of_sight,
+    oracle,
+    paths,
+    residual_process,
+    running_mean,
+    standard_design,
+)
+
+import trustbo as tb
+from trustbo.data import Bound, Mission
+from trustbo.errors import TrustboError
+from trustbo.planning import Planner
+from trustbo.simulation import Degradation, KinematicSimulator, Truth
+from trustbo.workspace.moves import MOVES, bounds_along
+
+START, GOAL = (3, 0), (0, 3)
+PEERS = [
+    pytest.param(make, marks=pytest.mark.skipif(not find_spec(package), reason=package))
+    for make, package in (
+        (botorch.expected_improvement, "botorch"),
+        (botorch.thompson, "botorch"),
+        (ax_default.AxDefault, "ax"),
+    )
+]
+LEARNERS = [
+    line_of_sight.LineOfSight,
+    running_mean.greedy,
+    running_mean.optimistic,
+    residual_process.ResidualProcess,
+    standard_design.StandardDesign,
+    *PEERS,
+]
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    terrain = tb.terrain.synthetic_terrain((80.0, 80.0), seed=3, relief=5.0)
+    return tb.Workspace.from_terrain(terrain, (4, 4))
+
+
+@pytest.fixture(scope="module", params=[8, 4])
+def planner(workspace, request):
+    return Planner(
+        workspace, START, GOAL, "lost_contact", connectivity=request.param, max_bounds="shortest+2"
+    )
+
+
+def every_path(planner):
+    """All walks without U-turns from start to goal, by depth first."""
+    steps, walks = MOVES[planner.connectivity], []
+    free = planner.workspace.passable_bounds.values
+
+    def extend(walk):
+        if walk[-1] == planner.goal:
+            walks.append(tuple(walk))
+        elif len(walk) <= planner.longest:
+            for step in steps:
+                cell = (walk[-1][0] + step[0], walk[-1][1] + step[1])
+                inside = all(0 <= i < n for i, n in zip(cell, free.shape[1:], strict=True))
+                if inside and cell not in walk[-2:-1] and free[(MOVES[8].index(step), *cell)]:
+                    extend([*walk, cell])
+
+    extend([planner.start])
+    return walks
+
+
+def mission_of(planner, path, rates, n_driven=None):
+    """Mission with these rates of its bounds, the same of all robots."""
+    n_robots, n_features = 3, len(planner.workspace.features)
+    bounds = tuple(
+        Bound(
+            cell, np.full((n_robots, n_features), 0.5), np.full(n_robots, rate), np.ones(n_robots)
+        )
+        for cell, rate in zip(path[1:], rates, strict=True)
+    )[:n_driven]
+    if n_driven is None:
+        return Mission(path, bounds)
+    bounds = (*bounds[:-1], dataclasses.replace(bounds[-1], status="stuck"))
+    return Mission(path, bounds, status="stuck")
+
+
+def rates_along(table, path):
+    return table[tuple(bounds_along(path).T)]
+
+
+@pytest.mark.parametrize("objective", ["lost_contact", "mean"])
+def test_candidates_are_admissible_and_the_best_under_their_jitter(planner, objective):
+    planner = Planner(
+        planner.workspace, START, GOAL, objective, connectivity=planner.connectivity,
+        max_bounds="shortest+2",
+    )  # fmt: skip
+    walks, rng = every_path(planner), np.random.default_rng(0)
+    tables = paths.jittered(paths.line_of_sight(planner), 40, rng)
+    chosen = paths.best_paths(planner, tables)
+    assert set(chosen) <= set(walks)
+    for table, path in zip(tables, chosen, strict=True):
+        values = [paths.value(planner, rates_along(table, walk)) for walk in walks]
+        assert paths.value(planner, rates_along(table, path)) == pytest.approx(max(values))
+    assert len(set(chosen)) > 5
+    np.testing.assert_array_equal(tables[0], np.clip(paths.line_of_sight(planner), 0.0, 1.0))
+
+
+def test_candidates_are_different_and_begin_with_the_best_by_line_of_sight(planner):
+    few = paths.candidates(planner, 20)
+    assert len(set(few)) == len(few) <= 20
+    walks = every_path(planner)
+    best = max(paths.predicted(planner, walk) for walk in walks)
+    assert paths.predicted(planner, few[0]) == pytest.approx(best)
+    assert few == paths.candidates(planner, 20)
+
+
+def test_line_of_sight_is_the_mean_over_robots_of_the_workspace_s_feature(planner):
+    feature = planner.workspace.bound_awareness.sel(feature="line_of_sight").values
+    table = paths.line_of_sight(planner)
+    there = np.isfinite(table)
+    np.testing.assert_allclose(table[there], feature.mean(0)[there])
+
+
+def test_features_of_a_path_are_sums_over_its_bounds(planner):
+    path = paths.candidates(planner, 1)[0]
+    maps = planner.workspace.bound_awareness.values
+    sums = np.zeros(maps.shape[-1])
+    for (r, c), (i, j) in itertools.pairwise(path):
+        sums += maps[:, MOVES[8].index((i - r, j - c)), i, j].mean(0)
+    np.testing.assert_allclose(paths.features(planner, [path])[0], [*sums, len(path) - 1])
+
+
+def test_the_value_of_a_mission_that_fails_is_without_the_bounds_that_it_did_not_drive(planner):
+    path = paths.candidates(planner, 1)[0]
+    n = len(path) - 1
+    assert paths.measured(planner, mission_of(planner, path, [0.75] * n)) == -0.25 * n
+    failed = mission_of(planner, path, [0.75] * n, n_driven=2)  # one kept, one failed
+    assert paths.measured(planner, failed) == 0.75 - n
+
+
+def test_the_running_mean_is_the_formula_by_hand(planner):
+    """Two bounds, one seen twice: moments and shrinkage written out."""
+    policy, sight = running_mean.greedy(), np.full((8, 4, 4), 0.5)
+    policy.rates |= {(0, 1, 1): [0.7, 0.6], (3, 2, 2): [0.4]}
+    mean, sd = policy.estimate(sight)
+    averages = np.array([0.15, -0.1])
+    mu = averages.sum() / 4
+    between = (((averages - mu) ** 2).sum() + 2 * 0.1**2) / 4
+    within = (0.05**2 + 0.05**2 + 2 * 0.03**2) / 3
+    shrunk = [(n * a / within + mu / between) / (n / within + 1 / between)
+              for n, a in zip((2, 1), averages, strict=True)]  # fmt: skip
+    assert mean[0, 1, 1] == pytest.approx(0.5 + shrunk[0])
+    assert mean[3, 2, 2] == pytest.approx(0.5 + shrunk[1])
+    assert mean[5, 0, 0] == pytest.approx(0.5 + mu)
+    assert sd[0, 1, 1] == pytest.approx((2 / within + 1 / between) ** -0.5)
+    assert sd[5, 0, 0] == pytest.approx(between**0.5)
+
+
+def test_the_residual_process_is_the_closed_form_under_its_hyperparameters(planner):
+    policy, sight = residual_process.ResidualProcess(), paths.line_of_sight(planner)
+    there = np.argwhere(np.isfinite(sight))
+    rng = np.random.default_rng(1)
+    seen = there[rng.permutation(len(there))[:12]]
+    errors = 0.1 * np.sin(seen[:, 1]) + 0.03 * rng.standard_normal(12)
+    policy.rates = [
+        (tuple(b), sight[tuple(b)] + e) for b, e in zip(seen.tolist(), errors, strict=True)
+    ]
+    mean, sd = policy.estimate(sight)
+    kernel = policy.process(sight).kernel_
+    shared, scale, lengths, noise = np.split(np.exp(kernel.theta), [1, 2, 6])
+
+    def covariance(a, b):
+        a, b = (residual_process.places(x) / lengths for x in (a, b))
+        square = ((a[:, None] - b[None]) ** 2).sum(-1)
+        return shared + scale * np.exp(-0.5 * square)
+
+    inner = covariance(seen, seen) + noise * np.eye(12)
+    cross = covariance(there, seen)
+    expected = cross @ np.linalg.solve(inner, errors)
+    variance = shared + scale - np.einsum("ij,ji->i", cross, np.linalg.solve(inner, cross.T))
+    where = tuple(there.T)
+    np.testing.assert_allclose(mean[where] - sight[where], expected, atol=1e-6)
+    np.testing.assert_allclose(sd[where], np.sqrt(np.maximum(variance, 0.0)), atol=1e-5)
+
+    def evidence(noise):  # the maximum of the marginal likelihood is in its hyperparameters
+        inner = covariance(seen, seen) + noise * np.eye(12)
+        return -0.5 * (errors @ np.linalg.solve(inner, errors) + np.linalg.slogdet(inner)[1])
+
+    steps = [evidence(noise[0] * factor) for factor in (0.7, 1.0, 1.4)]
+    assert steps[1] >= max(steps) - 1e-3 or noise[0] in (1e-5, 0.1)
+
+
+def test_the_middle_of_a_bound_lies_between_its_cells_and_its_direction_has_length_1():
+    diagonal = MOVES[8].index((-1, 1))
+    place = residual_process.places(np.array([[diagonal, 2, 3]]))[0]
+    np.testing.assert_allclose(place, [2.5, 2.5, -(0.5**0.5), 0.5**0.5])
+
+
+def test_the_design_drives_five_different_paths_in_turn_and_recommends_the_best_mean(planner):
+    policy, driven = standard_design.StandardDesign(), []
+    campaign = SimpleNamespace(planner=planner, planner_now=lambda: planner)
+    rates = [0.5, 0.6, 0.9, 0.4, 0.3] * 2
+    assert policy.recommend(campaign) == paths.candidates(planner)[0]
+    for rate in rates:
+        driven.append(policy.choose(planner, np.random.default_rng(0)))
+        n = len(driven[-1]) - 1
+        policy.learn(campaign, mission_of(planner, driven[-1], [rate] * n))
+    assert len(set(driven[:5])) == 5
+    assert driven[5:] == driven[:5]
+    kept = [rate * (len(p) - 1) - (len(p) - 1) for rate, p in zip(rates[:5], driven, strict=False)]
+    assert policy.recommend(campaign) == driven[int(np.argmax(kept))]
+
+
+@pytest.mark.parametrize("make", LEARNERS)
+def test_a_baseline_is_that_of_line_of_sight_at_first_and_leaves_a_path_that_is_bad(planner, make):
+    policy = make()
+    campaign = SimpleNamespace(planner=planner, planner_now=lambda: planner)
+    first = policy.recommend(campaign)
+    walks = every_path(planner)
+    best = max(paths.predicted(planner, walk) for walk in walks)
+    assert paths.predicted(planner, first) == pytest.approx(best)
+    sight = paths.line_of_sight(planner)
+    for k in range(3):  # no contact on the first path, as predicted on others
+        path = policy.choose(planner, np.random.default_rng(k))
+        assert path in walks
+        rates = np.zeros(len(path) - 1) if path == first else rates_along(sight, path)
+        policy.learn(campaign, mission_of(planner, path, rates))
+    after = policy.recommend(campaign)
+    assert after in walks
+    learns = not isinstance(policy, line_of_sight.LineOfSight)
+    assert (after != first) == learns
+
+
+def test_the_oracle_is_without_regret_in_the_world_of_each_mission(workspace, tmp_path):
+    blind = [Degradation(robot, 0.0, 1, 1) for robot in ("r1", "r2")]
+    simulator = KinematicSimulator(workspace, degradations=blind)
+    truth = Truth.of(simulator, standard_error=0.05, folder=tmp_path)
+    policy = oracle.Oracle(truth)
+    now = Planner(workspace, START, GOAL, "lost_contact", max_bounds="shortest+2")
+    campaign = SimpleNamespace(planner=now, planner_now=lambda: now)
+    chosen = []
+    for mission in range(3):
+        chosen.append(policy.recommend(campaign))
+        assert truth.at(mission).regret(chosen[-1], max_bounds="shortest+2") == 0.0
+        assert policy.choose(now, np.random.default_rng(0)) == chosen[-1]
+        policy.learn(campaign, None)
+    assert chosen[0] == chosen[2]
+    lost = [truth.at(mission).value(path).lost for mission, path in enumerate(chosen)]
+    assert lost[1] > lost[0]  # another world
+    with pytest.raises(TrustboError, match="the oracle needs the truth of the scene"):
+        oracle.Oracle(None).recommend(campaign)
