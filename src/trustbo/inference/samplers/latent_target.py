@@ -20,7 +20,12 @@ from trustbo.inference.evidence import place_prior
 from trustbo.inference.evidence.ep import draws, joint
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.laplace import laplace
-from trustbo.inference.samplers.place_target import hyperparameters, name_draws, prior_of_places
+from trustbo.inference.samplers.place_target import (
+    above_jitter,
+    hyperparameters,
+    name_draws,
+    prior_of_places,
+)
 from trustbo.inference.samplers.student import Spanning, Student
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.priors import Priors
@@ -63,6 +68,13 @@ class LatentTarget:
         parts = [self._evaluate(z[i : i + step], n_sweeps) for i in range(0, n, step)]
         return np.concatenate(parts)
 
+    def log_evidence(self, theta: np.ndarray) -> np.ndarray:
+        """Log p(rates | theta) by EP, theta (point, 3) or (point, 6); sites are recentred first."""
+        self._settle(np.median(theta, axis=0))
+        step, n = self._step, len(theta)
+        parts = [self._log_evidence(theta[i : i + step], SWEEPS) for i in range(0, n, step)]
+        return np.concatenate(parts)
+
     def first(self) -> Student:
         """Gaussian fit at the best mode, found from the best point of a grid."""
         grid = np.stack(np.meshgrid(*_GRID, indexing="ij")).reshape(3, -1).T
@@ -79,7 +91,10 @@ class LatentTarget:
 
     def recentre(self, z: np.ndarray) -> None:
         """Recentre the sites at one point, for sweeps to start from."""
-        (beta0, delta_w, delta_v, x0, P, g), _ = self._given(self._theta(z[None]))
+        self._settle(self._theta(z[None])[0])
+
+    def _settle(self, theta: np.ndarray) -> None:
+        (beta0, delta_w, delta_v, x0, P, g), _ = self._given(theta[None])
         fixed = x0, P[0], g[0], self.chains, self._sites
         self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *fixed, _SETTLED)
 
@@ -119,10 +134,7 @@ class LatentTarget:
         """Hyperparameters (point, 3), or (point, 6) with those of places."""
         if self._place is None:
             return scores.beta0_and_noises(self.priors, z)
-        theta = hyperparameters(self.priors, self._place[0], z)
-        least = place_prior.JITTER * np.maximum(theta[:, 3], np.hypot(theta[:, 1], theta[:, 2]))
-        theta[:, 5] = np.maximum(theta[:, 5], least)
-        return theta
+        return above_jitter(hyperparameters(self.priors, self._place[0], z))
 
     def _evaluate(self, z: np.ndarray, n_sweeps: int) -> np.ndarray:
         out = np.full(len(z), -np.inf)
@@ -130,10 +142,12 @@ class LatentTarget:
             theta, log_prior = self._theta(z), scores.log_prior(z)
             ok = np.isfinite(theta).all(1) & np.isfinite(log_prior)
             ok &= (theta[:, 1:3] > 1e-6).all(1)
-            given, log_det = self._given(theta[ok])
-            value = joint.log_evidence(*given, self.chains, self._sites, n_sweeps)
-            out[ok] = value + 0.5 * log_det + log_prior[ok]
+            out[ok] = self._log_evidence(theta[ok], n_sweeps) + log_prior[ok]
         return np.where(np.isfinite(out), out, -np.inf)
+
+    def _log_evidence(self, theta: np.ndarray, n_sweeps: int) -> np.ndarray:
+        given, log_det = self._given(theta)
+        return joint.log_evidence(*given, self.chains, self._sites, n_sweeps) + 0.5 * log_det
 
     def _given(self, theta: np.ndarray):
         """Arguments of the kernels at theta, and log |P| of the prior precision."""

@@ -55,6 +55,13 @@ def hyperparameters(priors: Priors, place: PlaceEffect, z: np.ndarray) -> np.nda
     return theta
 
 
+def above_jitter(theta: np.ndarray) -> np.ndarray:
+    """Theta (point, 6) with tau_e no less than a jitter that keeps K_g regular."""
+    noise = np.hypot(theta[:, 1], theta[:, 2])
+    least = place_prior.JITTER * np.maximum(theta[:, 3], noise)
+    return np.column_stack([theta[:, :5], np.maximum(theta[:, 5], least)])
+
+
 def prior_of_places(proposal: Student) -> Student:
     """Keep the fitted proposal of (beta0, noises); use the prior for the scores of places."""
     n, d = 3, len(proposal.center)
@@ -90,6 +97,12 @@ class PlaceTarget:
         """Log posterior density, not divided by the evidence; shape (point,)."""
         parts = [self._evaluate(z[i : i + self._chunk]) for i in range(0, len(z), self._chunk)]
         return np.concatenate([part.log_p for part in parts])
+
+    def log_evidence(self, theta: np.ndarray) -> np.ndarray:
+        """Log p(rates | theta), theta as from `hyperparameters`; shape (point,)."""
+        theta = above_jitter(theta)
+        parts = [theta[i : i + self._chunk] for i in range(0, len(theta), self._chunk)]
+        return np.concatenate([self._integrate(part, keep=False).log_p for part in parts])
 
     def conditional(self, z: np.ndarray) -> Conditional:
         """Conditional distribution of coefficients and effects given scores (point, score)."""
@@ -135,10 +148,7 @@ class PlaceTarget:
             total = np.hypot(theta[:, 1], theta[:, 2])
             ok = np.isfinite(theta).all(1) & (total > 1e-12) & np.isfinite(log_prior)
             theta = np.where(ok[:, None], theta, 0.1)
-            total = np.hypot(theta[:, 1], theta[:, 2])
-            floor = place_prior.JITTER * np.maximum(theta[:, 3], total)
-            theta[:, 5] = np.maximum(theta[:, 5], floor)
-            integrated = self._integrate(theta, keep=keep)
+            integrated = self._integrate(above_jitter(theta), keep=keep)
             log_p = np.where(
                 ok & np.isfinite(integrated.log_p), integrated.log_p + log_prior, -np.inf
             )
