@@ -25,7 +25,7 @@ def run_worlds(
     policies: Any = (POLICY,),
     models: Any = ("places",),
     simulator: Simulate | str | None = None,
-    baselines: Sequence[str] = BASELINES,
+    baselines: Sequence[str] = tuple(BASELINES),
     methods: Mapping[str, Callable[[], Any]] | None = None,
     objective: str = OBJECTIVE,
     max_bounds: int | str = "shortest+4",
