@@ -65,7 +65,7 @@ def compared(workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
             drives.append(simulator._drive(state, 1, c, ahead[k], np.random.default_rng(0)))
         drives = [drive for drive in drives if drive.status == "ok"]
         if drives:
-            detected = detections(simulator._now, simulator.sight, simulator.team, drives)
+            detected = detections(simulator._now, simulator.team, drives)
             simulated.append(np.mean([f.mean(0) for f in detected], axis=0))
             expected.append(workspace.bound_awareness.values[:, m, row, col, -1])
     return np.array(expected), np.array(simulated)

@@ -132,7 +132,7 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
             drives.append(simulator._drive(state, 1, c, n, np.random.default_rng(0)))
         if any(drive.status != "ok" for drive in drives):
             continue
-        rates = [f.mean(0) for f in detections(simulator._now, Sight(), simulator.team, drives)]
+        rates = [f.mean(0) for f in detections(simulator._now, simulator.team, drives)]
         simulated.append(np.mean(rates, axis=0))
         expected.append(workspace.bound_awareness.values[:, m, row, col, 2])
     expected, simulated = np.ravel(expected), np.ravel(simulated)
