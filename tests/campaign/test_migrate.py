@@ -62,3 +62,12 @@ def test_a_policy_of_ones_own_has_to_be_given_again():
     record = {"start": [0, 0], "goal": [1, 1], "policy": "bold", "own_policy": True}
     with pytest.raises(TrustboError, match="'bold'"):
         arguments_of(record, None)
+
+
+def test_a_simulator_of_version_0_2_had_no_events():
+    before = {"simulator": "KinematicSimulator", "tick": 0.5, "stop": []}
+    assert migrate_notes(before, {**before, "events": []}) == {**before, "events": []}
+    assert migrate_notes(before, before) == before
+    later = {**before, "events": [{"event": "Dust", "detection": 0.5}]}
+    assert migrate_notes(before, later)["events"] == []  # refused: it is another simulator
+    assert migrate_notes(later, later) == later

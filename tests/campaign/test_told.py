@@ -561,6 +561,7 @@ def test_settings_of_a_simulator_survive_a_file(workspace, tmp_path):
         {"lost_contact_after": 40.0},
         {"threats": [tb.simulation.Threat("jam", (380030.0, 5224950.0), 12.0, strength=0.4)]},
         {"degradations": [tb.simulation.Degradation("r1", 0.4)]},
+        {"events": [tb.simulation.Dust(0.5)]},
     ],
 )
 def test_the_description_of_the_simulator_is_complete(changed):

@@ -69,11 +69,13 @@ def migrate_notes(notes: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str,
     """Convert the notes of the simulator that a campaign was begun with.
 
     Version 0.1 recorded less: only its name, and lists by their lengths; the rest is taken from the
-    notes of now, and cannot be compared.
+    notes of now, and cannot be compared. Version 0.2 had no events.
     """
     before = {n: _SIMULATORS.get(v, v) if isinstance(v, str) else v for n, v in notes.items()}
     if "stop" not in notes:
         before = {**now, **before}
+    if "events" in now:
+        before.setdefault("events", [])
     for name, value in now.items():
         if isinstance(value, list) and before.get(name) == len(value):
             before[name] = value
