@@ -27,7 +27,9 @@ class PathProcess(PathPolicy):
 
     def __init__(self, acquisition: str) -> None:
         """Begin without missions; ImportError: BoTorch is not installed."""
-        import botorch  # noqa: F401
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of torch, about itself
+            import botorch  # noqa: F401
 
         self._acquisition = acquisition
         self._missions: list[tuple[Path, float]] = []

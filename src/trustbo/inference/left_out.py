@@ -15,13 +15,15 @@ import numpy as np
 import xarray as xr
 
 from trustbo.inference.draws import params_of, sites_of
+from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.fit import fit
 from trustbo.inference.place_maps import scales_of
 from trustbo.inference.posterior_tree import missions_of
-from trustbo.inference.samplers.run import score_targets
+from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.inference.samplers.weights import smoothed_weights
 from trustbo.models.model import TrustModel
 from trustbo.models.place import bounds_of, visited
+from trustbo.models.pooled import PooledTrust
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 
@@ -50,14 +52,16 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         model: Its model.
 
     Returns:
-        One for each mission; None where the model has no effects of places, or no target of
-        sampling integrates these out.
+        One for each mission; None where the model has no effects of places, or where only
+        approximations integrate these out (rates not Gaussian, a custom drift).
     """
-    if model.place is None or model.why_not_exact is not None:
+    exact = isinstance(model, PooledTrust) and model.family.integrates_out
+    if model.place is None or not exact or model.why_not_exact is not None:
         return None
+    priors, place = model.priors, model.place
     missions, weight = missions_of(posterior), weights_of(posterior)
     batch = stack_missions(missions, pad=False)
-    places = visited(bounds_of(missions), model.place, batch.contact_rate.shape[2])
+    places = visited(bounds_of(missions), place, batch.contact_rate.shape[2])
     sites = sites_of(posterior)
     theta = np.column_stack([sites["beta0"], sites["delta_w"], sites["delta_v"], *scales_of(sites)])
     theta, index = np.unique(theta, axis=0, return_inverse=True)
@@ -68,9 +72,8 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         if j is not None:
             counted[j] = w
         rates[counted == 0.0] = np.nan
-        given = batch._replace(contact_rate=rates)
-        (target,) = score_targets(model, given, counted, places)
-        return target.log_evidence(theta)[index]  # pyright: ignore[reportAttributeAccessIssue]
+        rows = gather_rows(batch.awareness, rates, places, counted, float(priors.x0_mean))
+        return PlaceTarget(rows, places, priors, place).log_evidence(theta)[index]
 
     whole, left_out = log_evidence(), []
     for j, w in enumerate(weight):

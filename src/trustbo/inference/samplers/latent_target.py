@@ -68,13 +68,6 @@ class LatentTarget:
         parts = [self._evaluate(z[i : i + step], n_sweeps) for i in range(0, n, step)]
         return np.concatenate(parts)
 
-    def log_evidence(self, theta: np.ndarray) -> np.ndarray:
-        """Log p(rates | theta) by EP, theta (point, 3) or (point, 6); sites are recentred first."""
-        self._settle(np.median(theta, axis=0))
-        step, n = self._step, len(theta)
-        parts = [self._log_evidence(theta[i : i + step], SWEEPS) for i in range(0, n, step)]
-        return np.concatenate(parts)
-
     def first(self) -> Student:
         """Gaussian fit at the best mode, found from the best point of a grid."""
         grid = np.stack(np.meshgrid(*_GRID, indexing="ij")).reshape(3, -1).T
@@ -91,10 +84,7 @@ class LatentTarget:
 
     def recentre(self, z: np.ndarray) -> None:
         """Recentre the sites at one point, for sweeps to start from."""
-        self._settle(self._theta(z[None])[0])
-
-    def _settle(self, theta: np.ndarray) -> None:
-        (beta0, delta_w, delta_v, x0, P, g), _ = self._given(theta[None])
+        (beta0, delta_w, delta_v, x0, P, g), _ = self._given(self._theta(z[None]))
         fixed = x0, P[0], g[0], self.chains, self._sites
         self._sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *fixed, _SETTLED)
 
@@ -142,12 +132,10 @@ class LatentTarget:
             theta, log_prior = self._theta(z), scores.log_prior(z)
             ok = np.isfinite(theta).all(1) & np.isfinite(log_prior)
             ok &= (theta[:, 1:3] > 1e-6).all(1)
-            out[ok] = self._log_evidence(theta[ok], n_sweeps) + log_prior[ok]
+            given, log_det = self._given(theta[ok])
+            value = joint.log_evidence(*given, self.chains, self._sites, n_sweeps)
+            out[ok] = value + 0.5 * log_det + log_prior[ok]
         return np.where(np.isfinite(out), out, -np.inf)
-
-    def _log_evidence(self, theta: np.ndarray, n_sweeps: int) -> np.ndarray:
-        given, log_det = self._given(theta)
-        return joint.log_evidence(*given, self.chains, self._sites, n_sweeps) + 0.5 * log_det
 
     def _given(self, theta: np.ndarray):
         """Arguments of the kernels at theta, and log |P| of the prior precision."""

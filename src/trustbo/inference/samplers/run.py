@@ -166,7 +166,7 @@ def _sample_scores(
 ) -> Draws:
     """Draws by importance sampling of scores: places, pooling, coupling, or rates not Gaussian."""
     shape = (settings.n_chains, settings.draws)
-    targets = score_targets(model, batch, weight, places)
+    targets = _targets(model, batch, weight, places)
     coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
     if start is not None and coupled and len(start.center) != coupled.n_scores:
         start = None  # of another team
@@ -193,7 +193,7 @@ def _sample_scores(
     return Draws(params, stats, summary, "exact", places=effects)
 
 
-def score_targets(
+def _targets(
     model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
