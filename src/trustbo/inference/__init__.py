@@ -15,6 +15,7 @@ from trustbo.inference.prior_from import prior_from
 from trustbo.inference.prior_predictive import prior_predictive, sample_prior
 from trustbo.inference.samplers.convergence import diagnostics
 from trustbo.inference.sbc import sbc
+from trustbo.inference.score import score
 from trustbo.inference.updating import sample_statistics, update_statistics
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "sample_prior",
     "sample_statistics",
     "sbc",
+    "score",
     "update_statistics",
 ]
 __dir__ = __all__.copy  # completion lists public names alone

@@ -67,6 +67,8 @@ class Family(ABC):
     propagates: ClassVar[bool] = True
     """Whether expectation propagation has its `terms`, hence the exact sampler applies."""
 
+    log_constant: ClassVar[float] = 0.0
+    """Term that the log density of `observe` lacks, nats."""
     expected_rate: ClassVar[str] = "identity"
     """Form of E[rate | trust] in compiled planning: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (of a normal with sd delta_v, cut to [0, 1]); the mean of `rate_moments`."""

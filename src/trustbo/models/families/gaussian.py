@@ -1,5 +1,6 @@
 """Gaussian rates, the paper's equation (4): y = x + v, latent trust integrated out exactly."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,6 +18,7 @@ class Gaussian(Family):
 
     name: ClassVar[str] = "gaussian"
     integrates_out: ClassVar[bool] = True
+    log_constant: ClassVar[float] = -0.5 * math.log(2.0 * math.pi)
 
     def log_density(self, ssm: SSM, observed: Observed, e: Array, complete: bool = False) -> Array:
         """See `Family.log_density`; innovations are not read."""

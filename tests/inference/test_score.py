@@ -1,0 +1,225 @@
+"""Scores of predictions against joint normals written out, and against simulation."""
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+from missions import N_TICKS, OF_FAMILY, counted_missions, simulate_missions
+from references import dense_joint
+from scipy import stats
+from scipy.linalg import block_diag
+
+import trustbo as tb
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.inference import fit, params_of, score
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust
+
+SHAPE = (5, 5)
+
+
+def random_missions(seed, n_missions=4):
+    """Missions of three robots along random walks, whose rates no model has drawn."""
+    rng, missions = np.random.default_rng(seed), []
+    for _ in range(n_missions):
+        n = int(rng.integers(4, 9))
+        cells = [tuple(rng.integers(SHAPE).tolist())]
+        while len(cells) <= n:
+            cell = np.array(cells[-1]) + rng.integers(-1, 2, size=2)
+            if (cell >= 0).all() and (cell < SHAPE).all() and tuple(cell) != cells[-1]:
+                cells.append(tuple(cell.tolist()))
+        z, rates = rng.uniform(size=(n, 3, 2)), rng.uniform(size=(n, 3))
+        missions.append(Mission.from_arrays(cells, z, rates))
+    return missions
+
+
+def joint_with_places(missions, theta, x0_mean=0.5, x0_sd=0.5):
+    """Mean and covariance of all rates, (mission, robot, bound) flat, coefficients integrated out.
+
+    Priors beta ~ N(0, 1), b ~ N(0, 0.5^2); theta = beta0, noises, tau_s, length scale, tau_e.
+    """
+    beta0, w, v, tau_s, length, tau_e = theta
+    carry, noise, mean, U, bounds = [], [], [], [], []
+    for mission in missions:
+        k = np.arange(len(mission.bounds))
+        T = np.where(k[:, None] >= k, beta0 ** np.maximum(k[:, None] - k, 0), 0.0)
+        start = beta0 ** (k + 1.0)
+        for i in range(3):
+            carry.append(T)
+            noise.append(x0_sd**2 * np.outer(start, start) + w**2 * T @ T.T + v**2 * np.eye(len(k)))
+            mean.append(x0_mean * start)
+            U.append(np.column_stack([mission.awareness[:, i], 0.5 * np.ones(len(k))]))
+            bounds += itertools.pairwise(mission.path)
+    cells = np.array([entered for _, entered in bounds])
+    h = np.sqrt(3.0) * np.linalg.norm(cells[:, None] - cells, axis=2) / length
+    same = np.array([[one == other for other in bounds] for one in bounds])
+    U, T = np.concatenate(U), block_diag(*carry)
+    drift = U @ U.T + tau_s**2 * (1.0 + h) * np.exp(-h) + tau_e**2 * same
+    return np.concatenate(mean), block_diag(*noise) + T @ drift @ T.T
+
+
+def conditioned(missions, theta):
+    """Mean and sd of the rates of the last mission given the others, (bound, robot)."""
+    mean, cov = joint_with_places(missions, theta)
+    y = np.concatenate([m.contact_rate.T.ravel() for m in missions])
+    n = len(y) - missions[-1].contact_rate.size
+    gain = np.linalg.solve(cov[:n, :n], cov[:n, n:]).T
+    mean, cov = mean[n:] + gain @ (y - mean)[:n], cov[n:, n:] - gain @ cov[:n, n:]
+    return [a.reshape(3, -1).T for a in (mean, np.sqrt(np.diag(cov)))]
+
+
+@pytest.fixture(scope="module")
+def placed():
+    """Missions, the last to be predicted, a posterior of the others, and the exact prediction."""
+    missions, place = random_missions(2), PlaceEffect()
+    workspace = tb.Workspace.from_awareness(np.zeros((3, *SHAPE, 2)))
+    posterior = fit(missions[:-1], PooledTrust(place=place), sampler="exact", workspace=workspace)
+    draws = posterior["posterior"].to_dataset()
+    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
+    theta = np.column_stack([draws[name].values.ravel() for name in names])
+    moments = [conditioned(missions, t) for t in theta[::10]]
+    return missions, posterior, *np.moveaxis([list(m) for m in moments], 1, 0)
+
+
+def test_a_prediction_is_the_joint_normal_given_earlier_missions_averaged_over_draws(placed):
+    missions, posterior, mean, sd = placed
+    scores = score(posterior, missions[-1:])
+    y = missions[-1].contact_rate
+    # 4000 draws, coefficients and effects among them, against 400 of the hyperparameters alone.
+    spread = np.sqrt((sd**2 + mean**2).mean(0) - mean.mean(0) ** 2)
+    np.testing.assert_allclose(scores["mean"][0], mean.mean(0), atol=6.0 * spread.max() / 4000**0.5)
+    pit = stats.norm.cdf(y, mean, sd).mean(0)
+    np.testing.assert_allclose(scores["pit"][0], pit, atol=6.0 * 0.5 / 4000**0.5)
+    density = np.log(stats.norm.pdf(y, mean, sd).mean(0))
+    np.testing.assert_allclose(scores["log_score"][0], density, atol=0.15)
+    low, high = (scores["quantile"].sel(level=level, mission=0).values for level in (0.05, 0.95))
+    for limit, level in ((low, 0.05), (high, 0.95)):
+        below = stats.norm.cdf(limit, mean, sd).mean(0)
+        np.testing.assert_allclose(below, level, atol=6.0 * 0.22 / 4000**0.5)
+
+
+@pytest.mark.parametrize("family", sorted(OF_FAMILY))
+def test_log_scores_are_shares_of_simulated_rates(family):
+    """Counts and limits have probabilities; rates inside, a density in bins around them."""
+    z, _, missions = counted_missions(family)
+    # NUTS would compile for minutes; these parameters do as well.
+    fitted = "gaussian" if family == "student_t" else family
+    posterior = fit(missions[:3], PooledTrust(observation=fitted), sampler="exact", progress=False)
+    posterior.attrs["observation"] = family
+    mission = missions[4]
+    scores = score(posterior, [mission])
+    params, rng, n = params_of(posterior).flat(), np.random.default_rng(1), 100
+    z, y = mission.awareness, mission.contact_rate
+    measured, drawn = tb.models.families.FAMILIES[family], []
+    for _ in range(n):
+        x = params.x0_mean + params.x0_sd * rng.standard_normal(len(params.b))
+        path = []
+        for k in range(len(z)):
+            x = params.beta0 * x + params.beta @ z[k, 0] + params.b
+            x = x + params.delta_w * rng.standard_normal(len(x))
+            rate = x + params.delta_v * rng.standard_normal(len(x))
+            path.append(measured.draw_rates(rng, x, rate, params.delta_v, np.full(len(x), N_TICKS)))
+        drawn.append(path)
+    drawn = np.moveaxis(np.array(drawn), 1, 0).reshape(len(z), -1)
+    assert scores.attrs["log_score_of"] == "ticks"
+    for k, rate in enumerate(y[:, 0]):
+        near = np.abs(drawn[k] - rate) < 0.5 / N_TICKS  # the width of one tick, or one count
+        if family == "censored" and 0.0 < rate < 1.0:
+            near &= (drawn[k] > 0.0) & (drawn[k] < 1.0)
+        elif family == "censored":
+            near = drawn[k] == rate
+        share = near.mean()
+        # A share of 400000 draws that are alike in their parameters; bins curve the density.
+        assert float(scores["log_score"][0, k, 0]) == pytest.approx(np.log(share), abs=0.1)
+        below, equal = (drawn[k] < rate - 1e-9).mean(), (np.abs(drawn[k] - rate) < 1e-9).mean()
+        # 6 standard errors of the 4000 draws that the score compares with.
+        assert below - 0.05 <= float(scores["pit"][0, k, 0]) <= below + equal + 0.05
+
+
+@pytest.mark.parametrize(
+    "model", [HierarchicalTrust(), CoupledTrust(inter_robot="ordered")], ids=["apart", "ordered"]
+)
+@pytest.mark.filterwarnings("ignore")
+def test_log_scores_of_robots_that_differ_are_marginals_of_their_joint_normal(model):
+    missions = simulate_missions(5)
+    posterior = fit(missions[:4], model, n_chains=2, draws=100, check=False, progress=False)
+    scores, z = score(posterior, missions[4:]), missions[4].awareness
+    params = params_of(posterior).flat()
+    y, densities = missions[4].contact_rate, []
+    for t in range(len(params.b)):
+        p = params.draw(t)
+        if hasattr(p, "B0"):
+            drift, B0, Q, R = np.einsum("kim,mai->ka", z, p.B) + p.b, p.B0, p.Delta_w, p.Delta_v
+        else:
+            drift = np.einsum("kim,im->ki", z, p.beta) + p.b
+            B0, Q, R = np.diag(p.beta0), np.diag(p.delta_w**2), np.diag(p.delta_v**2)
+        joint = dense_joint(B0, drift, Q, R, float(p.x0_mean), float(p.x0_sd))
+        densities.append(stats.norm.pdf(y.ravel(), joint.mean_y, np.sqrt(np.diag(joint.cov_y))))
+    expected = np.log(np.mean(densities, axis=0)).reshape(y.shape)
+    np.testing.assert_allclose(scores["log_score"][0], expected, rtol=1e-8)
+
+
+def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_ones():
+    """Parameters and rates from one posterior: coverage is exact, point masses among them."""
+    truth = OF_FAMILY["censored"]._replace(delta_w=0.4)
+    z = np.random.default_rng(0).uniform(size=(60, 5, 1, 2))
+    model = PooledTrust(observation="censored")
+    y = model.simulate(jax.random.key(0), truth, z).contact_rate
+    assert 0.2 < np.isin(y, (0.0, 1.0)).mean() < 0.8
+    path = [(0, k) for k in range(6)]
+    missions = [Mission.from_arrays(path, a, b) for a, b in zip(z, y, strict=True)]
+    posterior = fit(missions[:20], model, sampler="exact", progress=False)
+    scores = score(posterior, missions[20:])
+    # Of 200 rates, those of a mission alike: 4 standard errors of some 80 that are independent.
+    assert float(scores["coverage_50"].sel(among="all")) == pytest.approx(0.5, abs=0.22)
+    assert float(scores["coverage_90"].sel(among="all")) == pytest.approx(0.9, abs=0.13)
+    again = score(posterior, missions[20:])
+    assert again.identical(scores)
+    other = score(posterior, missions[20:], seed=1)
+    assert (np.abs(other["pit"] - scores["pit"]) > 0.01).any()
+
+
+def test_posteriors_of_a_campaign_predict_the_next_mission_on_bounds_seen_and_new():
+    missions = random_missions(3)
+    gap = missions[2].contact_rate.copy()
+    gap[1, 0] = np.nan
+    missions[2] = Mission.from_arrays(missions[2].path, missions[2].awareness, gap)
+    missions[3] = Mission.from_arrays(
+        missions[0].path, missions[0].awareness, missions[0].contact_rate
+    )
+    posteriors = [fit(missions[: j + 1], sampler="exact", seed=j) for j in range(4)]
+    scores = score(posteriors, missions)
+    assert scores["mission"].values.tolist() == [1, 2, 3]
+    n = len(missions[3].bounds)
+    assert scores["seen"].sel(mission=3).values[:n].all()
+    one = score(posteriors[1], missions[2:3])
+    for name in ("mean", "log_score"):
+        here = scores[name].sel(mission=2, bound=one["bound"])
+        np.testing.assert_allclose(here, one[name][0], atol=0.05)
+        assert np.isnan(here[1, 0])
+    assert int(scores["n"].sel(among="seen")) + int(scores["n"].sel(among="new")) == int(
+        scores["n"].sel(among="all")
+    )
+    y, mean = scores["contact_rate"].values, scores["mean"].values
+    y, mean = y[np.isfinite(y)], mean[np.isfinite(y)]
+    r2 = 1.0 - ((y - mean) ** 2).sum() / ((y - y.mean()) ** 2).sum()
+    assert float(scores["r2"].sel(among="all")) == pytest.approx(r2)
+    assert score(posteriors, missions, ahead=2)["mission"].values.tolist() == [2, 3]
+
+
+def test_what_cannot_be_scored_is_refused(placed):
+    missions, posterior, *_ = placed
+    with pytest.raises(TrustboError, match="2 posteriors and 4 missions"):
+        score([posterior, posterior], missions)
+    with pytest.raises(TrustboError, match="1 missions leave none to predict 1 ahead"):
+        score([posterior], missions[:1])
+    with pytest.raises(TrustboError, match="ahead=2 is of posteriors of a campaign"):
+        score(posterior, missions, ahead=2)
+    away = Mission.from_arrays([(0, 0), (0, 9)], *(np.zeros((1, 3, 2)), np.zeros((1, 3))))
+    with pytest.raises(TrustboError, match=r"\(0, 9\)"):
+        score(posterior, [away])
+    bare = posterior.copy()
+    del bare["constant_data"]
+    with pytest.raises(TrustboError, match="holds parameters alone"):
+        score(bare, missions)
