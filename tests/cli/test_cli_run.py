@@ -54,6 +54,7 @@ def test_run_s_files_say_the_same(finished):
     assert "after 2 missions" in (out / "report.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_a_page_that_became_the_report_is_not_written_again(invoke, flags, tmp_path, monkeypatch):
     written = []
@@ -126,6 +127,7 @@ def test_run_on_real_terrain(
     assert (tmp_path / "report.html").stat().st_size < 3e6
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_demo_runs_on_the_rasters_it_writes(invoke, tmp_path):
     out = tmp_path / "demo"

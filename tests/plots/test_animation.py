@@ -79,6 +79,7 @@ def test_a_gif_has_a_frame_for_each_step_of_the_film(result, mission, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["mission.gif"]
 
 
+@pytest.mark.slow
 def test_an_mp4_can_be_played(result, mission, tmp_path):
     path = tmp_path / "mission.mp4"
     span = mission.bounds[-1].t1

@@ -309,7 +309,7 @@ def map_pixels(chromium):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("relief", [True, False])
+@pytest.mark.parametrize("relief", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_map_has_the_colours_of_its_bar(scheme, relief, chromium, files, record):
     """Of all pixels, path and posts included, 85 % are within 30 RGB units of the bar's."""
     seen = opened(chromium, files["explore"], scheme=scheme)

@@ -120,7 +120,7 @@ def complaints_of(figure):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("width", [None, 3.5])
+@pytest.mark.parametrize("width", [3.5, pytest.param(None, marks=pytest.mark.slow)])
 def test_all_of_a_figure_is_inside_it_and_no_text_is_over_other_text(drawn, name, width):
     assert complaints_of(drawn(name, width=width).figure) == []
 

@@ -341,7 +341,7 @@ def test_a_page_follows_a_campaign_and_becomes_its_report(result, tmp_path, monk
     assert file.read_text() == "the report"
 
 
-@pytest.mark.parametrize("progress", [False, "bar"])
+@pytest.mark.parametrize("progress", ["bar", pytest.param(False, marks=pytest.mark.slow)])
 def test_the_page_of_a_run_that_was_killed_says_so_and_resume_takes_it_over(
     progress, result, tmp_path, monkeypatch
 ):
