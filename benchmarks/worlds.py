@@ -26,7 +26,7 @@ from baselines import (
 from common import arguments, parsed
 
 from trustbo.study import run_worlds, worlds, worlds_table
-from trustbo.study.methods import BASELINES
+from trustbo.study.methods import BASELINE_ROWS
 from trustbo.study.table import as_text, differences, worse_than
 
 OURS = "trustbo"
@@ -42,7 +42,7 @@ METHODS: dict[str, Any] = {
     "line of sight": line_of_sight.LineOfSight,
     "standard design": standard_design.StandardDesign,
     "oracle": oracle.Oracle,
-    **dict(BASELINES.values()),
+    **dict(BASELINE_ROWS.values()),
 }
 """Methods by the names of their rows."""
 PACKAGES = {"BoTorch EI": "botorch", "BoTorch Thompson": "botorch", "Ax": "ax"}

@@ -341,15 +341,29 @@ def test_a_method_whose_package_is_absent_is_refused_before_any_work(tiny, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-if find_spec("botorch"):  # a peer, which only `make bench` installs
+OUTSIDERS = {
+    "line_of_sight:LineOfSight": None,
+    "running_mean:optimistic": None,
+    "residual_process:ResidualProcess": None,
+    "standard_design:StandardDesign": None,
+    "oracle:Oracle": None,
+    "botorch:expected_improvement": "botorch",  # peers, which only `make bench` installs
+    "ax_default:AxDefault": "ax",
+}
 
-    def test_botorch_learns_and_recommends(tiny, tmp_path, monkeypatch):
-        monkeypatch.chdir(Path(__file__).parents[2])
-        monkeypatch.setattr("sys.path", list(sys.path))
-        baselines = ["benchmarks.baselines.botorch:expected_improvement"]
-        results = run(tmp_path, policies="greedy", baselines=baselines, n_iterations=3)
-        row = results.sel(run=results["method"] == "expected_improvement")
-        assert np.isfinite(row["regret"]).all()
+
+def test_outsiders_learn_and_recommend_in_campaigns(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    monkeypatch.setattr("sys.path", list(sys.path))
+    here = [name for name, package in OUTSIDERS.items() if package is None or find_spec(package)]
+    baselines = [f"benchmarks.baselines.{name}" for name in here]
+    results = run(tmp_path, policies=[], baselines=baselines, n_iterations=3)
+    assert results["method"].values.tolist() == [name.partition(":")[2] for name in here]
+    assert np.isfinite(results["regret"]).all()
+    by_method = results.set_index(run="method")
+    np.testing.assert_array_equal(by_method["regret"].sel(run="Oracle"), 0.0)
+    sight = by_method["path"].sel(run="LineOfSight").values
+    assert (sight == sight[0]).all()
 
 
 def test_results_of_version_0_2_are_read_under_the_new_name_of_their_rows(tiny, tmp_path):

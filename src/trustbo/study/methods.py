@@ -143,7 +143,7 @@ def _random_shortest(key: Array, posterior: Params, planner: Planner) -> Plan:
     return planner.evaluate(path, posterior.mean())
 
 
-BASELINES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+BASELINE_ROWS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "random": ("random path", {"policy": random_path, "factory": True}),
     "shortest": ("shortest path", {"policy": shortest_path, "factory": True}),
     "paper": ("paper", {
@@ -151,8 +151,9 @@ BASELINES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         "options": {"initial": "prior_draw", "max_bounds": "shortest+2"},
     }),
 }  # fmt: skip
-"""Baselines by name: a random path, a random one of the shortest, and the paper's method. Each is a
-name of its row, and settings of its `Case`."""
+"""Baselines by name: a random path, a random one of the shortest, and the paper's method. Each has
+the name of its row, and the settings of its `Case`."""
+BASELINES = tuple(BASELINE_ROWS)
 _SETTINGS = ("model", "policy", "objective", "options", "bounds", "factory")
 """Settings of a method, those of a `Case`."""
 
@@ -179,7 +180,7 @@ def cases_of(
         if ":" in name:
             rows[_name(name)] = {"policy": name, "factory": True}
         else:
-            row, settings = BASELINES[require_choice(f"baseline {IMPORTED}", name, BASELINES)]
+            row, settings = BASELINE_ROWS[require_choice(f"baseline {IMPORTED}", name, BASELINES)]
             rows[row] = settings
     for name, given in methods.items():
         rows[name] = given if isinstance(given, Mapping) else {"policy": given, "factory": True}
