@@ -1,13 +1,13 @@
 """Ax with its defaults, on the candidates of BoTorch.
 
-It knows what BoTorch's baseline does. A choice among 200 named paths would mean nothing to a
+It has what BoTorch's baseline does. A choice among 200 named paths would mean nothing to a
 Gaussian process, so its advocates would describe each candidate by a few numbers and let Ax choose
 these: here the principal components of the candidates' sums of features, each in its range over the
 candidates. The candidate nearest to what Ax asks for is driven, and reported at its own place. The
 first mission is that of line of sight; then follow Ax's own centre and Sobol points, five trials
 in all, before its Gaussian process; the recommended path is Ax's best trial by the model, thus one
 that was driven. The value is reported as it is: to Ax, line of sight is a feature like any other.
-SECONDS a mission.
+0.8 s a mission.
 """
 
 import logging

