@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-import xarray as xr
 from typer.testing import CliRunner
 
 import trustbo as tb
@@ -22,7 +21,6 @@ from trustbo.simulation import Dust, KinematicSimulator, Threat, Truth
 from trustbo.study import load_study, run_worlds, worlds_table
 from trustbo.study.calls import identity_of
 from trustbo.study.methods import cases_of
-from trustbo.study.table import as_text, differences, worse_than
 from trustbo.study.world import COURSES, World, aged
 from trustbo.workspace.sight import Sight
 
@@ -332,6 +330,44 @@ def test_factories_that_differ_in_a_constant_alone_have_rows_of_their_own(tiny, 
     assert one.identity() == cases("pooled", [], [], methods)["one"].identity()
 
 
+class Informed:
+    """Policy that is given the truth."""
+
+    def __init__(self, truth):
+        self.truth = truth
+
+    def __call__(self, key, posterior, planner):
+        return planner.evaluate(self.truth.best(planner.start, planner.goal), posterior.mean())
+
+    def recommend(self, campaign):
+        return self.truth.at(0).best(campaign.planner.start, campaign.planner.goal)
+
+
+def test_a_factory_with_a_parameter_truth_is_given_that_of_the_scene(tiny, tmp_path):
+    changes = {"policies": [], "baselines": [], "methods": {"informed": Informed}}
+    results = run(tmp_path, **changes)
+    np.testing.assert_array_equal(results["regret"], 0.0)
+    np.testing.assert_array_equal(results["regret_before"], 0.0)
+
+
+def test_a_method_may_have_the_settings_of_a_case():
+    """Models, policies and baselines are shorthands of it, of the same identity."""
+    methods = {
+        "mine": {"model": "places", "policy": "greedy"},
+        "as the paper": {
+            "policy": "greedy", "objective": "terminal", "bounds": False,
+            "options": {"initial": "prior_draw", "max_bounds": "shortest+2"},
+        },
+    }  # fmt: skip
+    rows = cases("places", "greedy", ["paper"], methods)
+    assert list(rows) == ["greedy", "paper", "mine", "as the paper"]
+    assert rows["mine"].identity() == rows["greedy"].identity()
+    assert rows["as the paper"].identity() == rows["paper"].identity()
+    assert rows["mine"].labels == {"method": "mine", "policy": "mine"}
+    with pytest.raises(TrustboError, match="unknown setting of method 'bad' 'polcy'; choose one"):
+        cases([], [], [], {"bad": {"polcy": "greedy"}})
+
+
 def test_a_method_whose_package_is_absent_is_refused_before_any_work(tiny, tmp_path):
     def absent():
         import no_such_package  # noqa: F401
@@ -393,135 +429,3 @@ def test_of_a_long_survey_the_part_with_most_data_is_taken(tmp_path):
     other = dataclasses.replace(world, data=survey(tmp_path / "three", 100))
     assert other.identity() != world.identity()
     assert "wellington" in World("here", "right", "wellington").files()[0]
-
-
-# --- methods as one table, and pairwise differences ---
-
-
-class Informed:
-    """Policy that is given the truth."""
-
-    def __init__(self, truth):
-        self.truth = truth
-
-    def __call__(self, key, posterior, planner):
-        return planner.evaluate(self.truth.best(planner.start, planner.goal), posterior.mean())
-
-    def recommend(self, campaign):
-        return self.truth.at(0).best(campaign.planner.start, campaign.planner.goal)
-
-
-def test_a_factory_with_a_parameter_truth_is_given_that_of_the_scene(tiny, tmp_path):
-    changes = {"policies": [], "baselines": [], "methods": {"informed": Informed}}
-    results = run(tmp_path, **changes)
-    np.testing.assert_array_equal(results["regret"], 0.0)
-    np.testing.assert_array_equal(results["regret_before"], 0.0)
-
-
-def test_a_method_may_have_the_settings_of_a_case():
-    """Models, policies and baselines are shorthands of it, of the same identity."""
-    methods = {
-        "mine": {"model": "places", "policy": "greedy"},
-        "as the paper": {
-            "policy": "greedy", "objective": "terminal", "bounds": False,
-            "options": {"initial": "prior_draw", "max_bounds": "shortest+2"},
-        },
-    }  # fmt: skip
-    rows = cases("places", "greedy", ["paper"], methods)
-    assert list(rows) == ["greedy", "paper", "mine", "as the paper"]
-    assert rows["mine"].identity() == rows["greedy"].identity()
-    assert rows["as the paper"].identity() == rows["paper"].identity()
-    assert rows["mine"].labels == {"method": "mine", "policy": "mine"}
-    with pytest.raises(TrustboError, match="unknown setting of method 'bad' 'polcy'; choose one"):
-        cases([], [], [], {"bad": {"polcy": "greedy"}})
-
-
-def results_by_hand():
-    """Two worlds, one course, two seeds, of three methods, three missions each."""
-    keys = [(m, w, s) for m in ("ours", "good", "bad") for w in ("a", "b") for s in (0, 1)]
-    shift = {"ours": 0.0, "good": -2.0, "bad": 3.0}
-    by_world = {"a": 4.0, "b": 8.0}
-    regret = np.array([[by_world[w] + s + shift[m]] * 3 for m, w, s in keys])
-    one = np.ones(regret.shape)
-    kinds = {"a": "right", "b": "wall"}
-    return xr.Dataset(
-        {
-            "regret": (("run", "mission"), regret),
-            "regret_before": ("run", np.full(len(keys), 10.0)),
-            "lost": (("run", "mission"), 2.0 * one),
-            "lost_before": ("run", np.full(len(keys), 5.0)),
-            "lost_followed": (("run", "mission"), regret / 4.0 + [1.0, 2.0, 6.0]),
-            "best": (("run", "mission"), one),
-            "best_followed": (("run", "mission"), one * [1.0, 2.0, 6.0]),
-            "oracle": ("run", np.full(len(keys), 0.5)),
-            "status": (("run", "mission"), np.full(regret.shape, "ok")),
-            "seconds_cpu": ("run", np.array([3.0 if m == "ours" else 1.5 for m, _, _ in keys])),
-        },
-        {
-            "method": ("run", [m for m, _, _ in keys]),
-            "world": ("run", [w for _, w, _ in keys]),
-            "kind": ("run", [kinds[w] for _, w, _ in keys]),
-            "course": ("run", ["n-s"] * len(keys)),
-            "seed": ("run", [s for _, _, s in keys]),
-        },
-    ).assign_coords(mission=[1, 2, 3])
-
-
-def test_differences_are_of_the_same_world_course_and_seed():
-    results = results_by_hand()
-    shuffled = results.isel(run=np.random.default_rng(0).permutation(results.sizes["run"]))
-    table = differences(shuffled, "ours")
-    assert sorted(table.index) == ["bad", "good"]
-    for column in ("value", "low", "high"):  # the same on every world, though worlds differ by 4
-        assert table.loc["good", ("regret after 3", column)] == pytest.approx(2.0)
-        assert table.loc["bad", ("regret after 3", column)] == pytest.approx(-3.0)
-        assert table.loc["bad", ("lost while learning", column)] == pytest.approx(-0.75)
-    assert table.loc["good", ("regret after 0", "value")] == 0.0
-    assert table.loc["good", ("regret now", "value")] == pytest.approx(2.0 * 3 / 4)
-    assert table.loc["good", ("seconds", "value")] == pytest.approx(0.5)
-    assert table.loc["good", ("pairs", "value")] == 2
-    by_kind = differences(results, "ours", "kind")
-    assert set(by_kind.index) == {(k, m) for k in ("right", "wall") for m in ("good", "bad")}
-    assert by_kind.loc[("wall", "bad"), ("pairs", "value")] == 1
-
-
-def test_what_ours_is_worse_in_is_listed_and_printed_like_what_it_is_better_in():
-    table = differences(results_by_hand(), "ours", "kind")
-    lines = worse_than(table)
-    assert "worse in regret now than: right, good; wall, good" in lines
-    assert not any("bad" in line for line in lines if "seconds" not in line)
-    assert not any(line.startswith("worse in regret after 0") for line in lines)
-    assert sum(line.startswith("worse in seconds") for line in lines) == 1
-    text = as_text(table)
-    assert "**" not in text
-    assert "| wall, good | 1 | 0.0 [0.0, 0.0] | 2.0 [2.0, 2.0] |" in text
-    assert "| wall, bad | 1 | 0.0 [0.0, 0.0] | -3.0 [-3.0, -3.0] |" in text
-    better = differences(results_by_hand(), "good").drop("ours")
-    assert worse_than(better) == ["worse than: none"]
-
-
-def test_a_comparison_with_no_other_method_on_the_same_worlds_is_refused():
-    results = results_by_hand()
-    with pytest.raises(TrustboError, match="unknown method 'his'; choose one of ours, good, bad"):
-        differences(results, "his")
-    ours = results["method"] == "ours"
-    apart = results.isel(run=np.where(ours, results["world"] == "a", results["world"] == "b"))
-    with pytest.raises(TrustboError, match="no other method was run on the worlds of 'ours'"):
-        differences(apart, "ours")
-
-
-def test_missions_to_1_percent_are_those_after_which_regret_stays_below():
-    results = results_by_hand().isel(run=[0, 1, 2, 3])
-    results["regret"][:] = [[0.5, 2.0, 1.0], [0.5, 0.2, 0.0], [9.0, 9.0, 9.0], [0.9, 0.9, 1.1]]
-    results["regret_before"][1] = 0.3
-    table = worlds_table(results, ["world", "seed"])
-    assert table["missions to 1 %", "value"].tolist() == [3.0, 0.0, 4.0, 4.0]
-
-
-def test_paths_driven_are_held_against_the_best_of_their_mission_s_world():
-    """Of version 0.2, against that before the first."""
-    results = results_by_hand().isel(run=[0, 1, 2, 3])
-    now = worlds_table(results)["lost while learning", "value"]
-    assert now.tolist() == pytest.approx([(4 + 5 + 8 + 9) / 16])
-    old = worlds_table(results.drop_vars(["best", "best_followed"]))
-    assert old["lost while learning", "value"].tolist() == pytest.approx([26 / 16 + 3 - 0.5])
