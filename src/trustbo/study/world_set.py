@@ -49,6 +49,11 @@ def _place(ground: str) -> tuple[float, float]:
     return float(x), float(y)
 
 
+def _reach(ground: str) -> float:
+    """Radius of a jammer, m: the real terrains are half as wide as the synthetic ones."""
+    return 40.0 if ground in REAL else 90.0
+
+
 def _one_poor(ground: str) -> dict[str, Any]:
     robots = [Robot()] * 3
     robots[_one_robot(ground)] = Robot(
@@ -93,7 +98,9 @@ def _trees(height: float, radius: float) -> Callable[[str], dict[str, Any]]:
 
 
 def _jam(first: int = 0, last: int | None = None) -> Callable[[str], dict[str, Any]]:
-    return lambda ground: {"events": (Threat("jam", _place(ground), 90.0, None, 0.8, first, last),)}
+    return lambda ground: {
+        "events": (Threat("jam", _place(ground), _reach(ground), None, 0.8, first, last),)
+    }
 
 
 def _season(factor: float) -> dict[str, Any]:
