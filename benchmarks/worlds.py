@@ -94,7 +94,7 @@ def report(results: xr.Dataset, title: str):
     for kind in ("all", *np.unique(kinds)):
         runs = results if kind == "all" else results.isel(run=kinds == kind)
         n = len(np.unique(runs["world"].values))
-        print(f"\n{kind} ({n} worlds), {title}\n\n{as_text(worlds_table(runs))}")
+        print(f"\n{kind} (worlds: {n}), {title}\n\n{as_text(worlds_table(runs))}")
     methods = set(results["method"].values.tolist())
     if OURS not in methods or len(methods) < 2:
         return

@@ -150,8 +150,8 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
     Returns:
         Table as of `worlds_table`: mean over campaigns of `regret after n`, `regret now`,
         `lost while learning`, `missions to 1 %`, `arrive` and `seconds` of `ours` less those of
-        the other, with 95 % intervals of a bootstrap over pairs of world and course; and their
-        number, `pairs`. Less is better, but for `arrive`.
+        the other, with 95 % intervals of a bootstrap over pairs of world and course (NaN for one
+        pair); and their number, `pairs`. Less is better, but for `arrive`.
 
     Raises:
         TrustboError: An unknown method or coordinate, or no other method on the same worlds.
@@ -176,10 +176,10 @@ def differences(dataset: xr.Dataset, ours: str, by: str | Sequence[str] = ()) ->
     for key, matched in sorted(rows.items(), key=lambda row: row[0][:-1]):
         one, other = np.array(matched).T
         less = {name: numbers[name][one] - numbers[name][other] for name in compared}
-        n_pairs = float(len(np.unique(pairs[one])))
-        table[key if by else key[0]] = {("pairs", "value"): n_pairs} | _summary(
-            less, pairs[one], middle=np.nanmean
-        )
+        row = _summary(less, pairs[one], middle=np.nanmean)
+        if (n_pairs := len(np.unique(pairs[one]))) == 1:
+            row |= {(name, limit): np.nan for name in compared for limit in ("low", "high")}
+        table[key if by else key[0]] = {("pairs", "value"): float(n_pairs)} | row
     return _table(table, " and ".join([*by, f"{ours} less"]))
 
 
