@@ -20,8 +20,8 @@ from scipy import ndimage
 from trustbo import Mission
 from trustbo.criticism import criticise
 from trustbo.inference import fit
-from trustbo.inference.evidence.place_prior import matern
 from trustbo.models import PooledTrust
+from trustbo.models.place import matern
 
 SHAPE, N_MISSIONS, N_ROBOTS = (10, 10), 15, 3
 FEATURES = ("traversability", "visibility", "line_of_sight")

@@ -56,6 +56,21 @@ def random_missions(rng, n_missions=3, n_robots=3, missing=0.2):
     return missions
 
 
+def walking_missions(seed, n_missions=4, shape=(5, 5), n_bounds=(4, 10), missing=0.2):
+    """Missions of three robots on random walks over a grid, whose rates no model has drawn."""
+    rng, missions = np.random.default_rng(seed), []
+    for _ in range(n_missions):
+        n, path = int(rng.integers(*n_bounds)), [tuple(rng.integers(shape).tolist())]
+        while len(path) <= n:
+            row, col = np.array(path[-1]) + rng.integers(-1, 2, size=2)
+            if 0 <= row < shape[0] and 0 <= col < shape[1] and (row, col) != path[-1]:
+                path.append((int(row), int(col)))
+        rates = rng.uniform(size=(n, 3))
+        rates[rng.uniform(size=rates.shape) < missing] = np.nan
+        missions.append(Mission.from_arrays(path, rng.uniform(size=(n, 3, 2)), rates))
+    return missions
+
+
 def random_params(rng):
     """Parameters of the pooled model, far wider than its prior."""
     return TrustParams(

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpyro.distributions as dist
+from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
@@ -185,3 +186,9 @@ def visited(
     unit = np.full((*there.shape, n_effects), -1)
     unit[there] = index.reshape(-1, n_effects)
     return Visited(shape, cells, units, cell_of.ravel(), unit)
+
+
+def matern(distance: ArrayLike, length_scale: ArrayLike) -> np.ndarray:
+    """Matern 3/2 correlation at a distance, both in cells."""
+    h = np.sqrt(3.0) * np.asarray(distance) / np.asarray(length_scale)
+    return (1.0 + h) * np.exp(-h)

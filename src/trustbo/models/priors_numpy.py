@@ -55,6 +55,13 @@ def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
     return jax.numpy.asarray(one.icdf(share))
 
 
+def half_normal(score: np.ndarray, scale: float) -> np.ndarray:
+    """Half-normal variable of a score; accurate in both tails."""
+    low = special.erfinv(special.ndtr(np.minimum(score, 0.0)))
+    high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
+    return scale * np.sqrt(2.0) * np.where(score < 0.0, low, high)
+
+
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:
     return -0.5 * ((x - loc) / scale) ** 2 - np.log(scale * np.sqrt(2.0 * np.pi))
 

@@ -12,8 +12,9 @@ cells, n_c = 1, and tau_e is only a jitter; without cells' effects tau_s = 0.
 
 import numba as nb
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs  # pyright: ignore
+
+from trustbo.models.place import matern
 
 JITTER = 1e-4
 """Lower limit of tau_e in units of tau_s or the noise: below, K_g is singular to rounding."""
@@ -21,12 +22,6 @@ LENGTH_SCALES = 1e-6, 1e6
 """Lower and upper limit of the length scale, in cells: outside, cells are independent, or equal."""
 
 _compiled = nb.njit(cache=True, error_model="numpy")
-
-
-def matern(distance: ArrayLike, length_scale: ArrayLike) -> np.ndarray:
-    """Matern 3/2 correlation at a distance, both in cells."""
-    h = np.sqrt(3.0) * np.asarray(distance) / np.asarray(length_scale)
-    return (1.0 + h) * np.exp(-h)
 
 
 def correlation(places: np.ndarray, others: np.ndarray, length_scale: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from trustbo.inference.samplers.small_matrices import small_cholesky
 from trustbo.inference.samplers.student import Student
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.priors import Priors
-from trustbo.models.priors_numpy import of_coefficients
+from trustbo.models.priors_numpy import half_normal, of_coefficients
 
 _MEMORY = 8e6  # numbers per chunk of parameter values
 _NUMBERS = 2e8  # bytes of factors kept at once
@@ -46,12 +46,12 @@ def hyperparameters(priors: Priors, place: PlaceEffect, z: np.ndarray) -> np.nda
     theta[:, :3] = scores.beta0_and_noises(priors, z)
     theta[:, 4], rest = 1.0, iter(z[:, 3:].T)
     if place.cells:
-        theta[:, 3] = scores.half_normal(next(rest), place.tau_s)
+        theta[:, 3] = half_normal(next(rest), place.tau_s)
         length_scale = place.length_scale * np.exp(place.length_scale_sd * next(rest))
         # Clip: trial points of the mode search can over- or underflow exp.
         theta[:, 4] = np.clip(length_scale, *place_prior.LENGTH_SCALES)
     if place.bounds:
-        theta[:, 5] = scores.half_normal(next(rest), place.tau_e)
+        theta[:, 5] = half_normal(next(rest), place.tau_e)
     return theta
 
 

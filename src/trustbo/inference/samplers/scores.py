@@ -16,7 +16,7 @@ from trustbo.errors import TrustboError
 from trustbo.models.backend import call, own_settings
 from trustbo.models.floored import Floored
 from trustbo.models.priors import Priors
-from trustbo.models.priors_numpy import number
+from trustbo.models.priors_numpy import half_normal, number
 
 LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
 
@@ -41,13 +41,6 @@ def beta0_and_noises(priors: Priors, z: np.ndarray) -> np.ndarray:
         angle = 0.5 * np.pi * special.ndtr(side * r)
         theta[:, i] = noise(prior, size * np.sin(angle))
     return theta
-
-
-def half_normal(score: np.ndarray, scale: float) -> np.ndarray:
-    """Half-normal variable of a score; accurate in both tails."""
-    low = special.erfinv(special.ndtr(np.minimum(score, 0.0)))
-    high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
-    return scale * np.sqrt(2.0) * np.where(score < 0.0, low, high)
 
 
 def quantile(prior: Distribution, score: np.ndarray) -> np.ndarray:

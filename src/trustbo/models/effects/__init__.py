@@ -1,0 +1,1 @@
+"""Effects on the drift of trust: groups of columns with Gaussian coefficients."""

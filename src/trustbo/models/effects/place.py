@@ -1,0 +1,163 @@
+"""Effects of places: s of the cell entered, and e of the directed bound.
+
+The sum g = B s + e of visited bounds has covariance tau_e^2 I + tau_s^2 B K B', B naming the cell
+that each enters. Helmert's rotation of the n_c bounds into each cell, independent of theta, leaves
+
+    mean of each cell times sqrt(n_c): covariance tau_e^2 I + tau_s^2 W K W, W = diag(sqrt(n_c)),
+    contrasts between its bounds:      independent, of variance tau_e^2,
+
+so that D bounds cost the root of a matrix of C cells, and neither tau is ever inverted.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.linalg import helmert
+
+from trustbo.errors import TrustboError
+from trustbo.models.effects.effect import Columns, Prior, Slots, Theta
+from trustbo.models.place import PlaceEffect, Visited, matern
+from trustbo.models.priors_numpy import half_normal
+
+_JITTER = 1e-12  # of a correlation, times the number of cells: below, rounding decides
+_LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
+
+
+@dataclass(frozen=True)
+class Place(PlaceEffect):
+    """Effect of a place, see `PlaceEffect`, as an effect among others."""
+
+    def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
+        """See `Effect.scales`."""
+        values, score = {}, dict(zip(self.names, scores.T, strict=True))
+        for name in self.names:
+            if name == "length_scale":
+                length_scale = self.length_scale * np.exp(self.length_scale_sd * score[name])
+                values[name] = np.clip(length_scale, *_LENGTH_SCALES)
+            else:
+                values[name] = half_normal(score[name], getattr(self, name))
+        return values
+
+    def group(self, slots: Slots) -> "PlaceColumns":
+        """See `Effect.group`.
+
+        Raises:
+            TrustboError: Visited places are not given.
+        """
+        if slots.places is None:
+            raise TrustboError("effects of places need the visited places; got None.")
+        return PlaceColumns.of(self, slots, slots.places)
+
+
+class PlaceColumns(NamedTuple):
+    """Rotated indicators of visited places: means of cells first, then contrasts, by robot."""
+
+    columns: Columns
+    rotation: Columns  # (column, unit), orthogonal
+    cells: tuple[tuple[int, np.ndarray, np.ndarray], ...]
+    """For each robot with separate effects, the first column, the distances between its visited
+    cells (cell, cell), and the roots of their numbers of bounds (cell,)."""
+    place: PlaceEffect
+    visited: Visited
+
+    @classmethod
+    def of(cls, place: PlaceEffect, slots: Slots, visited: Visited) -> "PlaceColumns":
+        """Columns of some slots."""
+        shared = visited.unit.shape[2] == 1
+        robot = np.zeros_like(slots.robot) if shared else slots.robot
+        unit = visited.unit[slots.mission, : slots.y.shape[1], robot].ravel()
+        met = np.flatnonzero(unit >= 0)
+        shape = len(unit), len(visited.units)
+        indicator = sparse.csr_array((np.ones(len(met)), (met, unit[met])), shape=shape)
+        rotation, cells = _rotation(visited)
+        columns = (indicator @ rotation.T).tocsr()
+        return cls(columns, rotation, cells, place, visited)
+
+    @property
+    def joined(self) -> list[slice]:
+        """Means of the cells of each robot."""
+        return [slice(i, i + len(w)) for i, _, w in self.cells if self.place.cells]
+
+    def prior(self, theta: Theta) -> Prior:
+        """Gaussian process over the cells' means, independent contrasts."""
+        nothing, place = np.zeros(len(theta["beta0"])), self.place
+        tau_e = theta["tau_e"] if place.bounds else nothing
+        sd, roots = np.repeat(tau_e[:, None], self.rotation.shape[0], axis=1), []
+        if not place.cells:
+            return Prior(np.zeros_like(sd), sd)
+        tau_s = theta["tau_s"]
+        scale = np.hypot(tau_s, tau_e)
+        share = np.divide(tau_s**2, scale**2, out=nothing, where=scale > 0.0)[:, None, None]
+        for first, distance, w in self.cells:
+            eye = np.eye(len(w))
+            K = matern(distance, theta["length_scale"][:, None, None])
+            C = share * (w[:, None] * w * K) + (1.0 - share + _JITTER * len(w) * w.max() ** 2) * eye
+            roots.append(np.linalg.cholesky(C))
+            sd[:, first : first + len(w)] = scale[:, None]
+        return Prior(np.zeros_like(sd), sd, roots)
+
+    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Effects of cells, place (draw, cell), and of bounds, place_bound (draw, unit)."""
+        g = c @ self.rotation
+        if not self.place.bounds:
+            return {"place": g}
+        if not self.place.cells:
+            return {"place_bound": g}
+        s = np.empty((len(g), len(self.visited.cells)))
+        theta_of = np.stack([theta[name] for name in ("tau_s", "length_scale", "tau_e")], axis=1)
+        for first, distance, w in self.cells:
+            mine = self._cells_of(first)
+            for values in np.unique(theta_of, axis=0):
+                rows = np.flatnonzero((theta_of == values).all(1))
+                mean = c[rows, first : first + len(w)]
+                s[np.ix_(rows, mine)] = _split(mean, w, distance, values, rng)
+        return {"place": s, "place_bound": g - s[:, self.visited.cell_of]}
+
+    def _cells_of(self, first: int) -> np.ndarray:
+        """Indices of the visited cells whose means begin at a column."""
+        robot = [start for start, *_ in self.cells].index(first)
+        return np.flatnonzero(
+            self.visited.cells[:, 0] == np.unique(self.visited.cells[:, 0])[robot]
+        )
+
+
+def _rotation(visited: Visited) -> tuple[Columns, tuple]:
+    """Helmert's rotation within each cell (column, unit), and the cells of each robot."""
+    rows, cols, values, cells, start = [], [], [], [], 0
+    for robot in np.unique(visited.cells[:, 0]):
+        mine = np.flatnonzero(visited.cells[:, 0] == robot)
+        position, n_units = visited.cells[mine, 1:].astype(float), []
+        contrast = start + len(mine)
+        for i, cell in enumerate(mine):
+            units = np.flatnonzero(visited.cell_of == cell)
+            n_units.append(len(units))
+            of_cell = np.append(start + i, contrast + np.arange(len(units) - 1))
+            contrast += len(units) - 1
+            at_row, at_col = np.meshgrid(of_cell, units, indexing="ij")
+            rows.append(at_row.ravel())
+            cols.append(at_col.ravel())
+            values.append(helmert(len(units), full=True).ravel())
+        gap = position[:, None] - position[None]
+        cells.append((start, np.hypot(gap[..., 0], gap[..., 1]), np.sqrt(n_units)))
+        start = contrast
+    entries = np.concatenate(rows), np.concatenate(cols)
+    shape = start, len(visited.units)
+    return sparse.csr_array((np.concatenate(values), entries), shape=shape), tuple(cells)
+
+
+def _split(
+    mean: np.ndarray, w: np.ndarray, distance: np.ndarray, theta: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:  # fmt: skip
+    """S (draw, cell) given means w s + e of cells, by Matheron's rule: a prior draw, corrected."""
+    tau_s, length_scale, tau_e = theta
+    if tau_s == 0.0:
+        return np.zeros_like(mean)
+    ratio, eye = (tau_e / tau_s) ** 2, np.eye(len(w))
+    K = matern(distance, length_scale) + _JITTER * len(w) * eye
+    s = rng.standard_normal(mean.shape) @ np.linalg.cholesky(K).T
+    off = mean / tau_s - w * s - np.sqrt(ratio) * rng.standard_normal(mean.shape)
+    M = w[:, None] * w * K + ratio * eye
+    return tau_s * (s + np.linalg.solve(M, off.T).T @ (w[:, None] * K))

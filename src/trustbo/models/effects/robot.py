@@ -1,0 +1,136 @@
+"""Effects of a robot in a mission: a part that stays, and a bad day.
+
+A damaged detector stays; rain is gone tomorrow. The drift of robot i at the bounds of mission m has
+a further term l d[i, m], l its predicted line of sight, and d, in units of stationary trust,
+independent between robots with covariance over missions
+
+    cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_day^2 [m = m'].
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpyro.distributions as dist
+from scipy import sparse
+
+from trustbo.errors import TrustboError, require_positive
+from trustbo.models.backend import own_settings
+from trustbo.models.effects.effect import Columns, Prior, Slots, Theta
+from trustbo.models.priors_numpy import half_normal, log_prob
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Effect of a robot in a mission, proportional to its line of sight.
+
+    Without a feature that predicts line of sight, the effect is a constant of the mission.
+
+    Attributes:
+        tau_slow: Scale of the half-normal prior of the sd of what stays.
+        tau_day: Scale of the half-normal prior of the sd of what is gone the next mission.
+        rho: Correlation of what stays between one mission and the next.
+
+    Raises:
+        TrustboError: A scale is not positive, or rho is not between 0 and 1.
+    """
+
+    tau_slow: float = 0.2
+    tau_day: float = 0.2
+    rho: float = 0.9
+    names = ("tau_slow", "tau_day")
+
+    def __post_init__(self) -> None:
+        for name in self.names:
+            require_positive(f"Robot.{name}", getattr(self, name))
+        if not 0.0 < self.rho < 1.0:
+            raise TrustboError(f"Robot.rho must be between 0 and 1; got {self.rho!r}.")
+
+    def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
+        """See `Effect.scales`."""
+        priors = self.tau_slow, self.tau_day
+        columns = zip(self.names, scores.T, priors, strict=True)
+        return {name: half_normal(score, scale) for name, score, scale in columns}
+
+    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Draws of the hyperparameters from their prior, each (draw,), by name."""
+        return self.scales(rng.standard_normal((n, 2)))
+
+    def log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Log prior density of the hyperparameters of draws, by name."""
+        with own_settings():
+            priors = {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
+        return {name: log_prob(prior, sites[name]) for name, prior in priors.items()}
+
+    def group(self, slots: Slots) -> "RobotColumns":
+        """See `Effect.group`."""
+        sight = slots.z[:, :, list(slots.sight)].mean(2) if slots.sight else np.ones(slots.y.shape)
+        index = slots.robot * slots.n_missions + slots.mission
+        size = slots.n_robots * slots.n_missions
+        where = np.repeat(index, slots.y.shape[1])
+        start = np.arange(len(where) + 1)
+        columns = sparse.csr_array((sight.ravel(), where, start), shape=(len(where), size))
+        return RobotColumns(columns, self.rho, (slots.n_robots, slots.n_missions))
+
+    def in_short(self) -> str:
+        """Text of what the effect is of."""
+        return "of robots by mission"
+
+    def to_record(self) -> dict[str, Any]:
+        """Fields by name, for JSON."""
+        return asdict(self)
+
+
+class RobotColumns(NamedTuple):
+    """Line of sight of one robot in one mission, for each pair of them, the mission fastest."""
+
+    columns: Columns
+    rho: float
+    shape: tuple[int, int]  # robots, missions
+
+    @property
+    def joined(self) -> list[slice]:
+        """Missions of each robot."""
+        n_robots, n = self.shape
+        return [slice(i * n, i * n + n) for i in range(n_robots)]
+
+    def prior(self, theta: Theta) -> Prior:
+        """Robots alike and independent."""
+        n_robots, n_missions = self.shape
+        scale, C = _correlation(theta, self.rho, n_missions)
+        sd = np.abs(theta["rest"]) * scale
+        sds = np.broadcast_to(sd[:, None], (len(sd), n_robots * n_missions))
+        return Prior(np.zeros(sds.shape), sds, [np.linalg.cholesky(C)] * n_robots)
+
+    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
+        d = (c / theta["rest"][:, None]).reshape(len(c), *self.shape)
+        return {"robot_effect": np.swapaxes(d, 1, 2)}
+
+
+def next_mission(effect: np.ndarray, theta: Theta, rho: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (draw, robot) and sd (draw,) of d in the mission that follows those of some draws.
+
+    Args:
+        effect: Effects d, (draw, mission, robot).
+        theta: Hyperparameters tau_slow and tau_day, (draw,).
+        rho: Correlation of what stays.
+    """
+    n_missions = effect.shape[1]
+    scale, C = _correlation(theta, rho, n_missions)
+    share = np.divide(theta["tau_slow"] ** 2, scale**2, out=np.zeros_like(scale), where=scale > 0.0)
+    k = share[:, None] * rho ** np.arange(n_missions, 0, -1)
+    gain = np.linalg.solve(C, k[..., None])[..., 0]
+    left = np.maximum(1.0 - (gain * k).sum(1), 0.0)
+    return np.einsum("nm,nmi->ni", gain, effect), scale * np.sqrt(left)
+
+
+def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sd (point,) and correlation (point, mission, mission) of d; never singular, as rho < 1."""
+    slow, day = theta["tau_slow"], theta["tau_day"]
+    scale = np.hypot(slow, day)
+    share = np.divide(slow**2, scale**2, out=np.zeros_like(scale), where=scale > 0.0)
+    m = np.arange(n_missions)
+    carried = rho ** np.abs(m[:, None] - m)
+    return scale, share[:, None, None] * (carried - np.eye(n_missions)) + np.eye(n_missions)
