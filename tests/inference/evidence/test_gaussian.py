@@ -1,0 +1,188 @@
+"""Evidence of Gaussian rates against the joint normal of all rates, and against closed forms."""
+
+import numpy as np
+import pytest
+from missions import walking_missions
+from references import dense_log_likelihood
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.inference.evidence.dense import Dense
+from trustbo.inference.evidence.gaussian import Gaussian
+from trustbo.inference.evidence.place_rows import gather_rows
+from trustbo.inference.evidence.statistics import gather
+from trustbo.inference.samplers import exact
+from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.models import PlaceEffect, PooledTrust, Priors
+from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.place import Place
+from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.weights import Weights
+from trustbo.models.place import bounds_of, visited
+from trustbo.stacking import stack_missions
+
+PRIORS = Priors.of(("line_of_sight", "slope"))
+EFFECTS = {
+    "weights": [],
+    "robots": [Robot()],
+    "places": [Place()],
+    "places and robots": [Place(), Robot()],
+    "cells and robots": [Robot(rho=0.5), Place(bounds=False)],
+    "bounds": [Place(cells=False)],
+    "places by robot, and robots": [Place(shared=False), Robot()],
+}
+X0 = 0.4, 0.6
+SCALES = {"tau_s", "tau_e", "tau_slow", "tau_day"}
+
+
+def gathered(missions, effects, weight=None):
+    batch = stack_missions(missions)
+    bounds = bounds_of(missions, batch.contact_rate.shape[:2])
+    place = next((e for e in effects if isinstance(e, PlaceEffect)), PlaceEffect())
+    places = visited(bounds, place, batch.contact_rate.shape[2], (5, 5))
+    slots = Slots.of(batch, len(missions), ("line_of_sight", "slope"), weight, places)
+    return slots, [effect.group(slots) for effect in (Weights(PRIORS), *effects)]
+
+
+def random_theta(effects, rng, n, memory="level"):
+    """Hyperparameters; some scales are 0, and beta0 once."""
+    beta0 = rng.uniform(0.0, 0.95, n)
+    beta0[0] = 0.0
+    theta = {"beta0": beta0, "rest": 1.0 - beta0 if memory == "level" else np.ones(n)}
+    theta |= {name: rng.uniform(0.01, 0.3, n) for name in ("delta_w", "delta_v")}
+    for effect in effects:
+        theta |= effect.scales(rng.standard_normal((n, len(effect.names))))
+    for t, name in enumerate(sorted(theta.keys() & SCALES)):
+        theta[name][1 + t % 2 :: 3] = 0.0
+    return theta
+
+
+def point(theta, t):
+    return {name: values[t : t + 1] for name, values in theta.items()}
+
+
+@pytest.mark.parametrize("memory", ["level", "deviation"])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_the_evidence_is_that_of_the_joint_normal(name, memory):
+    """With gaps, missions of any length and weight, scales of 0 and no memory."""
+    rng, effects = np.random.default_rng(3), EFFECTS[name]
+    for seed, missing in ((0, 0.0), (1, 0.3)):
+        weight = rng.uniform(0.2, 1.0, 5) if missing else None
+        missions = walking_missions(seed, 5, missing=missing)
+        slots, groups = gathered(missions, effects, weight)
+        theta = random_theta(effects, rng, 6, memory)
+        expected = [
+            Dense(slots, groups, point(theta, t), X0, memory).log_density() for t in range(6)
+        ]
+        found = Gaussian(slots, groups, X0, memory).log_density(theta)
+        np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("memory", ["level", "deviation"])
+def test_given_coefficients_the_evidence_is_that_of_each_chain(memory):
+    """The reference itself: without spread of the coefficients, chains are independent."""
+    (mission,) = walking_missions(0, 1)
+    slots, groups = gathered([mission], [])
+    narrow = groups[0]._replace(mean=np.array([0.4, 0.2, 0.1]), sd=np.full(3, 1e-9))
+    narrow = narrow._replace(stationary=False)
+    theta = point(random_theta([], np.random.default_rng(0), 2, memory), 1)
+    beta0, w, v = (theta[name][0] for name in ("beta0", "delta_w", "delta_v"))
+    expected = 0.0
+    for i in range(3):
+        z, u = mission.awareness[:, i], mission.awareness[:, i] @ [0.4, 0.2] + 0.1
+        if memory == "deviation":  # x - u is a chain without drift that begins at x_0 - E x_0
+            y = mission.contact_rate[:, i] - u
+            chain = dense_log_likelihood(beta0, np.zeros(2), 0.0, w, v, 0.0, X0[1], z, y)
+        else:
+            y = mission.contact_rate[:, i]
+            chain = dense_log_likelihood(beta0, np.array([0.4, 0.2]), 0.1, w, v, *X0, z, y)
+        expected += chain
+    found = Dense(slots, [narrow], theta, X0, memory).log_density()
+    np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
+def test_without_memory_level_and_deviation_are_one_model():
+    missions = walking_missions(4)
+    slots, groups = gathered(missions, EFFECTS["places and robots"])
+    theta = random_theta(EFFECTS["places and robots"], np.random.default_rng(0), 4)
+    theta |= {"beta0": np.zeros(4), "rest": np.ones(4)}
+    level, deviation = (Gaussian(slots, groups, X0, m).log_density(theta)
+                        for m in ("level", "deviation"))  # fmt: skip
+    np.testing.assert_allclose(level, deviation, rtol=1e-12)
+
+
+def test_a_mission_of_weight_0_is_not_there():
+    missions = walking_missions(5)
+    effects = EFFECTS["places and robots"]
+    theta = random_theta(effects, np.random.default_rng(0), 4)
+    rates = [m.contact_rate for m in missions]
+    rates[2] = np.full_like(rates[2], np.nan)
+    blank = [
+        Mission.from_arrays(m.path, m.awareness, y) for m, y in zip(missions, rates, strict=True)
+    ]
+    found = [
+        Gaussian(*gathered(some, effects, weight), X0).log_density(theta)
+        for some, weight in ((missions, np.array([1.0, 1.0, 0.0, 1.0])), (blank, None))
+    ]
+    np.testing.assert_allclose(*found, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["places", "places and robots", "places by robot, and robots"])
+def test_draws_have_the_moments_of_dense_conditioning(name):
+    effects, rng = EFFECTS[name], np.random.default_rng(0)
+    slots, groups = gathered(walking_missions(6), effects)
+    theta = point(random_theta(effects, rng, 4), 3)
+    theta |= {name: np.array([0.2]) for name in theta.keys() & SCALES}
+    mean, cov = Dense(slots, groups, theta, X0).coefficients()
+    n = 20_000
+    drawn = Gaussian(slots, groups, X0).coefficients(theta, np.array([n]), rng)
+    sd = np.sqrt(np.diag(cov))
+    # 5.5 standard errors, of some 100 means and 10 000 products.
+    assert (np.abs(drawn.mean(0) - mean) < 5.5 * sd / np.sqrt(n) + 1e-12).all()
+    white = (drawn - mean) / np.where(sd > 0.0, sd, 1.0)
+    correlation = cov / np.where(sd > 0.0, sd, 1.0) / np.where(sd > 0.0, sd, 1.0)[:, None]
+    error = np.sqrt((1.0 + correlation**2) / n)
+    assert (np.abs(white.T @ white / n - correlation) < 5.5 * error + 1e-9).all()
+
+
+def test_the_pooled_evidence_is_that_of_the_exact_sampler():
+    missions = walking_missions(7)
+    slots, groups = gathered(missions, [])
+    theta = random_theta([], np.random.default_rng(1), 20)
+    theta["beta0"][0] = 0.5
+    theta["rest"] = 1.0 - theta["beta0"]
+    model = PooledTrust(PRIORS)
+    (statistics,) = gather(model, stack_missions(missions))
+    z = np.stack([
+        np.log(theta["beta0"] / theta["rest"]),
+        np.log(np.hypot(theta["delta_w"], theta["delta_v"])),
+        np.log(theta["delta_w"] / theta["delta_v"]),
+    ], axis=1)  # fmt: skip
+    target = exact._target(statistics, PRIORS)
+    *_, jacobian = target.constrain(z)
+    prior = sum(PRIORS.log_density(name, theta[name], theta["beta0"])
+                for name in ("beta0", "delta_w", "delta_v"))  # fmt: skip
+    found = Gaussian(slots, groups, (PRIORS.x0_mean, PRIORS.x0_sd)).log_density(theta)
+    np.testing.assert_allclose(found, target.log_density(z) - jacobian - prior, rtol=1e-9)
+
+
+def test_the_evidence_of_places_is_that_of_their_target():
+    missions, place = walking_missions(8), Place()
+    slots, groups = gathered(missions, [place])
+    z = np.random.default_rng(2).standard_normal((30, 6))
+    rates = stack_missions(missions)
+    rows = gather_rows(rates.awareness, rates.contact_rate, slots.places,
+                       np.ones(len(rates.contact_rate)), float(PRIORS.x0_mean))  # fmt: skip
+    target = PlaceTarget(rows, slots.places, PRIORS, place)
+    values, log_prior = target.constrain(z)
+    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
+    theta = dict(zip(names, values.T, strict=True))
+    theta["rest"] = 1.0 - theta["beta0"]
+    found = Gaussian(slots, groups, (PRIORS.x0_mean, PRIORS.x0_sd)).log_density(theta)
+    np.testing.assert_allclose(found, target.log_density(z) - log_prior, rtol=1e-6)
+
+
+def test_an_unknown_memory_is_refused():
+    slots, groups = gathered(walking_missions(9), [])
+    with pytest.raises(TrustboError, match="'levels'"):
+        Gaussian(slots, groups, X0, "levels")
