@@ -31,15 +31,14 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dsyrk, dtrsm  # pyright: ignore
-from scipy.linalg.lapack import dpotrf  # pyright: ignore
+from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
 from trustbo.models.effects.effect import Columns, Group, Prior, Slots, Theta
 
 MEMORIES = ("level", "deviation")
-_NUMBERS = 2e6  # kept at once, of all points of a chunk: about the cache
+_NUMBERS = 1e6  # kept at once, of all points of a chunk: about the cache
 
 
 class Gaussian:
@@ -91,7 +90,7 @@ class Gaussian:
         n = len(theta["beta0"])
         with np.errstate(all="ignore"):  # far out noises under- and overflow: no density there
             parts = [self._factors(_take(theta, i)).log_p for i in self._chunks(n)]
-        return np.concatenate(parts)
+        return np.concatenate([np.zeros(0), *parts])
 
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
@@ -231,10 +230,10 @@ class Gaussian:
         arrow, prior = factors.arrows[t], factors.prior
         e, shared = rng.standard_normal((len(self.order), n)), self.blocks[-1]
         F, last = arrow.shared[:-1, :-1], slice(shared.start, shared.stop - 1)
-        e[last] = solve_triangular(F, arrow.shared[-1, :-1, None] + e[last], lower=True, trans=1)
+        e[last] = dtrtrs(F, arrow.shared[-1, :-1, None] + e[last], lower=1, trans=1)[0]
         for block, (F, X) in zip(self.blocks, arrow.robots, strict=False):
             right = X[-1, :, None] - X[:-1].T @ e[last] + e[block]
-            e[block] = solve_triangular(F, right, lower=True, trans=1)
+            e[block] = dtrtrs(F, right, lower=1, trans=1)[0]
         for columns, root in zip(self.joined, prior.roots, strict=True):
             e[columns] = root[t] @ e[columns]
         return prior.mean[t] + prior.sd[t] * e.T

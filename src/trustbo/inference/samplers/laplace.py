@@ -60,7 +60,7 @@ def laplace(
             break
         steps = np.zeros_like(z[active])
         for i, (gradient, hessian) in enumerate(
-            zip(*_derivatives(log_density, z[active]), strict=True)
+            zip(*derivatives(log_density, z[active]), strict=True)
         ):
             if np.isfinite(hessian).all():  # else it is next to a point of zero density
                 steps[i] = newton_direction(np, gradient, -hessian, 1e-3)
@@ -71,7 +71,7 @@ def laplace(
         better = values[row, best] > value[active] + 1e-10
         active, moved = active[better], candidates[row, best][better]
         z[active], value[active] = moved, values[row, best][better]
-    hessians = _derivatives(log_density, z)[1]
+    hessians = derivatives(log_density, z)[1]
     scales = np.tile(np.eye(z.shape[1]), (len(z), 1, 1))
     for i, hessian in enumerate(hessians):
         if np.isfinite(hessian).all():
@@ -125,7 +125,9 @@ def newton(
     return z, hessian
 
 
-def _derivatives(log_density: Density, z: np.ndarray, h: float = 1e-3):
+def derivatives(
+    log_density: Density, z: np.ndarray, h: float = 1e-3
+) -> tuple[np.ndarray, np.ndarray]:
     """Gradients and Hessians at points (point, axis) by central differences, in one batch."""
     n, d = z.shape
     steps = h * np.eye(d)

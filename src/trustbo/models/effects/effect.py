@@ -2,7 +2,7 @@
 
 The drift of a bound is u = sum_j U_j c_j, c Gaussian given hyperparameters theta. A chain is one
 robot in one mission; a slot is one bound of a chain. A new effect is a class with the methods of
-`Effect`, and whatever it binds to missions one with those of `Group`.
+`Effect`, and its columns at the slots of some missions one with those of `Group`.
 """
 
 from collections.abc import Mapping, Sequence
