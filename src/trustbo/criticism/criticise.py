@@ -239,6 +239,11 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
             f"this posterior lacks {what}, so that its residuals are not known; criticise takes "
             "posteriors of PooledTrust, HierarchicalTrust and CoupledTrust from trustbo.fit."
         )
+    if "robots" in posterior.children:
+        raise TrustboError(
+            "criticise reads the residuals of models without effects of robots; criticise "
+            "fit(missions, PooledTrust(place=Place())) of the same missions instead."
+        )
     if (family := posterior.attrs["observation"]) != "gaussian":
         raise TrustboError(
             f'criticise reads the residuals of Gaussian rates; this posterior has observation "'

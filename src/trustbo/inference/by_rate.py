@@ -7,11 +7,10 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import params_of
+from trustbo.inference.draws import params_of_missions
 from trustbo.inference.evidence import kalman_numpy
 from trustbo.inference.posterior_groups import Conditional, complete, is_weighted
 from trustbo.inference.posterior_tree import missions_of, require_posterior
-from trustbo.models.place import bounds_of
 from trustbo.stacking import stack_missions
 
 
@@ -50,9 +49,7 @@ def by_rate(posterior: xr.DataTree, missions: Sequence[Mission] | None = None) -
     posterior = complete(posterior, missions)
     missions = missions_of(posterior)
     batch = stack_missions(missions, pad=False)
-    params = params_of(posterior).flat()
-    if params.places:
-        params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
+    params = params_of_missions(posterior, missions, batch)
     measured = np.isfinite(batch.contact_rate)
     mean, sd = (a[:, measured] for a in kalman_numpy.one_step(params, conditional.lag, batch))
     y = batch.contact_rate[measured]

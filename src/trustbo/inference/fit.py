@@ -23,6 +23,7 @@ from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
 from trustbo.inference.samplers.watching import Watch
 from trustbo.models.backend import VERSIONS
+from trustbo.models.effects.effect import Slots
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.place import Visited, bounds_of, visited
@@ -141,10 +142,10 @@ def fit(
             warnings.warn(slow_places(reason), stacklevel=3)
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
-        start = _proposal(earlier)
+        start, slots = _proposal(earlier), _slots(model, missions, batch, weight, places)
         watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
         drawn, complaints = draw_posterior(
-            floored, chosen, settings, seed, batch, weight, places, start, check=check,
+            floored, chosen, settings, seed, batch, weight, places, start, slots, check=check,
             fallback=fallback, watch=watch,
         )  # fmt: skip
         return _Drawn(model, prior, drawn, complaints, drawn.fallback or reason)
@@ -160,8 +161,9 @@ def fit(
         "posterior": {name: sampled.params[name] for name in model.dims},
         "sample_stats": sampled.stats,
         "prior": {name: values[None] for name, values in prior.items()},
+        **({"robots": dict(sampled.robots)} if sampled.robots else {}),
     }
-    posterior = to_datatree(groups, missions, model.dims)
+    posterior = to_datatree(groups, missions, model.dims | {"robot_effect": ("mission", "robot")})
     if places is not None:
         posterior["places"] = xr.DataTree(place_group(sampled.places, places, seed))
     posterior.attrs |= {
@@ -258,6 +260,19 @@ def _places(
     shape = None if workspace is None else workspace.passable.shape
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
     return visited(bounds, model.place, batch.contact_rate.shape[2], shape)  # pyright: ignore
+
+
+def _slots(
+    model: TrustModel,
+    missions: Sequence[Mission],
+    batch: MissionBatch,
+    weight: np.ndarray,
+    places: Visited | None,
+) -> Slots | None:
+    """Rates by chain, where robots have effects."""
+    if not model.effects:
+        return None
+    return Slots.of(batch, len(missions), missions[0].features, weight, places)
 
 
 def _proposal(earlier: xr.DataTree | None) -> Student | None:

@@ -39,6 +39,8 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
             densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
     if model.place is not None:
         densities |= model.place.log_prior(sites)
+    for effect in model.effects:
+        densities |= effect.log_prior(sites)
     densities |= model.own_log_prior(sites)
     return {
         label: density.reshape(*density.shape[:2], -1).sum(-1)

@@ -9,13 +9,14 @@ from jax import random
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.draws import params_of
+from trustbo.inference.draws import params_of_missions, rho_of, with_robots
 from trustbo.inference.evidence import kalman_numpy, latent
 from trustbo.inference.evidence.ep import trust
 from trustbo.inference.log_prior import log_prior_group
 from trustbo.inference.place_maps import prior_maps
 from trustbo.inference.posterior_tree import missions_of, require_posterior, to_datatree
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.robot import prior_effect
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, params_from
@@ -29,7 +30,7 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
+_KEPT = ("posterior", "sample_stats", "prior", "places", "robots", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
@@ -137,9 +138,7 @@ def _groups(
     batch = stack_missions(missions, pad=not conditional.by_numpy)
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
-    every = params_of(posterior).flat()
-    bounds = bounds_of(missions, batch.contact_rate.shape[:2]) if every.places else None
-    every = every.on(bounds)
+    every = params_of_missions(posterior, missions, batch)
     index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     few = every.map(lambda values, _: values[index])
     seed = posterior.attrs["seed"]
@@ -148,7 +147,7 @@ def _groups(
         arrays = _trust_by_numpy(conditional, every, few, batch, n_bounds, seed)
     else:
         arrays = _trust_compiled(conditional, every, few, latents, kept, batch, seed)
-    prior = _prior_of(posterior).on(bounds)
+    prior = _prior_of(posterior, missions, batch)
 
     rng = np.random.default_rng(seed + 3)
 
@@ -181,12 +180,20 @@ def is_weighted(posterior: xr.DataTree) -> bool:
     return bool((np.asarray(posterior.attrs.get("weights", 1.0)) != 1.0).any())
 
 
-def _prior_of(posterior: xr.DataTree) -> Params:
+def _prior_of(posterior: xr.DataTree, missions: Sequence[Mission], batch: MissionBatch) -> Params:
+    """Draws of the prior, for the bounds of some missions."""
     sites = {str(n): a.values[0] for n, a in posterior["prior"].data_vars.items()}
     params = params_from(sites, posterior.attrs).flat()
-    if "places" not in posterior.children:
+    if "places" in posterior.children:
+        maps = prior_maps(posterior["places"].to_dataset(), sites)
+        params = params._replace(**maps)  # pyright: ignore
+        params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
+    if "robots" not in posterior.children:
         return params
-    return params._replace(**prior_maps(posterior["places"].to_dataset(), sites))  # pyright: ignore
+    shape = tuple(posterior["robots"].sizes[dim] for dim in ("mission", "robot"))
+    rng = np.random.default_rng([posterior.attrs["seed"], 4])
+    effect = prior_effect(sites, rho_of(posterior), shape, rng)  # pyright: ignore
+    return with_robots(params, effect, missions, batch)
 
 
 def _trust_by_numpy(

@@ -54,6 +54,11 @@ def prior_predictive(
     z = as_array("awareness", awareness)
     if z.ndim != 4:
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
+    if model.effects:
+        raise TrustboError(
+            "effects of robots are of fitted missions: fit them, and take the posterior's group "
+            "prior_predictive; or give a model without them."
+        )
     if model.place is not None:
         raise TrustboError(
             "effects of places need the paths of missions: fit them, and take the posterior's "
@@ -123,7 +128,7 @@ def draw_sites(
     if sites is None:
         sites = _compiled_draws(model, shape, n_draws, seed)
     model.check(sites, shape)
-    return sites | _place_draws(model, n_draws, seed)
+    return sites | _effect_draws(model, n_draws, seed)
 
 
 def _compiled_draws(
@@ -138,11 +143,14 @@ def _compiled_draws(
     return {name: np.concatenate([batch[name] for batch in drawn])[:n_draws] for name in drawn[0]}
 
 
-def _place_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:
-    """Draws of the hyperparameters of places, where these have effects."""
-    if model.place is None:
-        return {}
-    return model.place.draw(n_draws, np.random.default_rng([seed, 1]))
+def _effect_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.ndarray]:
+    """Draws of the hyperparameters of effects."""
+    drawn = {}
+    if model.place is not None:
+        drawn |= model.place.draw(n_draws, np.random.default_rng([seed, 1]))
+    for effect in model.effects:
+        drawn |= effect.draw(n_draws, np.random.default_rng([seed, 2]))
+    return drawn
 
 
 @partial(jax.jit, static_argnames="shape")

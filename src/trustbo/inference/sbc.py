@@ -91,6 +91,8 @@ def sbc(
     model = PooledTrust() if model is None else model
     sampler, _ = resolve_sampler(model, sampler)
     require_whole("n_datasets", n_datasets, 1)
+    if model.effects:
+        raise TrustboError("sbc draws no effects of robots; give a model without them.")
     if (model.place is None) != (design is None):
         raise TrustboError(
             f"design={design!r} and place={model.place!r}: a model with effects of places needs a "

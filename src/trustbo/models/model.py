@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import jax
 import numpy as np
@@ -56,6 +56,7 @@ class TrustModel(Displayed, ABC):
     observation: str = "gaussian"
     response: str = "level"
     place: PlaceEffect | None = None
+    effects: ClassVar[tuple[Any, ...]] = ()  # see `PooledTrust`
 
     def __post_init__(self) -> None:
         require_choice("observation", self.observation, (AUTO, *FAMILIES))
@@ -102,6 +103,11 @@ class TrustModel(Displayed, ABC):
         return {} if self.place is None else {name: () for name in self.place.names}
 
     @property
+    def effect_dims(self) -> dict[str, tuple[str, ...]]:
+        """Axes of the hyperparameters of all effects, those of places among them."""
+        return self.place_dims | {name: () for effect in self.effects for name in effect.names}
+
+    @property
     def robot_sets(self) -> str | None:
         """Robots that sufficient statistics are gathered of together: `"all"`, or `"each"` alone.
 
@@ -120,7 +126,7 @@ class TrustModel(Displayed, ABC):
         Args:
             sites: Parameters of a posterior, leading axes (...), with the axes of `dims`.
         """
-        return {name: (name, sites[name]) for name in self.dims if name not in self.place_dims}
+        return {name: (name, sites[name]) for name in self.dims if name not in self.effect_dims}
 
     def own_log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Log prior density (chain, draw), by label, of parameters without a field in `Priors`."""
@@ -129,7 +135,7 @@ class TrustModel(Displayed, ABC):
     def draw_prior(
         self, shape: tuple[int, int], n: int, rng: np.random.Generator
     ) -> dict[str, np.ndarray] | None:
-        """Draws of the parameters but those of places, (draw, ...), by name.
+        """Draws of the parameters but those of effects, (draw, ...), by name.
 
         None where only the numpyro model can draw them, which takes long to compile.
         """
@@ -208,15 +214,15 @@ class TrustModel(Displayed, ABC):
         return replace(self, priors=self.priors.above_resolution(resolution(ticks)))
 
     def sizes(self, n_robots: int, n_features: int) -> dict[str, tuple[int, ...]]:
-        """Shape of each parameter in a posterior, without those of places."""
+        """Shape of each parameter in a posterior, without those of effects."""
         length = {"robot": n_robots, "robot_": n_robots, "follower": n_robots - 1}
         length["feature"] = n_features
-        dims = {name: axes for name, axes in self.dims.items() if name not in self.place_dims}
+        dims = {name: axes for name, axes in self.dims.items() if name not in self.effect_dims}
         return {name: tuple(length[axis] for axis in axes) for name, axes in dims.items()}
 
     def options(self) -> dict[str, str]:
-        """Options by name, without the priors and the effects of places."""
-        others = ("priors", "place")
+        """Options by name, without the priors and the effects."""
+        others = ("priors", "place", "effects")
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
     def params(self, sites: Mapping[str, Any], n_features: int) -> Params:
@@ -357,8 +363,8 @@ class TrustModel(Displayed, ABC):
         """
         if not self.family.integrates_out:
             return "its observations are not Gaussian"
-        if self.why_not_exact or self.place:
-            return self.why_not_exact or "places have effects"
+        if self.why_not_exact or self.place or self.effects:
+            return self.why_not_exact or f"{'places' if self.place else 'robots'} have effects"
         if self.robot_sets is None:
             return "its robots share some parameters only, or influence each other"
         return None
@@ -378,6 +384,10 @@ class TrustModel(Displayed, ABC):
             return "it has effects of places, and " + (
                 "rates measure changes" if self.lag else "robots with nothing else in common"
             )
+        if self.effects and (self.lag or not self.family.integrates_out):
+            return "it has effects of robots, and " + (
+                "rates measure changes" if self.lag else "its observations are not Gaussian"
+            )
         return None
 
     def _card(self) -> Card:
@@ -389,6 +399,7 @@ class TrustModel(Displayed, ABC):
                 if n not in ("observation", "response")
             ),
             ("places", "no effects" if self.place is None else self.place.in_short()),
+            *(("effects", effect.in_short()) for effect in self.effects),
             ("sampler", "exact" if self.why_not_exact is None else f"nuts: {self.why_not_exact}"),
         ]
         priors = () if self.priors is None else self.priors._card().rows
@@ -402,13 +413,14 @@ class TrustModel(Displayed, ABC):
             for name, value in self.options().items()
             if name not in ("observation", "parameters") and value != usual.get(name)
         ]
-        places = ["places"] * (self.place is not None)
-        return ", ".join([type(self).__name__, *places, self.observation, *others])
+        effects = ["places"] * (self.place is not None) + ["robots"] * len(self.effects)
+        return ", ".join([type(self).__name__, *effects, self.observation, *others])
 
     def describe(self) -> str:
         """Text of the model's name and options."""
         listed = ", ".join(f'{name}="{value}"' for name, value in self.options().items())
         listed += "" if self.place is None else f", place={self.place}"
+        listed += f", effects={list(self.effects)}" if self.effects else ""
         return f"{type(self).__name__}({listed})"
 
 

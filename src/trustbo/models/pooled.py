@@ -5,14 +5,43 @@ from dataclasses import dataclass
 
 from jax import Array
 
+from trustbo.errors import TrustboError
+from trustbo.models.effects.robot import Robot
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import TrustParams
+from trustbo.models.place import PlaceEffect
 
 
 @register
 @dataclass(frozen=True, repr=False)
 class PooledTrust(TrustModel):
-    """One set of parameters for all robots, equations (3)-(4)."""
+    """One set of parameters for all robots, equations (3)-(4).
+
+    Attributes:
+        effects: Effects that add to trust: `Place()`, of which `place` is the short form, and
+            `Robot()`, of each robot in each mission. Effects of robots are for Gaussian rates.
+
+    Raises:
+        TrustboError: An effect is unknown, or of a kind that the model already has.
+    """
+
+    effects: tuple[Robot, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __post_init__(self) -> None:
+        effects = (self.effects,) if isinstance(self.effects, Robot) else tuple(self.effects)
+        for effect in effects:
+            if not isinstance(effect, PlaceEffect | Robot):
+                raise TrustboError(f"effects must be of Place() and Robot(); got {effect!r}.")
+        places = [effect for effect in effects if isinstance(effect, PlaceEffect)]
+        robots = tuple(effect for effect in effects if isinstance(effect, Robot))
+        if len(places) + (self.place is not None) > 1 or len(robots) > 1:
+            raise TrustboError(
+                f"effects must be of different kinds; got {effects!r} and place={self.place!r}."
+            )
+        if places:
+            object.__setattr__(self, "place", PlaceEffect(**places[0].to_record()))
+        object.__setattr__(self, "effects", robots)
+        super().__post_init__()
 
     def sample_params(self, n_robots: int, n_features: int) -> TrustParams:
         """Sample statements of beta0, beta, b, delta_w and delta_v."""
@@ -36,7 +65,7 @@ class PooledTrust(TrustModel):
     def dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of beta0, beta, b, delta_w and delta_v."""
         axes = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
-        return axes | self.place_dims
+        return axes | self.effect_dims
 
     @property
     def robot_sets(self) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 from trustbo.errors import TrustboError
 from trustbo.models.coupled import CoupledTrust
+from trustbo.models.effects.robot import Robot
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect
@@ -24,6 +25,8 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
         "priors": model.priors.describe(),
     }
     by_feature = model.priors is Priors.default(model.observation)
+    effects = [effect.to_record() for effect in model.effects]
+    custom |= {"effects": effects} if effects else {}
     return custom | ({"by_feature": True} if by_feature else {})
 
 
@@ -42,8 +45,10 @@ def model_from_record(
                 f"the campaign's model is {record}; the one given is {model_to_record(given)}."
             )
         return given
-    ours = ("class", "priors", "place", "by_feature")
+    ours = ("class", "priors", "place", "by_feature", "effects")
     options = {name: value for name, value in record.items() if name not in ours}
+    if effects := [Robot(**effect) for effect in record.get("effects", ())]:
+        options["effects"] = tuple(effects)
     kind = _MODELS.get(record["class"])
     place = None if record["place"] is None else PlaceEffect(**record["place"])
     if kind is not None:

@@ -21,6 +21,11 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
         raise TrustboError(
             f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
         )
+    if sampler in ("nuts", "joint") and model.effects:
+        raise TrustboError(
+            f'sampler "{sampler}" cannot treat {model.describe()}: NUTS has no effects of robots. '
+            'Use sampler="exact".'
+        )
     if sampler == "joint" and model.family.integrates_out:
         raise TrustboError(
             'sampler "joint" is for observations that trust does not integrate out of; with '
@@ -39,7 +44,14 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
         return sampler, "asked for"
     pooling = model.partial_pooling is not None
     custom_drift, coupled = isinstance(model, DriftTrust), is_coupled(model)
-    by_scores = model.place or pooling or custom_drift or coupled or not model.family.integrates_out
+    by_scores = (
+        model.place
+        or model.effects
+        or pooling
+        or custom_drift
+        or coupled
+        or not model.family.integrates_out
+    )
     reason = model.why_not_exact or (
         None if custom_drift else why_not_conjugate(model.priors, coupled=coupled)
     )
@@ -50,6 +62,11 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
         by = "" if model.family.integrates_out else " by expectation propagation, and weights"
         what = "trust integrates out" if custom_drift else "trust and coefficients integrate out"
         return "exact", f"{what}{by}"
+    if model.effects:
+        raise TrustboError(
+            f"no sampler can treat {model.describe()}: {reason}; NUTS has no effects of robots. "
+            "Give a model without them."
+        )
     return ("nuts" if model.family.integrates_out else "joint"), reason
 
 

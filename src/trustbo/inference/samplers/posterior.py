@@ -75,6 +75,11 @@ class Posterior:
         """Take the scores and an exact evidence; `spread` is the sd of the measured rates."""
         self.scores, self.evidence, self._spread = coordinates, evidence, spread
 
+    @property
+    def n_scores(self) -> int:
+        """Number of scores."""
+        return self.scores.n_scores
+
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density, not divided by the evidence; shape (point,)."""
         out = np.full(len(z), -np.inf)

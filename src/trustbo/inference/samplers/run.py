@@ -7,7 +7,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from jax import Array, random
 
+from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference.evidence.ep.chains import gather_chains
+from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.gram_jax import spectrum
 from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.place_marginal import PlaceIndex
@@ -18,7 +20,7 @@ from trustbo.inference.samplers.complaints import complaints_of, complaints_of_m
 from trustbo.inference.samplers.convergence import MAX_KHAT
 from trustbo.inference.samplers.coupled_target import CoupledTarget
 from trustbo.inference.samplers.drift_target import DriftTarget
-from trustbo.inference.samplers.exact import ExactDraws, sample_exact
+from trustbo.inference.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
 from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
 from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
@@ -26,6 +28,7 @@ from trustbo.inference.samplers.latent_target import LatentTarget
 from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.place_draws import split_units
 from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.posterior import Posterior, Shared
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
 from trustbo.inference.samplers.target import NutsData
@@ -33,6 +36,9 @@ from trustbo.inference.samplers.watching import SILENT, Watch
 from trustbo.models.backend import own_settings
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
+from trustbo.models.effects.effect import Effect, Slots
+from trustbo.models.effects.place import Place
+from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.parallel import one_blas_thread
@@ -50,6 +56,8 @@ class Draws(NamedTuple):
     """Innovations of latent trust, with the same leading axes, if it was sampled."""
     places: Mapping[str, np.ndarray] = {}
     """Effects of visited places, see `place_maps.place_group`."""
+    robots: Mapping[str, np.ndarray] = {}
+    """Effects of robots in missions, robot_effect (chain, draw, mission, robot)."""
     fallback: str = ""
     """Failure of the exact sampler, where NUTS was used for it."""
 
@@ -67,6 +75,7 @@ def draw_posterior(
     weight: np.ndarray | None = None,
     places: Visited | None = None,
     start: Student | None = None,
+    slots: Slots | None = None,
     *,
     check: bool,
     fallback: bool = True,
@@ -82,8 +91,9 @@ def draw_posterior(
         batch: Missions, padded.
         weight: Weight of each mission, shape (mission,); 1 by default.
         places: Visited places, where these have effects.
-        start: First proposal of the exact sampler with places or coupled robots, from an earlier
+        start: First proposal of the exact sampler with effects or coupled robots, from an earlier
             posterior.
+        slots: Rates by chain, where robots have effects; `places` are among them.
         check: Whether to check the diagnostics, and try again for longer if they are bad.
         fallback: Whether NUTS takes over, with a warning, where the exact sampler fails.
         watch: Observer of the progress.
@@ -95,10 +105,13 @@ def draw_posterior(
     failure = ""
     if sampler == "exact":
         try:
-            if places is None and model.family.integrates_out and model.robot_sets:
+            if not (places or slots) and model.family.integrates_out and model.robot_sets:
                 return _sample_exact(model, settings, seed, batch, weight), []
-            return _sample_scores(model, settings, seed, batch, weight, places, start, watch), []
+            targets = _targets(model, batch, weight, places, slots)
+            return _sample_scores(model, settings, seed, targets, start, watch), []
         except UnevenWeightsError as error:
+            if model.effects:
+                raise PosteriorError(f"the exact sampler's {error}.") from None
             if not fallback:
                 raise
             failure = str(error)
@@ -158,18 +171,16 @@ def _sample_scores(
     model: TrustModel,
     settings: NutsSettings,
     seed: int,
-    batch: MissionBatch,
-    weight: np.ndarray,
-    places: Visited | None,
+    targets: list[ScoreTarget],
     start: Student | None,
     watch: Watch,
 ) -> Draws:
-    """Draws by importance sampling of scores: places, pooling, coupling, or rates not Gaussian."""
+    """Draws by importance sampling of scores: effects, pooling, coupling, or rates not Gaussian."""
     shape = (settings.n_chains, settings.draws)
-    targets = _targets(model, batch, weight, places)
     coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
-    if start is not None and coupled and len(start.center) != coupled.n_scores:
-        start = None  # of another team
+    engine = next((t for t in targets if isinstance(t, Posterior)), None)
+    if start is not None and (sized := coupled or engine) and len(start.center) != sized.n_scores:
+        start = None  # of another team, or of other effects
     compiles = isinstance(targets[0], CoupledTarget | DriftTarget)
     watch.stage(
         f"exact sampler {'compiles, and ' if compiles else ''}seeks the mode", slow=compiles
@@ -185,19 +196,26 @@ def _sample_scores(
         )
     params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
     effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
+    robots = {name: params.pop(name) for name in ("robot_effect",) if name in params}
     summary = _summarize(posteriors)
-    if places is not None or coupled is not None:
+    if effects or coupled or engine:
         proposal = sampled[0].proposal
         summary["proposal_center"] = proposal.center.tolist()
         summary["proposal_scale"] = proposal.scale.ravel().tolist()
-    return Draws(params, stats, summary, "exact", places=effects)
+    return Draws(params, stats, summary, "exact", places=effects, robots=robots)
 
 
 def _targets(
-    model: TrustModel, batch: MissionBatch, weight: np.ndarray, places: Visited | None
+    model: TrustModel,
+    batch: MissionBatch,
+    weight: np.ndarray,
+    places: Visited | None,
+    slots: Slots | None,
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
     priors, family = model.priors, model.family
+    if slots is not None:
+        return [_by_evidence(model, slots)]
     if isinstance(model, DriftTrust):
         return [DriftTarget(model, batch, weight, places)]
     if places is not None:
@@ -216,6 +234,22 @@ def _targets(
     if is_coupled(model):
         return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
     return [LatentTarget(*gather_chains(family, one), priors) for one in split_robots(model, batch)]
+
+
+def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
+    """Posterior of a model of effects of Gaussian rates.
+
+    TrustboError: its coefficients have no Gaussian priors.
+    """
+    if reason := why_not_conjugate(model.priors):
+        raise TrustboError(f"effects of robots need other priors: {reason}.")
+    effects: list[Effect] = [Weights(model.priors)]
+    if model.place is not None:
+        effects.append(Place(**model.place.to_record()))
+    effects += model.effects
+    x0 = float(model.priors.x0_mean), float(model.priors.x0_sd)
+    evidence = Gaussian(slots, [effect.group(slots) for effect in effects], x0)
+    return Posterior(Shared(model.priors, effects), evidence, float(np.nanstd(slots.y)))
 
 
 def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:

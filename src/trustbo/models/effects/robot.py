@@ -126,6 +126,16 @@ def next_mission(effect: np.ndarray, theta: Theta, rho: float) -> tuple[np.ndarr
     return np.einsum("nm,nmi->ni", gain, effect), scale * np.sqrt(left)
 
 
+def prior_effect(
+    theta: Theta, rho: float, shape: tuple[int, int], rng: np.random.Generator
+) -> np.ndarray:
+    """Draws of d from the prior, (draw, mission, robot), for missions and robots `shape`."""
+    scale, C = _correlation(theta, rho, shape[0])
+    return scale[:, None, None] * (
+        np.linalg.cholesky(C) @ rng.standard_normal((len(scale), *shape))
+    )
+
+
 def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, np.ndarray]:
     """Sd (point,) and correlation (point, mission, mission) of d; never singular, as rho < 1."""
     slow, day = theta["tau_slow"], theta["tau_day"]

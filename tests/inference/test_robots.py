@@ -1,0 +1,186 @@
+"""Effects of robots in missions, from a fit to plans, against dense references."""
+
+import jax
+import numpy as np
+import pytest
+from missions import walking_missions
+from references import dense_log_likelihood
+
+import trustbo as tb
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.inference.draws import params_of_missions
+from trustbo.models import HierarchicalTrust, Place, PlaceEffect, PooledTrust, Robot, TrustParams
+from trustbo.models.record import model_from_record, model_to_record
+from trustbo.stacking import stack_missions
+
+FEATURES = ("line_of_sight", "slope")
+BROKEN = 5  # mission from which the second robot sees half of what it did
+
+
+@pytest.fixture(scope="module")
+def missions():
+    rng, missions = np.random.default_rng(0), []
+    model, truth = PooledTrust(), TrustParams(0.2, np.array([0.7, 0.0]), 0.05, 0.03, 0.03)
+    for j, drawn in enumerate(walking_missions(1, 8, n_bounds=(6, 9))):
+        z = drawn.awareness.copy()
+        lost = z * np.where(np.arange(3) == 1, 0.5, 1.0)[:, None] if j >= BROKEN else z
+        key = jax.random.key(int(rng.integers(1000)))
+        rates = model.simulate(key, truth, lost[None]).contact_rate[0]
+        rates = np.where(np.isnan(drawn.contact_rate), np.nan, np.clip(rates, 0.0, 1.0))
+        missions.append(Mission.from_arrays(drawn.path, z, rates, features=FEATURES))
+    return missions
+
+
+@pytest.fixture(scope="module")
+def posterior(missions):
+    model = PooledTrust(effects=[Place(), Robot()])
+    return tb.fit(missions, model, draws=100, seed=1, progress=False)
+
+
+def test_a_detector_that_breaks_is_named_with_its_mission(posterior):
+    effect = posterior["robots"]["robot_effect"]
+    assert effect.dims == ("chain", "draw", "mission", "robot")
+    worse = (effect < -0.1).mean(("chain", "draw"))
+    assert (worse.sel(robot="r2", mission=slice(BROKEN, None)) > 0.95).all()
+    assert (worse.sel(robot=["r1", "r3"]) < 0.5).all()
+    assert (worse.sel(mission=slice(0, BROKEN - 1)) < 0.5).all()
+
+
+def test_its_evidence_is_larger_than_that_of_places_alone(posterior, missions):
+    places = tb.fit(missions, PooledTrust(place=PlaceEffect()), draws=50, whole=False)
+    assert posterior.attrs["log_evidence"] - places.attrs["log_evidence"] > 10.0
+    again = tb.fit(
+        missions, PooledTrust(effects=[Place(), Robot()]), draws=50, earlier=places, whole=False
+    )
+    assert abs(again.attrs["log_evidence"] - posterior.attrs["log_evidence"]) < 1.0
+
+
+def test_likelihoods_are_those_of_each_robot_with_its_effect(posterior, missions):
+    draws = posterior["posterior"].isel(chain=0, draw=7)
+    beta0, b = float(draws["beta0"]), float(draws["b"])
+    d = posterior["robots"]["robot_effect"].values[0, 7]
+    places = tb.inference.params_of(posterior).draw(7)
+    for j, mission in enumerate(missions):
+        expected, effect = 0.0, places.of_places(tb.workspace.moves.bounds_along(mission.path))
+        for i in range(3):
+            z = np.column_stack([mission.awareness[:, i], effect[:, 0]])
+            beta = np.append(draws["beta"].values, 1.0)
+            beta[0] += (1.0 - beta0) * d[j, i]
+            noises = float(draws["delta_w"]), float(draws["delta_v"])
+            y = mission.contact_rate[:, i]
+            expected += dense_log_likelihood(beta0, beta, b, *noises, 0.5, 0.5, z, y)
+        found = posterior["log_likelihood"]["contact_rate"].values[0, 7, j]
+        np.testing.assert_allclose(found, expected, rtol=1e-8)
+
+
+def test_plans_have_what_stays_of_each_robot_and_no_bad_day(posterior):
+    params = tb.inference.params_of(posterior)
+    sites = posterior["posterior"].to_dataset().stack(d=("chain", "draw")).transpose("d", ...)
+    effect = posterior["robots"]["robot_effect"].values.reshape(-1, 8, 3)
+    slow, day = (sites[f"tau_{name}"].values[:, None, None] for name in ("slow", "day"))
+    gap = np.abs(np.subtract.outer(np.arange(9), np.arange(9)))
+    K = slow**2 * 0.9**gap + day**2 * (gap == 0)
+    gain = np.linalg.solve(K[:, :8, :8], K[:, :8, 8:])[..., 0]
+    d = np.einsum("nm,nmi->ni", gain, effect)
+    rest = 1.0 - sites["beta0"].values[:, None]
+    np.testing.assert_allclose(
+        params.beta[:, :, 0], sites["beta"].values[:, :1] + rest * d, rtol=1e-6, atol=1e-9
+    )
+    np.testing.assert_array_equal(params.beta[:, 2, 1], sites["beta"].values[:, 1])
+    assert params.beta[:, 1, 0].mean() < params.beta[:, [0, 2], 0].mean() - 0.1
+    assert params.place.shape == (400, 1, 5, 5)
+
+
+def test_without_line_of_sight_a_robot_changes_the_intercept(missions):
+    blind = [Mission.from_arrays(m.path, m.awareness, m.contact_rate) for m in missions]
+    posterior = tb.fit(blind, PooledTrust(effects=[Robot()]), draws=25, progress=False)
+    params = tb.inference.params_of(posterior)
+    assert (np.ptp(params.b, axis=1) > 0.0).all()
+    assert not np.ptp(params.beta, axis=1).any()
+    on = params_of_missions(posterior, blind, stack_missions(blind, pad=False))
+    d = posterior["robots"]["robot_effect"].values.reshape(-1, 8, 1, 3)
+    b, beta0 = (posterior["posterior"][n].values.reshape(-1, 1, 1, 1) for n in ("b", "beta0"))
+    expected = np.broadcast_to(b + (1.0 - beta0) * d, on.b.shape)
+    np.testing.assert_allclose(on.b, expected, rtol=1e-12)
+
+
+def test_rates_one_by_one_and_missions_left_out_have_the_effects(posterior):
+    rates = tb.inference.by_rate(posterior)["log_likelihood"]["contact_rate"]
+    by_mission = rates.groupby("mission").sum()
+    whole = posterior["log_likelihood"]["contact_rate"]
+    np.testing.assert_allclose(by_mission.values, whole.values, rtol=1e-8)
+
+
+def test_a_campaign_learns_and_plans_with_robots(tmp_path):
+    rng = np.random.default_rng(2)
+    z = rng.uniform(size=(3, 5, 5, 2))
+    workspace = tb.Workspace.from_awareness(z, features=FEATURES)
+    truth = TrustParams(0.2, np.array([0.7, 0.0]), 0.05, 0.03, 0.03)
+    simulator = tb.simulation.ModelSimulator(workspace, truth)
+    model = PooledTrust(effects=[Place(), Robot()])
+    options = {"simulator": simulator, "progress": False, "model": model}
+    tb.iterate(workspace, (4, 0), (0, 4), n_iterations=2, seed=3, checkpoint=tmp_path, **options)
+    del options["model"]  # it is in the record
+    result = tb.resume(tmp_path, n_iterations=3, **options)
+    assert [tree["robots"].sizes["mission"] for tree in result.posteriors] == [1, 2, 3]
+    live = tb.inference.TrustFilter(result.posterior)
+    mission = result.missions[-1]
+    now = live.update(mission.awareness[0], mission.contact_rate[0], bound=tuple(mission.path[:2]))
+    assert now.mean.shape == (3,)
+
+
+def test_place_is_a_short_form_of_an_effect():
+    assert PooledTrust(effects=[Place(tau_s=0.1)]) == PooledTrust(place=PlaceEffect(tau_s=0.1))
+    assert PooledTrust(effects=Robot()).effects == (Robot(),)
+
+
+def test_a_record_has_the_effects():
+    model = PooledTrust(effects=[Place(), Robot(tau_day=0.1)])
+    again = model_from_record(model_to_record(model))
+    assert again.effects == (Robot(tau_day=0.1),)
+    assert again.place == PlaceEffect()
+    assert "effects" not in model_to_record(PooledTrust())
+
+
+@pytest.mark.parametrize(
+    ("effects", "told"),
+    [([PooledTrust], "PooledTrust"), ([Robot(), Robot()], "different kinds"), ([None], "None")],
+)
+def test_effects_of_no_kind_or_of_one_kind_twice_are_refused(effects, told):
+    with pytest.raises(TrustboError, match=told):
+        PooledTrust(effects=effects)
+
+
+def test_what_has_no_effects_of_robots_refuses_them(posterior, missions):
+    model = PooledTrust(effects=[Robot()])
+    with pytest.raises(TrustboError, match=r'"nuts" cannot treat PooledTrust.*effects of robots'):
+        tb.fit(missions, model, "nuts")
+    censored = PooledTrust(effects=[Robot()], observation="censored")
+    with pytest.raises(TrustboError, match="its observations are not Gaussian"):
+        tb.fit(missions, censored)
+    changes = PooledTrust(effects=[Robot()], response="change")
+    with pytest.raises(TrustboError, match="effects of robots, and rates measure changes"):
+        tb.fit(missions, changes, "exact")
+    with pytest.raises(TrustboError, match="effects of robots"):
+        tb.criticise(posterior)
+    with pytest.raises(TrustboError, match="effects of robots"):
+        tb.inference.sbc(model, n_datasets=1)
+    with pytest.raises(TrustboError, match="effects of robots"):
+        tb.inference.prior_predictive(model, np.zeros((1, 2, 3, 2)))
+    with pytest.raises(TrustboError, match="robots have effects"):
+        tb.inference.update_statistics(model, None, missions)
+    with pytest.raises(TypeError, match="effects"):
+        HierarchicalTrust(effects=[Robot()])
+
+
+def test_rates_at_their_limits_are_taken_for_gaussian_ones_with_robots(missions):
+    rates = [np.where(m.contact_rate > 0.4, 1.0, m.contact_rate) for m in missions]
+    limits = [
+        Mission.from_arrays(m.path, m.awareness, y, features=FEATURES)
+        for m, y in zip(missions, rates, strict=True)
+    ]
+    model = PooledTrust(effects=[Robot()], observation="auto")
+    posterior = tb.fit(limits, model, draws=25, whole=False)
+    assert posterior.attrs["observation"] == "gaussian"
+    assert "effects of robots" in posterior.attrs["observation_reason"]
