@@ -180,17 +180,17 @@ def test_other_models_are_criticised_for_what_they_lack(planted):
         assert "coefficients of its own" in found.table.loc["robot", "finding"]
 
 
-def test_the_worth_of_the_parts_of_a_model(with_places, planted):
+def test_each_component_of_a_model_is_ablated(with_places, planted):
     posterior, _ = with_places
-    worth = criticise(posterior, n_replicates=100).worth
-    assert list(worth.index) == [
+    ablation = criticise(posterior, n_replicates=100).ablation
+    assert list(ablation.index) == [
         "prior", "traversability", "visibility", "line_of_sight", "places", "robots",
     ]  # fmt: skip
-    assert worth.loc["line_of_sight", "value"] > 2.0 * worth.loc["line_of_sight", "se"]
-    assert worth.loc["places", "value"] < -2.0 * worth.loc["places", "se"]
+    assert ablation.loc["line_of_sight", "value"] > 2.0 * ablation.loc["line_of_sight", "se"]
+    assert ablation.loc["places", "value"] < -2.0 * ablation.loc["places", "se"]
     own = replace(tb.models.Priors(), x0_sd=0.2)
     mine = fit(planted("place")[:3], PooledTrust(own), "exact")
-    said = criticise(mine, n_replicates=100).worth.loc["comparison", "finding"]
+    said = criticise(mine, n_replicates=100).ablation.loc["comparison", "finding"]
     assert "give it again with model=" in said
 
 
@@ -199,9 +199,11 @@ def test_with_places_nothing_is_compared_that_needs_nuts(planted, monkeypatch):
     by_nuts = importlib.import_module("trustbo.inference.samplers.run")
     monkeypatch.setattr(by_nuts, "_sample_nuts", lambda *_, **__: pytest.fail("NUTS was asked"))
     missions, place = planted("place")[:6], tb.models.PlaceEffect()
-    worth = criticise(fit(missions, PooledTrust(place=place), "exact"), n_replicates=100).worth
-    assert "without them" in worth.loc["places", "finding"]
-    assert "of their own, both without places: " in worth.loc["robots", "finding"]
+    ablation = criticise(
+        fit(missions, PooledTrust(place=place), "exact"), n_replicates=100
+    ).ablation
+    assert "without them" in ablation.loc["places", "finding"]
+    assert "of their own, both without places: " in ablation.loc["robots", "finding"]
 
 
 def test_what_cannot_be_criticised_says_why(with_places, planted):
@@ -303,3 +305,9 @@ def test_rates_that_are_all_alike_are_refused():
     same = [Mission.from_arrays(path, np.full((5, 3, 2), 0.5), np.ones((5, 3))) for _ in range(3)]
     with pytest.raises(tb.TrustboError, match="the rates are all but equal"):
         tb.criticise(tb.fit(same, model), compare=False)
+
+
+def test_the_former_name_of_the_ablation_warns(with_places):
+    _, found = with_places
+    with pytest.warns(FutureWarning, match=r"Criticism\.worth is Criticism\.ablation since"):
+        assert found.worth is found.ablation

@@ -167,7 +167,7 @@ class Campaign(Displayed):
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
         return summary_of(
-            f"Campaign: {n} missions", rows, self.workspace, settings, self.history,
+            f"Campaign: {n} mission{'s' * (n != 1)}", rows, self.workspace, settings, self.history,
             self.trust_map if n else None, lambda: self.recommend().path,
         )  # fmt: skip
 

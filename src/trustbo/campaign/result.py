@@ -72,15 +72,16 @@ class Result(Displayed):
     failures: Sequence[Failure] = ()
 
     def _card(self) -> Card:
+        n = len(self.missions)
         rows = [
-            ("missions", f"{len(self.missions)}; stopped: {self.stop_reason}"),
+            ("missions", f"{n}; stopped: {self.stop_reason}"),
             ("recommended", f"{self.path[0]} to {self.path[-1]}, {len(self.path) - 1} bounds"),
             ("value", f"{self.value:.3g} ({self.settings.get('objective', 'objective unknown')})"),
             ("contact rate", f"{self.history['contact_rate'].values[-1]:.3f} on the last mission"),
             ("outcomes", ", ".join(map(str, self.history["status"].values))),
         ]
         return summary_of(
-            f"Result: {len(self.missions)} missions", rows, self.workspace, self.settings,
+            f"Result: {n} mission{'s' * (n != 1)}", rows, self.workspace, self.settings,
             self.history, lambda: self.trust_map, lambda: self.path,
         )  # fmt: skip
 

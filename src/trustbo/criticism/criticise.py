@@ -1,5 +1,6 @@
 """Criticism of a fitted trust model: tests, residuals and comparisons, with a verdict."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -55,7 +56,7 @@ class Criticism(Displayed):
         curves: PIT (u, its distribution less the uniform one), autocorrelation (lag, in bounds;
             mission_lag) and coverage one mission ahead (level), each with `_low` and `_high` of its
             simultaneous 95 % band.
-        worth: Ablation: LOO with and without each component, and prior sensitivity: comparison,
+        ablation: LOO with and without each component, and prior sensitivity: comparison,
             difference, its standard error and finding; empty without `compare`.
     """
 
@@ -65,12 +66,22 @@ class Criticism(Displayed):
     rates: pd.DataFrame
     groups: pd.DataFrame
     curves: xr.Dataset
-    worth: pd.DataFrame
+    ablation: pd.DataFrame
+
+    @property
+    def worth(self) -> pd.DataFrame:
+        """Former name of `ablation`."""
+        warnings.warn(
+            "Criticism.worth is Criticism.ablation since version 0.3; the old name will go.",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return self.ablation
 
     def _card(self) -> Card:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]
-        worth = [(str(name), str(row["finding"])) for name, row in self.worth.iterrows()]
-        return Card(f"Criticism: {self.verdict}", rows, (), {"worth of each part": worth})
+        ablation = [(str(name), str(row["finding"])) for name, row in self.ablation.iterrows()]
+        return Card(f"Criticism: {self.verdict}", rows, (), {"without each component": ablation})
 
 
 @one_blas_thread()
@@ -171,8 +182,8 @@ def _criticise(
     table = pd.DataFrame.from_dict(rows, orient="index", columns=head).rename_axis("check")
     chances = ["p", "p_adjusted", "p_after"]
     table[chances] = table[chances].mask(table[chances] < _LEAST, 0.0)
-    worth = ablate(posterior, missions, model) if compare else ablate(None, missions, None)
-    return Criticism(verdict_of(fault, table), fault, table, rates, groups, curves, worth)
+    ablation = ablate(posterior, missions, model) if compare else ablate(None, missions, None)
+    return Criticism(verdict_of(fault, table), fault, table, rates, groups, curves, ablation)
 
 
 def _test_all(
