@@ -101,6 +101,26 @@ def test_given_coefficients_the_evidence_is_that_of_each_chain(memory):
     np.testing.assert_allclose(found, expected, rtol=1e-10)
 
 
+@pytest.mark.parametrize("n_robots", [1, 3])
+def test_robots_alone_or_without_a_rate_are_treated_too(n_robots, capfd):
+    """Blocks of the arrow may be empty: LAPACK prints a line about matrices of no rows."""
+    missions = []
+    for m in walking_missions(2, 4, missing=0.0):
+        rates = np.where(np.arange(n_robots) == 1, np.nan, m.contact_rate[:, :n_robots])
+        missions.append(Mission.from_arrays(m.path, m.awareness[:, :n_robots], rates))
+    rng = np.random.default_rng(0)
+    for effects in EFFECTS.values():
+        slots, groups = gathered(missions, effects)
+        theta = random_theta(effects, rng, 3)
+        evidence = Gaussian(slots, groups, X0)
+        expected = [Dense(slots, groups, point(theta, t), X0).log_density() for t in range(3)]
+        np.testing.assert_allclose(evidence.log_density(theta), expected, rtol=1e-10)
+        drawn = evidence.coefficients(theta, np.array([1, 2, 3]), rng)
+        assert np.isfinite(drawn).all()
+        assert len(drawn) == 6
+    assert not any(capfd.readouterr())
+
+
 def test_without_memory_level_and_deviation_are_one_model():
     missions = walking_missions(4)
     slots, groups = gathered(missions, EFFECTS["places and robots"])

@@ -128,7 +128,7 @@ class Gaussian:
         order = np.argsort(block, kind="stable")
         limits = np.searchsorted(block[order], np.arange(n_robots + 2)).tolist()
         limits[-1] += 1
-        return order, [slice(i, j) for i, j in itertools.pairwise(limits)]
+        return order, [slice(i, j) for i, j in itertools.pairwise(limits) if i < j]
 
     def _gram(self) -> None:
         """Step 2: G (entry of A, pair of bounds of a kind), and the entries that may not be 0.
@@ -213,8 +213,10 @@ class Gaussian:
     def _whiten(self, P: np.ndarray, prior: Prior) -> None:
         """Step 3: from A, h to I + R'AR, R'h, in place."""
         m, shared = len(self.order), self.blocks[-1]
-        P[:, :m] *= prior.sd[:, :, None]
-        P[:, :, :m] *= prior.sd[:, None]
+        sd = np.concatenate([prior.sd, np.ones((len(P), 1))], axis=1)
+        for block in self.blocks:
+            for rows in (block, shared) if block != shared else (shared,):
+                P[:, rows, block] *= sd[:, rows, None] * sd[:, None, block]
         for columns, root in zip(self.joined, prior.roots, strict=True):
             block = next(b for b in self.blocks if columns.start < b.stop)
             left = slice(0, m) if block == shared else block  # where rows of a block are not 0
@@ -230,7 +232,8 @@ class Gaussian:
         arrow, prior = factors.arrows[t], factors.prior
         e, shared = rng.standard_normal((len(self.order), n)), self.blocks[-1]
         F, last = arrow.shared[:-1, :-1], slice(shared.start, shared.stop - 1)
-        e[last] = dtrtrs(F, arrow.shared[-1, :-1, None] + e[last], lower=1, trans=1)[0]
+        if len(F):
+            e[last] = dtrtrs(F, arrow.shared[-1, :-1, None] + e[last], lower=1, trans=1)[0]
         for block, (F, X) in zip(self.blocks, arrow.robots, strict=False):
             right = X[-1, :, None] - X[:-1].T @ e[last] + e[block]
             e[block] = dtrtrs(F, right, lower=1, trans=1)[0]
@@ -296,16 +299,13 @@ def _eliminate(P: np.ndarray, blocks: list[slice]) -> _Arrow:
     last, robots, total = blocks[-1], [], 0.0
     rest = np.asfortranarray(P[last, last])
     for block in blocks[:-1]:
-        if block.start < block.stop:
-            F, failed = dpotrf(P[block, block], lower=1)
-            if failed:
-                return _Arrow([], rest, np.nan)
-            X = dtrsm(1.0, F, P[last, block], side=1, lower=1, trans_a=1)
-            rest = dsyrk(-1.0, X, beta=1.0, c=rest, lower=1, overwrite_c=1)
-            total += 2.0 * np.log(F.diagonal()).sum()
-            robots.append((F, X))
-        else:
-            robots.append((np.zeros((0, 0)), np.zeros((last.stop - last.start, 0))))
+        F, failed = dpotrf(P[block, block], lower=1)
+        if failed:
+            return _Arrow([], rest, np.nan)
+        X = dtrsm(1.0, F, P[last, block], side=1, lower=1, trans_a=1)
+        rest = dsyrk(-1.0, X, beta=1.0, c=rest, lower=1, overwrite_c=1)
+        total += 2.0 * np.log(F.diagonal()).sum()
+        robots.append((F, X))
     F, failed = dpotrf(rest, lower=1)
     diagonal = F.diagonal()
     total += 2.0 * np.log(diagonal[:-1]).sum() + diagonal[-1] ** 2

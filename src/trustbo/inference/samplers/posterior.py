@@ -111,12 +111,10 @@ class Posterior:
         return Student(z, np.linalg.cholesky(inverse_hessian(np, -hessian, _WIDEST)))
 
     def _cost(self, z: np.ndarray, h: float = 1e-3) -> tuple[float, np.ndarray]:
-        """Minus the log density and its gradient, by central differences in one batch."""
-        steps = h * np.eye(len(z))
-        value = -self.log_density(np.concatenate([z[None], z + steps, z - steps]))
+        """Minus the log density and its gradient, by forward differences in one batch."""
+        value = -self.log_density(np.concatenate([z[None], z + h * np.eye(len(z))]))
         value = np.minimum(value, 1e10)
-        plus, minus = value[1 : len(z) + 1], value[len(z) + 1 :]
-        return float(value[0]), (plus - minus) / (2.0 * h)
+        return float(value[0]), (value[1:] - value[0]) / h
 
     def recentre(self, z: np.ndarray) -> None:
         """No-op: the density is exact everywhere."""
