@@ -25,7 +25,6 @@ from baselines import (
 )
 from common import arguments, parsed
 
-from trustbo.models import Place, PooledTrust, Robot
 from trustbo.study import run_worlds, worlds, worlds_table
 from trustbo.study.methods import BASELINE_ROWS
 from trustbo.study.table import as_text, differences, worse_than
@@ -33,10 +32,7 @@ from trustbo.study.table import as_text, differences, worse_than
 OURS = "trustbo"
 METHODS: dict[str, Any] = {
     OURS: {"model": "places", "policy": "optimistic"},
-    "trustbo, robots": {
-        "model": PooledTrust(effects=(Place(), Robot())),
-        "policy": "optimistic",
-    },
+    "trustbo, robots": {"model": "robots", "policy": "optimistic"},
     "trustbo, no places": {"model": "pooled", "policy": "greedy"},
     "running mean": running_mean.greedy,
     "running mean, optimistic": running_mean.optimistic,

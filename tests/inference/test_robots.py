@@ -10,7 +10,7 @@ import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of_missions
-from trustbo.models import HierarchicalTrust, Place, PlaceEffect, PooledTrust, Robot, TrustParams
+from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.stacking import stack_missions
 
@@ -34,7 +34,7 @@ def missions():
 
 @pytest.fixture(scope="module")
 def posterior(missions):
-    model = PooledTrust(effects=[Place(), Robot()])
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
     return tb.fit(missions, model, draws=100, seed=1, progress=False)
 
 
@@ -51,7 +51,11 @@ def test_its_evidence_is_larger_than_that_of_places_alone(posterior, missions):
     places = tb.fit(missions, PooledTrust(place=PlaceEffect()), draws=50, whole=False)
     assert posterior.attrs["log_evidence"] - places.attrs["log_evidence"] > 10.0
     again = tb.fit(
-        missions, PooledTrust(effects=[Place(), Robot()]), draws=50, earlier=places, whole=False
+        missions,
+        PooledTrust(effects=[PlaceEffect(), RobotEffect()]),
+        draws=50,
+        earlier=places,
+        whole=False,
     )
     assert abs(again.attrs["log_evidence"] - posterior.attrs["log_evidence"]) < 1.0
 
@@ -94,7 +98,7 @@ def test_plans_have_what_stays_of_each_robot_and_no_bad_day(posterior):
 
 def test_without_line_of_sight_a_robot_changes_the_intercept(missions):
     blind = [Mission.from_arrays(m.path, m.awareness, m.contact_rate) for m in missions]
-    posterior = tb.fit(blind, PooledTrust(effects=[Robot()]), draws=25, progress=False)
+    posterior = tb.fit(blind, PooledTrust(effects=[RobotEffect()]), draws=25, progress=False)
     params = tb.inference.params_of(posterior)
     assert (np.ptp(params.b, axis=1) > 0.0).all()
     assert not np.ptp(params.beta, axis=1).any()
@@ -118,7 +122,7 @@ def test_a_campaign_learns_and_plans_with_robots(tmp_path):
     workspace = tb.Workspace.from_awareness(z, features=FEATURES)
     truth = TrustParams(0.2, np.array([0.7, 0.0]), 0.05, 0.03, 0.03)
     simulator = tb.simulation.ModelSimulator(workspace, truth)
-    model = PooledTrust(effects=[Place(), Robot()])
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
     options = {"simulator": simulator, "progress": False, "model": model}
     tb.iterate(workspace, (4, 0), (0, 4), n_iterations=2, seed=3, checkpoint=tmp_path, **options)
     del options["model"]  # it is in the record
@@ -131,21 +135,27 @@ def test_a_campaign_learns_and_plans_with_robots(tmp_path):
 
 
 def test_place_is_a_short_form_of_an_effect():
-    assert PooledTrust(effects=[Place(tau_s=0.1)]) == PooledTrust(place=PlaceEffect(tau_s=0.1))
-    assert PooledTrust(effects=Robot()).effects == (Robot(),)
+    assert PooledTrust(effects=[PlaceEffect(tau_s=0.1)]) == PooledTrust(
+        place=PlaceEffect(tau_s=0.1)
+    )
+    assert PooledTrust(effects=RobotEffect()).effects == (RobotEffect(),)
 
 
 def test_a_record_has_the_effects():
-    model = PooledTrust(effects=[Place(), Robot(tau_day=0.1)])
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect(tau_day=0.1)])
     again = model_from_record(model_to_record(model))
-    assert again.effects == (Robot(tau_day=0.1),)
+    assert again.effects == (RobotEffect(tau_day=0.1),)
     assert again.place == PlaceEffect()
     assert "effects" not in model_to_record(PooledTrust())
 
 
 @pytest.mark.parametrize(
     ("effects", "told"),
-    [([PooledTrust], "PooledTrust"), ([Robot(), Robot()], "different kinds"), ([None], "None")],
+    [
+        ([PooledTrust], "PooledTrust"),
+        ([RobotEffect(), RobotEffect()], "different kinds"),
+        ([None], "None"),
+    ],
 )
 def test_effects_of_no_kind_or_of_one_kind_twice_are_refused(effects, told):
     with pytest.raises(TrustboError, match=told):
@@ -153,13 +163,13 @@ def test_effects_of_no_kind_or_of_one_kind_twice_are_refused(effects, told):
 
 
 def test_what_has_no_effects_of_robots_refuses_them(posterior, missions):
-    model = PooledTrust(effects=[Robot()])
+    model = PooledTrust(effects=[RobotEffect()])
     with pytest.raises(TrustboError, match=r'"nuts" cannot treat PooledTrust.*effects of robots'):
         tb.fit(missions, model, "nuts")
-    censored = PooledTrust(effects=[Robot()], observation="censored")
+    censored = PooledTrust(effects=[RobotEffect()], observation="censored")
     with pytest.raises(TrustboError, match="its observations are not Gaussian"):
         tb.fit(missions, censored)
-    changes = PooledTrust(effects=[Robot()], response="change")
+    changes = PooledTrust(effects=[RobotEffect()], response="change")
     with pytest.raises(TrustboError, match="effects of robots, and rates measure changes"):
         tb.fit(missions, changes, "exact")
     with pytest.raises(TrustboError, match="effects of robots"):
@@ -171,7 +181,7 @@ def test_what_has_no_effects_of_robots_refuses_them(posterior, missions):
     with pytest.raises(TrustboError, match="robots have effects"):
         tb.inference.update_statistics(model, None, missions)
     with pytest.raises(TypeError, match="effects"):
-        HierarchicalTrust(effects=[Robot()])
+        HierarchicalTrust(effects=[RobotEffect()])
 
 
 def test_rates_at_their_limits_are_taken_for_gaussian_ones_with_robots(missions):
@@ -180,7 +190,7 @@ def test_rates_at_their_limits_are_taken_for_gaussian_ones_with_robots(missions)
         Mission.from_arrays(m.path, m.awareness, y, features=FEATURES)
         for m, y in zip(missions, rates, strict=True)
     ]
-    model = PooledTrust(effects=[Robot()], observation="auto")
+    model = PooledTrust(effects=[RobotEffect()], observation="auto")
     posterior = tb.fit(limits, model, draws=25, whole=False)
     assert posterior.attrs["observation"] == "gaussian"
     assert "effects of robots" in posterior.attrs["observation_reason"]

@@ -94,7 +94,7 @@ def with_robots(
 
 
 def rho_of(posterior: xr.DataTree) -> float:
-    """Correlation of what stays of a robot between missions, see `Robot`."""
+    """Correlation of what stays of a robot between missions, see `RobotEffect`."""
     record = json.loads(posterior.attrs["model_record"])
     return float(record["effects"][0]["rho"])
 

@@ -5,8 +5,7 @@ from trustbo.models import backend as backend  # first: it loads numpyro
 # isort: split
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
-from trustbo.models.effects.place import Place
-from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.params import CoupledParams, RobotParams, TrustParams
 from trustbo.models.place import PlaceEffect
@@ -19,11 +18,10 @@ __all__ = [
     "CoupledTrust",
     "DriftTrust",
     "HierarchicalTrust",
-    "Place",
     "PlaceEffect",
     "PooledTrust",
     "Priors",
-    "Robot",
+    "RobotEffect",
     "RobotParams",
     "TrustParams",
 ]

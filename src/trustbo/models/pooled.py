@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from jax import Array
 
 from trustbo.errors import TrustboError
-from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import TrustParams
 from trustbo.models.place import PlaceEffect
@@ -18,22 +18,24 @@ class PooledTrust(TrustModel):
     """One set of parameters for all robots, equations (3)-(4).
 
     Attributes:
-        effects: Effects that add to trust: `Place()`, of which `place` is the short form, and
-            `Robot()`, of each robot in each mission. Effects of robots are for Gaussian rates.
+        effects: Effects that add to trust: `PlaceEffect()`, of which `place` is the short form, and
+            `RobotEffect()`, of each robot in each mission, which is for Gaussian rates.
 
     Raises:
         TrustboError: An effect is unknown, or of a kind that the model already has.
     """
 
-    effects: tuple[Robot, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
+    effects: tuple[RobotEffect, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self) -> None:
-        effects = (self.effects,) if isinstance(self.effects, Robot) else tuple(self.effects)
+        effects = (self.effects,) if isinstance(self.effects, RobotEffect) else tuple(self.effects)
         for effect in effects:
-            if not isinstance(effect, PlaceEffect | Robot):
-                raise TrustboError(f"effects must be of Place() and Robot(); got {effect!r}.")
+            if not isinstance(effect, PlaceEffect | RobotEffect):
+                raise TrustboError(
+                    f"effects must be of PlaceEffect() and RobotEffect(); got {effect!r}."
+                )
         places = [effect for effect in effects if isinstance(effect, PlaceEffect)]
-        robots = tuple(effect for effect in effects if isinstance(effect, Robot))
+        robots = tuple(effect for effect in effects if isinstance(effect, RobotEffect))
         if len(places) + (self.place is not None) > 1 or len(robots) > 1:
             raise TrustboError(
                 f"effects must be of different kinds; got {effects!r} and place={self.place!r}."

@@ -6,7 +6,7 @@ from typing import Any
 
 from trustbo.errors import TrustboError
 from trustbo.models.coupled import CoupledTrust
-from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect
@@ -47,7 +47,7 @@ def model_from_record(
         return given
     ours = ("class", "priors", "place", "by_feature", "effects")
     options = {name: value for name, value in record.items() if name not in ours}
-    if effects := [Robot(**effect) for effect in record.get("effects", ())]:
+    if effects := [RobotEffect(**effect) for effect in record.get("effects", ())]:
         options["effects"] = tuple(effects)
     kind = _MODELS.get(record["class"])
     place = None if record["place"] is None else PlaceEffect(**record["place"])

@@ -16,7 +16,7 @@ from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.models import PlaceEffect, PooledTrust, Priors
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import Place
-from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
 from trustbo.stacking import stack_missions
@@ -24,12 +24,12 @@ from trustbo.stacking import stack_missions
 PRIORS = Priors.of(("line_of_sight", "slope"))
 EFFECTS = {
     "weights": [],
-    "robots": [Robot()],
+    "robots": [RobotEffect()],
     "places": [Place()],
-    "places and robots": [Place(), Robot()],
-    "cells and robots": [Robot(rho=0.5), Place(bounds=False)],
+    "places and robots": [Place(), RobotEffect()],
+    "cells and robots": [RobotEffect(rho=0.5), Place(bounds=False)],
     "bounds": [Place(cells=False)],
-    "places by robot, and robots": [Place(shared=False), Robot()],
+    "places by robot, and robots": [Place(shared=False), RobotEffect()],
 }
 X0 = 0.4, 0.6
 SCALES = {"tau_s", "tau_e", "tau_slow", "tau_day"}

@@ -11,7 +11,7 @@ from trustbo.inference.samplers.posterior import Posterior, Shared
 from trustbo.models import Priors
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import Place
-from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
 from trustbo.stacking import stack_missions
@@ -52,7 +52,9 @@ def test_pooled_draws_are_those_of_a_quadrature():
 @pytest.fixture(scope="module")
 def whole():
     """Posterior of places and robots."""
-    return posterior_of(walking_missions(0, 6), [Place(), Robot()], Priors.of(("line_of_sight",)))
+    return posterior_of(
+        walking_missions(0, 6), [Place(), RobotEffect()], Priors.of(("line_of_sight",))
+    )
 
 
 def test_draws_of_places_and_robots_are_those_of_many_wide_points(whole):

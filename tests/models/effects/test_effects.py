@@ -8,7 +8,7 @@ from trustbo.errors import TrustboError
 from trustbo.models import Priors
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import Place
-from trustbo.models.effects.robot import Robot, next_mission
+from trustbo.models.effects.robot import RobotEffect, next_mission
 from trustbo.models.effects.weights import Weights
 from trustbo.models.place import bounds_of, visited
 from trustbo.stacking import stack_missions
@@ -89,12 +89,14 @@ def test_a_robot_in_a_mission_has_a_part_that_stays_and_a_bad_day():
     sight, gap = slots.z[:, :, 0].ravel(), np.abs(m[:, None] - m[None])
     K = 0.2**2 * 0.9**gap + 0.3**2 * (gap == 0)
     expected = 0.7**2 * np.outer(sight, sight) * K * (i[:, None] == i[None])
-    np.testing.assert_allclose(covariance(Robot().group(slots)), expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(
+        covariance(RobotEffect().group(slots)), expected, rtol=1e-12, atol=1e-15
+    )
 
 
 def test_without_line_of_sight_a_robot_has_a_constant():
     slots = slots_of(walking_missions(3), features=("slope", "visibility"))
-    assert np.unique(Robot().group(slots).columns.data).tolist() == [1.0]
+    assert np.unique(RobotEffect().group(slots).columns.data).tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("slow", "day"), [(0.2, 0.3), (0.0, 0.3), (0.2, 0.0), (0.0, 0.0)])
@@ -126,6 +128,6 @@ def test_weights_are_those_of_stationary_trust_where_the_priors_are():
 
 def test_a_robot_refuses_a_correlation_that_does_not_fade():
     with pytest.raises(TrustboError, match=r"rho must be between 0 and 1; got 1\.0"):
-        Robot(rho=1.0)
+        RobotEffect(rho=1.0)
     with pytest.raises(TrustboError, match="tau_day"):
-        Robot(tau_day=0.0)
+        RobotEffect(tau_day=0.0)

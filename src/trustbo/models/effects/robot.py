@@ -22,7 +22,7 @@ from trustbo.models.priors_numpy import half_normal, log_prob
 
 
 @dataclass(frozen=True)
-class Robot:
+class RobotEffect:
     """Effect of a robot in a mission, proportional to its line of sight.
 
     Without a feature that predicts line of sight, the effect is a constant of the mission.
@@ -43,9 +43,9 @@ class Robot:
 
     def __post_init__(self) -> None:
         for name in self.names:
-            require_positive(f"Robot.{name}", getattr(self, name))
+            require_positive(f"RobotEffect.{name}", getattr(self, name))
         if not 0.0 < self.rho < 1.0:
-            raise TrustboError(f"Robot.rho must be between 0 and 1; got {self.rho!r}.")
+            raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
         """See `Effect.scales`."""
