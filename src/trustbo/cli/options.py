@@ -39,9 +39,9 @@ Paths
 Learning
   policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb,
     random.
-  model NAME: Trust model: places (robots are alike, places differ), pooled (places do not, as in
-    the paper), hierarchical (robots are similar), coupled (influence
-    each other).
+  model NAME: Trust model: places (robots are alike, places differ), robots (and a robot by mission:
+    damage, bad days), pooled (places do not, as in the paper), hierarchical (robots are similar),
+    coupled (influence each other).
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial,
     student_t, auto (the one that suits them).
   sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
