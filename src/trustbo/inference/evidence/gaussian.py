@@ -35,6 +35,7 @@ from scipy.linalg.blas import dsyrk, dtrsm  # pyright: ignore
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
+from trustbo.inference.evidence.scan import add_squares, weigh_chains
 from trustbo.models.effects.effect import Columns, Group, Prior, Slots, Theta
 
 MEMORIES = ("level", "deviation")
@@ -102,6 +103,50 @@ class Gaussian:
         for group, (i, j) in zip(self.groups, itertools.pairwise(self._first), strict=True):
             named |= group.name(c[:, i:j], of_draw, rng)
         return named
+
+    def scan(
+        self, theta: Theta, columns: Columns, run: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Products a = z'C^-1 z and b = z'C^-1 r of further columns z, each (point, column).
+
+        r are the rates less their mean and C is their covariance, each through L^-1 M z as above:
+        with a coefficient N(0, t^2) of z, the log evidence rises by
+        -log(1 + t^2 a) / 2 + t^2 b^2 / (2 (1 + t^2 a)), and given the rates the coefficient has
+        variance 1 / (a + t^-2) and mean b times that.
+
+        Args:
+            theta: Hyperparameters, each (point,).
+            columns: Sparse matrix (slot, column).
+            run: Run of each column (column,), runs being contiguous: z is the sum of a column and
+                of all later ones of its run, which may not share a chain. By default z is the
+                column.
+        """
+        columns = sparse.csc_array(columns)
+        columns.sort_indices()
+        n_columns = columns.shape[1]
+        run = np.arange(n_columns) if run is None else run
+        entries = columns.indptr, columns.indices, columns.data, run
+        out = np.zeros((2, len(theta["beta0"]), n_columns))
+        blocks = [self._rows_of(block) for block in self.blocks]
+        for i in self._chunks(len(theta["beta0"])):
+            some = _take(theta, i)
+            factors = self._factors(some)
+            N, E, _ = impulses(some, self.x0[1], self.seen)
+            C = N if self.level else E
+            S = np.swapaxes(C, 2, 3) @ C
+            R, _ = self._residual(some, N, E, factors.prior.mean)
+            for t in range(len(S)):
+                halves = self._halves(factors, t, S[t], blocks)
+                for T, row_of, right in halves:
+                    rows = np.flatnonzero(row_of >= 0)
+                    R[t, rows] -= T @ right
+                a, b = out[:, i.start + t]
+                weigh_chains(a, b, S[t], self.kind, self.slots.weight, R[t], *entries)
+                for T, row_of, _ in halves:
+                    less = np.zeros(n_columns)
+                    add_squares(less, T, row_of, *entries)
+                    a -= less
+        return out[0], out[1]
 
     def coefficients(self, theta: Theta, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Coefficients (draw, column) in the order of the groups, see `draw`."""
@@ -174,7 +219,8 @@ class Gaussian:
         upper = np.triu_indices(self.seen.shape[1])
         S = (np.swapaxes(C, 2, 3) @ C)[:, :, *upper]
         P.reshape(n, -1)[:, self._entry] = (self._G @ S.reshape(n, -1).T).T
-        P[:, -1, :-1], P[:, -1, -1] = self._residual(theta, N, E, prior.mean)
+        r, P[:, -1, -1] = self._residual(theta, N, E, prior.mean)
+        P[:, -1, :-1] = (self.U.T @ r.T).T
         self._whiten(P, prior)
         arrows = [_eliminate(one, self.blocks) for one in P]
         log_p = -0.5 * (log_det @ self.mass + self.n_measured * np.log(2.0 * np.pi))
@@ -194,7 +240,7 @@ class Gaussian:
     def _residual(
         self, theta: Theta, N: np.ndarray, E: np.ndarray, mean: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """H = sum U'C'r (point, column) and r'r (point,) of the rates less their prior mean."""
+        """C'r (point, slot) and r'r (point,) of the rates less their prior mean, weighted."""
         n, (n_chains, K) = len(mean), self.y.shape
         on = np.flatnonzero((mean != 0.0).any(0))
         expected = (self.U[:, on] @ mean[:, on].T).T.reshape(n, n_chains, K)
@@ -208,7 +254,7 @@ class Gaussian:
             weight = self.slots.weight[mine, None]
             misfit += (weight * r**2).sum((1, 2))
             R[:, mine] = (weight * r) @ C
-        return (self.U.T @ R.reshape(n, -1).T).T, misfit
+        return R.reshape(n, -1), misfit
 
     def _whiten(self, P: np.ndarray, prior: Prior) -> None:
         """Step 3: from A, h to I + R'AR, R'h, in place."""
@@ -226,6 +272,49 @@ class Gaussian:
                 P[:, shared, columns] = P[:, shared, columns] @ root
         diagonal = np.arange(m)
         P[:, diagonal, diagonal] += 1.0
+
+    def _rows_of(self, block: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Chains that columns of a block touch, and these (chain, bound, column), without rates."""
+        (n_chains, K), m = self.y.shape, len(self.order)
+        U = self.U[:, block.start : min(block.stop, m)]
+        chains = np.unique(U.tocoo().row // K)
+        values = U.toarray().reshape(n_chains, K, -1)
+        return chains, values[chains]
+
+    def _halves(
+        self, factors: "_Factors", t: int, S: np.ndarray, blocks: list
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """T = S U R F'^-1 of each block at the t-th theta, F being the factor of I + R'AR.
+
+        Each with the row of each slot, -1 for none, and with F^-1 R'h; the last is of the columns
+        that robots share.
+        """
+        arrow, prior, shared = factors.arrows[t], factors.prior, self.blocks[-1]
+        (n_chains, K), m = self.y.shape, len(self.order)
+        whitened = []
+        for block, (chains, U) in zip(self.blocks, blocks, strict=True):
+            W = (self.slots.weight[chains, None, None] * S[self.kind[chains]]) @ U
+            W = W.reshape(-1, U.shape[2]) * prior.sd[t, block.start : min(block.stop, m)]
+            for columns, root in zip(self.joined, prior.roots, strict=True):
+                if block.start <= columns.start < block.stop:
+                    mine = slice(columns.start - block.start, columns.stop - block.start)
+                    W[:, mine] = W[:, mine] @ root[t]
+            row_of = np.full((n_chains, K), -1)
+            row_of[chains] = np.arange(len(W)).reshape(-1, K)
+            whitened.append((W, row_of.ravel()))
+        last = np.zeros((n_chains * K, shared.stop - 1 - shared.start))
+        W, row_of = whitened[-1]
+        last[row_of >= 0] = W
+        halves = []
+        for (W, row_of), (F, X) in zip(whitened[:-1], arrow.robots, strict=True):
+            T = dtrsm(1.0, F, W.T, lower=1).T
+            last[row_of >= 0] -= T @ X[:-1].T
+            halves.append((np.ascontiguousarray(T), row_of, X[-1]))
+        if last.shape[1]:
+            T = dtrsm(1.0, arrow.shared[:-1, :-1], last.T, lower=1).T
+            T = np.ascontiguousarray(T)
+            halves.append((T, np.arange(n_chains * K), arrow.shared[-1, :-1]))
+        return halves
 
     def _draw(self, factors: "_Factors", t: int, n: int, rng: np.random.Generator) -> np.ndarray:
         """Step 5: coefficients (draw, column), in their order, at the t-th theta."""
