@@ -35,7 +35,7 @@ from scipy.linalg.blas import dsyrk, dtrsm  # pyright: ignore
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
-from trustbo.inference.evidence.scan import add_squares, weigh_chains
+from trustbo.inference.evidence.scan import Sums, take_projections, weigh_chains
 from trustbo.models.effects.effect import Columns, Group, Prior, Slots, Theta
 
 MEMORIES = ("level", "deviation")
@@ -121,13 +121,10 @@ class Gaussian:
                 of all later ones of its run, which may not share a chain. By default z is the
                 column.
         """
-        columns = sparse.csc_array(columns)
-        columns.sort_indices()
-        n_columns = columns.shape[1]
-        run = np.arange(n_columns) if run is None else run
-        entries = columns.indptr, columns.indices, columns.data, run
-        out = np.zeros((2, len(theta["beta0"]), n_columns))
-        blocks = [self._rows_of(block) for block in self.blocks]
+        run = np.arange(columns.shape[1]) if run is None else run
+        sums = Sums.of(sparse.csc_array(columns))
+        entries, G = self._products(sums.atoms)
+        out = np.zeros((2, len(theta["beta0"]), columns.shape[1]))
         for i in self._chunks(len(theta["beta0"])):
             some = _take(theta, i)
             factors = self._factors(some)
@@ -135,17 +132,13 @@ class Gaussian:
             C = N if self.level else E
             S = np.swapaxes(C, 2, 3) @ C
             R, _ = self._residual(some, N, E, factors.prior.mean)
+            values = (G @ _upper(S).T).T
             for t in range(len(S)):
-                halves = self._halves(factors, t, S[t], blocks)
-                for T, row_of, right in halves:
-                    rows = np.flatnonzero(row_of >= 0)
-                    R[t, rows] -= T @ right
-                a, b = out[:, i.start + t]
-                weigh_chains(a, b, S[t], self.kind, self.slots.weight, R[t], *entries)
-                for T, row_of, _ in halves:
-                    less = np.zeros(n_columns)
-                    add_squares(less, T, row_of, *entries)
-                    a -= less
+                a, b = out[0, i.start + t], out[1, i.start + t]
+                weigh_chains(a, b, S[t], self.kind, self.slots.weight, R[t], *sums.slots, run)
+                W = np.zeros((sums.atoms.shape[1], len(self.order)))
+                W[entries] = values[t]
+                take_projections(a, b, *self._half(factors, t, W), *sums.of_atoms, run)
         return out[0], out[1]
 
     def coefficients(self, theta: Theta, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -180,27 +173,36 @@ class Gaussian:
 
         Entries within a block are in both triangles, others in the lower one.
         """
-        (n_kinds, K), m = self.seen.shape, self.U.shape[1]
+        m = self.U.shape[1]
+        block = np.searchsorted([b.stop for b in self.blocks], np.arange(m), side="right")
+        (row, column), G = self._products(self.U)
+        kept = (row >= column) | (block[row] == block[column])
+        self._entry, self._G = (row * (m + 1) + column)[kept], G[kept]
+
+    def _products(self, left: Columns) -> tuple[tuple[np.ndarray, np.ndarray], Columns]:
+        """Products of columns `left` (slot, left) and all columns, by pair of bounds of a kind.
+
+        Left and column of the entries, in order, and the sparse matrix (entry, pair).
+        """
+        (n_kinds, K), m, n_left = self.seen.shape, self.U.shape[1], left.shape[1]
         pair = np.zeros((K, K), dtype=int)
         pair[np.triu_indices(K)] = np.arange(n_pairs := K * (K + 1) // 2)
         pair = np.maximum(pair, pair.T)
-        block = np.searchsorted([b.stop for b in self.blocks], np.arange(m), side="right")
         rows, columns, values = [], [], []
         for q in range(n_kinds):
             mine = np.flatnonzero(self.kind == q)
             slot = (mine[:, None] * K + np.arange(K)).ravel()
             X = sparse.csr_array(self.U[slot].reshape(len(mine), K * m))
-            weighted = sparse.diags_array(self.slots.weight[mine]) @ X
-            products = (X.T @ weighted).tocoo()
-            (k, a), (j, b) = np.divmod(products.row, m), np.divmod(products.col, m)
-            kept = (a >= b) | (block[a] == block[b])
-            rows.append((a * (m + 1) + b)[kept])
-            columns.append((q * n_pairs + pair[k, j])[kept])
-            values.append(products.data[kept])
-        row, index = np.unique(np.concatenate(rows), return_inverse=True)
-        self._entry, shape = row, (len(row), n_kinds * n_pairs)
-        where = index, np.concatenate(columns)
-        self._G = sparse.csr_array((np.concatenate(values), where), shape=shape)
+            Z = sparse.csr_array(left[slot].reshape(len(mine), K * n_left))
+            products = (Z.T @ (sparse.diags_array(self.slots.weight[mine]) @ X)).tocoo()
+            (k, a), (j, b) = np.divmod(products.row, n_left), np.divmod(products.col, m)
+            rows.append(a * m + b)
+            columns.append(q * n_pairs + pair[k, j])
+            values.append(products.data)
+        entry, index = np.unique(np.concatenate(rows), return_inverse=True)
+        where = index.ravel(), np.concatenate(columns)
+        shape = len(entry), n_kinds * n_pairs
+        return np.divmod(entry, m), sparse.csr_array((np.concatenate(values), where), shape=shape)
 
     def _chunks(self, n: int) -> list[slice]:
         """Points that are treated together."""
@@ -216,9 +218,7 @@ class Gaussian:
         N, E, log_det = impulses(theta, self.x0[1], self.seen)
         C = N if self.level else E
         P = np.zeros((n, m + 1, m + 1))
-        upper = np.triu_indices(self.seen.shape[1])
-        S = (np.swapaxes(C, 2, 3) @ C)[:, :, *upper]
-        P.reshape(n, -1)[:, self._entry] = (self._G @ S.reshape(n, -1).T).T
+        P.reshape(n, -1)[:, self._entry] = (self._G @ _upper(np.swapaxes(C, 2, 3) @ C).T).T
         r, P[:, -1, -1] = self._residual(theta, N, E, prior.mean)
         P[:, -1, :-1] = (self.U.T @ r.T).T
         self._whiten(P, prior)
@@ -273,48 +273,24 @@ class Gaussian:
         diagonal = np.arange(m)
         P[:, diagonal, diagonal] += 1.0
 
-    def _rows_of(self, block: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Chains that columns of a block touch, and these (chain, bound, column), without rates."""
-        (n_chains, K), m = self.y.shape, len(self.order)
-        U = self.U[:, block.start : min(block.stop, m)]
-        chains = np.unique(U.tocoo().row // K)
-        values = U.toarray().reshape(n_chains, K, -1)
-        return chains, values[chains]
+    def _half(self, factors: "_Factors", t: int, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """W R F'^-1 of rows W = Z'S U (row, column) at the t-th theta, and F^-1 R'h.
 
-    def _halves(
-        self, factors: "_Factors", t: int, S: np.ndarray, blocks: list
-    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """T = S U R F'^-1 of each block at the t-th theta, F being the factor of I + R'AR.
-
-        Each with the row of each slot, -1 for none, and with F^-1 R'h; the last is of the columns
-        that robots share.
+        F is the factor of I + R'AR.
         """
         arrow, prior, shared = factors.arrows[t], factors.prior, self.blocks[-1]
-        (n_chains, K), m = self.y.shape, len(self.order)
-        whitened = []
-        for block, (chains, U) in zip(self.blocks, blocks, strict=True):
-            W = (self.slots.weight[chains, None, None] * S[self.kind[chains]]) @ U
-            W = W.reshape(-1, U.shape[2]) * prior.sd[t, block.start : min(block.stop, m)]
-            for columns, root in zip(self.joined, prior.roots, strict=True):
-                if block.start <= columns.start < block.stop:
-                    mine = slice(columns.start - block.start, columns.stop - block.start)
-                    W[:, mine] = W[:, mine] @ root[t]
-            row_of = np.full((n_chains, K), -1)
-            row_of[chains] = np.arange(len(W)).reshape(-1, K)
-            whitened.append((W, row_of.ravel()))
-        last = np.zeros((n_chains * K, shared.stop - 1 - shared.start))
-        W, row_of = whitened[-1]
-        last[row_of >= 0] = W
-        halves = []
-        for (W, row_of), (F, X) in zip(whitened[:-1], arrow.robots, strict=True):
-            T = dtrsm(1.0, F, W.T, lower=1).T
-            last[row_of >= 0] -= T @ X[:-1].T
-            halves.append((np.ascontiguousarray(T), row_of, X[-1]))
-        if last.shape[1]:
-            T = dtrsm(1.0, arrow.shared[:-1, :-1], last.T, lower=1).T
-            T = np.ascontiguousarray(T)
-            halves.append((T, np.arange(n_chains * K), arrow.shared[-1, :-1]))
-        return halves
+        W *= prior.sd[t]
+        for columns, root in zip(self.joined, prior.roots, strict=True):
+            W[:, columns] = W[:, columns] @ root[t]
+        right, last = np.empty(W.shape[1]), slice(shared.start, shared.stop - 1)
+        for block, (F, X) in zip(self.blocks, arrow.robots, strict=False):
+            W[:, block] = dtrsm(1.0, F, W[:, block].T, lower=1).T
+            W[:, last] -= W[:, block] @ X[:-1].T
+            right[block] = X[-1]
+        if last.start < last.stop:
+            W[:, last] = dtrsm(1.0, arrow.shared[:-1, :-1], W[:, last].T, lower=1).T
+            right[last] = arrow.shared[-1, :-1]
+        return W, right
 
     def _draw(self, factors: "_Factors", t: int, n: int, rng: np.random.Generator) -> np.ndarray:
         """Step 5: coefficients (draw, column), in their order, at the t-th theta."""
@@ -399,6 +375,11 @@ def _eliminate(P: np.ndarray, blocks: list[slice]) -> _Arrow:
     diagonal = F.diagonal()
     total += 2.0 * np.log(diagonal[:-1]).sum() + diagonal[-1] ** 2
     return _Arrow(robots, F, np.nan if failed else total)
+
+
+def _upper(S: np.ndarray) -> np.ndarray:
+    """Upper triangles of S (point, kind, bound, bound), (point, pair of bounds of a kind)."""
+    return S[:, :, *np.triu_indices(S.shape[2])].reshape(len(S), -1)
 
 
 def _take(theta: Theta, points: slice) -> dict[str, np.ndarray]:

@@ -1,0 +1,200 @@
+"""Changes planted in missions, their probabilities against evidences of each candidate."""
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from trustbo.data import Mission
+from trustbo.inference.changes import N_DRAWS, find_changes, weigh
+from trustbo.inference.evidence.gaussian import Gaussian
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.models import Priors
+from trustbo.models.effects.change import SDS, Candidates, Change
+from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.place import Place
+from trustbo.models.effects.robot import Robot
+from trustbo.models.effects.weights import Weights
+from trustbo.models.place import bounds_of, visited
+from trustbo.stacking import stack_missions
+from trustbo.workspace.moves import moves_along
+
+FEATURES = ("line_of_sight", "slope")
+PRIORS = Priors.of(FEATURES)
+SIDE, CENTRE, START = 6, (3, 3), 6
+SIZES = {"all": -0.4, "robot": -0.5, "area": -0.5}
+PLANTED = {
+    "all": Change("all", (), START),
+    "robot": Change("robot", (1,), START),
+    "area": Change("area", (*CENTRE, 1), START),
+}
+
+
+def changing_missions(seed, change=None, n_missions=11):
+    """Missions down a grid, half of them through its middle; the drift changes if asked for."""
+    rng = np.random.default_rng(seed)
+    sight, slope = rng.uniform(0.3, 1.0, (8, SIDE, SIDE, 3)), rng.uniform(size=(8, SIDE, SIDE))
+    cell, bound = 0.1 * rng.standard_normal((SIDE, SIDE)), 0.05 * rng.standard_normal(sight.shape)
+    missions = []
+    for j in range(n_missions):
+        path = [(0, 0)]
+        while path[-1] != (SIDE - 1, SIDE - 1):
+            steps = np.array([(0, 1), (1, 0), (1, 1)])[rng.permutation(3)] + path[-1]
+            path.append(tuple(next(step for step in steps.tolist() if max(step) < SIDE)))
+        rows, cols = np.array(path)[1:].T
+        at = moves_along(path), rows, cols
+        z = np.stack([sight[at], np.repeat(slope[at][:, None], 3, axis=1)], axis=2)
+        drift = 0.5 * z[..., 0] - 0.1 * z[..., 1] + 0.25
+        if change is not None and j >= change.from_mission:
+            of_robots = z[..., 0] * ((change.kind == "all") | (np.arange(3) == 1))
+            met = change.met(np.array(path)[1:])[:, None]
+            drift += SIZES[change.kind] * (met if change.kind == "area" else of_robots)
+        u = 0.7 * drift + (cell[rows, cols] + bound[at][:, 0])[:, None]
+        x, rates = rng.normal(0.5, 0.2, 3), np.empty(u.shape)
+        for k in range(len(u)):
+            x = 0.3 * x + u[k] + 0.04 * rng.standard_normal(3)
+            rates[k] = x + 0.04 * rng.standard_normal(3)
+        missions.append(Mission.from_arrays(path, z, np.clip(rates, 0.0, 1.0), features=FEATURES))
+    return missions
+
+
+def slots_of(missions):
+    batch = stack_missions(missions)
+    places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), Place(), 3, (SIDE, SIDE))
+    return Slots.of(batch, len(missions), FEATURES, None, places)
+
+
+def evidence_of(slots, effects):
+    return Gaussian(slots, [effect.group(slots) for effect in effects])
+
+
+def search(missions, further=()):
+    """Changes found in missions."""
+    slots, effects = slots_of(missions), [Weights(PRIORS), Place(), *further]
+
+    def draw_theta(change):
+        some = effects if change is None else [*effects, change]
+        target = Posterior(
+            Shared(PRIORS, some), evidence_of(slots, some), float(np.nanstd(slots.y))
+        )
+        drawn = sample_scores(target, N_DRAWS, 0).draws.params
+        names = [name for effect in some for name in effect.names]
+        theta = {name: drawn[name] for name in ("beta0", "delta_w", "delta_v", *names)}
+        return theta | {"rest": 1.0 - theta["beta0"]}
+
+    return find_changes(evidence_of(slots, effects), Candidates.of(slots), draw_theta)
+
+
+def random_theta(n, seed=0):
+    rng = np.random.default_rng(seed)
+    theta = {"beta0": rng.uniform(0.1, 0.5, n)} | Place().scales(rng.standard_normal((n, 3)))
+    theta |= {name: rng.uniform(0.03, 0.1, n) for name in ("delta_w", "delta_v")}
+    return theta | {"rest": 1.0 - theta["beta0"]}
+
+
+def test_probabilities_are_in_proportion_to_prior_odds_and_evidences():
+    slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), Place()]
+    candidates, theta, evidence = Candidates.of(slots), random_theta(1), evidence_of(slots, effects)
+    n = len(candidates.first)
+    without = evidence.log_density(theta)[0]
+    log_w = [
+        evidence_of(slots, [*effects, candidates.change(i)]).log_density(theta)[0] - without
+        for i in range(n)
+    ]
+    log_w = np.append(log_w + candidates.log_odds, 0.0)
+    expected = np.exp(log_w - logsumexp(log_w))
+    for believed in (None, 3):  # with one theta the reference does not matter
+        weighed = weigh(evidence, theta, candidates, believed)
+        np.testing.assert_allclose(weighed.p, expected[:-1], rtol=1e-8)
+        np.testing.assert_allclose(weighed.p_none, expected[-1], rtol=1e-8)
+    assert sum(weighed.by_kind().values()) == pytest.approx(1.0 - weighed.p_none)
+
+
+def test_weights_relative_to_a_change_are_means_of_ratios():
+    slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), Place()]
+    candidates, theta, evidence = Candidates.of(slots), random_theta(5), evidence_of(slots, effects)
+    a, b = evidence.scan(theta, candidates.columns, candidates.run)
+    a, b = a[:, candidates.first], b[:, candidates.first]
+    t = theta["rest"][:, None] * candidates.sd
+    bf = np.exp(t**2 * b**2 / (2 + 2 * t**2 * a)) / np.sqrt(1 + t**2 * a)
+    ratio = np.exp(candidates.log_odds) * (bf / bf[:, [3]])
+    total = ratio.sum(1) + 1.0 / bf[:, 3]
+    weighed = weigh(evidence, theta, candidates, 3)
+    np.testing.assert_allclose(weighed.p, ratio.sum(0) / total.sum(), rtol=1e-10)
+    np.testing.assert_allclose(weighed.p_none, (1.0 / bf[:, 3]).sum() / total.sum(), rtol=1e-10)
+    np.testing.assert_allclose(weighed.largest_share, total.max() / total.sum(), rtol=1e-10)
+
+
+def test_the_size_of_a_change_is_that_of_its_coefficient():
+    slots, effects = slots_of(changing_missions(1, PLANTED["robot"])), [Weights(PRIORS), Place()]
+    candidates, theta = Candidates.of(slots), random_theta(1)
+    weighed = weigh(evidence_of(slots, effects), theta, candidates)
+    change = weighed.candidates.change(weighed.best)
+    whole = evidence_of(slots, [*effects, change])
+    d = whole.draw(theta, np.array([20_000]), np.random.default_rng(0))["change"]
+    # 4 standard errors
+    assert abs(d.mean() - weighed.effect[weighed.best]) < 4.0 * d.std() / np.sqrt(20_000)
+    assert weighed.sd[weighed.best] == pytest.approx(d.std(), rel=4.0 / np.sqrt(40_000))
+
+
+@pytest.mark.parametrize("kind", PLANTED)
+def test_a_change_is_named_with_its_mission_and_size(kind):
+    """8 data sets; at a rate of .95, 6 or more of them are named with chance .994."""
+    planted, named = PLANTED[kind], 0
+    for seed in range(8):
+        found = search(changing_missions(seed, planted))
+        change = found.candidates.change(found.best)
+        right = (change.kind, change.from_mission) == (kind, START)
+        if kind == "robot":
+            right &= change.where == planted.where
+        if kind == "area":
+            right &= np.hypot(*np.subtract(change.where[:2], CENTRE)) <= 1.5
+        size = found.effect[found.best], found.sd[found.best]
+        right &= abs(size[0] - SIZES[kind]) < 4.0 * size[1] + 0.1  # rates are cut off at 0
+        named += found.alarm and right
+        assert found.believed == change
+        assert found.largest_share < 0.5
+    assert named >= 6
+
+
+def test_nothing_is_named_where_nothing_changes():
+    """30 data sets: with an alarm in 1 of 200, more than one has a chance of .01."""
+    alarms = [search(changing_missions(100 + seed)).alarm for seed in range(30)]
+    assert sum(alarms) <= 1
+
+
+def test_a_bad_day_is_no_change_where_robots_have_days():
+    missions = changing_missions(0)
+    for j in (3, 6, 7):
+        rates = missions[j].contact_rate - 0.35 * missions[j].awareness[..., 0] * [0, 1, 0]
+        args = missions[j].path, missions[j].awareness, np.clip(rates, 0.0, 1.0)
+        missions[j] = Mission.from_arrays(*args, features=FEATURES)
+    assert not search(missions, [Robot()]).alarm
+
+
+def test_the_table_lists_changes_by_probability_and_none():
+    found = search(changing_missions(0, PLANTED["area"]))
+    table = found.table()
+    assert table.columns.tolist() == [
+        "kind", "where", "from_mission", "earliest", "effect", "sd", "probability", "ties",
+    ]  # fmt: skip
+    none, changes = table.iloc[0], table.iloc[1:]
+    assert (none["kind"], none["probability"]) == ("none", found.p_none)
+    assert changes["probability"].is_monotonic_decreasing
+    assert (changes["earliest"] <= changes["from_mission"]).all()
+    assert table["probability"].sum() == pytest.approx(1.0, abs=len(found.p) * 1e-3)
+    assert changes.iloc[0]["kind"] == "area"
+
+
+def test_missions_without_candidates_have_no_change():
+    found = search(changing_missions(0, n_missions=3))
+    assert found.p_none == 1.0
+    assert not found.alarm
+    assert found.table()["kind"].tolist() == ["none"]
+
+
+def test_sizes_are_a_priori_those_of_their_kind():
+    slots = slots_of(changing_missions(0))
+    candidates = Candidates.of(slots)
+    kind = candidates.profile[candidates.first, 0]
+    np.testing.assert_array_equal(candidates.sd, np.array(SDS)[kind])
