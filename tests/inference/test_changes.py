@@ -137,24 +137,25 @@ def test_the_size_of_a_change_is_that_of_its_coefficient():
     assert weighed.sd[weighed.best] == pytest.approx(d.std(), rel=4.0 / np.sqrt(40_000))
 
 
-@pytest.mark.parametrize("kind", PLANTED)
-def test_a_change_is_named_with_its_mission_and_size(kind):
-    """8 data sets; at a rate of .95, 6 or more of them are named with chance .994."""
+@pytest.mark.parametrize(("kind", "n", "least"), [("all", 4, 3), ("robot", 4, 3), ("area", 8, 5)])
+def test_a_change_is_named_with_its_mission_and_size(kind, n, least):
+    """At a rate of .95, 3 or more of 4 data sets have chance .986; at .85, 5 of 8 have .979.
+
+    Paths meet an area by chance: some too seldom to name it.
+    """
     planted, named = PLANTED[kind], 0
-    for seed in range(8):
+    for seed in range(n):
         found = search(changing_missions(seed, planted))
         change = found.candidates.change(found.best)
         right = (change.kind, change.from_mission) == (kind, START)
-        if kind == "robot":
-            right &= change.where == planted.where
-        if kind == "area":
-            right &= np.hypot(*np.subtract(change.where[:2], CENTRE)) <= 1.5
+        near = 1 if kind == "area" else 0
+        right = right and np.abs(np.subtract(change.where, planted.where))[:2].max(initial=0) <= near
         size = found.effect[found.best], found.sd[found.best]
-        right &= abs(size[0] - SIZES[kind]) < 4.0 * size[1] + 0.1  # rates are cut off at 0
+        right = right and abs(size[0] - SIZES[kind]) < 4.0 * size[1] + 0.1  # rates are cut off at 0
         named += found.alarm and right
-        assert found.believed == change
+        assert found.believed == (change if found.p_none < 0.5 else None)
         assert found.largest_share < 0.5
-    assert named >= 6
+    assert named >= least
 
 
 def test_nothing_is_named_where_nothing_changes():
