@@ -123,7 +123,9 @@ class Gaussian:
         """
         run = np.arange(columns.shape[1]) if run is None else run
         sums = Sums.of(sparse.csc_array(columns))
-        entries, G = self._products(sums.atoms)
+        (atom, column), G = self._products(sums.atoms)
+        shape = sums.atoms.shape[1], len(self.order)
+        start = np.searchsorted(atom, np.arange(shape[0] + 1))
         out = np.zeros((2, len(theta["beta0"]), columns.shape[1]))
         for i in self._chunks(len(theta["beta0"])):
             some = _take(theta, i)
@@ -136,9 +138,9 @@ class Gaussian:
             for t in range(len(S)):
                 a, b = out[0, i.start + t], out[1, i.start + t]
                 weigh_chains(a, b, S[t], self.kind, self.slots.weight, R[t], *sums.slots, run)
-                W = np.zeros((sums.atoms.shape[1], len(self.order)))
-                W[entries] = values[t]
-                take_projections(a, b, *self._half(factors, t, W), *sums.of_atoms, run)
+                half, right = self._half(factors, t)
+                T = sparse.csr_array((values[t], column, start), shape=shape) @ half
+                take_projections(a, b, T, right, *sums.of_atoms, run)
         return out[0], out[1]
 
     def coefficients(self, theta: Theta, count: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -273,24 +275,22 @@ class Gaussian:
         diagonal = np.arange(m)
         P[:, diagonal, diagonal] += 1.0
 
-    def _half(self, factors: "_Factors", t: int, W: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """W R F'^-1 of rows W = Z'S U (row, column) at the t-th theta, and F^-1 R'h.
-
-        F is the factor of I + R'AR.
-        """
+    def _half(self, factors: "_Factors", t: int) -> tuple[np.ndarray, np.ndarray]:
+        """R F'^-1 (column, column) at the t-th theta, F the factor of I + R'AR, and F^-1 R'h."""
         arrow, prior, shared = factors.arrows[t], factors.prior, self.blocks[-1]
-        W *= prior.sd[t]
+        R, last = np.diag(prior.sd[t]), slice(shared.start, shared.stop - 1)
         for columns, root in zip(self.joined, prior.roots, strict=True):
-            W[:, columns] = W[:, columns] @ root[t]
-        right, last = np.empty(W.shape[1]), slice(shared.start, shared.stop - 1)
+            R[columns, columns] = prior.sd[t][columns, None] * root[t]
+        half, right = np.zeros_like(R), np.zeros(len(R))
         for block, (F, X) in zip(self.blocks, arrow.robots, strict=False):
-            W[:, block] = dtrsm(1.0, F, W[:, block].T, lower=1).T
-            W[:, last] -= W[:, block] @ X[:-1].T
+            half[block, block] = dtrsm(1.0, F, R[block, block].T, lower=1).T
+            half[block, last] = -half[block, block] @ X[:-1].T
             right[block] = X[-1]
         if last.start < last.stop:
-            W[:, last] = dtrsm(1.0, arrow.shared[:-1, :-1], W[:, last].T, lower=1).T
+            half[last, last] = R[last, last]
+            half[:, last] = dtrsm(1.0, arrow.shared[:-1, :-1], half[:, last].T, lower=1).T
             right[last] = arrow.shared[-1, :-1]
-        return W, right
+        return half, right
 
     def _draw(self, factors: "_Factors", t: int, n: int, rng: np.random.Generator) -> np.ndarray:
         """Step 5: coefficients (draw, column), in their order, at the t-th theta."""
