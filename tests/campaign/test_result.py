@@ -65,8 +65,9 @@ def test_its_maps_are_over_the_posterior(result):
     assert all(np.isnan(maps[name][1, 1]) for name in maps)
     share = maps["path_probability"]
     assert share[3, 0] == share[0, 3] == 1.0
-    # The mean cost and the cost of the mean differ by little, as sigma bends little.
-    np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=5e-3)
+    # The mean cost and the cost of the mean differ by little, as sigma bends little: its second
+    # derivative is at most .1, and the sd of trust with effects of robots some .4.
+    np.testing.assert_allclose(maps["cost"], 1.0 - expit(maps["trust_mean"]), atol=1e-2)
     assert result.maps(n_draws=300).identical(maps)
     believed = result.workspace.awareness if result.believed is None else result.believed["mean"]
     expected = np.where(PASSABLE, believed.sel(feature="visibility").mean("robot"), np.nan)

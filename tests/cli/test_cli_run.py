@@ -169,7 +169,7 @@ def test_a_dem_alone_is_enough_and_its_feet_are_read(invoke, rasters, flags, tmp
         (("--objective", "best"), "unknown objective 'best'; choose one of lost_contact, terminal"),
         (
             ("--model", "own"),
-            "unknown model 'own'; choose one of places, robots, pooled, hierarchical, coupled",
+            "unknown model 'own'; choose one of robots, places, pooled, hierarchical, coupled",
         ),
         (("--sampler", "gibbs"), "unknown sampler 'gibbs'; choose one of auto, exact, nuts, joint"),
         (

@@ -1,6 +1,7 @@
 """Criticism of a fitted model: residuals, calibrated tests, and the names of planted faults."""
 
 import importlib.util
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from trustbo.models import (
     HierarchicalTrust,
     PlaceEffect,
     PooledTrust,
+    RobotEffect,
     TrustParams,
 )
 
@@ -66,7 +68,7 @@ def test_the_joint_normal_is_the_product_of_the_robots_densities():
     missions[1] = Mission.from_arrays(missions[1].path, missions[1].awareness, rates)
     params = TrustParams(0.6, np.array([0.3, -0.2]), 0.1, 0.05, 0.08, 0.4, 0.3)
     data = dense.gather(missions, None)
-    normal = dense.joint_normal(dense.Point(params, {}, 0.0), data)
+    normal = dense.joint_normal(dense.Point(params, {}, 0.0, None), data)
     expected = sum(
         dense_log_likelihood(*params[:7], mission.awareness[:, i], mission.contact_rate[:, i])
         for mission in missions
@@ -82,7 +84,7 @@ def test_the_joint_normal_of_robots_that_influence_each_other(lag):
     B0, B = np.array([[0.5, 0.1], [-0.2, 0.4]]), np.array([0.3 * np.eye(2), 0.2 * np.ones((2, 2))])
     params = CoupledParams(B0, B, np.array([0.1, 0.0]), Q, R, 0.4, 0.3)
     data = dense.gather(missions, None)
-    normal = dense.joint_normal(dense.Point(params, {}, lag), data)
+    normal = dense.joint_normal(dense.Point(params, {}, lag, None), data)
     expected = 0.0
     for mission in missions:
         drift = np.einsum("kim,mai->ka", mission.awareness, B) + params.b
@@ -97,9 +99,60 @@ def test_effects_of_places_tie_missions_together():
     params = TrustParams(0.6, np.array([0.3, -0.2]), 0.1, 0.05, 0.08, 0.4, 0.3)
     data = dense.gather(missions, place)
     scales = {"tau_s": 0.3, "length_scale": 2.0, "tau_e": 0.4}
-    normal = dense.joint_normal(dense.Point(params, scales, 0.0), data)
+    normal = dense.joint_normal(dense.Point(params, scales, 0.0, None), data)
     own = 0.6**2 * 0.3**2 + 0.05**2 + 0.08**2
     np.testing.assert_allclose(normal.cov, 0.25 + own * np.eye(4), rtol=1e-12)
+
+
+def test_effects_of_robots_tie_missions_of_one_robot_together():
+    """Missions of one bound each: shares of sight times 1 - beta0, slow ones fading by .9."""
+    rng, z = np.random.default_rng(0), np.array([[0.9, 0.5], [0.4, 0.8], [0.7, 0.3]])
+    missions = [
+        Mission.from_arrays([(0, 0), (0, 1)], one[None, :, None], rng.uniform(size=(1, 2)),
+                            features=["line_of_sight"])
+        for one in z
+    ]  # fmt: skip
+    params = TrustParams(0.6, np.array([0.3]), 0.1, 0.05, 0.08, 0.4, 0.3)
+    data, scales = dense.gather(missions, None), {"tau_slow": 0.3, "tau_day": 0.2}
+    normal = dense.joint_normal(dense.Point(params, scales, 0.0, 0.9), data)
+    own = 0.6**2 * 0.3**2 + 0.05**2 + 0.08**2
+    gap = np.abs(np.subtract.outer(np.arange(3), np.arange(3)))
+    K = 0.4**2 * (0.3**2 * 0.9**gap + 0.2**2 * np.eye(3))
+    expected = own * np.eye(6)
+    for i in range(2):
+        expected[i::2, i::2] += z[:, i, None] * K * z[:, i]
+    np.testing.assert_allclose(normal.cov, expected, rtol=1e-12, atol=1e-15)
+
+
+def less_contact(missions, robot, which, size=0.5):
+    """Missions in some of which a robot's rates fall by a share of its line of sight."""
+    worse = list(missions)
+    for j in which:
+        loss = size * worse[j].awareness[..., 2] * (np.arange(3) == robot)
+        rates = np.clip(worse[j].contact_rate - loss, 0.0, 1.0)
+        args = worse[j].path, worse[j].awareness, rates
+        worse[j] = Mission.from_arrays(*args, features=worse[j].features)
+    return worse
+
+
+@pytest.mark.parametrize(
+    ("which", "when"),
+    [
+        ([], ""),
+        (range(9, 15), "r2 has .* less contact in full sight .*, from mission 9 on"),
+        ([3, 8], "r2 has .* less contact in full sight .*, in missions 3 and 8"),
+        (range(15), "r2 has .* less contact in full sight .*, in all missions"),
+    ],
+    ids=["healthy", "dead from 9 on", "two bad days", "poor"],
+)
+def test_a_robot_is_named_with_its_missions(planted, which, when):
+    missions = less_contact(planted("none"), 1, which)
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
+    found = criticise(fit(missions, model, draws=250, whole=False), missions, compare=False)
+    assert found.fault == ("robot in a mission" if when else "none")
+    assert re.search(when, found.verdict)
+    chosen = found.robots[found.robots["stands_out"]]
+    assert set(zip(chosen["robot"], chosen["mission"], strict=True)) <= {("r2", j) for j in which}
 
 
 def test_residuals_are_those_of_the_kalman_filter(planted):
@@ -121,7 +174,7 @@ def test_p_values_of_the_right_model_are_uniform():
     """Rates drawn from one point; parameters are estimated by the step of scoring alone."""
     missions = missions_of_shape(8, 6)
     params = TrustParams(0.5, np.array([0.3, 0.2]), 0.1, 0.06, 0.06, 0.5, 0.2)
-    point, data = dense.Point(params, {}, 0.0), dense.gather(missions, None)
+    point, data = dense.Point(params, {}, 0.0, None), dense.gather(missions, None)
     normal, by_parameter = dense.joint_normal(point, data), derivatives(point, data)
     tests, left_out = departures(missions, data, normal, point, None)
     assert left_out == {}

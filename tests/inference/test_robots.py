@@ -96,6 +96,22 @@ def test_plans_have_what_stays_of_each_robot_and_no_bad_day(posterior):
     assert params.place.shape == (400, 1, 5, 5)
 
 
+def test_bands_have_the_day_to_come_with_its_variance(posterior):
+    """Of the draws, and of them alone: the mean is that of plans, up to 4 standard errors."""
+    plan, day = (tb.inference.params_of(posterior, day=day) for day in (False, True))
+    sites = posterior["posterior"].to_dataset().stack(d=("chain", "draw"))
+    slow, tau_day = sites["tau_slow"].values, sites["tau_day"].values
+    gap = np.abs(np.subtract.outer(np.arange(9), np.arange(9)))
+    K = slow[:, None, None] ** 2 * 0.9**gap + tau_day[:, None, None] ** 2 * (gap == 0)
+    gain = np.linalg.solve(K[:, :8, :8], K[:, :8, 8:])[..., 0]
+    sd = np.sqrt(K[:, 8, 8] - (gain * K[:, 8, :8]).sum(1)) * (1.0 - sites["beta0"].values)
+    e = (day.beta - plan.beta)[:, :, 0] / sd[:, None]
+    assert abs(e.mean()) < 4.0 / np.sqrt(e.size)
+    assert abs((e**2).mean() - 1.0) < 4.0 * np.sqrt(2.0 / e.size)
+    np.testing.assert_array_equal(day.beta[..., 1], plan.beta[..., 1])
+    np.testing.assert_array_equal(day.place, plan.place)
+
+
 def test_without_line_of_sight_a_robot_changes_the_intercept(missions):
     blind = [Mission.from_arrays(m.path, m.awareness, m.contact_rate) for m in missions]
     posterior = tb.fit(blind, PooledTrust(effects=[RobotEffect()]), draws=25, progress=False)

@@ -104,7 +104,7 @@ class Campaign(Displayed):
             workspace: Workspace of the paths.
             start: First cell of every path, or a position in it; see `Workspace.locate`.
             goal: Last cell of every path, or a position in it.
-            model: Trust model; by default `PooledTrust(place=PlaceEffect())`.
+            model: Trust model; by default `PooledTrust` with effects of places and robots.
             policy: Name of a policy, or a callable `policy(key, draws, planner) -> Plan`.
             objective: Objective of the paths; see `Planner`.
             sampler: Sampler of the posterior; see `trustbo.fit`.

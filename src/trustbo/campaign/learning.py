@@ -23,7 +23,7 @@ from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.updating import moment_matched
-from trustbo.models import PlaceEffect, PooledTrust, TrustParams
+from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
@@ -43,7 +43,7 @@ class Learner:
     Attributes:
         workspace: Workspace of the missions.
         options: Options of the campaign.
-        model: Trust model, by default `PooledTrust` with effects of places.
+        model: Trust model, see `default_model`.
         sampler: Sampler of the posterior.
         belief: Parameter draws: the posterior's, or, before the first mission, one from the prior.
         observation: Family of observations of the belief.
@@ -62,8 +62,7 @@ class Learner:
         seed: int,
     ) -> None:
         """Begin with the prior, drawn by a seed; see `Campaign` for what is refused."""
-        if model is None:  # moments that are matched are those of the paper's parameters
-            model = PooledTrust(place=PlaceEffect() if options.update == "refit" else None)
+        model = default_model(options.update, sampler) if model is None else model
         _require_learnable(model, sampler, options)
         self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
         self._prior = _prior_belief(model, options.initial, workspace, seed)
@@ -226,6 +225,17 @@ class Learner:
             return attempts
         shared = NutsSettings.of(asked | {"draws": 2 * max(asked["draws"], _N_DRAWS)}).shared
         return [*attempts, (other, shared)]
+
+
+def default_model(update: str, sampler: str) -> TrustModel:
+    """Effects of places and of robots, as far as the update and the sampler know them.
+
+    Moments that are matched are those of the paper's parameters.
+    """
+    if update != "refit":
+        return PooledTrust()
+    robots = [] if sampler in ("nuts", "joint") else [RobotEffect()]
+    return PooledTrust(effects=[PlaceEffect(), *robots])
 
 
 def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions) -> None:

@@ -120,7 +120,10 @@ def run_replanning(campaign: "Campaign", simulator: Any, plan: Plan, **start: An
     if (posterior := campaign.state.last_tree) is not None:
         response, observation = campaign.model.response, campaign.learner.observation
         live = TrustFilter(
-            params_of(posterior), len(names[1]), response=response, observation=observation
+            params_of(posterior, day=True),
+            len(names[1]),
+            response=response,
+            observation=observation,
         )
     if takes(simulator.reset, "next_cell"):
         start["next_cell"] = path[1]

@@ -31,7 +31,7 @@ def run(
     sight: str = "transmittance",
     objective: str = OBJECTIVE,
     policy: str = POLICY,
-    model: str = "places",
+    model: str = "robots",
     observation: str = "gaussian",
     sampler: str = SAMPLER,
     iterations: int = 8,
@@ -86,7 +86,7 @@ def run(
 def demo(
     policy: str = POLICY,
     objective: str = OBJECTIVE,
-    model: str = "places",
+    model: str = "robots",
     sampler: str = SAMPLER,
     iterations: int = 8,
     seed: int = 0,

@@ -39,9 +39,9 @@ Paths
 Learning
   policy NAME: Choice of the next path: greedy, optimistic, thompson, information, ucb,
     random.
-  model NAME: Trust model: places (robots are alike, places differ), robots (and a robot by mission:
-    damage, bad days), pooled (places do not, as in the paper), hierarchical (robots are similar),
-    coupled (influence each other).
+  model NAME: Trust model: robots (places differ, and a robot from mission to mission: damage, bad
+    days), places (robots are alike), pooled (places are too, as in the paper), hierarchical
+    (robots are similar), coupled (they influence each other).
   observation NAME: Family of contact rates: gaussian (as in the paper), censored, beta_binomial,
     student_t, auto (the one that suits them).
   sampler NAME: Sampler of the posterior: auto (exact where it applies, else nuts); exact
@@ -55,8 +55,8 @@ Benchmark
     default all.
   worlds.policy NAME: Policy, may be repeated: a name as for [b]trustbo run[/b], or module:name;
     by default optimistic.
-  worlds.model NAME: Model, may be repeated: places (the default), pooled, hierarchical,
-    coupled, or module:name.
+  worlds.model NAME: Model, may be repeated: robots (the default), places, pooled,
+    hierarchical, coupled, or module:name.
   simulator NAME: Simulator of a world, module:name.
   baseline NAME: Baseline, may be repeated: random, shortest, paper, none, or module:name; by
     default the first three.

@@ -90,7 +90,7 @@ def worlds(
     Store(out).require_free("worlds.csv")
     chosen = {
         "policies": policy or (POLICY,),
-        "models": model or ("places",),
+        "models": model or ("robots",),
         "baselines": BASELINES if baseline is None else [b for b in baseline if b != "none"],
     }
     results = run_worlds(

@@ -67,12 +67,7 @@ def _rows(
     else:
         others["places"] = missions, replace(model, place=None), "without them"
     if len(missions[0].robots) > 1:
-        shared = {"priors": model.priors, "response": model.response, "place": model.place}
-        if isinstance(model, PooledTrust):
-            wider, how = HierarchicalTrust(**shared), "with coefficients of their own"
-        else:
-            wider, how = PooledTrust(**shared), "with shared coefficients"
-        others["robots"] = missions, wider, how
+        others["robots"] = missions, *_other_robots(model)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of single influential missions, by k-hat
         fitted = loo(posterior)
@@ -92,6 +87,16 @@ def _rows(
             gap = np.asarray(beside.elpd_i) - np.asarray(other_loo.elpd_i)  # pyright: ignore
             rows[name] = _compared(gap, how)
     return rows
+
+
+def _other_robots(model: TrustModel) -> tuple[TrustModel, str]:
+    """Model in which robots are as they are not in a given one, and the difference in words."""
+    if isinstance(model, PooledTrust) and model.effects:
+        return replace(model, effects=()), "without effects of robots"
+    shared = {"priors": model.priors, "response": model.response, "place": model.place}
+    if isinstance(model, PooledTrust):
+        return HierarchicalTrust(**shared), "with coefficients of their own"
+    return PooledTrust(**shared), "with shared coefficients"
 
 
 def _compared(gap: np.ndarray, how: str) -> tuple[float, float, str]:

@@ -16,6 +16,7 @@ from trustbo.display.card import joined
 
 _MOST_CELLS = 3
 _LEVEL = 0.05
+_SKEWNESS, _KURTOSIS = 0.5, 1.0  # of residuals, from which on they matter
 
 
 def family_test(innovations: Innovations) -> Outcome:
@@ -25,6 +26,18 @@ def family_test(innovations: Innovations) -> Outcome:
     z = (moments - moments[:, 1:].mean(1, keepdims=True)) / sd
     log_p = np.log(2.0) + stats.norm.logsf(np.abs(z))
     return judge(["skewness", "tails"], z[:, 0], log_p[:, 0], log_p[:, 1:])
+
+
+def shape_of(innovations: Innovations) -> tuple[float, float]:
+    """Skewness and excess kurtosis of the residuals."""
+    e = innovations.e[:, 0]
+    return float(stats.skew(e)), float(stats.kurtosis(e))
+
+
+def changes_plans(innovations: Innovations) -> bool:
+    """Whether the residuals' shape is far enough from the normal one to matter for plans."""
+    skewness, kurtosis = shape_of(innovations)
+    return abs(skewness) > _SKEWNESS or abs(kurtosis) > _KURTOSIS
 
 
 def coverage_row(curves: xr.Dataset) -> tuple[str, float, float, float, float, str]:
@@ -83,7 +96,9 @@ def finding(
         return f"noise is correlated: {label} go together beyond what the model says."
     limits = ((data.y <= 0.0) | (data.y >= 1.0)).mean()
     end = f"; {limits:.0%} of the rates are 0 or 1, try observation='auto'" if limits else ""
-    return f"residuals are not normal ({label}){end}."
+    skewness, kurtosis = shape_of(innovations)
+    shape = f"{label}: skewness {skewness:.2f}, excess kurtosis {kurtosis:.2f}"
+    return f"residuals are not normal ({shape}){end}."
 
 
 def _of_places(
@@ -113,15 +128,15 @@ def _shift(innovations: Innovations, column: np.ndarray) -> str:
     return f"{effect:+.3f} +- {se:.3f}"
 
 
-def verdict_of(fault: str, table: pd.DataFrame) -> str:
-    """Verdict in words from the rows of the checks."""
+def verdict_of(fault: str, table: pd.DataFrame, wrong: Sequence[str]) -> str:
+    """Verdict in words from the rows of the checks, and those in which something is found."""
     checks = [str(name) for name in table.index]
     adjusted, after = (table[name].to_numpy(dtype=float) for name in ("p_adjusted", "p_after"))
     n = int(np.isfinite(adjusted).sum())
     if fault == "none":
         return f"no fault is found by {n} checks, at a level of 5 % for all together."
     verdict = f"{fault}: {table['finding'].to_numpy()[checks.index(fault)]}"
-    others = [i for i, p in enumerate(adjusted) if p <= _LEVEL and checks[i] != fault]
+    others = [i for i, name in enumerate(checks) if name in wrong and name != fault]
     gone = [checks[i] for i in others if after[i] * len(others) > _LEVEL]
     left = [checks[i] for i in others if not after[i] * len(others) > _LEVEL]
     if gone:

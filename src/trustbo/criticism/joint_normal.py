@@ -15,8 +15,9 @@ import numpy as np
 import xarray as xr
 from scipy.linalg import solve_triangular
 
-from trustbo.data import Mission
+from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
+from trustbo.inference.draws import rho_of
 from trustbo.inference.evidence.place_prior import correlation
 from trustbo.models.params import CoupledParams, Params, assemble_params
 from trustbo.models.place import PlaceEffect, Visited, bounds_of, visited
@@ -24,7 +25,7 @@ from trustbo.stacking import MissionBatch, stack_missions
 
 MOST_RATES = 2000
 _STARTS = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0, 1.4])
-_PLACE_SCALES = ("tau_s", "length_scale", "tau_e")
+_SCALES = ("tau_s", "length_scale", "tau_e", "tau_slow", "tau_day")
 
 
 class Data(NamedTuple):
@@ -36,6 +37,7 @@ class Data(NamedTuple):
     seen: np.ndarray  # (rate,), slots with a rate
     y: np.ndarray  # (rate,)
     places: Visited | None  # of the model
+    sight: tuple[int, ...]  # features that are predicted contact rates
 
     @property
     def z(self) -> np.ndarray:
@@ -57,11 +59,12 @@ class Normal(NamedTuple):
 
 
 class Point(NamedTuple):
-    """One value of the parameters, those of places among them."""
+    """One value of the parameters, those of places and robots among them."""
 
     params: Params
     scales: Mapping[str, float]
     lag: float
+    rho: float | None  # of robots, see `RobotEffect`
 
 
 def gather(missions: Sequence[Mission], place: PlaceEffect | None) -> Data:
@@ -82,7 +85,8 @@ def gather(missions: Sequence[Mission], place: PlaceEffect | None) -> Data:
     places = None
     if place is not None:
         places = visited(bounds_of(missions), place, n_robots)
-    return Data(batch, n_bounds, slots, seen, rates[seen], places)
+    sight = tuple(m for m, name in enumerate(missions[0].features) if is_line_of_sight(name))
+    return Data(batch, n_bounds, slots, seen, rates[seen], places, sight)
 
 
 def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:
@@ -93,11 +97,12 @@ def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:
     }
     x0 = {name: float(posterior.attrs[name]) for name in ("x0_mean", "x0_sd")}
     params = assemble_params({n: np.asarray(m)[None] for n, m in means.items()}, x0).draw(0)
-    scales = {name: float(means[name]) for name in _PLACE_SCALES if name in means}
+    scales = {name: float(means[name]) for name in _SCALES if name in means}
     lag = float(posterior.attrs["response"] == "change")
     record = posterior.attrs.get("place", "none")
     place = None if record == "none" else PlaceEffect(**json.loads(record))
-    return Point(params, scales, lag), place
+    rho = rho_of(posterior) if "robots" in posterior.children else None
+    return Point(params, scales, lag, rho), place
 
 
 def joint_normal(point: Point, data: Data) -> Normal:
@@ -117,6 +122,8 @@ def joint_normal(point: Point, data: Data) -> Normal:
     carry, cov = carry[seen], cov[np.ix_(seen, seen)]
     if data.places is not None:
         cov = cov + _place_cov(carry, data, point.scales)
+    if point.rho is not None:
+        cov = cov + _robot_cov(carry, data, point)
     return Normal(mean[seen], cov, carry)
 
 
@@ -208,3 +215,18 @@ def _place_cov(carry: np.ndarray, data: Data, scales: Mapping[str, float]) -> np
         of_cells = correlation(places.cells, places.cells, scales["length_scale"])
         K = K + scales["tau_s"] ** 2 * of_cells[np.ix_(places.cell_of, places.cell_of)]
     return effects @ K @ effects.T
+
+
+def _robot_cov(carry: np.ndarray, data: Data, point: Point) -> np.ndarray:
+    mission, _, robot = data.slots.T
+    rest = 1.0 - np.asarray(point.params.beta0)  # pyright: ignore[reportAttributeAccessIssue]
+    sight = data.z[:, list(data.sight)].mean(1) if data.sight else np.ones(len(mission))
+    missions = np.arange(len(data.n_bounds))
+    gap = np.abs(missions[:, None] - missions)
+    K = point.scales["tau_slow"] ** 2 * float(point.rho or 0.0) ** gap
+    K += point.scales["tau_day"] ** 2 * np.eye(len(missions))
+    cov = np.zeros((len(carry), len(carry)))
+    for i in range(data.n_robots):
+        effects = carry @ ((rest * sight * (robot == i))[:, None] * (mission[:, None] == missions))
+        cov += effects @ K @ effects.T
+    return cov

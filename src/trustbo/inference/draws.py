@@ -15,6 +15,8 @@ from trustbo.models.params import Params, RobotParams, params_from
 from trustbo.models.place import bounds_of
 from trustbo.stacking import MissionBatch
 
+_DAYS = 20261123  # seed of the next mission's effects: the same posterior has the same bands
+
 
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """All draws of a posterior by name, chains joined: leading axis (draw,)."""
@@ -28,16 +30,19 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(a).reshape(n, *a.shape[2:]) for name, a in arrays.items()}
 
 
-def params_of(posterior: xr.DataTree) -> Params:
+def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
     """All draws of a posterior as parameters, chains joined: leading axis (draw,).
 
     Args:
         posterior: DataTree from `fit`.
+        day: Whether each draw has an effect of each robot drawn for the next mission, a bad day
+            among them, for bands and predictions of rates; by default it has the expected one, for
+            plans. Without effects of robots there is no difference.
 
     Returns:
         `TrustParams`, `RobotParams`, `CoupledParams` or `DriftParams`, according to the model. With
         effects of robots, `RobotParams` of the next mission: weights of line of sight have the
-        expected effect of each robot, in which a bad day is gone and what stays fades.
+        effect of each robot, in which the last bad day is gone and what stays fades.
 
     Raises:
         TrustboError: No posterior of `fit`; or one with the drift of a `DriftTrust` that this
@@ -46,7 +51,9 @@ def params_of(posterior: xr.DataTree) -> Params:
     params, sites = _params(require_posterior("params_of", posterior))
     if "robots" not in posterior.children:
         return params
-    d, _ = next_mission(_robot_effect(posterior), sites, rho_of(posterior))
+    d, sd = next_mission(_robot_effect(posterior), sites, rho_of(posterior))
+    if day:
+        d = d + sd[:, None] * np.random.default_rng(_DAYS).standard_normal(d.shape)
     robots = (len(d), d.shape[1])
     fields = {
         name: np.broadcast_to(sites[name][:, None], robots)

@@ -109,7 +109,7 @@ class TrustFilter:
             n_robots = n_robots if recorded is None else recorded
             response = _of_posterior(posterior, "response", response)
             observation = _of_posterior(posterior, "observation", observation)
-            posterior = params_of(posterior)
+            posterior = params_of(posterior, day=True)
         elif not isinstance(posterior, Params):
             raise TrustboError(
                 "a filter follows a posterior of fit, or draws of parameters; got "

@@ -71,10 +71,10 @@ def score(
     shape = batch.contact_rate.shape
     columns = {name: np.full(shape, np.nan) for name in ("mean", "pit", "log_score")}
     quantile, seen = np.full((*shape, len(QUANTILES)), np.nan), np.zeros(shape[:2], dtype=bool)
-    latest, params = pairs[0][0], params_of(pairs[0][0]).flat()
+    latest, params = pairs[0][0], params_of(pairs[0][0], day=True).flat()
     for j, (tree, mission, learned) in enumerate(pairs):
         if tree is not latest:
-            latest, params = tree, params_of(tree).flat()
+            latest, params = tree, params_of(tree, day=True).flat()
         conditional = Conditional.of(tree)
         one = MissionBatch(*(a[j : j + 1, : len(mission.bounds)] for a in batch))
         require_ticks(conditional.family, one)

@@ -342,14 +342,15 @@ class Planner(Displayed):
             path: Cells from start to goal, each a neighbour of the last.
             params: Draws of parameters, one or many, or a posterior; of many, `trust` and `value`
                 are those of mean trust, and `bands` its quantiles. For lost_contact and stationary,
-                `value` is the mean over draws.
+                `value` is the mean over draws. Draws of a posterior have the next mission's day of
+                each robot, see `params_of`.
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
             ShapeError: Parameters of other robots or features.
             TrustboError: A path that is broken, or does not lead from start to goal.
         """
-        return evaluate(self.problem, self.require_path(path), draws_of(params), x0)
+        return evaluate(self.problem, self.require_path(path), draws_of(params, day=True), x0)
 
     def bands(self, path: Sequence[Cell], posterior: Params | xr.DataTree) -> np.ndarray:
         """`Plan.bands` of a path over draws, shape (quantile, bound, robot)."""

@@ -226,11 +226,11 @@ def _any_move(cells: np.ndarray) -> np.ndarray:
     return cells[..., None, :, :, :]
 
 
-def draws_of(posterior: Params | xr.DataTree) -> Params:
+def draws_of(posterior: Params | xr.DataTree, *, day: bool = False) -> Params:
     """Return parameters unchanged, or the draws of a posterior: leading axis (draw,).
 
-    TrustboError: another object.
+    `day`: see `params_of`. TrustboError: another object.
     """
     if isinstance(posterior, xr.DataTree):
-        return params_of(posterior)
+        return params_of(posterior, day=day)
     return require_kind("posterior", posterior, Params, "give one of fit, or draws of parameters")

@@ -129,7 +129,7 @@ def _mission_step(result: Result, j: int, bound_maps: _Moments) -> Step:
 def _last_step(result: Result, bound_maps: _Moments) -> Step:
     """Recommended path, with the trust expected along it."""
     path, planner = result.path, result.planner
-    params, chosen = choose_draws(params_of(result.posterior), None, 0)
+    params, chosen = choose_draws(params_of(result.posterior, day=True), None, 0)
     along = planner.dynamics(params, draws=chosen).along(path)
     expected = path_trust(along, planner.problem.objective, 0.0, cap=False).trust
     stops, posts = _planned(path, result.workspace)

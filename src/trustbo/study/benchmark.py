@@ -23,7 +23,7 @@ def run_worlds(
     kinds: Sequence[str] | None = None,
     courses: Sequence[str] = COURSES,
     policies: Any = (POLICY,),
-    models: Any = ("places",),
+    models: Any = ("robots",),
     simulator: Simulate | str | None = None,
     baselines: Sequence[str] = tuple(BASELINES),
     methods: Mapping[str, Callable[[], Any]] | None = None,

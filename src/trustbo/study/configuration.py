@@ -99,7 +99,7 @@ class Study:
         terrains: Terrains, with keywords of `Workspace.from_terrain`, `start` and `goal`.
         policies: Names in `planning.POLICIES`.
         objectives: Names in `planning.OBJECTIVES`.
-        models: Models, or the names `pooled`, `places`, `hierarchical`, `coupled`.
+        models: Models, or the names `robots`, `places`, `pooled`, `hierarchical`, `coupled`.
         samplers: `"auto"`, `"exact"`, `"nuts"`, `"joint"`.
         simulators: Simulators, with `known_truth` where regret is asked for.
         seeds: Seeds, or their number: 0, 1, ...
