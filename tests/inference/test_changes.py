@@ -131,7 +131,7 @@ def test_the_size_of_a_change_is_that_of_its_coefficient():
     weighed = weigh(evidence_of(slots, effects), theta, candidates)
     change = weighed.candidates.change(weighed.best)
     whole = evidence_of(slots, [*effects, change])
-    d = whole.draw(theta, np.array([20_000]), np.random.default_rng(0))["change"]
+    d = whole.draw(theta, np.array([20_000]), np.random.default_rng(0))[0]["change"]
     # 4 standard errors
     assert abs(d.mean() - weighed.effect[weighed.best]) < 4.0 * d.std() / np.sqrt(20_000)
     assert weighed.sd[weighed.best] == pytest.approx(d.std(), rel=4.0 / np.sqrt(40_000))

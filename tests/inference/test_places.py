@@ -16,17 +16,18 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import complete, fit, params_of
 from trustbo.inference.evidence import place_marginal
-from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_group, place_maps_of
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.latent_target import LatentTarget
 from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.samplers.run import nuts_data
 from trustbo.inference.samplers.student import Student, log_mixture
 from trustbo.inference.samplers.target import Target
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.place import Place
 from trustbo.models.families import FAMILIES
 from trustbo.models.place import bounds_of, visited
 from trustbo.models.priors import Priors
@@ -119,6 +120,15 @@ def target_of(missions, place, priors=None, shape=SHAPE):
     return PlaceTarget(rows, places, priors, place)
 
 
+def by_sites(missions, place, priors=None):
+    """Posterior of censored rates by expectation propagation."""
+    batch = tb.stacking.stack_missions(missions)
+    places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
+    slots = Slots.of(batch, len(missions), places=places)
+    effects = [Place(**place.to_record())]
+    return posterior_of(priors or Priors(), FAMILIES["censored"], effects, slots)
+
+
 @pytest.mark.parametrize("stationary", [False, True])
 @pytest.mark.parametrize("place", PLACES, ids=str)
 def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationary):
@@ -134,10 +144,7 @@ def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationa
         rtol = 1e-9 if place.bounds else 1e-5
         np.testing.assert_allclose(target.log_density(z) - log_prior, expected, rtol=rtol)
         # No rate is at a limit: expectation propagation is exact.
-        batch = tb.stacking.stack_missions(missions)
-        places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
-        gathered = gather_chains(FAMILIES["censored"], batch, places=places)
-        latent = LatentTarget(*gathered, priors, (place, places))
+        latent = by_sites(missions, place, priors)
         np.testing.assert_allclose(latent.log_density(z) - log_prior, expected, rtol=10 * rtol)
 
 
@@ -148,10 +155,7 @@ def test_a_length_scale_that_underflows_is_one_of_independent_cells(score, famil
     missions, place = random_missions(0), PlaceEffect()
     target = target_of(missions, place)
     if family == "censored":
-        batch = tb.stacking.stack_missions(missions)
-        places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
-        gathered = gather_chains(FAMILIES[family], batch, places=places)
-        target = LatentTarget(*gathered, Priors(), (place, places))
+        target = by_sites(missions, place)
     z = np.zeros((2, target.n_scores if family == "gaussian" else 6))
     z[:, 4] = score, 40.0 * np.sign(score)  # a length scale of 1e-9 cells, or of 1e9
     far, near = target.log_density(z) + 0.5 * z[:, 4] ** 2
@@ -549,9 +553,7 @@ def test_rates_within_the_limits_have_the_gaussian_effects_of_places():
         for m in missions
     ]
     exact = target_of(missions, place)
-    gathered = gather_chains(FAMILIES["censored"], tb.stacking.stack_missions(missions, pad=False),
-                             places=exact.places)  # fmt: skip
-    latent = LatentTarget(*gathered, exact.priors, (place, exact.places))
+    latent = by_sites(missions, place, exact.priors)
     theirs = sample_scores(exact, 2000, 0).draws
     ours = [sample_scores(latent, 1000, seed).draws for seed in range(3)]
     assert max(one.khat for one in ours) < 0.7

@@ -384,10 +384,8 @@ class TrustModel(Displayed, ABC):
             return "it has effects of places, and " + (
                 "rates measure changes" if self.lag else "robots with nothing else in common"
             )
-        if self.effects and (self.lag or not self.family.integrates_out):
-            return "it has effects of robots, and " + (
-                "rates measure changes" if self.lag else "its observations are not Gaussian"
-            )
+        if self.effects and self.lag:
+            return "it has effects of robots, and rates measure changes"
         return None
 
     def _card(self) -> Card:

@@ -17,8 +17,16 @@ class Evidence(Protocol):
         """Log density of the rates at each theta (point,), in nats; NaN where it is not finite."""
         ...
 
+    def recentre(self, theta: Theta) -> None:
+        """Re-expand an approximate density around one theta, of a leading axis of length 1."""
+        ...
+
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
-    ) -> dict[str, np.ndarray]:
-        """Effects by name, each (draw, ...), `count` (point,) draws of each theta in turn."""
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Effects by name, each (draw, ...), `count` (point,) draws of each theta in turn.
+
+        With them, where the density is approximate, the log weight of each draw: its exponential
+        averages to the density of the rates.
+        """
         ...

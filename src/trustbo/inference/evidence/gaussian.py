@@ -70,12 +70,7 @@ class Gaussian:
         self.n_measured = float(slots.weight @ seen.sum(1))
         self.mass = np.bincount(self.kind, slots.weight, len(self.seen))
         self.y = np.where(seen, slots.y, 0.0)
-        self._first = np.cumsum([0, *(group.columns.shape[1] for group in groups)]).tolist()
-        joined = [
-            slice(first + columns.start, first + columns.stop)
-            for first, group in zip(self._first[:-1], groups, strict=True)
-            for columns in group.joined
-        ]
+        joined = joined_columns(groups)
         U = sparse.hstack([group.columns for group in groups], format="csr")
         ahead = np.cumsum(seen[:, ::-1], axis=1)[:, ::-1] > 0  # up to the last rate of a chain
         U: Columns = sparse.csr_array(sparse.diags_array(ahead.ravel().astype(float)) @ U)
@@ -93,16 +88,16 @@ class Gaussian:
             parts = [self._factors(_take(theta, i)).log_p for i in self._chunks(n)]
         return np.concatenate([np.zeros(0), *parts])
 
+    def recentre(self, theta: Theta) -> None:
+        """No-op: the density is exact everywhere."""
+
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
-    ) -> dict[str, np.ndarray]:
-        """See `Evidence.draw`."""
+    ) -> tuple[dict[str, np.ndarray], None]:
+        """See `Evidence.draw`; no weights are needed."""
         c = self.coefficients(theta, count, rng)
         of_draw = {name: np.repeat(values, count) for name, values in theta.items()}
-        named = {}
-        for group, (i, j) in zip(self.groups, itertools.pairwise(self._first), strict=True):
-            named |= group.name(c[:, i:j], of_draw, rng)
-        return named
+        return named_effects(self.groups, c, of_draw, rng), None
 
     def scan(
         self, theta: Theta, columns: Columns, run: np.ndarray | None = None
@@ -231,13 +226,8 @@ class Gaussian:
 
     def _prior(self, theta: Theta) -> Prior:
         """Prior of all columns, in their order; the roots are of the columns joined."""
-        n, m = len(theta["beta0"]), len(self.order)
-        mean, sd, roots = np.zeros((n, m)), np.empty((n, m)), []
-        for group, (i, j) in zip(self.groups, itertools.pairwise(self._first), strict=True):
-            one = group.prior(theta)
-            mean[:, i:j], sd[:, i:j] = one.mean, one.sd
-            roots += one.roots
-        return Prior(mean[:, self.order], sd[:, self.order], roots)
+        prior, _ = prior_of(self.groups, theta)
+        return Prior(prior.mean[:, self.order], prior.sd[:, self.order], prior.roots)
 
     def _residual(
         self, theta: Theta, N: np.ndarray, E: np.ndarray, mean: np.ndarray
@@ -322,6 +312,34 @@ class _Factors(NamedTuple):
     log_p: np.ndarray
     arrows: list[_Arrow]
     prior: Prior
+
+
+def joined_columns(groups: Sequence[Group]) -> list[slice]:
+    """Columns of all groups that depend on each other a priori."""
+    first = np.cumsum([0, *(group.columns.shape[1] for group in groups)]).tolist()
+    return [
+        slice(start + columns.start, start + columns.stop)
+        for start, group in zip(first[:-1], groups, strict=True)
+        for columns in group.joined
+    ]
+
+
+def prior_of(groups: Sequence[Group], theta: Theta) -> tuple[Prior, list[slice]]:
+    """Prior of the columns of all groups, and the columns that its roots are of."""
+    priors = [group.prior(theta) for group in groups]
+    mean, sd = (np.concatenate([p[i] for p in priors], axis=1) for i in range(2))
+    return Prior(mean, sd, [root for p in priors for root in p.roots]), joined_columns(groups)
+
+
+def named_effects(
+    groups: Sequence[Group], c: np.ndarray, theta: Theta, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Effects by name of coefficients (draw, column) of all groups, at theta (draw,)."""
+    first = np.cumsum([0, *(group.columns.shape[1] for group in groups)]).tolist()
+    named = {}
+    for group, (i, j) in zip(groups, itertools.pairwise(first), strict=True):
+        named |= group.name(c[:, i:j], theta, rng)
+    return named
 
 
 def impulses(

@@ -1,8 +1,8 @@
 """Importance sampling of a few scores of hyperparameters, all else drawn given them.
 
-A target integrates out coefficients, effects of places and trust: exactly where rates are Gaussian
-(`place_target`), by expectation propagation where they are not (`latent_target`). Three to six
-scores are left (`scores`). They are drawn in rounds:
+A target integrates out coefficients, effects and trust: exactly where rates are Gaussian
+(`evidence.gaussian`), by expectation propagation where they are not (`evidence.sites`). Three to
+ten scores are left (`scores`). They are drawn in rounds:
 
 1. A first proposal: a Student-t density with the moments of an earlier posterior, or else around
    the mode that Newton's searches find.

@@ -11,8 +11,9 @@ means follow from the coefficients in closed form.
 import numpy as np
 
 from trustbo.inference.evidence.ep import joint
+from trustbo.inference.evidence.ep.draws import draw_weighted
+from trustbo.inference.evidence.sites import SWEEPS
 from trustbo.inference.samplers.hierarchical_target import HierarchicalScores
-from trustbo.inference.samplers.latent_target import SWEEPS, draw_weighted
 from trustbo.models.priors import Priors
 
 _SETTLED = 8  # sweeps to find the sites' mode
@@ -69,7 +70,8 @@ class LatentHierarchicalTarget(HierarchicalScores):
         given, log_det = self._given(theta)
         of_point = ((given[0][t], given[1][t], given[2][t], given[3], given[4][t], given[5][t])
                     for t in range(len(unique)))  # fmt: skip
-        c, log_weight = draw_weighted(of_point, count, self._nu, self.chains, self._sites, rng)
+        fixed = self.chains, self._sites, SWEEPS
+        c, log_weight = draw_weighted(of_point, count, self._nu, *fixed, rng)
         log_weight += np.repeat(log_prior + 0.5 * log_det, count) - log_p[chosen]
         theta = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
         c = c.reshape(len(c), self.n_robots, self.n_coefficients)

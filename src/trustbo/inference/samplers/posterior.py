@@ -12,15 +12,20 @@ import numpy as np
 from scipy.optimize import minimize
 
 from trustbo.inference.evidence.evidence import Evidence
+from trustbo.inference.evidence.gaussian import Gaussian
+from trustbo.inference.evidence.sites import Sites
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
-from trustbo.inference.samplers.student import Student
-from trustbo.models.effects.effect import Effect, Theta
+from trustbo.inference.samplers.student import Proposal, Spanning, Student
+from trustbo.models.effects.effect import Effect, Slots, Theta
+from trustbo.models.effects.weights import Weights
+from trustbo.models.families import Family
 from trustbo.models.priors import Priors
 
 _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
 _FARTHEST = 7.0  # score that a search of the mode tries
 _ENOUGH = 1e-2  # nats that a further step of the search must gain
+_ROUNDS, _STILL = 3, 0.1  # rounds of the search and of sites; step of a score taken as none
 _WIDEST = 0.3  # precision of a score, at least: the prior's is 1
 
 
@@ -68,12 +73,14 @@ class Shared:
 class Posterior:
     """Log posterior density of scores, and draws of all else; see `importance.ScoreTarget`."""
 
-    n_pilot, n_final, widths = 256, 512, (1.25, 1.1)
-    n_corrected = None
+    n_pilot, widths = 256, (1.25, 1.1)
 
     def __init__(self, coordinates: Scores, evidence: Evidence, spread: float) -> None:
-        """Take the scores and an exact evidence; `spread` is the sd of the measured rates."""
+        """Take the scores and an evidence; `spread` is the sd of the measured rates."""
         self.scores, self.evidence, self._spread = coordinates, evidence, spread
+        alone = coordinates.n_scores == coordinates.n_core  # few coefficients: draws are cheap
+        self.n_final = 1024 if alone and not evidence.exact else 512
+        self.n_corrected = None if evidence.exact else 1000 if alone else 500
 
     @property
     def n_scores(self) -> int:
@@ -98,17 +105,25 @@ class Posterior:
         size = np.log(np.clip(self._spread / 0.2, 1e-2, 3.0))
         start[:, 1] = size - np.array([0.3, 1.0, 1.8, 2.6])
         best = start[self.log_density(start).argmax()]
+        for _ in range(1 if self.evidence.exact else _ROUNDS):
+            last, best = best, self._mode(best)
+            if np.abs(best - last).max() < _STILL:
+                break
+            self.recentre(best)
+        hessian = derivatives(self.log_density, best[None])[1][0]
+        if not np.isfinite(hessian).all():
+            return Student(best, np.eye(len(best)))
+        return Student(best, np.linalg.cholesky(inverse_hessian(np, -hessian, _WIDEST)))
+
+    def _mode(self, best: np.ndarray) -> np.ndarray:
+        """Mode by BFGS from a point."""
         limits = [(-_FARTHEST, _FARTHEST)] * len(best)
         limits[1] = (-_FARTHEST, np.log(_LARGEST_NOISE))
-        z = minimize(
+        return minimize(
             self._cost, best, jac=True, method="L-BFGS-B", bounds=limits,
             options={"ftol": _ENOUGH / max(1.0, -float(self.log_density(best[None])[0])),
                      "maxiter": 40},
         ).x  # fmt: skip
-        hessian = derivatives(self.log_density, z[None])[1][0]
-        if not np.isfinite(hessian).all():
-            return Student(z, np.eye(len(z)))
-        return Student(z, np.linalg.cholesky(inverse_hessian(np, -hessian, _WIDEST)))
 
     def _cost(self, z: np.ndarray, h: float = 1e-3) -> tuple[float, np.ndarray]:
         """Minus the log density and its gradient, by forward differences in one batch."""
@@ -117,26 +132,48 @@ class Posterior:
         return float(value[0]), (value[1:] - value[0]) / h
 
     def recentre(self, z: np.ndarray) -> None:
-        """No-op: the density is exact everywhere."""
+        """See `Evidence.recentre`."""
+        self.evidence.recentre(self.scores.theta(z[None]))
 
-    def defensive(self, proposal: Student) -> Student:
-        """Fitted memory and noises; the prior for the scores of effects' scales."""
+    def defensive(self, proposal: Student) -> Proposal:
+        """Fitted memory and noises; the prior for the scores of effects' scales.
+
+        Where the rates are not Gaussian, all angles between the two noises: the smaller one has a
+        thin tail towards 0.
+        """
         n, d = self.scores.n_core, len(proposal.center)
         cov = 1.5 * proposal.scale @ proposal.scale.T
         cov[n:], cov[:, n:] = 0.0, 0.0
         cov[n:, n:] = np.eye(d - n)
         center = np.append(proposal.center[:n], np.zeros(d - n))
-        return proposal._replace(center=center, scale=np.linalg.cholesky(cov))
+        wide = proposal._replace(center=center, scale=np.linalg.cholesky(cov))
+        return wide if self.evidence.exact else Spanning.of(wide, 2)
 
     def draw(
         self, z: np.ndarray, log_p: np.ndarray, chosen: np.ndarray, rng: np.random.Generator
-    ) -> tuple[dict[str, np.ndarray], None]:
-        """Hyperparameters and effects at the points of sorted indices; no weights are needed."""
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Hyperparameters and effects at the points of sorted indices; see `ScoreTarget.draw`."""
         unique, count = np.unique(chosen, return_counts=True)
         theta = self.scores.theta(z[unique])
         named = {name: np.repeat(values, count) for name, values in theta.items()}
         del named["rest"]
-        return named | self.evidence.draw(theta, count, rng), None
+        effects, log_weight = self.evidence.draw(theta, count, rng)
+        if log_weight is not None:
+            log_weight = log_weight + scores.log_prior(z[chosen]) - log_p[chosen]
+        return named | effects, log_weight
+
+
+def posterior_of(
+    priors: Priors, family: Family, effects: Sequence[Effect], slots: Slots
+) -> Posterior:
+    """Posterior of weights and other effects, by the evidence of a family of observations."""
+    effects = [Weights(priors), *effects]
+    groups, x0 = [e.group(slots) for e in effects], (float(priors.x0_mean), float(priors.x0_sd))
+    if family.integrates_out:
+        evidence = Gaussian(slots, groups, x0)
+    else:
+        evidence = Sites(slots, groups, family, x0)
+    return Posterior(Shared(priors, effects), evidence, float(np.nanstd(slots.y)))
 
 
 def _take(theta: Theta, points: np.ndarray) -> dict[str, np.ndarray]:

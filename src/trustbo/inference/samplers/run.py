@@ -9,7 +9,6 @@ from jax import Array, random
 
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference.evidence.ep.chains import gather_chains
-from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.gram_jax import spectrum
 from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.place_marginal import PlaceIndex
@@ -24,11 +23,10 @@ from trustbo.inference.samplers.exact import ExactDraws, sample_exact, why_not_c
 from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
 from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
-from trustbo.inference.samplers.latent_target import LatentTarget
 from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.place_draws import split_units
 from trustbo.inference.samplers.place_target import PlaceTarget
-from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
 from trustbo.inference.samplers.target import NutsData
@@ -36,9 +34,8 @@ from trustbo.inference.samplers.watching import SILENT, Watch
 from trustbo.models.backend import own_settings
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
-from trustbo.models.effects.effect import Effect, Slots
+from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import Place
-from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.parallel import one_blas_thread
@@ -181,6 +178,8 @@ def _sample_scores(
     engine = next((t for t in targets if isinstance(t, Posterior)), None)
     if start is not None and (sized := coupled or engine) and len(start.center) != sized.n_scores:
         start = None  # of another team, or of other effects
+    if len(targets) > 1:
+        start = None  # that of the first robot
     compiles = isinstance(targets[0], CoupledTarget | DriftTarget)
     watch.stage(
         f"exact sampler {'compiles, and ' if compiles else ''}seeks the mode", slow=compiles
@@ -218,11 +217,10 @@ def _targets(
         return [_by_evidence(model, slots)]
     if isinstance(model, DriftTrust):
         return [DriftTarget(model, batch, weight, places)]
+    if places is not None and not family.integrates_out:
+        return [_by_evidence(model, Slots.of(batch, len(weight), (), weight, places))]
     if places is not None:
         place = cast(PlaceEffect, model.place)
-        if not family.integrates_out:
-            gathered = gather_chains(family, batch, places=places)
-            return [LatentTarget(*gathered, priors, (place, places))]
         rates = batch.awareness, batch.contact_rate
         rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
         return [PlaceTarget(rows, places, priors, place)]
@@ -233,23 +231,19 @@ def _targets(
         return [HierarchicalTarget(gather(model, batch, weight), priors)]
     if is_coupled(model):
         return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
-    return [LatentTarget(*gather_chains(family, one), priors) for one in split_robots(model, batch)]
+    robots = split_robots(model, batch)
+    return [_by_evidence(model, Slots.of(one, len(weight), (), weight)) for one in robots]
 
 
 def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
-    """Posterior of a model of effects of Gaussian rates.
+    """Posterior of a model of effects, of robots that share its parameters.
 
     TrustboError: its coefficients have no Gaussian priors.
     """
     if reason := why_not_conjugate(model.priors):
         raise TrustboError(f"effects of robots need other priors: {reason}.")
-    effects: list[Effect] = [Weights(model.priors)]
-    if model.place is not None:
-        effects.append(Place(**model.place.to_record()))
-    effects += model.effects
-    x0 = float(model.priors.x0_mean), float(model.priors.x0_sd)
-    evidence = Gaussian(slots, [effect.group(slots) for effect in effects], x0)
-    return Posterior(Shared(model.priors, effects), evidence, float(np.nanstd(slots.y)))
+    place = [] if model.place is None else [Place(**model.place.to_record())]
+    return posterior_of(model.priors, model.family, [*place, *model.effects], slots)
 
 
 def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:

@@ -36,6 +36,7 @@ class Slots(NamedTuple):
     sight: tuple[int, ...] = ()
     """Features that are predicted contact rates."""
     places: Visited | None = None
+    n_ticks: np.ndarray | None = None  # (chain, bound), NaN where not known
 
     @classmethod
     def of(
@@ -56,7 +57,10 @@ class Slots(NamedTuple):
         sight = tuple(m for m, name in enumerate(features) if is_line_of_sight(name))
         y, z = y[mission, robot], z[mission, robot]
         sizes = n_missions, batch.contact_rate.shape[2]
-        return cls(y, z, mission, robot, weight[mission], *sizes, sight, places)
+        rates = batch.contact_rate[:n_missions]
+        n_ticks = np.swapaxes(np.broadcast_to(batch.n_ticks[:n_missions], rates.shape), 1, 2)
+        n_ticks = n_ticks[mission, robot, :longest]
+        return cls(y, z, mission, robot, weight[mission], *sizes, sight, places, n_ticks)
 
 
 class Prior(NamedTuple):

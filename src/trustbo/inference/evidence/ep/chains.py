@@ -5,7 +5,6 @@ import numpy as np
 from trustbo.inference.evidence.ep.joint import Chains
 from trustbo.models.families import Family
 from trustbo.models.families.terms import AT_ONE, GAUSSIAN, count_tables
-from trustbo.models.place import Visited
 from trustbo.parallel import plain
 from trustbo.stacking import MissionBatch
 
@@ -14,7 +13,6 @@ def gather_chains(
     family: Family,
     batch: MissionBatch,
     *,
-    places: Visited | None = None,
     whole: np.ndarray | None = None,
     apart: bool = False,
 ) -> tuple[Chains, np.ndarray]:
@@ -23,14 +21,12 @@ def gather_chains(
     Args:
         family: Family of observations.
         batch: Missions, padded with NaN.
-        places: Visited places, where these have effects.
         whole: Bounds of each mission, (mission,): chains have these lengths, and those without a
             rate are kept; by default they end at their last rate.
         apart: Whether each robot has separate beta0, weights and intercept.
 
     Returns:
-        Chains whose gamma is (weights, intercept, effects of visited units), or where robots are
-        apart (weights, intercept) of one robot after the other.
+        Chains whose gamma is (weights, intercept), where robots are apart of one after the other.
     """
     n_robots = batch.contact_rate.shape[2]
     # One row per mission and robot: (chain, bound[, column]).
@@ -43,11 +39,6 @@ def gather_chains(
     robot = kept % n_robots if apart else np.zeros(len(kept), dtype=int)
     column = plain(u.shape[-1] * robot[:, None] + np.arange(u.shape[-1]))
     drift = u[kept]
-    if places is not None:  # each bound has the effect of its unit, one column for each bound
-        effect = np.minimum(kept % n_robots, places.unit.shape[2] - 1)
-        unit = places.unit[kept // n_robots, :, effect]
-        drift = np.concatenate([drift, np.eye(y.shape[1]) * (unit >= 0)[..., None]], axis=-1)
-        column = np.concatenate([column, u.shape[-1] + np.maximum(unit, 0)], axis=1)
     length = y.shape[1] - np.argmax(seen[kept][:, ::-1], axis=1)
     if whole is not None:
         length = np.repeat(whole, n_robots)

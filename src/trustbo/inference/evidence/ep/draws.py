@@ -12,11 +12,13 @@ particle. The closer EP's messages, the more even the weights.
 """
 
 import math
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numba import njit
 
-from trustbo.inference.evidence.ep.joint import backward, propagate, start_sites
+from trustbo.inference.evidence.ep.joint import Chains, backward, propagate, start_sites
 from trustbo.models.families.terms import (
     AT_ONE,
     COUNT,
@@ -149,3 +151,35 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
             )  # fmt: skip
         weight[t] = total
     return weight
+
+
+def draw_weighted(
+    given: Iterable[tuple[Any, ...]],
+    count: np.ndarray,
+    nu: float,
+    chains: Chains,
+    sites: np.ndarray,
+    n_sweeps: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (draw, coefficient) at each of some points, and log weights but for |P|^(1/2).
+
+    Args:
+        given: Arguments of the kernel at each point: beta0 of the robots, noises, mean and sd of
+            x0, prior precision and mean of the coefficients.
+        count: Draws at each point.
+        nu: Degrees of freedom of the proposals.
+        chains: Rates.
+        sites: Sites to begin with.
+        n_sweeps: Sweeps of EP at each point.
+        rng: Random number generator.
+    """
+    gammas, log_weights = [], []
+    for point, n in zip(given, count, strict=True):
+        gamma = rng.standard_normal((n, len(point[-1])))
+        gamma /= np.sqrt(rng.chisquare(nu, (n, 1)) / nu)
+        args: tuple[Any, ...] = *point, chains, sites, n_sweeps, nu, gamma, rng
+        weights = draw_coefficients(*args)
+        gammas.append(gamma)
+        log_weights.append(weights)
+    return np.concatenate(gammas), np.concatenate(log_weights)

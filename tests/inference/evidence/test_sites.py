@@ -11,11 +11,11 @@ from scipy import special, stats
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import complete, diagnostics, fit
-from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.latent_target import LatentTarget
+from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.models import CoupledTrust, PooledTrust, Priors, TrustParams
+from trustbo.models.effects.effect import Slots
 from trustbo.stacking import stack_missions
 
 FAMILIES = ("censored", "beta_binomial")
@@ -39,9 +39,9 @@ def counted(family, n_missions=2, n_bounds=3, n_robots=2, seed=1):
 
 def sample_exactly(missions, model, n_seeds=3, n_draws=2000):
     """Draws of several seeds together, and the mean of their log evidence."""
-    gathered = gather_chains(model.family, stack_missions(missions))
+    slots = Slots.of(stack_missions(missions), len(missions))
     found = [
-        sample_scores(LatentTarget(*gathered, model.priors), n_draws, seed).draws
+        sample_scores(posterior_of(model.priors, model.family, [], slots), n_draws, seed).draws
         for seed in range(n_seeds)
     ]
     assert max(each.khat for each in found) < 0.7

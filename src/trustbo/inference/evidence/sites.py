@@ -1,0 +1,134 @@
+"""Evidence of rates that are no linear function of trust under any effects, by sites of EP.
+
+The drift of a chain is u = U c as in `gaussian`; c ~ N(m(theta), P(theta)^-1) are the coefficients
+gamma of `ep.joint`, in the chains of which a bound has the columns that touch it. EP gives
+log p(rates | theta) to a few hundredths of a nat; draws of the coefficients come with weights that
+average to its ratio to the exact one (`ep.draws`).
+
+EP inverts the prior, so that a scale is `_LEAST` at least: a coefficient of sd 1e-4 changes contact
+by less than any rate shows.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from trustbo.inference.evidence.ep import joint
+from trustbo.inference.evidence.ep.draws import draw_weighted
+from trustbo.inference.evidence.gaussian import named_effects, prior_of
+from trustbo.models.effects.effect import Columns, Group, Slots, Theta
+from trustbo.models.families import Family
+from trustbo.models.families.terms import AT_ONE, GAUSSIAN, count_tables
+
+_LEAST = 1e-4  # sd of a coefficient
+_NOISE = 1e-6  # sd of a noise
+SWEEPS, _SETTLED = 2, 8  # sweeps near the sites' mode, and to find it
+_MEMORY = 4e6  # numbers of precisions at once
+
+
+class Sites:
+    """Evidence by expectation propagation; draws of coefficients have weights."""
+
+    exact = False
+
+    def __init__(
+        self, slots: Slots, groups: Sequence[Group], family: Family, x0: tuple[float, float]
+    ) -> None:
+        """Make chains of the columns of all effects.
+
+        Args:
+            slots: Rates of all chains, each of weight 1.
+            groups: Columns of all effects.
+            family: Family of observations.
+            x0: Mean and sd of trust before the first bound.
+        """
+        self.slots, self.groups, self.x0 = slots, tuple(groups), np.array(x0, dtype=float)
+        U: Columns = sparse.hstack([group.columns for group in groups], format="csr")
+        self.n_columns = U.shape[1]
+        self.chains, self.sites = _chains(slots, U, family)
+        self._chunk = max(1, int(_MEMORY / self.n_columns**2))
+        self._nu = max(8.0, 3.0 * self.n_columns)  # more where a heavy tail would cost evenness
+
+    def log_density(self, theta: Theta) -> np.ndarray:
+        """See `Evidence.log_density`."""
+        n = len(theta["beta0"])
+        out = np.full(n, np.nan)
+        some = np.flatnonzero((theta["delta_w"] > _NOISE) & (theta["delta_v"] > _NOISE))
+        for i in range(0, len(some), self._chunk):
+            points = some[i : i + self._chunk]
+            given, log_det = self._given({name: v[points] for name, v in theta.items()})
+            args = *given, self.chains, self.sites, SWEEPS
+            out[points] = joint.log_evidence(*args) + 0.5 * log_det
+        return out
+
+    def recentre(self, theta: Theta) -> None:
+        """See `Evidence.recentre`: sites at one theta, from which sweeps start."""
+        (beta0, delta_w, delta_v, x0, P, mean), _ = self._given(theta)
+        fixed = x0, P[0], mean[0], self.chains, self.sites
+        self.sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *fixed, _SETTLED)
+
+    def draw(
+        self, theta: Theta, count: np.ndarray, rng: np.random.Generator
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """See `Evidence.draw`."""
+        log_dets = []
+
+        def points():
+            for t in range(len(count)):
+                one = {name: values[t : t + 1] for name, values in theta.items()}
+                (beta0, delta_w, delta_v, x0, P, mean), log_det = self._given(one)
+                log_dets.append(log_det[0])
+                yield beta0[0], delta_w[0], delta_v[0], x0, P[0], mean[0]
+
+        fixed = self._nu, self.chains, self.sites, SWEEPS
+        c, log_weight = draw_weighted(points(), count, *fixed, rng)
+        of_draw = {name: np.repeat(values, count) for name, values in theta.items()}
+        named = named_effects(self.groups, c, of_draw, rng)
+        return named, log_weight + 0.5 * np.repeat(log_dets, count)
+
+    def _given(self, theta: Theta) -> tuple[tuple[Any, ...], np.ndarray]:
+        """Arguments of the kernels at each theta, and log |P| (point,)."""
+        n, m = len(theta["beta0"]), self.n_columns
+        prior, at = prior_of(self.groups, theta)
+        sd = np.maximum(prior.sd, _LEAST)
+        P, diagonal = np.zeros((n, m, m)), np.arange(m)
+        P[:, diagonal, diagonal] = sd**-2.0
+        log_det = -2.0 * np.log(sd).sum(1)
+        for i, root in zip(at, prior.roots, strict=True):
+            half = np.linalg.inv(root) / sd[:, None, i]
+            P[:, i, i] = np.swapaxes(half, 1, 2) @ half
+            log_det -= 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+        beta0, *noises = (np.ascontiguousarray(theta[n]) for n in ("beta0", "delta_w", "delta_v"))
+        return (beta0[:, None], *noises, self.x0, P, prior.mean), log_det
+
+
+def _chains(slots: Slots, U: Columns, family: Family) -> tuple[joint.Chains, np.ndarray]:
+    """Chains with the columns that touch each, and the sites to begin with."""
+    n_chains, K = slots.y.shape
+    touched = [np.unique(U[i * K : i * K + K].indices) for i in range(n_chains)]
+    column = np.zeros((n_chains, max(map(len, touched))), dtype=int)
+    u = np.zeros((*slots.y.shape, column.shape[1]))
+    for i, of_chain in enumerate(touched):
+        column[i, : len(of_chain)] = of_chain
+        u[i, :, : len(of_chain)] = U[i * K : i * K + K][:, of_chain].toarray()
+    n_ticks = np.full(slots.y.shape, np.nan) if slots.n_ticks is None else slots.n_ticks
+    terms, seen = family.terms(slots.y, n_ticks), ~np.isnan(slots.y)
+    gaussian, late = terms.kind == GAUSSIAN, terms.kind >= AT_ONE
+    y, length = np.where(seen, slots.y, 0.0), K - np.argmax(seen[:, ::-1], axis=1)
+    chains = joint.Chains(
+        y,
+        terms.kind,
+        terms.case,
+        u,
+        column,
+        np.zeros(n_chains, dtype=int),
+        length,
+        np.where(late.any(1), np.argmax(late, axis=1), length),
+        np.stack([gaussian.sum(1), (np.where(gaussian, y, 0.0) ** 2).sum(1)], axis=1),
+        np.zeros(slots.y.shape),
+        terms.counts,
+        count_tables(terms.counts),
+    )
+    return chains, np.stack([terms.lam, terms.eta])
