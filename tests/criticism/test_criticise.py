@@ -155,6 +155,15 @@ def test_a_robot_is_named_with_its_missions(planted, which, when):
     assert set(zip(chosen["robot"], chosen["mission"], strict=True)) <= {("r2", j) for j in which}
 
 
+def test_a_posterior_of_another_family_is_criticised_too(planted):
+    missions = less_contact(planted("none"), 1, range(9, 15))
+    model = PooledTrust(effects=[RobotEffect()], observation="censored")
+    found = criticise(fit(missions, model, draws=100), compare=False)
+    assert found.fault == "robot in a mission"
+    assert "from mission 9 on" in found.verdict
+    assert "the posterior is of censored ones" in found.table.loc["family", "finding"]
+
+
 def test_residuals_are_those_of_the_kalman_filter(planted):
     posterior = fit(planted("none"), PooledTrust(), "exact", whole=False)
     found = criticise(posterior, compare=False, n_replicates=100)
@@ -276,8 +285,8 @@ def test_what_cannot_be_criticised_says_why(with_places, planted):
     with pytest.raises(TrustboError, match="give the missions it was fitted to"):
         criticise(alone)
     alone = posterior.copy()
-    alone.attrs = posterior.attrs | {"observation": "censored"}
-    with pytest.raises(TrustboError, match='has observation "censored"'):
+    alone.attrs = {k: v for k, v in posterior.attrs.items() if k != "response"}
+    with pytest.raises(TrustboError, match="lacks the attribute 'response'"):
         criticise(alone)
     first = planted("none")[0]
     short = replace(first, path=first.path[:5], bounds=first.bounds[:4])

@@ -1,8 +1,9 @@
 """Criticism of a fitted trust model: tests, residuals and comparisons, with a verdict."""
 
+import json
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -26,8 +27,10 @@ from trustbo.criticism.score import Derivatives, Innovations, Outcome, derivativ
 from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import TrustboError, require_whole
+from trustbo.inference.fit import fit
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.models.model import TrustModel
+from trustbo.models.record import model_from_record
 from trustbo.parallel import one_blas_thread
 
 _LEVEL = 0.05
@@ -113,7 +116,9 @@ def criticise(
     fault, however small its p. Missions are counted from 0, as in the posterior.
 
     Args:
-        posterior: DataTree from `fit`, or one of `Result.posteriors`; Gaussian observations.
+        posterior: DataTree from `fit`, or one of `Result.posteriors`. Of observations that are not
+            Gaussian the model is fitted again, to the same rates taken for Gaussian ones, whose
+            residuals are tested for all but the family.
         missions: Missions that it was fitted to, or all of its campaign; needed where it holds no
             data.
         model: Its model, needed for comparisons if its priors are custom.
@@ -123,12 +128,14 @@ def criticise(
         seed: Seed of the replicates.
 
     Raises:
-        TrustboError: The posterior is not of a linear model with Gaussian observations, or holds no
-            data and no missions are given; the missions are others than it was fitted to; there are
+        TrustboError: The posterior is not of a linear model, or holds no data and no missions are
+            given; the missions are others than it was fitted to; there are
             too few rates, or more than 2000; or they are all but equal.
     """
     require_whole("n_replicates", n_replicates, 100)
     missions = _checked(posterior, missions)
+    if posterior.attrs["observation"] != "gaussian":
+        posterior, model = _of_gaussian_rates(posterior, missions, model)
     try:
         return _criticise(posterior, missions, model, compare, n_replicates, seed)
     except np.linalg.LinAlgError:
@@ -160,8 +167,15 @@ def _criticise(
     draws = rng.standard_normal((len(data.y), n_replicates))
     innovations = Innovations.of_rates(normal, data.y, by_parameter, draws)
     tests, left_out = departures(missions, data, normal, point, place)
+    family = posterior.attrs.get("criticised_for", "gaussian")
     coefficients = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
     outcomes = _test_all(innovations, tests, coefficients, seed)
+    if family != "gaussian":
+        del outcomes["family"]
+        left_out["family"] = (
+            f"residuals are those of Gaussian rates, the posterior is of {family} ones; see "
+            "tb.inference.by_rate and az.plot_ppc_pit."
+        )
     adjusted = holm(np.array([outcome.p for outcome in outcomes.values()]))
     wrong = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
     if not changes_plans(innovations):
@@ -175,6 +189,10 @@ def _criticise(
         after[outcome.name] = _test_all(
             wider, [o for o in tests if o is not outcome], coefficients, seed
         )
+    if "family" in left_out:
+        after = {
+            name: {k: o for k, o in one.items() if k != "family"} for name, one in after.items()
+        }
     fault = _most_explaining(outcomes, after)
     rows = {}
     for (name, one), p in zip(outcomes.items(), adjusted, strict=True):
@@ -266,12 +284,6 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
             f"this posterior lacks {what}, so that its residuals are not known; criticise takes "
             "posteriors of PooledTrust, HierarchicalTrust and CoupledTrust from trustbo.fit."
         )
-    if (family := posterior.attrs["observation"]) != "gaussian":
-        raise TrustboError(
-            f'criticise reads the residuals of Gaussian rates; this posterior has observation "'
-            f'{family}". Criticise fit(missions, PooledTrust()) of the same missions instead, and '
-            "see az.plot_ppc_dist and loo for the family."
-        )
     if missions is not None:
         return _learned(posterior, missions)
     if "constant_data" not in posterior.children:
@@ -280,6 +292,23 @@ def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list
             "criticise(result.posteriors[j], result.missions[: j + 1])."
         )
     return missions_of(posterior)
+
+
+def _of_gaussian_rates(
+    posterior: xr.DataTree, missions: Sequence[Mission], model: TrustModel | None
+) -> tuple[xr.DataTree, TrustModel]:
+    """Posterior and model of the same missions, the rates taken for Gaussian ones.
+
+    Priors are the default ones, as those of counts are of another scale.
+    """
+    if model is None:
+        record = json.loads(posterior.attrs["model_record"])
+        model = model_from_record(record, features=missions[0].features)
+    model = replace(model, observation="gaussian", priors=None)
+    seed = int(posterior.attrs["seed"])
+    fitted = fit(missions, model, seed=seed, draws=250, check=False)
+    fitted.attrs["criticised_for"] = posterior.attrs["observation"]
+    return fitted, model
 
 
 def _learned(posterior: xr.DataTree, missions: Sequence[Mission]) -> list[Mission]:
