@@ -31,8 +31,8 @@ from trustbo.study.table import as_text, differences, worse_than
 
 OURS = "trustbo"
 METHODS: dict[str, Any] = {
-    OURS: {"model": "places", "policy": "optimistic"},
-    "trustbo, robots": {"model": "robots", "policy": "optimistic"},
+    OURS: {"model": "robots", "policy": "optimistic"},
+    "trustbo, places": {"model": "places", "policy": "optimistic"},
     "trustbo, no places": {"model": "pooled", "policy": "greedy"},
     "running mean": running_mean.greedy,
     "running mean, optimistic": running_mean.optimistic,

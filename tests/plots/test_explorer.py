@@ -92,7 +92,7 @@ def test_the_slider_has_a_step_for_each_mission_and_the_recommended_path(explore
         close(step["trust"], five.transpose("quantile", "bound").values)
     assert [tuple(cell) for cell in last["path"]] == result.path
     assert np.isnan(np.array(last["contact"], dtype=float)).all()
-    params = tb.inference.params_of(result.posterior).flat()
+    params = tb.inference.params_of(result.posterior, day=True).flat()
     some = [result.planner.evaluate(result.path, params.draw(i)).trust for i in range(1000)]
     five = np.quantile(np.mean(some, axis=2), [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
     close(last["trust"], five)

@@ -228,7 +228,7 @@ class Learner:
 
 
 def default_model(update: str, sampler: str) -> TrustModel:
-    """Effects of places and of robots, as far as the update and the sampler know them.
+    """Effects of places and of robots, as far as the update and the sampler take them.
 
     Moments that are matched are those of the paper's parameters.
     """

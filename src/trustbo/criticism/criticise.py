@@ -158,9 +158,10 @@ def _criticise(
     data = gather(missions, place)
     point = with_start(point, data)
     normal, by_parameter = joint_normal(point, data), derivatives(point, data)
-    if len(data.y) < 2 * len(by_parameter.names):
+    n_parameters = len(by_parameter.names) - len(point.scales)  # scales of effects have priors
+    if len(data.y) < 2 * n_parameters:
         raise TrustboError(
-            f"{len(data.y)} rates are too few to criticise {len(by_parameter.names)} parameters; "
+            f"{len(data.y)} rates are too few to criticise {n_parameters} parameters; "
             "give more missions."
         )
     rng = np.random.default_rng([seed, len(data.y)])
