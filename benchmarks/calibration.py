@@ -13,7 +13,14 @@ from numpyro.distributions import HalfNormal, LogNormal, Normal
 from sbc_places import Walks
 
 from trustbo.inference import sbc
-from trustbo.models import CoupledTrust, DriftTrust, HierarchicalTrust, PlaceEffect, PooledTrust
+from trustbo.models import (
+    CoupledTrust,
+    DriftTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    RobotEffect,
+)
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
 OWN = {
@@ -37,6 +44,10 @@ def cases():
         yield CoupledTrust(observation=observation, inter_robot="none"), "exact", 200, SMALL
         yield PooledTrust(observation=observation, place=PlaceEffect()), "exact", 200, SMALL
         yield HierarchicalTrust(observation=observation), "exact", 200, SMALL
+    for observation in ("gaussian", "censored", "beta_binomial"):
+        for places in ([], [PlaceEffect()]):
+            effects = [*places, RobotEffect()]
+            yield PooledTrust(effects=effects, observation=observation), "exact", 200, SMALL
     yield HierarchicalTrust(), "exact", 300, SMALL
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     yield CoupledTrust(), "exact", 200, SMALL
@@ -69,7 +80,8 @@ def main():
         name = type(model).__name__
         detail = getattr(model, "inter_robot", model.response)
         detail = "saturating" if isinstance(model, DriftTrust) else detail
-        detail = "places" if model.place is not None else detail
+        effects = ["places"] * (model.place is not None) + ["robots"] * bool(model.effects)
+        detail = " and ".join(effects) or detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
         file = given.out / f"{name}-{detail}-{model.observation}-{sampler}.json"
         design = None if model.place is None else Walks.random(shape[:2], seed=0)

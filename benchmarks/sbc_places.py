@@ -8,6 +8,7 @@ from jax import random
 from trustbo.inference.place_maps import draw_maps, nowhere, scales_of
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.run import Draws
+from trustbo.inference.sbc import with_robots_drawn
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited, visited
@@ -56,10 +57,13 @@ class Walks(NamedTuple):
         params = params._replace(  # pyright: ignore
             **{n: m if m is None else m[0] for n, m in zip(_EFFECTS, maps, strict=True)}
         )
+        on_walks, ranked = with_robots_drawn(
+            model, sites, params.on(self.bounds), awareness.shape, seed
+        )
         with own_settings():
             key = random.key(seed)
-        sample = model.simulate(key, params.on(self.bounds), awareness, ticks)
-        values = {name: value[0] for name, value in sites.items()}
+        sample = model.simulate(key, on_walks, awareness, ticks)
+        values = {name: value[0] for name, value in sites.items()} | ranked
         return values | self._ranked(*maps, ()) | {"contact_rate": sample.contact_rate}
 
     def effects(self, model: TrustModel, draws: Draws, seed: int) -> dict[str, np.ndarray]:

@@ -17,7 +17,10 @@ from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.run import Draws, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.effect import Slots, Theta
+from trustbo.models.effects.robot import prior_effect
 from trustbo.models.model import TrustModel
+from trustbo.models.params import Params
 from trustbo.models.place import Visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.stacking import MissionBatch
@@ -91,8 +94,6 @@ def sbc(
     model = PooledTrust() if model is None else model
     sampler, _ = resolve_sampler(model, sampler)
     require_whole("n_datasets", n_datasets, 1)
-    if model.effects:
-        raise TrustboError("sbc draws no effects of robots; give a model without them.")
     if (model.place is None) != (design is None):
         raise TrustboError(
             f"design={design!r} and place={model.place!r}: a model with effects of places needs a "
@@ -119,10 +120,11 @@ def sbc(
             simulated = design.simulate(model, awareness, ticks, own)
         batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
         places = None if design is None else design.places(model)
+        slots = Slots.of(batch, shape[0], places=places) if model.effects else None
         draws, _ = draw_posterior(
-            model, sampler, settings, seed + j, batch, places=places, check=False
+            model, sampler, settings, seed + j, batch, places=places, slots=slots, check=False
         )
-        found = draws.params
+        found = draws.params | {n: d[:, :, [0, -1], [0, -1]] for n, d in draws.robots.items()}
         if design is not None:
             found = found | design.effects(model, draws, seed + j)
         rank = {}
@@ -142,10 +144,36 @@ def _simulate(
     """Parameters and contact rates drawn from the prior, by name."""
     sites = draw_sites(model, awareness.shape[2:], 1, seed)
     params = model.params(sites, awareness.shape[3]).draw(0)
+    params, ranked = with_robots_drawn(model, sites, params, awareness.shape, seed)
     with own_settings():
         key = random.key(seed)
     rates = model.simulate(key, params, awareness, ticks).contact_rate
-    return {name: value[0] for name, value in sites.items()} | {"contact_rate": rates}
+    values = {name: value[0] for name, value in sites.items()}
+    return values | ranked | {"contact_rate": rates}
+
+
+def with_robots_drawn(
+    model: TrustModel, sites: Theta, params: Params, shape: tuple[int, ...], seed: int
+) -> tuple[Params, dict[str, np.ndarray]]:
+    """Parameters with effects of robots from the prior, if the model has them, and those ranked.
+
+    Ranked are that of the first robot in the first mission, and that of the last in the last. No
+    feature is a line of sight, so that an effect is a constant of its mission.
+
+    Args:
+        model: Trust model.
+        sites: Parameters, leading axis (draw,) of length 1.
+        params: The same without it, the intercept perhaps of each (mission, bound, robot).
+        shape: Missions, bounds, robots and features.
+        seed: Seed of the effects.
+    """
+    for effect in model.effects:
+        rng = np.random.default_rng([seed, 4])
+        d = prior_effect(sites, effect.rho, (shape[0], shape[2]), rng)[0]
+        rest = 1.0 - np.asarray(sites["beta0"])[0]
+        b = np.broadcast_to(np.asarray(params.b), shape[:3]) + rest * d[:, None]
+        return params._replace(b=b), {"robot_effect": d[[0, -1], [0, -1]]}
+    return params, {}
 
 
 def _label(name: str, index: tuple[int, ...]) -> str:
