@@ -217,6 +217,7 @@ class Further(NamedTuple):
     columns: sparse.csr_array
     sd: float
     joined = ()
+    fades = False
 
     def prior(self, theta):
         shape = len(theta["beta0"]), 1

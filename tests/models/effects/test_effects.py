@@ -6,7 +6,7 @@ from missions import walking_missions
 
 from trustbo.errors import TrustboError
 from trustbo.models import Priors
-from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.effect import Slots, dense_root
 from trustbo.models.effects.place import Place
 from trustbo.models.effects.robot import RobotEffect, next_mission
 from trustbo.models.effects.weights import Weights
@@ -34,7 +34,7 @@ def covariance(group, theta=THETA):
     prior = group.prior(theta)
     root = np.eye(prior.sd.shape[1])
     for columns, one in zip(group.joined, prior.roots, strict=True):
-        root[columns, columns] = one[0]
+        root[columns, columns] = dense_root(one)[0]
     scaled = group.columns @ (prior.sd[0][:, None] * root)
     return scaled @ scaled.T
 

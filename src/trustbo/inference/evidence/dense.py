@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from trustbo.models.effects.effect import Group, Slots, Theta
+from trustbo.models.effects.effect import Group, Slots, Theta, dense_root
 
 
 class Dense:
@@ -56,7 +56,7 @@ class Dense:
             n = prior.sd.shape[1]
             root = np.eye(n)
             for columns, one in zip(group.joined, prior.roots, strict=True):
-                root[columns, columns] = one[0]
+                root[columns, columns] = dense_root(one)[0]
             root = prior.sd[0][:, None] * root
             self.prior_cov[start : start + n, start : start + n] = root @ root.T
             start += n

@@ -13,13 +13,14 @@ noise's covariance is V = L L'. The steps, named at the lines of the code:
    product for all theta.
 3. Whitening: c = mean + R e, e ~ N(0, I), R = sd times the root of the prior's correlation. No
    prior is inverted, so that a scale of 0 is exact.
-4. Elimination: columns of one robot alone touch no chain of another; with blocks of robots first,
-   the matrix [[I + R'AR, .], [h'R, r'r]], h = sum U'C'r, is an arrow, and its Cholesky factor costs
-   a factor for each block. Its last diagonal element is the root of the misfit, and
+4. Elimination: columns of a robot in a mission touch one chain each. Sets of such columns whose
+   coefficients fade from mission to mission go first, see `fading`, before the columns left are
+   whitened. Of these the matrix [[I + R'AR, .], [h'R, r'r]], h = sum U'C'r, less what the sets
+   took, has one Cholesky factor. Its last diagonal element is the root of the misfit, and
 
     -2 log p = sum log |V| + log |I + R'AR| + misfit + n log 2 pi.
 
-5. Draws: e from the same factor, c = mean + R e.
+5. Draws: e of the columns left from the same factor, those of the sets given them.
 
 Exact: the only errors are those of rounding. References: sequential conditioning of a Gaussian
 state space, and the bordered Cholesky factor of least squares (Golub and Van Loan 2013, 5.3).
@@ -31,12 +32,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg.blas import dsyrk, dtrsm  # pyright: ignore
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 
 from trustbo.errors import require_choice
+from trustbo.inference.evidence.fading import Eliminated, Sets, eliminate, spread
 from trustbo.inference.evidence.scan import Sums, take_projections, weigh_chains
-from trustbo.models.effects.effect import Columns, Group, Prior, Slots, Theta
+from trustbo.models.effects.effect import Columns, Fading, Group, Prior, Slots, Theta, dense_root
 
 MEMORIES = ("level", "deviation")
 _NUMBERS = 1e6  # kept at once, of all points of a chunk: about the cache
@@ -70,15 +71,25 @@ class Gaussian:
         self.n_measured = float(slots.weight @ seen.sum(1))
         self.mass = np.bincount(self.kind, slots.weight, len(self.seen))
         self.y = np.where(seen, slots.y, 0.0)
-        joined = joined_columns(groups)
+        self._first = np.cumsum([0, *(group.columns.shape[1] for group in groups)]).tolist()
         U = sparse.hstack([group.columns for group in groups], format="csr")
         ahead = np.cumsum(seen[:, ::-1], axis=1)[:, ::-1] > 0  # up to the last rate of a chain
         U: Columns = sparse.csr_array(sparse.diags_array(ahead.ravel().astype(float)) @ U)
         U.eliminate_zeros()
-        self.order, self.blocks = self._arrow(U, joined)
+        fading = self._fading(U, self._first)
+        size = [0, *(columns.stop - columns.start for columns in fading)]
+        self.n_fading = sum(size)
+        early = np.concatenate([np.zeros(0, int), *(np.r_[columns] for columns in fading)])
+        self.order = np.append(early, np.setdiff1d(np.arange(U.shape[1]), early))
         place = np.argsort(self.order)
-        self.joined = [slice(place[c.start], place[c.stop - 1] + 1) for c in joined]
-        self.U = U[:, self.order]
+        self.joined: list[slice | None] = []  # of columns left, None where eliminated before
+        for first, group in zip(self._first, groups, strict=False):
+            for columns in group.joined:
+                mine = slice(first + columns.start, first + columns.stop)
+                i = int(place[mine.start]) - self.n_fading
+                self.joined.append(None if mine in fading else slice(i, i + mine.stop - mine.start))
+        self.U: Columns = U[:, self.order]
+        self.sets = Sets.of(np.cumsum(size), self.U, len(self.y))
         self._gram()
 
     def log_density(self, theta: Theta) -> np.ndarray:
@@ -118,7 +129,7 @@ class Gaussian:
         """
         run = np.arange(columns.shape[1]) if run is None else run
         sums = Sums.of(sparse.csc_array(columns))
-        (atom, column), G = self._products(sums.atoms)
+        (atom, column), G = self._products(sums.atoms, self.U)
         shape = sums.atoms.shape[1], len(self.order)
         start = np.searchsorted(atom, np.arange(shape[0] + 1))
         out = np.zeros((2, len(theta["beta0"]), columns.shape[1]))
@@ -148,40 +159,35 @@ class Gaussian:
         c[:, self.order] = np.concatenate(drawn)
         return c
 
-    def _arrow(self, U: Columns, joined: list[slice]) -> tuple[np.ndarray, list[slice]]:
-        """Order of columns, those of one robot alone first, and the slices of their blocks.
-
-        The last block has the columns that robots share, and the rates.
-        """
-        n_robots, entries = self.slots.n_robots, U.tocoo()
-        robot = np.repeat(self.slots.robot, self.slots.y.shape[1])
-        touched = np.zeros((U.shape[1], n_robots), dtype=bool)
-        touched[entries.col, robot[entries.row]] = True
-        for columns in joined:
-            touched[columns] = touched[columns].any(0)
-        block = np.where(touched.sum(1) == 1, touched.argmax(1), n_robots)
-        order = np.argsort(block, kind="stable")
-        limits = np.searchsorted(block[order], np.arange(n_robots + 2)).tolist()
-        limits[-1] += 1
-        return order, [slice(i, j) for i, j in itertools.pairwise(limits) if i < j]
+    def _fading(self, U: Columns, first: list[int]) -> list[slice]:
+        """Sets of columns to eliminate first: they fade, each of one chain shared with no other."""
+        chain_of = np.repeat(np.arange(len(self.y)), self.y.shape[1])
+        taken, sets = np.zeros(len(self.y), dtype=bool), []
+        for start, group in zip(first, self.groups, strict=False):
+            for columns in group.joined if group.fades else ():
+                mine = slice(start + columns.start, start + columns.stop)
+                entries = U[:, mine].tocoo()
+                pairs = np.unique(np.stack([entries.col, chain_of[entries.row]]), axis=1)
+                chains = pairs[1]
+                if len(np.unique(pairs[0])) == len(np.unique(chains)) == len(chains) and not (
+                    taken[chains].any()
+                ):
+                    taken[chains] = True
+                    sets.append(mine)
+        return sets
 
     def _gram(self) -> None:
-        """Step 2: G (entry of A, pair of bounds of a kind), and the entries that may not be 0.
+        """Step 2: G (entry of A, pair of bounds of a kind), and the entries that may not be 0."""
+        left = self.U[:, self.n_fading :]
+        (row, column), self._G = self._products(left, left)
+        self._entry = row * (left.shape[1] + 1) + column
 
-        Entries within a block are in both triangles, others in the lower one.
-        """
-        m = self.U.shape[1]
-        block = np.searchsorted([b.stop for b in self.blocks], np.arange(m), side="right")
-        (row, column), G = self._products(self.U)
-        kept = (row >= column) | (block[row] == block[column])
-        self._entry, self._G = (row * (m + 1) + column)[kept], G[kept]
-
-    def _products(self, left: Columns) -> tuple[tuple[np.ndarray, np.ndarray], Columns]:
-        """Products of columns `left` (slot, left) and all columns, by pair of bounds of a kind.
+    def _products(self, left: Columns, U: Columns) -> tuple[tuple[np.ndarray, np.ndarray], Columns]:
+        """Products of columns `left` (slot, left) and U, by pair of bounds of a kind.
 
         Left and column of the entries, in order, and the sparse matrix (entry, pair).
         """
-        (n_kinds, K), m, n_left = self.seen.shape, self.U.shape[1], left.shape[1]
+        (n_kinds, K), m, n_left = self.seen.shape, U.shape[1], left.shape[1]
         pair = np.zeros((K, K), dtype=int)
         pair[np.triu_indices(K)] = np.arange(n_pairs := K * (K + 1) // 2)
         pair = np.maximum(pair, pair.T)
@@ -189,7 +195,7 @@ class Gaussian:
         for q in range(n_kinds):
             mine = np.flatnonzero(self.kind == q)
             slot = (mine[:, None] * K + np.arange(K)).ravel()
-            X = sparse.csr_array(self.U[slot].reshape(len(mine), K * m))
+            X = sparse.csr_array(U[slot].reshape(len(mine), K * m))
             Z = sparse.csr_array(left[slot].reshape(len(mine), K * n_left))
             products = (Z.T @ (sparse.diags_array(self.slots.weight[mine]) @ X)).tocoo()
             (k, a), (j, b) = np.divmod(products.row, n_left), np.divmod(products.col, m)
@@ -204,25 +210,35 @@ class Gaussian:
     def _chunks(self, n: int) -> list[slice]:
         """Points that are treated together."""
         (n_kinds, K), n_chains = self.seen.shape, len(self.y)
-        numbers = (len(self.order) + 1) ** 2 + len(self._entry) + 4 * n_kinds * K**2 + n_chains * K
+        f, m = self.n_fading, len(self.order) - self.n_fading + 1
+        numbers = m * (m + 2 * f) + len(self._entry) + 4 * n_kinds * K**2 + n_chains * K
         size = max(4, int(_NUMBERS / numbers))
         return [slice(i, min(i + size, n)) for i in range(0, n, size)]
 
     def _factors(self, theta: Theta) -> "_Factors":
         """Steps 1 to 4 at each theta."""
-        n, m = len(theta["beta0"]), len(self.order)
+        n, f = len(theta["beta0"]), self.n_fading
+        m = len(self.order) - f
         prior = self._prior(theta)
         N, E, log_det = impulses(theta, self.x0[1], self.seen)
         C = N if self.level else E
+        S = np.swapaxes(C, 2, 3) @ C
         P = np.zeros((n, m + 1, m + 1))
-        P.reshape(n, -1)[:, self._entry] = (self._G @ _upper(np.swapaxes(C, 2, 3) @ C).T).T
+        P.reshape(n, -1)[:, self._entry] = (self._G @ _upper(S).T).T
         r, P[:, -1, -1] = self._residual(theta, N, E, prior.mean)
-        P[:, -1, :-1] = (self.U.T @ r.T).T
+        h = np.ascontiguousarray((self.U.T @ r.T).T)
+        P[:, -1, :-1] = P[:, :-1, -1] = h[:, f:]
+        pairs = zip(prior.roots, self.joined, strict=True)
+        roots = [root for root, left in pairs if left is None and isinstance(root, Fading)]
+        early = eliminate(
+            self.sets, P, h[:, :f], S, self.kind, self.slots.weight, prior.sd[:, :f], roots
+        )
         self._whiten(P, prior)
-        arrows = [_eliminate(one, self.blocks) for one in P]
+        failed = [dpotrf(one.T, lower=0, clean=0, overwrite_a=1)[1] != 0 for one in P]
+        diagonal = np.diagonal(P, axis1=1, axis2=2)
         log_p = -0.5 * (log_det @ self.mass + self.n_measured * np.log(2.0 * np.pi))
-        log_p -= [0.5 * arrow.minus_two_log for arrow in arrows]
-        return _Factors(log_p, arrows, prior)
+        log_p -= 0.5 * (early.log_det + diagonal[:, -1] ** 2) + np.log(diagonal[:, :-1]).sum(1)
+        return _Factors(np.where(failed, np.nan, log_p), P, early, prior)
 
     def _prior(self, theta: Theta) -> Prior:
         """Prior of all columns, in their order; the roots are of the columns joined."""
@@ -249,68 +265,55 @@ class Gaussian:
         return R.reshape(n, -1), misfit
 
     def _whiten(self, P: np.ndarray, prior: Prior) -> None:
-        """Step 3: from A, h to I + R'AR, R'h, in place."""
-        m, shared = len(self.order), self.blocks[-1]
-        sd = np.concatenate([prior.sd, np.ones((len(P), 1))], axis=1)
-        for block in self.blocks:
-            for rows in (block, shared) if block != shared else (shared,):
-                P[:, rows, block] *= sd[:, rows, None] * sd[:, None, block]
-        for columns, root in zip(self.joined, prior.roots, strict=True):
-            block = next(b for b in self.blocks if columns.start < b.stop)
-            left = slice(0, m) if block == shared else block  # where rows of a block are not 0
-            P[:, columns, left] = np.swapaxes(root, 1, 2) @ P[:, columns, left]
-            P[:, block, columns] = P[:, block, columns] @ root
-            if block != shared:
-                P[:, shared, columns] = P[:, shared, columns] @ root
+        """Step 3: from A, h of the columns left to I + R'AR, R'h, in place."""
+        m = P.shape[1] - 1
+        sd = np.concatenate([prior.sd[:, self.n_fading :], np.ones((len(P), 1))], axis=1)
+        P *= sd[:, :, None] * sd[:, None, :]
+        for columns, root in self._roots(prior):
+            P[:, columns] = np.swapaxes(root, 1, 2) @ P[:, columns]
+            P[:, :, columns] = P[:, :, columns] @ root
         diagonal = np.arange(m)
         P[:, diagonal, diagonal] += 1.0
 
+    def _roots(self, prior: Prior) -> list[tuple[slice, np.ndarray]]:
+        """Columns left that are joined, and the roots of their correlations."""
+        pairs = zip(self.joined, prior.roots, strict=True)
+        return [(columns, dense_root(root)) for columns, root in pairs if columns is not None]
+
+    def _coloured(self, factors: "_Factors", t: int, white: np.ndarray) -> np.ndarray:
+        """Coefficients less their means (column, draw) of independent normal numbers."""
+        f, n = self.n_fading, len(self.order)
+        left = white[2 * f :]
+        if n > f:
+            left = dtrtrs(factors.P[t, :-1, :-1].T, left, lower=0)[0]
+            for columns, root in self._roots(factors.prior):
+                left[columns] = root[t] @ left[columns]
+            left *= factors.prior.sd[t, f:, None]
+        return np.append(spread(factors.early, self.sets, t, white[: 2 * f], left), left, axis=0)
+
+    def _right(self, factors: "_Factors", t: int) -> np.ndarray:
+        """Means of the numbers that `_coloured` takes."""
+        return np.append(factors.early.Z[t, :, -1], factors.P[t, -1, :-1])
+
     def _half(self, factors: "_Factors", t: int) -> tuple[np.ndarray, np.ndarray]:
-        """R F'^-1 (column, column) at the t-th theta, F the factor of I + R'AR, and F^-1 R'h."""
-        arrow, prior, shared = factors.arrows[t], factors.prior, self.blocks[-1]
-        R, last = np.diag(prior.sd[t]), slice(shared.start, shared.stop - 1)
-        for columns, root in zip(self.joined, prior.roots, strict=True):
-            R[columns, columns] = prior.sd[t][columns, None] * root[t]
-        half, right = np.zeros_like(R), np.zeros(len(R))
-        for block, (F, X) in zip(self.blocks, arrow.robots, strict=False):
-            half[block, block] = dtrsm(1.0, F, R[block, block].T, lower=1).T
-            half[block, last] = -half[block, block] @ X[:-1].T
-            right[block] = X[-1]
-        if last.start < last.stop:
-            half[last, last] = R[last, last]
-            half[:, last] = dtrsm(1.0, arrow.shared[:-1, :-1], half[:, last].T, lower=1).T
-            right[last] = arrow.shared[-1, :-1]
-        return half, right
+        """Matrix (column, number) of `_coloured` at the t-th theta, and the numbers' means."""
+        right = self._right(factors, t)
+        return self._coloured(factors, t, np.eye(len(right))), right
 
     def _draw(self, factors: "_Factors", t: int, n: int, rng: np.random.Generator) -> np.ndarray:
         """Step 5: coefficients (draw, column), in their order, at the t-th theta."""
-        arrow, prior = factors.arrows[t], factors.prior
-        e, shared = rng.standard_normal((len(self.order), n)), self.blocks[-1]
-        F, last = arrow.shared[:-1, :-1], slice(shared.start, shared.stop - 1)
-        if len(F):
-            e[last] = dtrtrs(F, arrow.shared[-1, :-1, None] + e[last], lower=1, trans=1)[0]
-        for block, (F, X) in zip(self.blocks, arrow.robots, strict=False):
-            right = X[-1, :, None] - X[:-1].T @ e[last] + e[block]
-            e[block] = dtrtrs(F, right, lower=1, trans=1)[0]
-        for columns, root in zip(self.joined, prior.roots, strict=True):
-            e[columns] = root[t] @ e[columns]
-        return prior.mean[t] + prior.sd[t] * e.T
-
-
-class _Arrow(NamedTuple):
-    """Cholesky factor of the arrow of one theta."""
-
-    robots: list[tuple[np.ndarray, np.ndarray]]  # factor of a block, and its rows of the last block
-    shared: np.ndarray  # factor of the last block
-    minus_two_log: float
-    """Log |I + R'AR| + misfit; NaN where there is no factor."""
+        right = self._right(factors, t)
+        white = right[:, None] + rng.standard_normal((len(right), n))
+        return factors.prior.mean[t] + self._coloured(factors, t, white).T
 
 
 class _Factors(NamedTuple):
-    """Density, factor and prior at each of some theta."""
+    """Density, factors and prior at each of some theta."""
 
     log_p: np.ndarray
-    arrows: list[_Arrow]
+    P: np.ndarray
+    """Cholesky factor of the columns left in the lower triangles; the rates' row is the last."""
+    early: Eliminated
     prior: Prior
 
 
@@ -375,24 +378,6 @@ def impulses(
     diagonal = np.arange(K)
     E[..., diagonal, diagonal] = N[..., diagonal, diagonal]
     return N, E, log_det
-
-
-def _eliminate(P: np.ndarray, blocks: list[slice]) -> _Arrow:
-    """Step 4: Cholesky factor of an arrow, block by block."""
-    last, robots, total = blocks[-1], [], 0.0
-    rest = np.asfortranarray(P[last, last])
-    for block in blocks[:-1]:
-        F, failed = dpotrf(P[block, block], lower=1)
-        if failed:
-            return _Arrow([], rest, np.nan)
-        X = dtrsm(1.0, F, P[last, block], side=1, lower=1, trans_a=1)
-        rest = dsyrk(-1.0, X, beta=1.0, c=rest, lower=1, overwrite_c=1)
-        total += 2.0 * np.log(F.diagonal()).sum()
-        robots.append((F, X))
-    F, failed = dpotrf(rest, lower=1)
-    diagonal = F.diagonal()
-    total += 2.0 * np.log(diagonal[:-1]).sum() + diagonal[-1] ** 2
-    return _Arrow(robots, F, np.nan if failed else total)
 
 
 def _upper(S: np.ndarray) -> np.ndarray:

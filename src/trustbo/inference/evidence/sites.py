@@ -18,7 +18,7 @@ from scipy import sparse
 from trustbo.inference.evidence.ep import joint
 from trustbo.inference.evidence.ep.draws import draw_weighted
 from trustbo.inference.evidence.gaussian import named_effects, prior_of
-from trustbo.models.effects.effect import Columns, Group, Slots, Theta
+from trustbo.models.effects.effect import Columns, Group, Slots, Theta, dense_root
 from trustbo.models.families import Family
 from trustbo.models.families.terms import AT_ONE, GAUSSIAN, count_tables
 
@@ -96,7 +96,8 @@ class Sites:
         P, diagonal = np.zeros((n, m, m)), np.arange(m)
         P[:, diagonal, diagonal] = sd**-2.0
         log_det = -2.0 * np.log(sd).sum(1)
-        for i, root in zip(at, prior.roots, strict=True):
+        for i, one in zip(at, prior.roots, strict=True):
+            root = dense_root(one)
             half = np.linalg.inv(root) / sd[:, None, i]
             P[:, i, i] = np.swapaxes(half, 1, 2) @ half
             log_det -= 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)

@@ -72,6 +72,7 @@ class ChangeColumn(NamedTuple):
     columns: Columns
     sd: float
     joined = ()
+    fades = False
 
     def prior(self, theta: Theta) -> Prior:
         """Normal, in units of stationary trust."""

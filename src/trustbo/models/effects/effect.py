@@ -63,13 +63,28 @@ class Slots(NamedTuple):
         return cls(y, z, mission, robot, weight[mission], *sizes, sight, places, n_ticks)
 
 
+class Fading(NamedTuple):
+    """Correlation share rho^|i - j| + (1 - share) [i = j] of columns i and j."""
+
+    share: np.ndarray  # (point,)
+    rho: float
+    size: int
+
+    def correlation(self) -> np.ndarray:
+        """Correlations (point, column, column)."""
+        i = np.arange(self.size)
+        eye = np.eye(self.size)
+        return self.share[:, None, None] * (self.rho ** np.abs(i[:, None] - i) - eye) + eye
+
+
 class Prior(NamedTuple):
     """Gaussian prior of a group's coefficients at some theta."""
 
     mean: np.ndarray  # (point, column)
     sd: np.ndarray  # (point, column), may be 0
-    roots: Sequence[np.ndarray] = ()
-    """Cholesky factors (point, column, column) of the correlations of the columns joined."""
+    roots: Sequence[np.ndarray | Fading] = ()
+    """Cholesky factors (point, column, column) of the correlations of the columns joined, or the
+    correlations themselves where they fade."""
 
 
 class Group(Protocol):
@@ -83,6 +98,11 @@ class Group(Protocol):
     @property
     def joined(self) -> Sequence[slice]:
         """Columns that depend on each other a priori; all others are independent."""
+        ...
+
+    @property
+    def fades(self) -> bool:
+        """Whether the correlations of the columns joined are `Fading`."""
         ...
 
     def prior(self, theta: Theta) -> Prior:
@@ -109,6 +129,11 @@ class Effect(Protocol):
     def group(self, slots: Slots) -> Group:
         """Columns at the slots of some missions."""
         ...
+
+
+def dense_root(root: np.ndarray | Fading) -> np.ndarray:
+    """Cholesky factor (point, column, column) of a correlation."""
+    return np.linalg.cholesky(root.correlation()) if isinstance(root, Fading) else root
 
 
 def dense_columns(values: np.ndarray) -> Columns:

@@ -61,6 +61,7 @@ class PlaceColumns(NamedTuple):
     cells (cell, cell), and the roots of their numbers of bounds (cell,)."""
     place: PlaceEffect
     visited: Visited
+    fades = False
 
     @classmethod
     def of(cls, place: PlaceEffect, slots: Slots, visited: Visited) -> "PlaceColumns":

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import own_settings
-from trustbo.models.effects.effect import Columns, Prior, Slots, Theta
+from trustbo.models.effects.effect import Columns, Fading, Prior, Slots, Theta
 from trustbo.models.priors_numpy import half_normal, log_prob
 
 
@@ -88,6 +88,7 @@ class RobotColumns(NamedTuple):
     columns: Columns
     rho: float
     shape: tuple[int, int]  # robots, missions
+    fades = True
 
     @property
     def joined(self) -> list[slice]:
@@ -98,10 +99,10 @@ class RobotColumns(NamedTuple):
     def prior(self, theta: Theta) -> Prior:
         """Robots alike and independent."""
         n_robots, n_missions = self.shape
-        scale, C = _correlation(theta, self.rho, n_missions)
+        scale, fading = _correlation(theta, self.rho, n_missions)
         sd = np.abs(theta["rest"]) * scale
         sds = np.broadcast_to(sd[:, None], (len(sd), n_robots * n_missions))
-        return Prior(np.zeros(sds.shape), sds, [np.linalg.cholesky(C)] * n_robots)
+        return Prior(np.zeros(sds.shape), sds, [fading] * n_robots)
 
     def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Effects d on stationary trust, robot_effect (draw, mission, robot)."""
@@ -118,9 +119,8 @@ def next_mission(effect: np.ndarray, theta: Theta, rho: float) -> tuple[np.ndarr
         rho: Correlation of what stays.
     """
     n_missions = effect.shape[1]
-    scale, C = _correlation(theta, rho, n_missions)
-    share = np.divide(theta["tau_slow"] ** 2, scale**2, out=np.zeros_like(scale), where=scale > 0.0)
-    k = share[:, None] * rho ** np.arange(n_missions, 0, -1)
+    scale, fading = _correlation(theta, rho, n_missions)
+    C, k = fading.correlation(), fading.share[:, None] * rho ** np.arange(n_missions, 0, -1)
     gain = np.linalg.solve(C, k[..., None])[..., 0]
     left = np.maximum(1.0 - (gain * k).sum(1), 0.0)
     return np.einsum("nm,nmi->ni", gain, effect), scale * np.sqrt(left)
@@ -130,17 +130,15 @@ def prior_effect(
     theta: Theta, rho: float, shape: tuple[int, int], rng: np.random.Generator
 ) -> np.ndarray:
     """Draws of d from the prior, (draw, mission, robot), for missions and robots `shape`."""
-    scale, C = _correlation(theta, rho, shape[0])
+    scale, fading = _correlation(theta, rho, shape[0])
     return scale[:, None, None] * (
-        np.linalg.cholesky(C) @ rng.standard_normal((len(scale), *shape))
+        np.linalg.cholesky(fading.correlation()) @ rng.standard_normal((len(scale), *shape))
     )
 
 
-def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sd (point,) and correlation (point, mission, mission) of d; never singular, as rho < 1."""
+def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, Fading]:
+    """Sd (point,) and correlation of d; never singular, as rho < 1."""
     slow, day = theta["tau_slow"], theta["tau_day"]
     scale = np.hypot(slow, day)
     share = np.divide(slow**2, scale**2, out=np.zeros_like(scale), where=scale > 0.0)
-    m = np.arange(n_missions)
-    carried = rho ** np.abs(m[:, None] - m)
-    return scale, share[:, None, None] * (carried - np.eye(n_missions)) + np.eye(n_missions)
+    return scale, Fading(share, rho, n_missions)

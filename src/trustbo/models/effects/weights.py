@@ -37,6 +37,7 @@ class FeatureColumns(NamedTuple):
     sd: np.ndarray
     stationary: bool
     joined = ()
+    fades = False
 
     def prior(self, theta: Theta) -> Prior:
         """Independent coefficients, of stationary trust if these are what the priors are of."""
