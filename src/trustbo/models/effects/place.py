@@ -108,12 +108,15 @@ class PlaceColumns(NamedTuple):
             return {"place_bound": g}
         s = np.empty((len(g), len(self.visited.cells)))
         theta_of = np.stack([theta[name] for name in ("tau_s", "length_scale", "tau_e")], axis=1)
+        values, point = np.unique(theta_of, axis=0, return_inverse=True)
+        point, count = point.ravel(), np.bincount(point.ravel())
+        order = np.argsort(point, kind="stable")
+        index = np.empty_like(order)  # of a draw among those of its theta
+        index[order] = np.arange(len(c)) - np.repeat(np.cumsum(count) - count, count)
         for first, distance, w in self.cells:
-            mine = self._cells_of(first)
-            for values in np.unique(theta_of, axis=0):
-                rows = np.flatnonzero((theta_of == values).all(1))
-                mean = c[rows, first : first + len(w)]
-                s[np.ix_(rows, mine)] = _split(mean, w, distance, values, rng)
+            mean = np.zeros((len(values), count.max(), len(w)))
+            mean[point, index] = c[:, first : first + len(w)]
+            s[:, self._cells_of(first)] = _split(mean, w, distance, values, rng)[point, index]
         return {"place": s, "place_bound": g - s[:, self.visited.cell_of]}
 
     def _cells_of(self, first: int) -> np.ndarray:
@@ -152,13 +155,16 @@ def _split(
     mean: np.ndarray, w: np.ndarray, distance: np.ndarray, theta: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
-    """S (draw, cell) given means w s + e of cells, by Matheron's rule: a prior draw, corrected."""
-    tau_s, length_scale, tau_e = theta
-    if tau_s == 0.0:
-        return np.zeros_like(mean)
-    ratio, eye = (tau_e / tau_s) ** 2, np.eye(len(w))
+    """S (point, draw, cell) given means w s + e of cells, by Matheron's rule.
+
+    A prior draw is corrected by its misfit; theta is (point, 3).
+    """
+    tau_s, length_scale, tau_e = theta.T[:, :, None, None]
+    unit, eye = np.where(tau_s > 0.0, tau_s, 1.0), np.eye(len(w))
+    ratio = (tau_e / unit) ** 2
     K = matern(distance, length_scale) + _JITTER * len(w) * eye
-    s = rng.standard_normal(mean.shape) @ np.linalg.cholesky(K).T
-    off = mean / tau_s - w * s - np.sqrt(ratio) * rng.standard_normal(mean.shape)
+    s = rng.standard_normal(mean.shape) @ np.swapaxes(np.linalg.cholesky(K), 1, 2)
+    off = mean / unit - w * s - np.sqrt(ratio) * rng.standard_normal(mean.shape)
     M = w[:, None] * w * K + ratio * eye
-    return tau_s * (s + np.linalg.solve(M, off.T).T @ (w[:, None] * K))
+    gain = np.swapaxes(np.linalg.solve(M, np.swapaxes(off, 1, 2)), 1, 2)
+    return tau_s * (s + gain @ (w[:, None] * K))
