@@ -28,6 +28,7 @@ PRIORS = Priors.of(("line_of_sight", "slope"))
 EFFECTS = {
     "weights": [],
     "robots": [RobotEffect()],
+    "robots twice": [RobotEffect(rho=0.5), RobotEffect()],  # of shared chains: one set goes first
     "places": [Place()],
     "places and robots": [Place(), RobotEffect()],
     "cells and robots": [RobotEffect(rho=0.5), Place(bounds=False)],
