@@ -330,7 +330,8 @@ def joined_columns(groups: Sequence[Group]) -> list[slice]:
 def prior_of(groups: Sequence[Group], theta: Theta) -> tuple[Prior, list[slice]]:
     """Prior of the columns of all groups, and the columns that its roots are of."""
     priors = [group.prior(theta) for group in groups]
-    mean, sd = (np.concatenate([p[i] for p in priors], axis=1) for i in range(2))
+    mean = np.concatenate([p.mean for p in priors], axis=1)
+    sd = np.concatenate([p.sd for p in priors], axis=1)
     return Prior(mean, sd, [root for p in priors for root in p.roots]), joined_columns(groups)
 
 

@@ -59,7 +59,7 @@ class Sites:
         for i in range(0, len(some), self._chunk):
             points = some[i : i + self._chunk]
             given, log_det = self._given({name: v[points] for name, v in theta.items()})
-            args = *given, self.chains, self.sites, SWEEPS
+            args: tuple[Any, ...] = *given, self.chains, self.sites, SWEEPS
             out[points] = joint.log_evidence(*args) + 0.5 * log_det
         return out
 
