@@ -47,6 +47,37 @@ def test_a_detector_that_breaks_is_named_with_its_mission(posterior):
     assert (worse.sel(mission=slice(0, BROKEN - 1)) < 0.5).all()
 
 
+def require_same_moments(nuts, exact, largest_shift, largest_ratio):
+    """Means within some sds, and sds within a factor, of all parameters and effects of robots."""
+    pairs = [(nuts["posterior"][name], values) for name, values in exact["posterior"].items()]
+    pairs.append((nuts["robots"]["robot_effect"], exact["robots"]["robot_effect"]))
+    pairs += [(nuts["places"][name], exact["places"][name]) for name in ("place", "place_bound")]
+    over = ("chain", "draw")
+    for a, b in pairs:
+        shift = abs(a.mean(over) - b.mean(over)) / b.std(over)
+        assert float(shift.max()) < largest_shift, a.name
+        assert float(abs(np.log(a.std(over) / b.std(over))).max()) < np.log(largest_ratio), a.name
+
+
+def test_nuts_draws_from_the_posterior_of_the_exact_sampler(missions):
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
+    exact = tb.fit(missions[:3], model, whole=False)
+    run = {"n_chains": 2, "warmup": 100, "draws": 600, "check": False, "whole": False}
+    nuts = tb.fit(missions[:3], model, "nuts", **run)
+    assert nuts.attrs["sampler"] == "nuts"
+    assert nuts["sample_stats"]["n_steps"].shape == (2, 600)
+    assert not nuts["sample_stats"]["diverging"].any()
+    require_same_moments(nuts, exact, 0.2, 1.2)
+
+
+@pytest.mark.slow  # 8 000 draws of NUTS
+def test_a_long_run_of_nuts_has_the_moments_of_the_exact_sampler(missions):
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
+    exact = tb.fit(missions[:4], model, draws=5000, whole=False)
+    nuts = tb.fit(missions[:4], model, "nuts", draws=2000, whole=False)
+    require_same_moments(nuts, exact, 0.1, 1.1)
+
+
 def test_its_evidence_is_larger_than_that_of_places_alone(posterior, missions):
     places = tb.fit(missions, PooledTrust(place=PlaceEffect()), draws=50, whole=False)
     assert posterior.attrs["log_evidence"] - places.attrs["log_evidence"] > 10.0
@@ -229,8 +260,9 @@ def test_draws_are_calibrated(family):
 
 def test_what_has_no_effects_of_robots_refuses_them(missions):
     model = PooledTrust(effects=[RobotEffect()])
-    with pytest.raises(TrustboError, match=r'"nuts" cannot treat PooledTrust.*effects of robots'):
-        tb.fit(missions, model, "nuts")
+    censored = PooledTrust(effects=[RobotEffect()], observation="censored")
+    with pytest.raises(TrustboError, match=r'"nuts" cannot treat.*observations are not Gaussian'):
+        tb.fit(missions, censored, "nuts")
     changes = PooledTrust(effects=[RobotEffect()], response="change")
     with pytest.raises(TrustboError, match="effects of robots, and rates measure changes"):
         tb.fit(missions, changes, "exact")

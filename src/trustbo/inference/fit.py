@@ -17,7 +17,12 @@ from trustbo.inference.place_maps import place_group
 from trustbo.inference.posterior_groups import Conditional, complete
 from trustbo.inference.posterior_tree import require_posterior, to_datatree
 from trustbo.inference.prior_predictive import draw_sites
-from trustbo.inference.samplers.choice import faster_than_nuts, resolve_sampler, slow_places
+from trustbo.inference.samplers.choice import (
+    faster_than_nuts,
+    needs_evidence,
+    resolve_sampler,
+    slow_places,
+)
 from trustbo.inference.samplers.run import Draws, UnevenWeightsError, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
@@ -142,7 +147,10 @@ def fit(
             warnings.warn(slow_places(reason), stacklevel=3)
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
-        start, slots = _proposal(earlier), _slots(model, missions, batch, weight, places)
+        start, slots = (
+            _proposal(earlier),
+            _slots(model, chosen, missions, batch, weight, places),
+        )
         watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
         drawn, complaints = draw_posterior(
             floored, chosen, settings, seed, batch, weight, places, start, slots, check=check,
@@ -264,13 +272,14 @@ def _places(
 
 def _slots(
     model: TrustModel,
+    sampler: str,
     missions: Sequence[Mission],
     batch: MissionBatch,
     weight: np.ndarray,
     places: Visited | None,
 ) -> Slots | None:
-    """Rates by chain, where robots have effects."""
-    if not model.effects:
+    """Rates by chain, where the evidence of all effects is needed."""
+    if not needs_evidence(model, sampler):
         return None
     return Slots.of(batch, len(missions), missions[0].features, weight, places)
 

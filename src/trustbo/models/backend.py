@@ -15,9 +15,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
+from types import ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
@@ -34,6 +37,11 @@ for _name, _module in list(sys.modules.items()):
     _package, _, _child = _name.rpartition(".")
     if _package.startswith("numpyro") and not hasattr(sys.modules[_package], _child):
         setattr(sys.modules[_package], _child, _module)
+
+
+def namespace(x: Any) -> ModuleType:
+    """`jax.numpy` for arrays of JAX, else NumPy: formulas written once serve both."""
+    return jnp if isinstance(x, jax.Array) else np
 
 
 @partial(jax.jit, static_argnums=1)

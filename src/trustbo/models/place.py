@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import namespace, own_settings
 from trustbo.models.priors_numpy import log_prob
 from trustbo.workspace.moves import MOVES, bounds_along
 
@@ -190,5 +190,6 @@ def visited(
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> np.ndarray:
     """Matern 3/2 correlation at a distance, both in cells."""
-    h = np.sqrt(3.0) * np.asarray(distance) / np.asarray(length_scale)
-    return (1.0 + h) * np.exp(-h)
+    xp: Any = namespace(length_scale)
+    h = np.sqrt(3.0) * np.asarray(distance) / xp.asarray(length_scale)
+    return (1.0 + h) * xp.exp(-h)

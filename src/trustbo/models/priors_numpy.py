@@ -12,7 +12,7 @@ from numpyro.distributions.transforms import biject_to
 from scipy import special
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import call, own_settings
+from trustbo.models.backend import call, namespace, own_settings
 from trustbo.models.floored import Floored
 
 _LEAST_MASS = 1e-3  # above a floor: with less, rejection would draw for long
@@ -55,11 +55,18 @@ def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
     return jax.numpy.asarray(one.icdf(share))
 
 
-def half_normal(score: np.ndarray, scale: float) -> np.ndarray:
-    """Half-normal variable of a score; accurate in both tails."""
-    low = special.erfinv(special.ndtr(np.minimum(score, 0.0)))
-    high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
-    return scale * np.sqrt(2.0) * np.where(score < 0.0, low, high)
+def half_normal(score: np.ndarray, scale: float | np.ndarray) -> np.ndarray:
+    """Half-normal variable of a score, in NumPy or JAX; accurate in both tails."""
+    xp: Any = namespace(score)
+    functions, erfcinv = (special, special.erfcinv) if xp is np else (jax.scipy.special, _erfcinv)
+    low = functions.erfinv(functions.ndtr(xp.minimum(score, 0.0)))
+    high = erfcinv(functions.ndtr(-xp.maximum(score, 0.0)))
+    return scale * np.sqrt(2.0) * xp.where(score < 0.0, low, high)
+
+
+def _erfcinv(x: Any) -> Any:
+    """Inverse of erfc, which JAX lacks."""
+    return -jax.scipy.special.ndtri(0.5 * x) / np.sqrt(2.0)
 
 
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:

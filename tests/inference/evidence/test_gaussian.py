@@ -2,6 +2,8 @@
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from missions import walking_missions
@@ -12,11 +14,13 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.evidence.dense import Dense
 from trustbo.inference.evidence.gaussian import Gaussian
+from trustbo.inference.evidence.gaussian_jax import GaussianJax, Sums
 from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers import exact
 from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.models import PlaceEffect, PooledTrust, Priors
+from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Prior, Slots
 from trustbo.models.effects.place import Place
 from trustbo.models.effects.robot import RobotEffect
@@ -80,6 +84,20 @@ def test_the_evidence_is_that_of_the_joint_normal(name, memory):
         ]
         found = Gaussian(slots, groups, X0, memory).log_density(theta)
         np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("memory", ["level", "deviation"])
+@pytest.mark.parametrize("name", EFFECTS)
+def test_the_evidence_in_jax_is_that_in_numpy(name, memory):
+    """With gaps, weights, scales of 0 and no memory."""
+    rng, effects = np.random.default_rng(3), EFFECTS[name]
+    missions = walking_missions(1, 4, missing=0.3)
+    evidence = Gaussian(*gathered(missions, effects, rng.uniform(0.2, 1.0, 4)), X0, memory)
+    theta = random_theta(effects, rng, 4, memory)
+    with own_settings():
+        sums, density = Sums.of(evidence), jax.jit(GaussianJax(evidence).log_density)
+        in_jax = [density(jax.tree.map(jnp.asarray, point(theta, t)), sums) for t in range(4)]
+    np.testing.assert_allclose(in_jax, evidence.log_density(theta), rtol=1e-9)
 
 
 @pytest.mark.parametrize("memory", ["level", "deviation"])

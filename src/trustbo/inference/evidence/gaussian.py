@@ -159,6 +159,15 @@ class Gaussian:
         c[:, self.order] = np.concatenate(drawn)
         return c
 
+    def gram(self) -> tuple[np.ndarray, np.ndarray, Columns]:
+        """Row and column of the entries of A, and G (entry, pair of bounds of a kind), see step 2.
+
+        Of all columns, in the order of `order`; the upper triangle is left out.
+        """
+        (row, column), G = self._products(self.U, self.U)
+        lower = row >= column
+        return row[lower], column[lower], G[lower]
+
     def _fading(self, U: Columns, first: list[int]) -> list[slice]:
         """Sets of columns to eliminate first: they fade, each of one chain shared with no other."""
         chain_of = np.repeat(np.arange(len(self.y)), self.y.shape[1])

@@ -6,6 +6,7 @@ from trustbo.inference.samplers.scores import why_no_quantiles
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.model import TrustModel
+from trustbo.models.pooled import PooledTrust
 
 SAMPLERS = ("auto", "exact", "nuts", "joint")
 
@@ -21,11 +22,8 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
         raise TrustboError(
             f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
         )
-    if sampler in ("nuts", "joint") and model.effects:
-        raise TrustboError(
-            f'sampler "{sampler}" cannot treat {model.describe()}: NUTS has no effects of robots. '
-            'Use sampler="exact".'
-        )
+    if sampler in ("nuts", "joint") and model.effects and (reason := why_not_scores(model)):
+        raise TrustboError(f'sampler "{sampler}" cannot treat {model.describe()}: {reason}.')
     if sampler == "joint" and model.family.integrates_out:
         raise TrustboError(
             'sampler "joint" is for observations that trust does not integrate out of; with '
@@ -64,10 +62,29 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
         return "exact", f"{what}{by}"
     if model.effects:
         raise TrustboError(
-            f"no sampler can treat {model.describe()}: {reason}; NUTS has no effects of robots. "
-            "Give a model without them."
+            f"no sampler can treat {model.describe()}: {reason}. Give a model without effects of "
+            "robots, or other priors."
         )
     return ("nuts" if model.family.integrates_out else "joint"), reason
+
+
+def why_not_scores(model: TrustModel) -> str | None:
+    """Reason why no evidence serves NUTS of scores alone; None if one does.
+
+    It is for Gaussian rates, effects that the engine has, and priors of the exact sampler.
+    """
+    if reason := model.why_not_exact:
+        return reason
+    if not isinstance(model, PooledTrust) or not model.family.integrates_out:
+        return "its robots do not share all parameters, or its observations are not Gaussian"
+    return why_not_conjugate(model.priors) or why_no_quantiles(model.priors, partial_pooling=False)
+
+
+def needs_evidence(model: TrustModel, sampler: str) -> bool:
+    """Whether a sampler integrates effects out by the evidence of all of them."""
+    if model.effects:
+        return True
+    return sampler == "nuts" and model.place is not None and why_not_scores(model) is None
 
 
 def slow_places(reason: str) -> str:

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -49,13 +49,22 @@ class NutsDraws(NamedTuple):
     params_at_modes: dict[str, Array]
 
 
-class _Chain(NamedTuple):
+class Density(Protocol):
+    """A log posterior density."""
+
+    def potential(self, site: dict[str, Array]) -> Array:
+        """Minus the log density of sites, `theta` among them."""
+        ...
+
+
+class Chain(NamedTuple):
     """Coordinates of a chain, standard normal around its mode; or of all, (chain, ...)."""
 
     mode: Array  # (unknown,)
     scale: Array  # (unknown, unknown)
 
     def theta(self, x: Array) -> Array:
+        """Unknowns at standard coordinates."""
         return self.mode + self.scale @ x
 
 
@@ -64,7 +73,7 @@ class _Start(NamedTuple):
 
     frame: Frame
     modes: Modes
-    chains: _Chain
+    chains: Chain
     states: HMCState
     effect_keys: Array  # (chain,)
 
@@ -96,7 +105,7 @@ def run_nuts(
         for i in range(settings.n_chains):
             chain, state = jax.tree.map(lambda a, i=i: a[i], (start.chains, start.states))
             go_on = partial(advance, start.frame, chain, complete=complete)
-            runs.append(_run_chain(settings, go_on, state, seen))
+            runs.append(run_chain(settings, go_on, state, seen))
         z, stats = jax.tree.map(lambda *a: np.stack(a), *runs)
         finish = partial(_finish, length_free, model, data, complete=complete)
         theta, params, at_modes = finish(start, z["theta"])
@@ -104,7 +113,7 @@ def run_nuts(
     return NutsDraws(params, stats, *kept, theta, start.modes, at_modes)
 
 
-def _run_chain(
+def run_chain(
     settings: NutsSettings, go_on: Callable[..., Any], state: HMCState, seen: Watch
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Draws of z and statistics of one chain, warm-up left out."""
@@ -134,16 +143,16 @@ def _begin(
         return -target.potential({"theta": theta, **zeros})
 
     modes = find_modes(target.profile, log_density, target.starts, target.longest)
-    chains = _Chain(*modes.spread(settings.n_chains))
+    chains = Chain(*modes.spread(settings.n_chains))
 
-    def begin(inputs: tuple[Array, _Chain]) -> tuple[HMCState, Array]:
+    def begin(inputs: tuple[Array, Chain]) -> tuple[HMCState, Array]:
         key, chain = inputs
         key_start, key_innovations, key_run = random.split(key, 3)
         # Overdispersed starts (1.5 Laplace sd), so that R-hat means something.
         z = {"theta": 1.5 * random.normal(key_start, chain.mode.shape, chain.mode.dtype)}
         if joint:
             z["innovations"] = random.normal(key_innovations, shape, chain.mode.dtype)
-        state, _ = _kernel(settings, target, chain, z, key_run)
+        state, _ = kernel(settings, target, chain, z, key_run)
         return state, random.fold_in(key, 3)
 
     states, effect_keys = lax.map(begin, (random.split(key, settings.n_chains), chains))
@@ -156,7 +165,7 @@ def _advance(
     model: TrustModel,
     data: NutsData,
     frame: Frame,
-    chain: _Chain,
+    chain: Chain,
     state: HMCState,
     n: int,
     *,
@@ -164,8 +173,19 @@ def _advance(
 ) -> tuple[HMCState, tuple[dict[str, Array], dict[str, Array]]]:
     """State after n more draws; and these, with their statistics, as the first of `_MOST` rows."""
     target = _target(settings, model, data, frame, complete=complete)
+    return step_on(settings, target, chain, state, n)
+
+
+def step_on(
+    settings: NutsSettings,
+    target: Density | Reparametrisation,
+    chain: Chain,
+    state: HMCState,
+    n: Array | int,
+) -> tuple[HMCState, tuple[dict[str, Array], dict[str, Array]]]:
+    """See `_advance`, of any density."""
     info = ParamInfo(state.z, state.potential_energy, state.z_grad)  # costs no gradient
-    _, step = _kernel(settings, target, chain, info, state.rng_key)
+    _, step = kernel(settings, target, chain, info, state.rng_key)
 
     def row(state: HMCState) -> tuple[dict[str, Array], dict[str, Array]]:
         stats = {
@@ -201,7 +221,7 @@ def _finish(
     """Draws in the coordinates of the modes, as parameters, and the parameters at the modes."""
     target = _target(settings, model, data, start.frame, complete=complete)
 
-    def finish(inputs: tuple[_Chain, Array, Array]) -> tuple[Array, dict[str, Array]]:
+    def finish(inputs: tuple[Chain, Array, Array]) -> tuple[Array, dict[str, Array]]:
         chain, x, key = inputs
         theta = jax.vmap(chain.theta)(x)
         params = jax.vmap(target.constrain)(theta)
@@ -226,10 +246,10 @@ def _target(
     return reparametrise(model, data, frame=frame, **care)
 
 
-def _kernel(
+def kernel(
     settings: NutsSettings,
-    target: Reparametrisation,
-    chain: _Chain,
+    target: Density | Reparametrisation,
+    chain: Chain,
     z: dict[str, Array] | ParamInfo,
     key: Array,
 ) -> tuple[HMCState, Callable[[HMCState], HMCState]]:

@@ -6,7 +6,7 @@ one of each.
 """
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
@@ -59,7 +59,11 @@ class Shared:
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """See `Scores.theta`."""
-        beta0, delta_w, delta_v = scores.beta0_and_noises(self.priors, z).T
+        return self.with_core(scores.beta0_and_noises(self.priors, z), z)
+
+    def with_core(self, core: Any, z: Any) -> dict[str, Any]:
+        """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
+        beta0, delta_w, delta_v = core.T
         rest = 1.0 - beta0 if self.memory == "level" else np.ones(len(z))
         theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
         start = self.n_core

@@ -1,7 +1,7 @@
 """Draws from a model's posterior by the chosen sampler."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -14,7 +14,7 @@ from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.place_marginal import PlaceIndex
 from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.evidence.statistics import gather, split_robots
-from trustbo.inference.samplers.choice import is_coupled
+from trustbo.inference.samplers.choice import is_coupled, why_not_scores
 from trustbo.inference.samplers.complaints import complaints_of, complaints_of_modes
 from trustbo.inference.samplers.convergence import MAX_KHAT
 from trustbo.inference.samplers.coupled_target import CoupledTarget
@@ -24,6 +24,7 @@ from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
 from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
 from trustbo.inference.samplers.nuts import run_nuts
+from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
 from trustbo.inference.samplers.place_draws import split_units
 from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
@@ -107,12 +108,15 @@ def draw_posterior(
             targets = _targets(model, batch, weight, places, slots)
             return _sample_scores(model, settings, seed, targets, start, watch), []
         except UnevenWeightsError as error:
-            if model.effects:
-                raise PosteriorError(f"the exact sampler's {error}.") from None
             if not fallback:
                 raise
+            if slots is not None and why_not_scores(model):
+                raise PosteriorError(f"the exact sampler's {error}.") from None
             failure = str(error)
             warnings.warn(f"the exact sampler's {failure}; NUTS is used instead.", stacklevel=4)
+    if slots is not None:
+        draws, complaints = _sample_nuts_of_scores(model, settings, seed, slots, watch, check=check)
+        return draws._replace(fallback=failure), complaints
     data = nuts_data(model, batch, weight, places)
     with own_settings(), one_blas_thread():
         draws, complaints = _sample_nuts(
@@ -194,14 +198,22 @@ def _sample_scores(
             "weights do not tell the shares of modes, of which the posterior has more than one"
         )
     params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
-    effects = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
-    robots = {name: params.pop(name) for name in ("robot_effect",) if name in params}
+    effects, robots = _pop_effects(params)
     summary = _summarize(posteriors)
     if effects or coupled or engine:
         proposal = sampled[0].proposal
         summary["proposal_center"] = proposal.center.tolist()
         summary["proposal_scale"] = proposal.scale.ravel().tolist()
     return Draws(params, stats, summary, "exact", places=effects, robots=robots)
+
+
+def _pop_effects(
+    params: dict[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Effects of places and of robots, taken out of parameters by name."""
+    places = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
+    robots = {name: params.pop(name) for name in ("robot_effect",) if name in params}
+    return places, robots
 
 
 def _targets(
@@ -300,10 +312,49 @@ def _sample_nuts(
         draws = Draws(params, stats, {"retries": retries}, name, latents)
         return draws, [*complaints_of(params, stats), *complaints_of_modes(raw)] if check else []
 
+    return _retried(attempt, settings, watch, collapse=data.places is None)
+
+
+def _sample_nuts_of_scores(
+    model: TrustModel,
+    settings: NutsSettings,
+    seed: int,
+    slots: Slots,
+    watch: Watch,
+    *,
+    check: bool,
+) -> tuple[Draws, list[str]]:
+    """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
+    posterior = _by_evidence(model, slots)
+
+    def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
+        z, stats = run_nuts_of_scores(tried, seed + 7919 * retries, posterior, watch)
+        shape = z.shape[:2]
+        flat, n = z.reshape(-1, z.shape[2]), z.shape[0] * z.shape[1]
+        rng = np.random.default_rng([seed, 3, retries])
+        drawn, _ = posterior.draw(flat, np.zeros(n), np.arange(n), rng)
+        params = {name: values.reshape(*shape, *values.shape[1:]) for name, values in drawn.items()}
+        places, robots = _pop_effects(params)
+        stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
+        summary = {"retries": retries}
+        draws = Draws(params, stats, summary, "nuts", places=places, robots=robots)
+        return draws, complaints_of(params, stats) if check else []
+
+    return _retried(attempt, settings, watch, collapse=False)
+
+
+def _retried(
+    attempt: Callable[[NutsSettings, int], tuple[Draws, list[str]]],
+    settings: NutsSettings,
+    watch: Watch,
+    *,
+    collapse: bool,
+) -> tuple[Draws, list[str]]:
+    """Draws of an attempt, or of a second, longer one where the diagnostics of the first fail."""
     draws, complaints = attempt(settings, 0)
     if not complaints:
         return draws, complaints
-    longer = settings.longer(collapse=data.places is None)
+    longer = settings.longer(collapse=collapse)
     watch.retry(longer, complaints)
     return attempt(longer, 1)
 

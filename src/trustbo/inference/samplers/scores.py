@@ -6,6 +6,8 @@ with half-normal priors log size has the density of a Rayleigh variable's logari
 over pi / 2 is uniform. On log and logit scales tails are exponential, and weights uneven.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
@@ -13,7 +15,7 @@ from numpyro.distributions import Distribution
 from scipy import special
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import call, own_settings
+from trustbo.models.backend import call, namespace, own_settings
 from trustbo.models.floored import Floored
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import half_normal, number
@@ -27,9 +29,13 @@ def log_normal_density(scores: np.ndarray) -> np.ndarray:
 
 
 def log_prior(z: np.ndarray) -> np.ndarray:
-    """Log prior density of scores (point, score), the second being the log size of the noises."""
-    normal = log_normal_density(np.delete(z, 1, axis=1))
-    return 2.0 * z[:, 1] - 0.5 * np.exp(z[:, 1]) ** 2 + normal
+    """Log prior density of scores (point, score), the second being the log size of the noises.
+
+    In NumPy or JAX.
+    """
+    xp: Any = namespace(z)
+    normal = log_normal_density(xp.delete(z, 1, axis=1))
+    return 2.0 * z[:, 1] - 0.5 * xp.exp(z[:, 1]) ** 2 + normal
 
 
 def beta0_and_noises(priors: Priors, z: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse
 
 from trustbo.data import is_line_of_sight
+from trustbo.models.backend import namespace
 from trustbo.models.place import Visited
 from trustbo.stacking import MissionBatch
 
@@ -106,7 +107,7 @@ class Group(Protocol):
         ...
 
     def prior(self, theta: Theta) -> Prior:
-        """Prior of the coefficients at each theta."""
+        """Prior of the coefficients at each theta, which may be arrays of JAX."""
         ...
 
     def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -123,7 +124,7 @@ class Effect(Protocol):
         ...
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
-        """Hyperparameters by name of their normal scores (point, hyperparameter)."""
+        """Hyperparameters by name of normal scores (point, hyperparameter), maybe of JAX."""
         ...
 
     def group(self, slots: Slots) -> Group:
@@ -131,9 +132,29 @@ class Effect(Protocol):
         ...
 
 
-def dense_root(root: np.ndarray | Fading) -> np.ndarray:
-    """Cholesky factor (point, column, column) of a correlation."""
-    return np.linalg.cholesky(root.correlation()) if isinstance(root, Fading) else root
+def dense_root(root: Any) -> Any:
+    """Cholesky factor (point, column, column) of a correlation, in NumPy or JAX."""
+    if not isinstance(root, Fading):
+        return root
+    xp: Any = namespace(root.share)
+    return xp.linalg.cholesky(root.correlation())
+
+
+def share_of(sd: Any, whole: Any) -> Any:
+    """Share of a variance (sd / whole)^2, 0 where the whole is 0; in NumPy or JAX."""
+    xp: Any = namespace(whole)
+    some = whole > 0.0
+    return xp.where(some, sd**2 / xp.where(some, whole, 1.0) ** 2, 0.0)
+
+
+def hypot(a: Any, b: Any) -> Any:
+    """Sd of a sum of independent variables of two sds, in NumPy or JAX; slope 0 where both are."""
+    xp: Any = namespace(a)
+    if xp is np:
+        return np.hypot(a, b)
+    square = a**2 + b**2
+    some = square > 0.0
+    return xp.where(some, xp.sqrt(xp.where(some, square, 1.0)), 0.0)
 
 
 def dense_columns(values: np.ndarray) -> Columns:

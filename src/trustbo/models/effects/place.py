@@ -10,14 +10,15 @@ so that D bounds cost the root of a matrix of C cells, and neither tau is ever i
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import sparse
 from scipy.linalg import helmert
 
 from trustbo.errors import TrustboError
-from trustbo.models.effects.effect import Columns, Prior, Slots, Theta
+from trustbo.models.backend import namespace
+from trustbo.models.effects.effect import Columns, Prior, Slots, Theta, hypot, share_of
 from trustbo.models.place import PlaceEffect, Visited, matern
 from trustbo.models.priors_numpy import half_normal
 
@@ -31,14 +32,17 @@ class Place(PlaceEffect):
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
         """See `Effect.scales`."""
-        values, score = {}, dict(zip(self.names, scores.T, strict=True))
-        for name in self.names:
-            if name == "length_scale":
-                length_scale = self.length_scale * np.exp(self.length_scale_sd * score[name])
-                values[name] = np.clip(length_scale, *_LENGTH_SCALES)
-            else:
-                values[name] = half_normal(score[name], getattr(self, name))
-        return values
+        xp: Any = namespace(scores)
+        taus = [i for i, name in enumerate(self.names) if name != "length_scale"]
+        values = half_normal(
+            scores[:, taus], np.array([getattr(self, self.names[i]) for i in taus])
+        )
+        named = {self.names[i]: value for i, value in zip(taus, values.T, strict=True)}
+        if self.cells:
+            score = scores[:, self.names.index("length_scale")]
+            length_scale = self.length_scale * xp.exp(self.length_scale_sd * score)
+            named["length_scale"] = xp.clip(length_scale, *_LENGTH_SCALES)
+        return named
 
     def group(self, slots: Slots) -> "PlaceColumns":
         """See `Effect.group`.
@@ -83,21 +87,24 @@ class PlaceColumns(NamedTuple):
 
     def prior(self, theta: Theta) -> Prior:
         """Gaussian process over the cells' means, independent contrasts."""
-        nothing, place = np.zeros(len(theta["beta0"])), self.place
-        tau_e = theta["tau_e"] if place.bounds else nothing
-        sd, roots = np.repeat(tau_e[:, None], self.rotation.shape[0], axis=1), []
+        xp: Any = namespace(theta["beta0"])
+        n, place = len(theta["beta0"]), self.place
+        tau_e = theta["tau_e"] if place.bounds else xp.zeros(n)
+        mean = np.zeros((n, self.rotation.shape[0]))
         if not place.cells:
-            return Prior(np.zeros_like(sd), sd)
-        tau_s = theta["tau_s"]
-        scale = np.hypot(tau_s, tau_e)
-        share = np.divide(tau_s**2, scale**2, out=nothing, where=scale > 0.0)[:, None, None]
-        for first, distance, w in self.cells:
+            return Prior(mean, xp.repeat(tau_e[:, None], mean.shape[1], axis=1))
+        tau_s, roots, sds = theta["tau_s"], [], []
+        scale = hypot(tau_s, tau_e)
+        share = share_of(tau_s, scale)[:, None, None]
+        stops = [first for first, *_ in self.cells[1:]] + [mean.shape[1]]
+        for (first, distance, w), stop in zip(self.cells, stops, strict=True):
             eye = np.eye(len(w))
             K = matern(distance, theta["length_scale"][:, None, None])
             C = share * (w[:, None] * w * K) + (1.0 - share + _JITTER * len(w) * w.max() ** 2) * eye
-            roots.append(np.linalg.cholesky(C))
-            sd[:, first : first + len(w)] = scale[:, None]
-        return Prior(np.zeros_like(sd), sd, roots)
+            roots.append(xp.linalg.cholesky(C))
+            sds.append(xp.repeat(scale[:, None], len(w), axis=1))
+            sds.append(xp.repeat(tau_e[:, None], stop - first - len(w), axis=1))
+        return Prior(mean, xp.concatenate(sds, axis=1), roots)
 
     def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Effects of cells, place (draw, cell), and of bounds, place_bound (draw, unit)."""

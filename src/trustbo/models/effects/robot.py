@@ -16,8 +16,8 @@ import numpyro.distributions as dist
 from scipy import sparse
 
 from trustbo.errors import TrustboError, require_positive
-from trustbo.models.backend import own_settings
-from trustbo.models.effects.effect import Columns, Fading, Prior, Slots, Theta
+from trustbo.models.backend import namespace, own_settings
+from trustbo.models.effects.effect import Columns, Fading, Prior, Slots, Theta, hypot, share_of
 from trustbo.models.priors_numpy import half_normal, log_prob
 
 
@@ -49,9 +49,8 @@ class RobotEffect:
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
         """See `Effect.scales`."""
-        priors = self.tau_slow, self.tau_day
-        columns = zip(self.names, scores.T, priors, strict=True)
-        return {name: half_normal(score, scale) for name, score, scale in columns}
+        values = half_normal(scores, np.array([self.tau_slow, self.tau_day]))
+        return dict(zip(self.names, values.T, strict=True))
 
     def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Draws of the hyperparameters from their prior, each (draw,), by name."""
@@ -100,8 +99,9 @@ class RobotColumns(NamedTuple):
         """Robots alike and independent."""
         n_robots, n_missions = self.shape
         scale, fading = _correlation(theta, self.rho, n_missions)
-        sd = np.abs(theta["rest"]) * scale
-        sds = np.broadcast_to(sd[:, None], (len(sd), n_robots * n_missions))
+        xp: Any = namespace(scale)
+        sd = xp.abs(theta["rest"]) * scale
+        sds = xp.broadcast_to(sd[:, None], (len(sd), n_robots * n_missions))
         return Prior(np.zeros(sds.shape), sds, [fading] * n_robots)
 
     def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
@@ -139,6 +139,5 @@ def prior_effect(
 def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, Fading]:
     """Sd (point,) and correlation of d; never singular, as rho < 1."""
     slow, day = theta["tau_slow"], theta["tau_day"]
-    scale = np.hypot(slow, day)
-    share = np.divide(slow**2, scale**2, out=np.zeros_like(scale), where=scale > 0.0)
-    return scale, Fading(share, rho, n_missions)
+    scale = hypot(slow, day)
+    return scale, Fading(share_of(slow, scale), rho, n_missions)
