@@ -3,15 +3,23 @@
 import jax
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from missions import walking_missions
+from numpyro import handlers
+from numpyro.infer.util import log_density
 from references import dense_log_likelihood
 
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of_missions
+from trustbo.inference.samplers.run import _by_evidence
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
+from trustbo.models.backend import own_settings
+from trustbo.models.effects.effect import Slots
+from trustbo.models.place import bounds_of, visited
 from trustbo.models.record import model_from_record, model_to_record
+from trustbo.models.ticks import weigh_ticks
 from trustbo.stacking import stack_missions
 
 FEATURES = ("line_of_sight", "slope")
@@ -68,6 +76,39 @@ def test_nuts_draws_from_the_posterior_of_the_exact_sampler(missions):
     assert nuts["sample_stats"]["n_steps"].shape == (2, 600)
     assert not nuts["sample_stats"]["diverging"].any()
     require_same_moments(nuts, exact, 0.2, 1.2)
+
+
+def test_the_numpyro_model_has_the_same_evidence(missions):
+    """Given hyperparameters, coefficients are Gaussian: Laplace's formula is exact for them."""
+    missions = missions[:3]
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
+    batch = stack_missions(missions)
+    fitted = model.for_features(FEATURES).at_resolution(weigh_ticks(batch, np.ones(8)))
+    places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), PlaceEffect(), 3)
+    evidence = _by_evidence(fitted, Slots.of(batch, 3, FEATURES, None, places)).evidence
+    theta = {"beta0": 0.3, "delta_w": 0.05, "delta_v": 0.07, "tau_s": 0.1, "tau_e": 0.05}
+    theta |= {"length_scale": 1.5, "tau_slow": 0.1, "tau_day": 0.04}
+    with own_settings():
+        program = model.numpyro_model(missions)
+        values = {name: jax.numpy.asarray(v) for name, v in theta.items()}
+        fixed = handlers.substitute(program, values)
+        sites = handlers.trace(handlers.seed(fixed, 0)).get_trace()
+        prior = sum(float(sites[name]["fn"].log_prob(v)) for name, v in theta.items())
+        free = {n: s["value"] for n, s in sites.items() if n.startswith(("white", "b"))}
+        flat, unravel = ravel_pytree({n: v for n, v in free.items() if n not in theta})
+
+        def log_joint(x):
+            return log_density(program, (), {}, values | unravel(x))[0]
+
+        both = jax.jit(jax.value_and_grad(log_joint))
+        value, slope = both(0.0 * flat)
+        hessian = np.array([both(step)[1] - slope for step in np.eye(len(flat))])
+    slope = np.asarray(slope)
+    highest = float(value) + 0.5 * slope @ np.linalg.solve(-hessian, slope)
+    volume = 0.5 * len(flat) * np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(-hessian)[1]
+    point = {name: np.array([v]) for name, v in theta.items()} | {"rest": np.array([0.7])}
+    expected = evidence.log_density(point)[0]
+    np.testing.assert_allclose(highest + volume - prior, expected, rtol=1e-8)
 
 
 @pytest.mark.slow  # 8 000 draws of NUTS

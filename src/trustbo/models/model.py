@@ -1,8 +1,9 @@
 """The base of all trust models: numpyro model, likelihood, simulation, sufficient statistics."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import jax
@@ -16,14 +17,17 @@ from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
+from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.place import Place
+from trustbo.models.effects.sampled import sampled_drift
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
 from trustbo.models.params import Params, assemble_params, check_params
-from trustbo.models.place import PlaceEffect, bounds_of
+from trustbo.models.place import PlaceEffect, bounds_of, visited
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import draw
 from trustbo.models.state_space.contact_rate import ContactRate, mission_log_likelihood
 from trustbo.models.state_space.generate import TrustSample, draw_missions
-from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution
+from trustbo.models.ticks import broadcast_ticks, require_ticks, resolution, weigh_ticks
 from trustbo.stacking import MissionBatch, stack_missions
 
 if TYPE_CHECKING:
@@ -265,8 +269,50 @@ class TrustModel(Displayed, ABC):
             contact_rate: Shape (mission, bound, robot), NaN where not measured; None draws it.
             n_ticks: Ticks, of that shape; the beta-binomial family needs them.
         """
+        self._program(awareness, contact_rate, n_ticks)
+
+    def numpyro_model(self, missions: Sequence[Mission]) -> Callable[[], None]:
+        """The numpyro model of missions, as a function without arguments.
+
+        With the effects of places and of robots, and the priors that `fit` takes for these
+        missions: for a kernel of numpyro, SVI, or `numpyro.render_model`. Effects are sampled as
+        white coefficients, and not integrated out as in `fit`, which is much faster. Call
+        it, and the kernel, within `jax.enable_x64(True)`: effects need double precision.
+
+        Raises:
+            ShapeError: There are no missions, or they disagree on robots or features.
+            TrustboError: An awareness value is NaN, no rate was measured, or effects are of robots
+                with separate parameters or of changes of trust.
+        """
+        batch = stack_missions(missions)
+        ticks = weigh_ticks(batch, np.ones(len(batch.contact_rate)))
+        if not ticks:
+            raise TrustboError("every contact rate is NaN: nothing was measured.")
+        model = self.for_rates(batch)[0].for_features(missions[0].features).at_resolution(ticks)
+        require_ticks(model.family, batch)
+        drift, shape = None, batch.contact_rate.shape
+        if model.place is not None or model.effects:
+            effects, places = [*model.effects], None
+            if model.place is not None:
+                effects.insert(0, Place(**model.place.to_record()))
+                places = visited(bounds_of(missions, shape[:2]), model.place, shape[2])
+            slots = Slots.of(batch, len(missions), missions[0].features, places=places)
+            drift = sampled_drift(effects, slots, shape)
+        return partial(model._program, *batch, drift=drift)
+
+    def _program(
+        self,
+        awareness: Array,
+        contact_rate: Array | None,
+        n_ticks: Array | None,
+        *,
+        drift: Callable[[Array], Array] | None = None,
+    ) -> None:
+        """Sample statements; `drift`, of beta0, adds the effects."""
         n_missions, n_bounds, n_robots, n_features = awareness.shape
         params, innovations = self.sample_params(n_robots, n_features), None
+        if drift is not None:
+            params: Any = params._replace(b=params.b + drift(params.beta0))  # pyright: ignore
         if not self.family.integrates_out:
             innovations = sample_innovations((n_bounds, n_missions, n_robots))
         self.sample_rates(params, awareness, contact_rate, n_ticks, innovations)

@@ -83,15 +83,20 @@ class PlaceEffect:
         }
         return {name: drawn[name] for name in self.names}
 
+    def hyperpriors(self) -> dict[str, dist.Distribution]:
+        """Priors of the hyperparameters, by name."""
+        priors = {
+            "tau_s": dist.HalfNormal(self.tau_s),
+            "length_scale": dist.LogNormal(np.log(self.length_scale), self.length_scale_sd),
+            "tau_e": dist.HalfNormal(self.tau_e),
+        }
+        return {name: priors[name] for name in self.names}
+
     def log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Log prior density of the hyperparameters of draws, by name."""
         with own_settings():
-            priors = {
-                "tau_s": dist.HalfNormal(self.tau_s),
-                "length_scale": dist.LogNormal(np.log(self.length_scale), self.length_scale_sd),
-                "tau_e": dist.HalfNormal(self.tau_e),
-            }
-        return {name: log_prob(priors[name], sites[name]) for name in self.names}
+            priors = self.hyperpriors()
+        return {name: log_prob(prior, sites[name]) for name, prior in priors.items()}
 
     def in_short(self) -> str:
         """Places that have effects, and whether robots share them."""

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
+from numpyro.distributions import Distribution
 from scipy import sparse
 
 from trustbo.data import is_line_of_sight
@@ -125,6 +126,10 @@ class Effect(Protocol):
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
         """Hyperparameters by name of normal scores (point, hyperparameter), maybe of JAX."""
+        ...
+
+    def hyperpriors(self) -> dict[str, Distribution]:
+        """Priors of the hyperparameters, by name."""
         ...
 
     def group(self, slots: Slots) -> Group:

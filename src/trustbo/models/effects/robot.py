@@ -56,10 +56,14 @@ class RobotEffect:
         """Draws of the hyperparameters from their prior, each (draw,), by name."""
         return self.scales(rng.standard_normal((n, 2)))
 
+    def hyperpriors(self) -> dict[str, dist.Distribution]:
+        """Priors of the hyperparameters, by name."""
+        return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
+
     def log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Log prior density of the hyperparameters of draws, by name."""
         with own_settings():
-            priors = {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
+            priors = self.hyperpriors()
         return {name: log_prob(prior, sites[name]) for name, prior in priors.items()}
 
     def group(self, slots: Slots) -> "RobotColumns":

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpyro.distributions import Distribution
 
 from trustbo.models.effects.effect import Columns, Prior, Slots, Theta, dense_columns
 from trustbo.models.priors import Priors
@@ -18,6 +19,10 @@ class Weights:
     names = ()
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
+        """No hyperparameters."""
+        return {}
+
+    def hyperpriors(self) -> dict[str, Distribution]:
         """No hyperparameters."""
         return {}
 
