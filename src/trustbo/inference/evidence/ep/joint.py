@@ -33,8 +33,6 @@ from trustbo.models.families.terms import (
     table_at,
 )
 
-_BY_LOOPS = 24  # coefficients from which on LAPACK is faster than loops
-
 
 class Chains(NamedTuple):
     """Sequences of rates, one for each mission and robot with a rate; the kernels' arguments."""
@@ -106,18 +104,18 @@ def copy(source, target):
 @njit(**PART_OPTIONS)
 def cholesky(A, L):
     """Lower factor of A's lower triangle; whether it is positive definite."""
-    for j in range(len(A)):
-        d = A[j, j]
-        for k in range(j):
-            d -= L[j, k] * L[j, k]
-        if not d > 0.0:
-            return False
-        L[j, j] = np.sqrt(d)
-        for i in range(j + 1, len(A)):
+    for i in range(len(A)):
+        for j in range(i):
             z = A[i, j]
             for k in range(j):
                 z -= L[i, k] * L[j, k]
             L[i, j] = z / L[j, j]
+        d = A[i, i]
+        for k in range(i):
+            d -= L[i, k] * L[i, k]
+        if not d > 0.0:
+            return False
+        L[i, i] = np.sqrt(d)
     return True
 
 
@@ -131,45 +129,42 @@ def backward(L, b):
 
 
 @njit(**PART_OPTIONS)
-def _solve(Q, h, L, mean, covariance):
-    """Factor of Q, mean Q^-1 h and covariance Q^-1; returns h'Q^-1 h - log |Q|, or NaN."""
-    D, total = len(h), 0.0
-    if D > _BY_LOOPS:
-        try:
-            factor = np.linalg.cholesky(Q)
-        except Exception:  # not positive definite: numba supports no narrower class
-            return np.nan
-        copy(factor, L)
-    elif not cholesky(Q, L):
+def _solve(Q, h, L, mean):
+    """Factor of Q and mean Q^-1 h; returns h'Q^-1 h - log |Q|, or NaN."""
+    total = 0.0
+    if not cholesky(Q, L):
         return np.nan
-    for i in range(D):
+    for i in range(len(h)):
         z = h[i]
         for k in range(i):
             z -= L[i, k] * mean[k]
         mean[i] = z / L[i, i]
         total += mean[i] * mean[i] - 2.0 * np.log(L[i, i])
     backward(L, mean)
-    if D > _BY_LOOPS:
-        for i in range(D):
-            for j in range(i):
-                Q[j, i] = Q[i, j]
-        copy(np.linalg.inv(Q), covariance)
-        return total
-    inverse = np.zeros((D, D))  # L^-1
-    for j in range(D):
-        inverse[j, j] = 1.0 / L[j, j]
-        for i in range(j + 1, D):
-            z = 0.0
-            for k in range(j, i):
-                z -= L[i, k] * inverse[k, j]
-            inverse[i, j] = z / L[i, i]
-    for i in range(D):
-        for j in range(i + 1):
-            z = 0.0
-            for k in range(i, D):
-                z += inverse[k, i] * inverse[k, j]
-            covariance[i, j] = covariance[j, i] = z
     return total
+
+
+@njit(**PART_OPTIONS)
+def _invert(L, inverse, covariance):
+    """L^-1 and (LL')^-1, by rows: the inner loops run along the memory, and beat LAPACK's."""
+    D = len(L)
+    for i in range(D):
+        scale = 1.0 / L[i, i]
+        for j in range(i + 1):
+            inverse[i, j] = covariance[i, j] = 0.0
+        for k in range(i):
+            z = L[i, k] * scale
+            for j in range(k + 1):
+                inverse[i, j] -= z * inverse[k, j]
+        inverse[i, i] = scale
+    for k in range(D):
+        for i in range(k + 1):
+            z = inverse[k, i]
+            for j in range(i + 1):
+                covariance[i, j] += z * inverse[k, j]
+    for i in range(D):
+        for j in range(i):
+            covariance[j, i] = covariance[i, j]
 
 
 @njit(**PART_OPTIONS)
@@ -237,8 +232,9 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
     factor of its precision at the last. Without `evaluate` only these are computed.
     """
     (n_chains, K), D, last = chains.y.shape, len(g), chains.gamma_index.shape[1]
-    predicted, filtered = np.empty((2, n_chains, K, last + 1))
-    var, cov = np.empty((n_chains, K, 2)), np.empty((D, D))
+    # One by one: numba takes arrays unpacked from a larger one for strided, and loops run slower.
+    predicted, filtered = np.empty((n_chains, K, last + 1)), np.empty((n_chains, K, last + 1))
+    var, inverse, cov = np.empty((n_chains, K, 2)), np.empty((D, D)), np.empty((D, D))
     Q, h, own_Q, own_h = np.empty((D, D)), np.empty(D), np.empty((last, last)), np.empty(last)
     gamma, Sigma, s = np.empty(last), np.empty((last, last)), np.empty(last + 1)
     easy = not (chains.kind >= AT_ONE).any()
@@ -265,12 +261,12 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
                     # A bound made twice: both columns have one index in gamma.
                     twice = 2.0 if i == j and a != b else 1.0
                     Q[max(i, j), min(i, j)] += twice * own_Q[a, b]
-        quadratic = _solve(Q, h, L, mean, cov)
-        total += 0.5 * quadratic
+        total += 0.5 * _solve(Q, h, L, mean)
         if not np.isfinite(total):
             return -np.inf
         if sweep + 1 == n_sweeps and not evaluate:
             return np.nan
+        _invert(L, inverse, cov)
         for c in range(n_chains):
             total += _match_chain(
                 b0[chains.robot[c]], c, chains, delta_v, table, predicted[c], filtered[c],
