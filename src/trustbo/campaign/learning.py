@@ -62,7 +62,7 @@ class Learner:
         seed: int,
     ) -> None:
         """Begin with the prior, drawn by a seed; see `Campaign` for what is refused."""
-        model = default_model(options.update, sampler) if model is None else model
+        model = default_model(options.update) if model is None else model
         _require_learnable(model, sampler, options)
         self.workspace, self.options, self.model, self.sampler = workspace, options, model, sampler
         self._prior = _prior_belief(model, options.initial, workspace, seed)
@@ -227,15 +227,9 @@ class Learner:
         return [*attempts, (other, shared)]
 
 
-def default_model(update: str, sampler: str) -> TrustModel:
-    """Effects of places and of robots, as far as the update and the sampler take them.
-
-    Moments that are matched are those of the paper's parameters.
-    """
-    if update != "refit":
-        return PooledTrust()
-    robots = [] if sampler in ("nuts", "joint") else [RobotEffect()]
-    return PooledTrust(effects=[PlaceEffect(), *robots])
+def default_model(update: str) -> TrustModel:
+    """Effects of places and of robots; moments that are matched are of parameters alone."""
+    return PooledTrust(effects=[PlaceEffect(), RobotEffect()] if update == "refit" else ())
 
 
 def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions) -> None:

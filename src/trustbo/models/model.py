@@ -292,6 +292,11 @@ class TrustModel(Displayed, ABC):
         require_ticks(model.family, batch)
         drift, shape = None, batch.contact_rate.shape
         if model.place is not None or model.effects:
+            if model.robot_sets != "all" or model.lag:
+                raise TrustboError(
+                    "numpyro_model has effects of robots that share all parameters, and of rates "
+                    f"that measure trust; got {model.describe()}."
+                )
             effects, places = [*model.effects], None
             if model.place is not None:
                 effects.insert(0, Place(**model.place.to_record()))
