@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 from jax import Array
 from jax.experimental.sparse import BCOO
 
-from trustbo.models.effects.effect import Effect, Slots
+from trustbo.models.effects.effect import Effect, Slots, dense_root
 
 
 def sampled_drift(
@@ -38,7 +38,7 @@ def sampled_drift(
             white = dist.Normal(0.0, 1.0).expand((U.shape[1],)).to_event(1)
             c: Any = numpyro.sample(f"white_{'_'.join(priors)}", white)
             for joined, root in zip(group.joined, prior.roots, strict=True):
-                c = c.at[joined].set(root[0] @ c[joined])
+                c = c.at[joined].set(dense_root(root)[0] @ c[joined])
             u = U @ (prior.mean[0] + prior.sd[0] * c)
             total = total.at[slot].add(u.reshape(slots.y.shape))
         return total
