@@ -33,7 +33,7 @@ from trustbo.inference.samplers.weights import smoothed_weights, systematic
 from trustbo.parallel import one_blas_thread
 
 _MAX_ROUNDS, _MAX_FINAL = 4, 3
-_MAX_LAST = 8  # rounds of the last proposal where weights would be refused after fewer
+_MAX_LAST = 20  # rounds of the last proposal where weights would be refused after fewer
 _FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
 _RIDGE = 1e-3
 _MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
