@@ -142,7 +142,7 @@ class Campaign(Displayed):
             "seed": self.state.seed,
         } | self.options.to_record()
         self.settings = record | {
-            "model": type(model).__name__ + " with places" * (model.place is not None),
+            "model": model.named_with_effects,
             "observation": model.observation,
             "response": model.response,
             "max_bounds": self.planner.max_bounds,

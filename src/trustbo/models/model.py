@@ -462,8 +462,17 @@ class TrustModel(Displayed, ABC):
             for name, value in self.options().items()
             if name not in ("observation", "parameters") and value != usual.get(name)
         ]
-        effects = ["places"] * (self.place is not None) + ["robots"] * len(self.effects)
-        return ", ".join([type(self).__name__, *effects, self.observation, *others])
+        return ", ".join([type(self).__name__, *self._effects, self.observation, *others])
+
+    @property
+    def named_with_effects(self) -> str:
+        """Name of the class, and what has effects."""
+        effects = " and ".join(self._effects)
+        return type(self).__name__ + (f" with {effects}" if effects else "")
+
+    @property
+    def _effects(self) -> list[str]:
+        return ["places"] * (self.place is not None) + ["robots"] * len(self.effects)
 
     def describe(self) -> str:
         """Text of the model's name and options."""
