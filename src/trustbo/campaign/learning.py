@@ -229,7 +229,9 @@ class Learner:
 
 def default_model(update: str) -> TrustModel:
     """Effects of places and of robots; moments that are matched are of parameters alone."""
-    return PooledTrust(effects=[PlaceEffect(), RobotEffect()] if update == "refit" else ())
+    if update != "refit":
+        return PooledTrust()
+    return PooledTrust(place=PlaceEffect(), effects=(RobotEffect(),))
 
 
 def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions) -> None:
