@@ -6,15 +6,31 @@ a large one, which inflates the noises and hides: once a change is more probable
 drawn again with the column of the most probable one, and every weight is relative to it.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple, Protocol
+import json
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 from scipy.special import logsumexp
 
+from trustbo.data import Mission
+from trustbo.errors import TrustboError, require_whole
+from trustbo.inference.evidence.gaussian import Gaussian
+from trustbo.inference.posterior_tree import missions_of, require_posterior
+from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
-from trustbo.models.effects.effect import Columns, Theta
+from trustbo.models.effects.effect import Columns, Effect, Slots, Theta
+from trustbo.models.effects.place import Place
+from trustbo.models.model import TrustModel
+from trustbo.models.place import PlaceEffect, bounds_of, visited
+from trustbo.models.pooled import PooledTrust
+from trustbo.models.record import model_from_record
+from trustbo.models.ticks import weigh_ticks
+from trustbo.stacking import stack_missions
+from trustbo.workspace import Workspace
 
 ALARM = 0.9  # probability of a change
 N_DRAWS = 24  # of theta in a scan
@@ -79,6 +95,98 @@ class Weighed(NamedTuple):
             rows.append((change.kind, change.where, change.from_mission, earliest, *numbers, ties))
         names = ("kind", "where", "from_mission", "earliest", "effect", "sd", "probability", "ties")
         return pd.DataFrame(rows, columns=list(names))
+
+
+def changes(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    workspace: Workspace | None = None,
+    *,
+    model: TrustModel | None = None,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Weigh changes of the world from some mission on, of all robots, one robot, or an area.
+
+    Every start and place that the paths separate is weighed, with two missions on each side; areas
+    are the cells within a radius of 0, 1 or 2 cells. A change of all robots, or of one, is d times
+    their line of sight, and of an area d at each bound into it. Effects of robots in the model
+    stand for bad days and slow drifts, against which a change has to stand out.
+
+    Args:
+        posterior: Posterior of `PooledTrust` for Gaussian rates that measure trust, with any
+            effects.
+        missions: Missions that it was fitted to, in order; by default those it holds.
+        workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`; its
+            grid is that of the areas.
+        model: Model of the posterior; needed with custom priors.
+        seed: Seed of the draws of the hyperparameters.
+
+    Returns:
+        Table of the changes in the order of their probability, down to one in a thousand, with
+        "none" as its first row: kind; where, the index of the robot or (row, col, radius);
+        from_mission, the index of the first mission after the change; earliest, that of the
+        earliest start that gives the same rates; effect and sd, the mean and sd of d in units of
+        stationary trust; probability; and ties, changes that these paths do not separate from it.
+
+    Raises:
+        TrustboError: A posterior of another model, without its missions, or with custom priors and
+            no model.
+    """
+    return scan_posterior(posterior, missions, workspace, model=model, seed=seed).table()
+
+
+def scan_posterior(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    workspace: Workspace | None = None,
+    *,
+    model: TrustModel | None = None,
+    seed: int = 0,
+) -> "Weighed":
+    """Weigh the changes of `changes`."""
+    seed = require_whole("seed", seed, 0)
+    attrs = require_posterior("changes", posterior).attrs
+    if missions is None and "constant_data" not in posterior.children:
+        raise TrustboError(
+            "this posterior holds parameters alone: give the missions it was fitted to, such as "
+            "changes(result.posteriors[-1], result.missions)."
+        )
+    missions = missions_of(posterior) if missions is None else list(missions)
+    missions = missions if workspace is None else [workspace.fill(m) for m in missions]
+    features = missions[0].features
+    if model is None:
+        model = model_from_record(json.loads(attrs["model_record"]), features=features)
+    model = model.observing(attrs["observation"])
+    if not isinstance(model, PooledTrust) or not model.family.integrates_out or model.lag:
+        raise TrustboError(
+            "changes are weighed under PooledTrust for Gaussian rates of trust; got "
+            f'{model.describe()}. Fit the missions with PooledTrust(observation="gaussian").'
+        )
+    batch = stack_missions(missions)
+    weight = np.ones(len(batch.contact_rate))
+    weight[: len(missions)] = np.atleast_1d(attrs.get("weights", 1.0))
+    model = model.for_features(features).at_resolution(weigh_ticks(batch, weight))
+    place = PlaceEffect() if model.place is None else model.place
+    shape = None if workspace is None else workspace.passable.shape
+    bounds = bounds_of(missions, batch.contact_rate.shape[:2])
+    places = visited(bounds, place, batch.contact_rate.shape[2], shape)  # pyright: ignore
+    slots = Slots.of(batch, len(missions), features, weight, places)
+    of_places = [] if model.place is None else [Place(**model.place.to_record())]
+    effects: list[Effect] = [*of_places, *model.effects]
+
+    def target_of(further: list[Change]) -> Posterior:
+        return posterior_of(model.priors, model.family, [*effects, *further], slots)
+
+    target = target_of([])
+
+    def draw_theta(change: Change | None) -> Theta:
+        given = target if change is None else target_of([change])
+        params = sample_scores(given, N_DRAWS, seed).draws.params
+        names = "beta0", "delta_w", "delta_v", *(name for e in effects for name in e.names)
+        return {name: params[name] for name in names} | {"rest": 1.0 - params["beta0"]}
+
+    evidence = cast(Gaussian, target.evidence)  # that of rates that integrate out
+    return find_changes(evidence, Candidates.of(slots), draw_theta)
 
 
 def weigh(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpyro.distributions import Distribution
 from scipy import sparse
 
 from trustbo.models.effects.effect import Columns, Prior, Slots, Theta
@@ -41,6 +42,10 @@ class Change:
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
         """No hyperparameters."""
+        return {}
+
+    def hyperpriors(self) -> dict[str, Distribution]:
+        """No priors of hyperparameters."""
         return {}
 
     def group(self, slots: Slots) -> "ChangeColumn":
