@@ -2,9 +2,11 @@
 
 import numpy as np
 
+from trustbo.campaign.alarms import sentences_of
 from trustbo.campaign.result import Result
 from trustbo.data import path_text
 from trustbo.display.card import arrival, joined
+from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
@@ -24,10 +26,11 @@ _MEANS = {
 
 
 def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
-    """Return the facts of the summary: campaign, recommendation, value, diagnostics.
+    """Return the facts of the summary: campaign, recommendation, value, diagnostics, changes.
 
-    The `plan` is that of the result; a running campaign passes it.
+    The `plan` is that of the result; a running campaign passes it, and has no time for changes.
     """
+    changes = [_changes(result)] if plan is None else []
     plan = result.plan if plan is None else plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
@@ -35,6 +38,7 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
         _soundness(result),
+        *changes,
         Fact("Why it ended", _end(result)),
     ]
 
@@ -124,6 +128,17 @@ def _soundness(result: Result) -> Fact:
         return Fact("Posteriors", "Nothing could be learned yet.")
     verdict = "They are well sampled" if good else "Do not rely on them"
     return Fact("Posteriors", f"{verdict}: {'; '.join(sentences)}.", good)
+
+
+def _changes(result: Result) -> Fact:
+    """State which changes of the world are probable, or why they were not weighed."""
+    try:
+        alarms = result.alarms
+    except TrustboError as error:
+        return Fact("Changes", f"Not weighed: {error}")
+    if alarms.empty:
+        return Fact("Changes", "No change of a robot or an area is more probable than none.")
+    return Fact("Changes", " ".join(sentences_of(alarms)), good=False)
 
 
 def _end(result: Result) -> str:
