@@ -16,10 +16,9 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import complete, fit, params_of
 from trustbo.inference.evidence import place_marginal
-from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.place_maps import PlaceScales, draw_maps, nowhere, place_group, place_maps_of
+from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.samplers.run import nuts_data
 from trustbo.inference.samplers.student import Student, log_mixture
@@ -111,22 +110,23 @@ class Dense:
         return prior_mean + gain @ self.off, prior_cov - gain @ cross.T
 
 
-def target_of(missions, place, priors=None, shape=SHAPE):
-    priors = priors or Priors()
-    batch = tb.stacking.stack_missions(missions, pad=False)
-    places = visited(bounds_of(missions), place, 3, shape)
-    weight = np.ones(len(missions))
-    rows = gather_rows(batch.awareness, batch.contact_rate, places, weight, priors.x0_mean)
-    return PlaceTarget(rows, places, priors, place)
+NAMES = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
+ABSENT = {"tau_s": 0.0, "length_scale": 1.0, "tau_e": 0.0}
 
 
-def by_sites(missions, place, priors=None):
-    """Posterior of censored rates by expectation propagation."""
+def target_of(missions, place, priors=None, family="gaussian", weight=None):
+    """Posterior of the scores, by the evidence of a family."""
     batch = tb.stacking.stack_missions(missions)
     places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), place, 3, SHAPE)
-    slots = Slots.of(batch, len(missions), places=places)
+    slots = Slots.of(batch, len(missions), (), weight, places)
     effects = [Place(**place.to_record())]
-    return posterior_of(priors or Priors(), FAMILIES["censored"], effects, slots)
+    return posterior_of(priors or Priors(), FAMILIES[family], effects, slots)
+
+
+def thetas(target, z):
+    """Hyperparameters (point, 6) of scores."""
+    theta = ABSENT | target.scores.theta(z)
+    return np.stack([np.broadcast_to(theta[name], len(z)) for name in NAMES], axis=1)
 
 
 @pytest.mark.parametrize("stationary", [False, True])
@@ -138,25 +138,20 @@ def test_the_marginal_likelihood_is_that_of_a_dense_joint_normal(place, stationa
         target = target_of(missions, place, priors)
         rng = np.random.default_rng(seed)
         z = 0.7 * rng.standard_normal((4, target.n_scores))
-        theta, log_prior = target.constrain(z)
-        expected = [Dense(missions, place, t, priors).log_likelihood() for t in theta]
-        # e has variance (1e-4 tau)^2 where bounds have none, as a jitter.
-        rtol = 1e-9 if place.bounds else 1e-5
-        np.testing.assert_allclose(target.log_density(z) - log_prior, expected, rtol=rtol)
+        dense = [Dense(missions, place, theta, priors) for theta in thetas(target, z)]
+        expected = scores.log_prior(z) + [each.log_likelihood() for each in dense]
+        np.testing.assert_allclose(target.log_density(z), expected, rtol=1e-9)
         # No rate is at a limit: expectation propagation is exact.
-        latent = by_sites(missions, place, priors)
-        np.testing.assert_allclose(latent.log_density(z) - log_prior, expected, rtol=10 * rtol)
+        latent = target_of(missions, place, priors, "censored")
+        np.testing.assert_allclose(latent.log_density(z), expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("family", ["gaussian", "censored"])
 @pytest.mark.parametrize("score", [-3000.0, -1450.0, 1450.0, 3000.0])
 def test_a_length_scale_that_underflows_is_one_of_independent_cells(score, family):
     """Newton's search for the mode looks so far out, where exp is 0, denormal or infinite."""
-    missions, place = random_missions(0), PlaceEffect()
-    target = target_of(missions, place)
-    if family == "censored":
-        target = by_sites(missions, place)
-    z = np.zeros((2, target.n_scores if family == "gaussian" else 6))
+    target = target_of(random_missions(0), PlaceEffect(), family=family)
+    z = np.zeros((2, target.n_scores))
     z[:, 4] = score, 40.0 * np.sign(score)  # a length scale of 1e-9 cells, or of 1e9
     far, near = target.log_density(z) + 0.5 * z[:, 4] ** 2
     assert far == pytest.approx(near, abs=1e-6)
@@ -164,46 +159,48 @@ def test_a_length_scale_that_underflows_is_one_of_independent_cells(score, famil
 
 def test_a_mission_of_weight_one_half_counts_by_the_root_of_its_density():
     """With no effect in common, densities of missions multiply."""
-    place, priors = PlaceEffect(), Priors()
+    zero = dist.Normal(0.0, 1e-9)
+    priors = Priors(beta=zero, b=zero)
     one, other = (random_missions(seed, 1) for seed in (3, 4))
-    theta = np.array([[0.4, 0.1, 0.2, 1e-6, 2.0, 1e-6]])
+    values = dict(zip((*NAMES, "rest"), (0.4, 0.1, 0.2, 0.0, 2.0, 0.0, 0.6), strict=True))
+    theta = {name: np.array([value]) for name, value in values.items()}
     found = []
     for missions, weight in ((one, [1.0]), (other, [1.0]), (one + other, [1.0, 0.5])):
-        batch = tb.stacking.stack_missions(missions, pad=False)
-        places = visited(bounds_of(missions), place, 3, SHAPE)
-        rows = gather_rows(batch.awareness, batch.contact_rate, places, np.array(weight), 0.5)
-        fixed = priors.__class__(beta=priors.beta, b=priors.b)
-        target = PlaceTarget(rows, places, fixed, place)
-        target.precision = target.precision * 1e12  # coefficients known to be 0
-        found.append(target._integrate(theta.copy(), keep=False).log_p)
+        target = target_of(missions, PlaceEffect(), priors, weight=np.array(weight))
+        found.append(target.evidence.log_density(theta))
     np.testing.assert_allclose(found[2], found[0] + 0.5 * found[1], atol=1e-6)
 
 
-@pytest.mark.parametrize("place", [PLACES[0], PLACES[2]], ids=str)
+@pytest.mark.parametrize("place", PLACES[:3], ids=str)
 def test_effects_given_hyperparameters_are_those_of_dense_conditioning(place):
-    missions = random_missions(1)
+    """Moments of draws, those of cells and of bounds apart."""
+    missions, n = random_missions(1), 20_000
     target = target_of(missions, place)
     z = np.array([[0.2, -0.5, 0.3, 0.4, 0.1, 0.2][: target.n_scores]])
-    law = target.conditional(z)
-    dense = Dense(missions, place, law.theta[0], target.priors)
-    c_mean, _ = dense.posterior(dense.c_cov @ dense.U.T, dense.c_cov, dense.c_mean)
-    found = np.linalg.solve(law.factor[0].T, law.half[0])
-    np.testing.assert_allclose(found, c_mean, rtol=1e-8, atol=1e-9)
-    K = dense.K_s + dense.K_e
-    mean, cov = dense.posterior(K, K, 0.0)
-    right = law.of_units[0, -1] - found @ law.of_units[0, :-1]
-    g = np.linalg.solve(law.L[0].T * np.triu(np.ones_like(law.L[0])), right)
-    units = [tuple(u) for u in target.places.units.tolist()]
+    dense = Dense(missions, place, thetas(target, z)[0], Priors())
+    drawn, _ = target.draw(z, np.zeros(1), np.zeros(n, dtype=int), np.random.default_rng(0))
+    there = visited(bounds_of(missions), place, 3, SHAPE)
     moves = {tuple(m): i for i, m in enumerate(tb.workspace.moves.MOVES[8])}
-    index = [
-        units.index((0, moves[tuple(np.subtract(c, a).tolist())], *c)) for _, a, c in dense.rows
-    ]
-    np.testing.assert_allclose(g[index], mean, atol=1e-8)
-    L = np.tril(law.L[0])
-    inverse = np.linalg.inv(L @ L.T)
-    of_c = np.linalg.solve(L.T, law.of_units[0, :-1].T)
-    whole = inverse + of_c @ np.linalg.inv(law.factor[0] @ law.factor[0].T) @ of_c.T
-    np.testing.assert_allclose(whole[np.ix_(index, index)], cov, atol=1e-9)
+    units, cells = there.units[:, 1:].tolist(), there.cells[:, 1:].tolist()
+    expected = {"c": (dense.c_cov @ dense.U.T, dense.c_cov, dense.c_mean)}
+    found = {"c": np.column_stack([drawn["beta"], drawn["b"]])}
+    if place.cells:
+        index = [cells.index(list(c)) for *_, c in dense.rows]
+        found["s"], expected["s"] = drawn["place"][:, index], (dense.K_s, dense.K_s, 0.0)
+    if place.bounds:
+        index = [
+            units.index([moves[tuple(np.subtract(c, a).tolist())], *c]) for _, a, c in dense.rows
+        ]
+        found["e"], expected["e"] = drawn["place_bound"][:, index], (dense.K_e, dense.K_e, 0.0)
+    for name, draws in found.items():
+        mean, cov = dense.posterior(*expected[name])
+        sd = np.sqrt(np.diag(cov))
+        # 5.5 standard errors, of some 70 means and 5000 products.
+        assert (np.abs(draws.mean(0) - mean) < 5.5 * sd / np.sqrt(n)).all(), name
+        correlation = cov / np.outer(sd, sd)
+        error = np.sqrt((1.0 + correlation**2) / n)
+        white = (draws - mean) / sd
+        assert (np.abs(white.T @ white / n - correlation) < 5.5 * error).all(), name
 
 
 @pytest.mark.parametrize("place", PLACES, ids=str)
@@ -248,8 +245,7 @@ def test_nuts_integrates_weights_and_intercept_out_with_the_effects():
     data = nuts_data(PooledTrust(priors=priors, place=place), batch, weight, there)
     with own_settings():
         target = Target(PooledTrust(priors=priors, place=place), data, complete=False)
-        names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
-        values = {name: jax.numpy.asarray(v) for name, v in zip(names, theta, strict=True)}
+        values = {name: jax.numpy.asarray(v) for name, v in zip(NAMES, theta, strict=True)}
 
         @jax.jit  # one program compiles faster than each operation by itself
         def on_the_line(values):
@@ -264,9 +260,9 @@ def test_nuts_integrates_weights_and_intercept_out_with_the_effects():
         potential = jax.jit(target.potential)
         jump = float(potential(base) - potential(site))
     # Of two points the difference: the priors' densities on the real line, by SciPy.
-    again = Dense(missions, place, tuple(other[name] for name in names), priors)
+    again = Dense(missions, place, tuple(other[name] for name in NAMES), priors)
     expected = dense.log_likelihood() - again.log_likelihood()
-    for name in names:
+    for name in NAMES:
         expected += log_prior(priors, place, name, float(values[name]))
         expected -= log_prior(priors, place, name, other[name])
     assert jump == pytest.approx(expected, rel=1e-8)
@@ -532,12 +528,11 @@ def test_the_exact_sampler_agrees_with_a_quadrature():
     proposal = stats.multivariate_t(center, 1.5 * cov, df=5)
     weight = np.exp(target.log_density(z) - proposal.logpdf(z))
     assert weight.sum() ** 2 / (weight**2).sum() > 1500
-    theta, _ = target.constrain(z)
+    theta = thetas(target, z)
     mean = np.average(theta, axis=0, weights=weight)
     sd = np.sqrt(np.average((theta - mean) ** 2, axis=0, weights=weight))
     drawn = [sample_scores(target, 4000, seed).draws.params for seed in range(3)]
-    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
-    for k, name in enumerate(names):
+    for k, name in enumerate(NAMES):
         values = np.concatenate([np.ravel(draws[name]) for draws in drawn])
         # The quadrature's own error is .026 sd, that of 10 000 draws .01; skew tails double them.
         assert abs(values.mean() - mean[k]) < 0.06 * sd[k], name
@@ -553,7 +548,7 @@ def test_rates_within_the_limits_have_the_gaussian_effects_of_places():
         for m in missions
     ]
     exact = target_of(missions, place)
-    latent = by_sites(missions, place, exact.priors)
+    latent = target_of(missions, place, family="censored")
     theirs = sample_scores(exact, 2000, 0).draws
     ours = [sample_scores(latent, 1000, seed).draws for seed in range(3)]
     assert max(one.khat for one in ours) < 0.7

@@ -13,6 +13,7 @@ import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import params_of_missions
+from trustbo.inference.left_out import by_hyperparameters, by_refit
 from trustbo.inference.samplers.run import _by_evidence
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.models.backend import own_settings
@@ -326,3 +327,13 @@ def test_rates_at_their_limits_are_taken_for_censored_ones_with_robots(missions)
     model = PooledTrust(effects=[RobotEffect()], observation="auto")
     posterior = tb.fit(limits, model, draws=25, whole=False)
     assert posterior.attrs["observation"] == "censored"
+
+
+def test_missions_left_out_by_hyperparameters_have_the_effects_of_robots(posterior):
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()]).for_features(FEATURES)
+    left_out = by_hyperparameters(posterior, model)
+    for j in (0, 7):  # the others keep their distances in missions, by which effects fade
+        # Evidences of two samplers of some 300 points each: .1 nats.
+        assert left_out[j].log_density == pytest.approx(
+            by_refit(posterior, model, j).log_density, abs=0.4
+        )

@@ -18,9 +18,8 @@ from scipy.linalg import solve_triangular
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import rho_of
-from trustbo.inference.evidence.place_prior import correlation
 from trustbo.models.params import CoupledParams, Params, assemble_params
-from trustbo.models.place import PlaceEffect, Visited, bounds_of, visited
+from trustbo.models.place import PlaceEffect, Visited, bounds_of, correlation, visited
 from trustbo.stacking import MissionBatch, stack_missions
 
 MOST_RATES = 2000

@@ -15,12 +15,11 @@ import numpy as np
 import xarray as xr
 
 from trustbo.inference.draws import params_of, sites_of
-from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.fit import fit
-from trustbo.inference.place_maps import scales_of
 from trustbo.inference.posterior_tree import missions_of
-from trustbo.inference.samplers.place_target import PlaceTarget
+from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.samplers.weights import smoothed_weights
+from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
 from trustbo.models.place import bounds_of, visited
 from trustbo.models.pooled import PooledTrust
@@ -52,28 +51,29 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         model: Its model.
 
     Returns:
-        One for each mission; None where the model has no effects of places, or where only
-        approximations integrate these out (rates not Gaussian, a custom drift).
+        One for each mission; None where the model has no effects, or where only approximations
+        integrate these out (rates not Gaussian, a custom drift).
     """
     exact = isinstance(model, PooledTrust) and model.family.integrates_out
-    if model.place is None or not exact or model.why_not_exact is not None:
+    if not model.all_effects or not exact or model.why_not_exact is not None:
         return None
-    priors, place = model.priors, model.place
     missions, weight = missions_of(posterior), weights_of(posterior)
-    batch = stack_missions(missions, pad=False)
-    places = visited(bounds_of(missions), place, batch.contact_rate.shape[2])
-    sites = sites_of(posterior)
-    theta = np.column_stack([sites["beta0"], sites["delta_w"], sites["delta_v"], *scales_of(sites)])
-    theta, index = np.unique(theta, axis=0, return_inverse=True)
+    batch, places = stack_missions(missions, pad=False), None
+    if model.place is not None:
+        places = visited(bounds_of(missions), model.place, batch.contact_rate.shape[2])
+    sites, names = sites_of(posterior), ("beta0", "delta_w", "delta_v", *model.effect_dims)
+    points = np.column_stack([sites[name] for name in names])
+    points, index = np.unique(points, axis=0, return_inverse=True)
+    theta = dict(zip(names, points.T, strict=True)) | {"rest": 1.0 - points[:, 0]}
 
     def log_evidence(j: int | None = None, w: float = 1.0) -> np.ndarray:
         """Log evidence at theta, the weight of mission j being w."""
-        counted, rates = weight.copy(), batch.contact_rate.copy()
+        counted = weight.copy()
         if j is not None:
             counted[j] = w
-        rates[counted == 0.0] = np.nan
-        rows = gather_rows(batch.awareness, rates, places, counted, float(priors.x0_mean))
-        return PlaceTarget(rows, places, priors, place).log_evidence(theta)[index]
+        slots = Slots.of(batch, len(missions), missions[0].features, counted, places)
+        rates = posterior_of(model.priors, model.family, model.all_effects, slots)
+        return rates.evidence.log_density(theta)[index]
 
     whole, left_out = log_evidence(), []
     for j, w in enumerate(weight):

@@ -19,8 +19,7 @@ from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.errors import TrustboError, require_kind
-from trustbo.inference.evidence.place_prior import correlation
-from trustbo.models.place import N_MOVES, Visited, matern
+from trustbo.models.place import N_MOVES, Visited, correlation, matern
 from trustbo.parallel import one_blas_thread
 from trustbo.workspace.moves import MOVE_NAMES, existing_bounds
 

@@ -109,7 +109,13 @@ class TrustModel(Displayed, ABC):
     @property
     def effect_dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of the hyperparameters of all effects, those of places among them."""
-        return self.place_dims | {name: () for effect in self.effects for name in effect.names}
+        return {name: () for effect in self.all_effects for name in effect.names}
+
+    @property
+    def all_effects(self) -> list[Any]:
+        """Effects of places and of robots, as columns of the evidence."""
+        place = [] if self.place is None else [Place(**self.place.to_record())]
+        return [*place, *self.effects]
 
     @property
     def robot_sets(self) -> str | None:
@@ -297,12 +303,11 @@ class TrustModel(Displayed, ABC):
                     "numpyro_model has effects of robots that share all parameters, and of rates "
                     f"that measure trust; got {model.describe()}."
                 )
-            effects, places = [*model.effects], None
+            places = None
             if model.place is not None:
-                effects.insert(0, Place(**model.place.to_record()))
                 places = visited(bounds_of(missions, shape[:2]), model.place, shape[2])
             slots = Slots.of(batch, len(missions), missions[0].features, places=places)
-            drift = sampled_drift(effects, slots, shape)
+            drift = sampled_drift(model.all_effects, slots, shape)
         return partial(model._program, *batch, drift=drift)
 
     def _program(

@@ -198,3 +198,9 @@ def matern(distance: ArrayLike, length_scale: ArrayLike) -> np.ndarray:
     xp: Any = namespace(length_scale)
     h = np.sqrt(3.0) * np.asarray(distance) / xp.asarray(length_scale)
     return (1.0 + h) * xp.exp(-h)
+
+
+def correlation(cells: np.ndarray, others: np.ndarray, length_scale: float) -> np.ndarray:
+    """Correlation of s between cells (cell, 3) and others (other, 3): robot, row, col."""
+    gap = cells[:, None].astype(float) - others[None]
+    return matern(np.hypot(gap[..., 1], gap[..., 2]), length_scale) * (gap[..., 0] == 0)

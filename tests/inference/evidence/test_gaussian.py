@@ -15,10 +15,8 @@ from trustbo.errors import TrustboError
 from trustbo.inference.evidence.dense import Dense
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.gaussian_jax import GaussianJax, Sums
-from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers import exact
-from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.models import PlaceEffect, PooledTrust, Priors
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Prior, Slots
@@ -206,22 +204,6 @@ def test_the_pooled_evidence_is_that_of_the_exact_sampler():
                 for name in ("beta0", "delta_w", "delta_v"))  # fmt: skip
     found = Gaussian(slots, groups, (PRIORS.x0_mean, PRIORS.x0_sd)).log_density(theta)
     np.testing.assert_allclose(found, target.log_density(z) - jacobian - prior, rtol=1e-9)
-
-
-def test_the_evidence_of_places_is_that_of_their_target():
-    missions, place = walking_missions(8), Place()
-    slots, groups = gathered(missions, [place])
-    z = np.random.default_rng(2).standard_normal((30, 6))
-    rates = stack_missions(missions)
-    rows = gather_rows(rates.awareness, rates.contact_rate, slots.places,
-                       np.ones(len(rates.contact_rate)), float(PRIORS.x0_mean))  # fmt: skip
-    target = PlaceTarget(rows, slots.places, PRIORS, place)
-    values, log_prior = target.constrain(z)
-    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
-    theta = dict(zip(names, values.T, strict=True))
-    theta["rest"] = 1.0 - theta["beta0"]
-    found = Gaussian(slots, groups, (PRIORS.x0_mean, PRIORS.x0_sd)).log_density(theta)
-    np.testing.assert_allclose(found, target.log_density(z) - log_prior, rtol=1e-6)
 
 
 def test_an_unknown_memory_is_refused():

@@ -1,6 +1,6 @@
 """Likelihood of all missions together, effects of places integrated out, as compiled code for NUTS.
 
-Dense where `place_rows` filters, so that each is a check of the other: with x = (x_0, ..., x_K) of
+Dense where `gaussian` filters, so that each is a check of the other: with x = (x_0, ..., x_K) of
 one robot in one mission, rates are y = H x + v, H = (0 I) - lag (I 0), and the effects g of its
 bounds enter x by T, T_kj = beta0^(k - j). Whitened by the covariance of its rates, the T of all
 missions and robots add up to the precision W that the data lend to g, and then, with L_g L_g' the

@@ -84,7 +84,7 @@ def needs_evidence(model: TrustModel, sampler: str) -> bool:
     """Whether a sampler integrates effects out by the evidence of all of them."""
     if model.effects:
         return True
-    return sampler == "nuts" and model.place is not None and why_not_scores(model) is None
+    return sampler != "joint" and model.place is not None and why_not_scores(model) is None
 
 
 def slow_places(reason: str) -> str:

@@ -20,12 +20,11 @@ from trustbo.inference.evidence import place_marginal
 from trustbo.inference.evidence.place_marginal import PlaceHyper, PlaceIndex
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.laplace import laplace
-from trustbo.inference.samplers.place_draws import split_units
-from trustbo.inference.samplers.place_target import hyperparameters
 from trustbo.inference.samplers.student import Spanning, Student
 from trustbo.models.backend import own_settings
 from trustbo.models.drift import DriftTrust
 from trustbo.models.drift_form import Drift
+from trustbo.models.effects.place import Place, split_units
 from trustbo.models.params import DriftParams
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.models.state_space.scalar import ScalarSSM
@@ -118,13 +117,18 @@ class DriftTarget:
                 for i in rows.reshape(-1, _CHUNK)
             ]
         flat = np.concatenate(units)[: len(theta), : len(self._visited.units)]
-        return params | hyper | split_units(flat, hyper, self._visited, place, rng), None
+        return params | hyper | split_units(place, self._visited, flat, hyper, rng), None
 
     def _theta(self, z: np.ndarray) -> np.ndarray:
         """Parameters (point, 3), or (point, 6) with those of places, without those of the drift."""
+        theta = scores.beta0_and_noises(self.model.priors, z)
         if self.model.place is None:
-            return scores.beta0_and_noises(self.model.priors, z)
-        return hyperparameters(self.model.priors, self.model.place, z)
+            return theta
+        place = Place(**self.model.place.to_record())
+        absent = {"tau_s": np.zeros(len(z)), "length_scale": np.ones(len(z))}
+        absent["tau_e"] = absent["tau_s"]
+        hyper = absent | place.scales(z[:, 3 : self._n_given])
+        return np.column_stack([theta, *hyper.values()])
 
 
 @jax.jit

@@ -12,7 +12,6 @@ from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.inference.evidence.gram_jax import spectrum
 from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.place_marginal import PlaceIndex
-from trustbo.inference.evidence.place_rows import gather_rows
 from trustbo.inference.evidence.statistics import gather, split_robots
 from trustbo.inference.samplers.choice import is_coupled, why_not_scores
 from trustbo.inference.samplers.complaints import complaints_of, complaints_of_modes
@@ -25,8 +24,6 @@ from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
 from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
 from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
-from trustbo.inference.samplers.place_draws import split_units
-from trustbo.inference.samplers.place_target import PlaceTarget
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
@@ -36,7 +33,7 @@ from trustbo.models.backend import own_settings
 from trustbo.models.coupled import CoupledTrust
 from trustbo.models.drift import DriftTrust
 from trustbo.models.effects.effect import Slots
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.place import split_units
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited
 from trustbo.parallel import one_blas_thread
@@ -225,17 +222,12 @@ def _targets(
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
     priors, family = model.priors, model.family
-    if slots is not None:
-        return [_by_evidence(model, slots)]
     if isinstance(model, DriftTrust):
         return [DriftTarget(model, batch, weight, places)]
-    if places is not None and not family.integrates_out:
-        return [_by_evidence(model, Slots.of(batch, len(weight), (), weight, places))]
-    if places is not None:
-        place = cast(PlaceEffect, model.place)
-        rates = batch.awareness, batch.contact_rate
-        rows = gather_rows(*rates, places, weight, float(priors.x0_mean))
-        return [PlaceTarget(rows, places, priors, place)]
+    if slots is None and places is not None:
+        slots = Slots.of(batch, len(weight), (), weight, places)
+    if slots is not None:
+        return [_by_evidence(model, slots)]
     if model.partial_pooling is not None and not family.integrates_out:
         gathered = gather_chains(family, batch, apart=True)
         return [LatentHierarchicalTarget(*gathered, priors, batch.contact_rate.shape[2])]
@@ -253,9 +245,8 @@ def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
     TrustboError: its coefficients have no Gaussian priors.
     """
     if reason := why_not_conjugate(model.priors):
-        raise TrustboError(f"effects of robots need other priors: {reason}.")
-    place = [] if model.place is None else [Place(**model.place.to_record())]
-    return posterior_of(model.priors, model.family, [*place, *model.effects], slots)
+        raise TrustboError(f"effects need other priors: {reason}.")
+    return posterior_of(model.priors, model.family, model.all_effects, slots)
 
 
 def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:
@@ -366,7 +357,7 @@ def _with_effects(model: TrustModel, draws: Draws, places: Visited, seed: int) -
     flat = units.reshape(-1, units.shape[-1])
     hyper = {name: params[name].ravel() for name in model.place_dims}
     rng = np.random.default_rng([seed, 3])
-    effects = split_units(flat, hyper, places, cast(PlaceEffect, model.place), rng)
+    effects = split_units(cast(PlaceEffect, model.place), places, flat, hyper, rng)
     shaped = {n: values.reshape(*units.shape[:2], -1) for n, values in effects.items()}
     return draws._replace(params=params, places=shaped)
 

@@ -108,30 +108,40 @@ class PlaceColumns(NamedTuple):
 
     def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Effects of cells, place (draw, cell), and of bounds, place_bound (draw, unit)."""
-        g = c @ self.rotation
-        if not self.place.bounds:
-            return {"place": g}
-        if not self.place.cells:
-            return {"place_bound": g}
-        s = np.empty((len(g), len(self.visited.cells)))
-        theta_of = np.stack([theta[name] for name in ("tau_s", "length_scale", "tau_e")], axis=1)
-        values, point = np.unique(theta_of, axis=0, return_inverse=True)
-        point, count = point.ravel(), np.bincount(point.ravel())
-        order = np.argsort(point, kind="stable")
-        index = np.empty_like(order)  # of a draw among those of its theta
-        index[order] = np.arange(len(c)) - np.repeat(np.cumsum(count) - count, count)
-        for first, distance, w in self.cells:
-            mean = np.zeros((len(values), count.max(), len(w)))
-            mean[point, index] = c[:, first : first + len(w)]
-            s[:, self._cells_of(first)] = _split(mean, w, distance, values, rng)[point, index]
-        return {"place": s, "place_bound": g - s[:, self.visited.cell_of]}
+        return split_units(self.place, self.visited, c @ self.rotation, theta, rng)
 
-    def _cells_of(self, first: int) -> np.ndarray:
-        """Indices of the visited cells whose means begin at a column."""
-        robot = [start for start, *_ in self.cells].index(first)
-        return np.flatnonzero(
-            self.visited.cells[:, 0] == np.unique(self.visited.cells[:, 0])[robot]
-        )
+
+def split_units(
+    place: PlaceEffect, visited: Visited, g: np.ndarray, theta: Theta, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Effects of cells, place (draw, cell), and of bounds, place_bound (draw, unit), of their sums.
+
+    Args:
+        place: Effects in the model.
+        visited: Visited places.
+        g: Sums of the effects of visited bounds (draw, unit).
+        theta: Hyperparameters by name, each (draw,).
+        rng: Random number generator.
+    """
+    if not place.bounds:
+        return {"place": g}
+    if not place.cells:
+        return {"place_bound": g}
+    s = np.empty((len(g), len(visited.cells)))
+    theta_of = np.stack([theta[name] for name in ("tau_s", "length_scale", "tau_e")], axis=1)
+    values, point = np.unique(theta_of, axis=0, return_inverse=True)
+    point, count = point.ravel(), np.bincount(point.ravel())
+    order = np.argsort(point, kind="stable")
+    index = np.empty_like(order)  # of a draw among those of its theta
+    index[order] = np.arange(len(g)) - np.repeat(np.cumsum(count) - count, count)
+    rotation, cells = _rotation(visited)
+    c = g @ rotation.T
+    for robot, (first, distance, w) in zip(np.unique(visited.cells[:, 0]), cells, strict=True):
+        mean = np.zeros((len(values), count.max(), len(w)))
+        mean[point, index] = c[:, first : first + len(w)]
+        of_robot = visited.cells[:, 0] == robot
+        s[:, of_robot] = _split(mean, w, distance, values, rng)[point, index]
+    return {"place": s, "place_bound": g - s[:, visited.cell_of]}
 
 
 def _rotation(visited: Visited) -> tuple[Columns, tuple]:
