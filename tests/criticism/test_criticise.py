@@ -141,9 +141,10 @@ def less_contact(missions, robot, which, size=0.5):
         ([], ""),
         (range(9, 15), "r2 has .* less contact in full sight .*, from mission 9 on"),
         ([3, 8], "r2 has .* less contact in full sight .*, in missions 3 and 8"),
+        ([12, 14], "r2 has .* less contact in full sight .*, in missions 12 and 14"),
         (range(15), "r2 has .* less contact in full sight .*, in all missions"),
     ],
-    ids=["healthy", "dead from 9 on", "two bad days", "poor"],
+    ids=["healthy", "dead from 9 on", "two bad days", "two late ones", "poor"],
 )
 def test_a_robot_is_named_with_its_missions(planted, which, when):
     missions = less_contact(planted("none"), 1, which)

@@ -68,7 +68,7 @@ def test_numbers_have_their_units(shown):
 
 def test_the_model_of_a_campaign_is_a_few_words(shown):
     row = re.search(r"^  model +(.*)$", repr(shown["Campaign"]), re.M)[1]
-    assert row == "PooledTrust, places, gaussian"
+    assert row == "PooledTrust, places, robots, gaussian"
     assert CoupledTrust(inter_robot="none").in_short() == "CoupledTrust, gaussian, inter_robot none"
     placed = PooledTrust(observation="censored", place=PlaceEffect(bounds=False, shared=False))
     assert placed.in_short() == "PooledTrust, places, censored"

@@ -48,7 +48,7 @@ def figures(result):
         "plan_map": (lambda **o: plots.plan_map(result.plan, bounds=[1], **o), 2),
         "plan_trust": (lambda **o: plots.plan_trust(result.plan, names, **o), 3),
         "mission_trust": (lambda **o: plots.mission_trust(posterior, **o), 3),
-        "parameter_history": (lambda **o: plots.parameter_history(result.posteriors, **o), 10),
+        "parameter_history": (lambda **o: plots.parameter_history(result.posteriors, **o), 12),
         "campaign_history": (lambda **o: plots.campaign_history(result.history, **o), 2),
         "criticism": (lambda **o: plots.criticism(found, **o), 9),
         "calibration": (lambda **o: plots.calibration(ranks, **o), 2),

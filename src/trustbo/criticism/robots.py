@@ -63,10 +63,12 @@ def finding_on_robots(table: pd.DataFrame) -> tuple[str, float, str]:
 def _when(these: Sequence[int], missions: Sequence[int]) -> str:
     """Time of some of a robot's missions, counted from 0.
 
-    Some missions show too little to stand out: most of those from the first on are enough.
+    Some missions show too little to stand out: three, and most of those from the first on, the last
+    among them, are enough. Two are, where they are all.
     """
     left = [j for j in missions if j >= these[0]]
-    if len(these) > 1 and len(these) >= _MOST * len(left):
+    most = len(these) > 2 and len(these) >= _MOST * len(left) and these[-1] == left[-1]
+    if most or (len(these) > 1 and len(these) == len(left)):
         early = len(missions) - len(left) < _BEFORE
         return "in all missions" if early else f"from mission {these[0]} on"
     return f"in mission{'s' if len(these) > 1 else ''} {joined([str(j) for j in these])}"
