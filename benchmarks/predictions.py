@@ -2,44 +2,46 @@
 
     python benchmarks/predictions.py --data DIR --out out/predictions
 
-Missions of the default campaign are driven in every world on every course; each method predicts
-the rates of mission m + 1 on the path it took, given missions 1 to m. Methods: the default model;
-`no memory`, the same with beta0 ~ Beta(1, 1000), 0 but for .001 (a point mass has no quantiles,
-which the exact sampler needs); `no places`; and methods that predict rates without a state space,
-see `Predictor`. Called again, it goes on where it stopped; worlds added later are added to it.
+Missions of the default campaign are driven in every world; after missions 1, 2, 4, 8 and 12, each
+method predicts the rates of the next one on the path it took. Methods: the default model; the same
+without one of its parts (`no memory`: beta0 ~ Beta(1, 1000), 0 but for .001, for a point mass has
+no quantiles, which the exact sampler needs); and those that predict rates without a state space,
+see `Predictor`. Of the default model also the 90 % band of the contact kept on the path that it
+would recommend, against the truth. Called again, it goes on where it stopped; worlds and courses
+added later are added to it. Intervals are 95 %, by a bootstrap over worlds and courses.
 """
 
-import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
+from baselines import residual_process
 from common import Table, add_record, arguments, parsed, read_records
 from scipy import stats
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell, Mission, is_line_of_sight
 from trustbo.inference import fit, score
-from trustbo.inference.score import AMONG, summarize_scores
-from trustbo.models import PlaceEffect, PooledTrust, Priors
+from trustbo.inference.score import AMONG
+from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
-from trustbo.workspace import Workspace
+from trustbo.workspace.moves import bounds_along
 
+AFTER = (1, 2, 4, 8, 12)
+"""Numbers of missions after which the next is predicted."""
 NAMES = ("contact_rate", "mean", "pit", "log_score", "seen")
 
 
 class Predictor(Protocol):
-    """Method that predicts contact rates, made for a workspace."""
+    """Method that predicts contact rates."""
 
-    def predict(
-        self, missions: Sequence[Mission], path: Sequence[Cell]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and sd of the rates of a path given missions, each (bound, robot)."""
+    def predict(self, missions: Sequence[Mission], ahead: Mission) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and sd of the rates of the next mission, whose own are not read; (bound, robot)."""
         ...
 
 
@@ -50,27 +52,18 @@ class RunningMean:
     and both variances by moments.
     """
 
-    def __init__(self, workspace: Workspace) -> None:
-        """Take the workspace of the missions, filled in."""
-        self._workspace = workspace
-
-    def predict(
-        self, missions: Sequence[Mission], path: Sequence[Cell]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, missions: Sequence[Mission], ahead: Mission) -> tuple[np.ndarray, np.ndarray]:
         """See `Predictor.predict`."""
-        robots, features = missions[0].robots, missions[0].features
-        shape = len(path) - 1, len(robots)
-        nothing = np.full((*shape, len(features)), np.nan), np.full(shape, np.nan)
-        ahead = Mission.from_arrays(path, *nothing, robots=robots, features=features)
+        shape = ahead.contact_rate.shape
         residuals = self._residuals(missions)
         every = np.concatenate([np.array(r) for r in residuals.values()])
         shift, total = every.mean(), max(every.var(), 1e-4)
         repeated = [np.var(r, ddof=1) for r in residuals.values() if len(r) > 1]
         noise = min(max(float(np.mean(repeated)) if repeated else 0.5 * total, 1e-4), total)
         spread = max(total - noise, 1e-4)
-        mean = _sight(self._workspace.fill(ahead)) + shift
+        mean = _sight(ahead) + shift
         var = np.full(shape, spread + noise)
-        for k, bound in enumerate(_bounds(ahead)):
+        for k, bound in enumerate(_bounds(ahead).tolist()):
             for i in range(shape[1]):
                 if (r := residuals.get((*bound, i))) is not None:
                     gain = spread / (spread + noise / len(r))
@@ -83,13 +76,33 @@ class RunningMean:
         residuals: dict[Any, list[float]] = {}
         for mission in missions:
             r = mission.contact_rate - _sight(mission)
-            for k, bound in enumerate(_bounds(mission)):
+            for k, bound in enumerate(_bounds(mission).tolist()):
                 for i in np.flatnonzero(~np.isnan(r[k])):
                     residuals.setdefault((*bound, int(i)), []).append(float(r[k, i]))
         return residuals
 
 
-PREDICTORS: dict[str, Callable[[Workspace], Predictor]] = {"running mean": RunningMean}
+class ResidualProcess:
+    """Gaussian process over bounds of the error of line of sight; robots are alike in it."""
+
+    def predict(self, missions: Sequence[Mission], ahead: Mission) -> tuple[np.ndarray, np.ndarray]:
+        """See `Predictor.predict`."""
+        bounds, errors = [], []
+        for mission in missions:
+            error = mission.contact_rate - _sight(mission)
+            for k, i in np.argwhere(~np.isnan(error)):
+                bounds.append(_bounds(mission)[k])
+                errors.append(error[k, i])
+        process = residual_process.fitted(np.array(bounds), np.array(errors))
+        mean, sd = process.predict(residual_process.places(_bounds(ahead)), return_std=True)
+        sight = _sight(ahead)
+        return sight + mean[:, None], np.broadcast_to(sd[:, None], sight.shape)
+
+
+PREDICTORS: dict[str, Callable[[], Predictor]] = {
+    "running mean": RunningMean,
+    "residual process": ResidualProcess,
+}
 
 
 def main():
@@ -98,13 +111,13 @@ def main():
     )
     parser.add_argument("--only", nargs="*", help="names of worlds; all by default")
     parser.add_argument("--courses", nargs="*", default=list(COURSES))
-    parser.add_argument("-m", "--missions", type=int, default=15, help="missions, default 15")
+    parser.add_argument("-m", "--missions", type=int, default=13, help="missions, default 13")
     given = parsed(parser)
     chosen, file = _chosen(given), given.out / "scores.jsonl"
     courses, n = (given.courses[:1], 4) if given.quick else (given.courses, given.missions)
     done = {(r["world"], r["course"], r["n"]) for r in read_records(file)}
-    for world in chosen:
-        for course in courses:
+    for course in courses:
+        for world in chosen:
             if (world.name, course, n) not in done:
                 add_record(file, scored(world, course, n))
                 print(f"{world.name}, {course}", flush=True)
@@ -114,39 +127,95 @@ def main():
 
 
 def scored(world: World, course: str, n: int) -> dict[str, Any]:
-    """Scores of every method on the missions of one campaign, rate by rate."""
-    workspace = world.workspace()
+    """Scores of every method on some missions of one campaign, rate by rate; and path values."""
+    workspace, truth = world.workspace(), world.truth()
     campaign = Campaign(workspace, *world.ends(course), seed=0)
-    driven = [mission for _, mission in campaign.run(world.simulator(workspace), n)]
-    missions = [workspace.fill(mission) for mission in driven]
-    methods = {name: _of_model(model, missions, workspace)
-               for name, model in _models(missions[0].features).items()}  # fmt: skip
-    (first, *_) = methods.values()
-    for name, make in PREDICTORS.items():
-        methods[name] = _of_predictor(make(workspace), missions, first)
+    missions, values = [], []
+    for _, mission in campaign.run(world.simulator(workspace), n):
+        missions.append(workspace.fill(mission))
+        if (m := len(missions)) in AFTER and m < n:
+            low, high, path = _band(campaign)
+            values.append([low, high, truth.at(m).value(path).lost])
+    methods: dict[str, dict[str, list[float]]] = {}
+    for m in AFTER:
+        if m >= n:
+            break
+        learned, ahead = missions[:m], missions[m]
+        scores = {
+            name: score(fit(learned, model, "exact", workspace=workspace, check=False,
+                            progress=False), [ahead])
+            for name, model in _models(ahead.features).items()
+        }  # fmt: skip
+        like = scores["default"]
+        for name, make in PREDICTORS.items():
+            scores[name] = _of_normal(*make().predict(learned, ahead), ahead, like)
+        for name, one in scores.items():
+            columns = methods.setdefault(name, {column: [] for column in NAMES})
+            for column, values_of in _columns(one).items():
+                columns[column] += values_of
     return {"world": world.name, "kind": world.kind, "course": course, "n": n,
-            "methods": {name: _columns(scores) for name, scores in methods.items()}}  # fmt: skip
+            "methods": methods, "values": values}  # fmt: skip
 
 
 def show(records: Sequence[dict[str, Any]]) -> None:
-    """Print a table for all worlds and one for each kind."""
+    """Print tables for all worlds and each kind."""
     kinds = list(dict.fromkeys(r["kind"] for r in records))
     for title, members in [("all kinds", kinds), *((kind, [kind]) for kind in kinds)]:
         mine = [r for r in records if r["kind"] in members]
         print(f"\n{title}: {len({r['world'] for r in mine})} worlds, {len(mine)} campaigns\n")
         table = Table("method", "bounds", "rates", "within 50 %", "within 90 %",
-                      "log score, nats", "R2", first=14)  # fmt: skip
-        for name in mine[0]["methods"]:
-            y, mean, pit, log_score, seen = (
-                np.concatenate([np.array(r["methods"][name][column], float) for r in mine])
-                for column in NAMES
-            )
-            for among in AMONG:
-                kept = {"all": seen >= 0.0, "seen": seen == 1.0, "new": seen == 0.0}[among]
-                one = summarize_scores(y[kept], mean[kept], pit[kept], log_score[kept])
-                table.row(name, among, one["n"], f"{one['coverage_50']:.2f}",
-                          f"{one['coverage_90']:.2f}", f"{one['mean_log_score']:.3f}",
-                          f"{one['r2']:.3f}")  # fmt: skip
+                      "log score, nats", "default's more", "R2", first=16)  # fmt: skip
+        for among in AMONG:
+            sums = {name: np.array([_sums(r["methods"][name], among) for r in mine])
+                    for name in mine[0]["methods"]}  # fmt: skip
+            for name, one in sums.items():
+                cells = [interval(one, share) for share in (_within_50, _within_90, _log_score)]
+                more = "" if name == "default" else interval(
+                    np.hstack([sums["default"], one]),
+                    lambda both: _log_score(both[:7]) - _log_score(both[7:]),
+                )  # fmt: skip
+                table.row(name, among, f"{one[:, 0].sum():.0f}", *cells, more, interval(one, _r2))
+        inside = np.array([[len(v), sum(low <= lost <= high for low, high, lost in v)]
+                           for v in (r["values"] for r in mine)], float)  # fmt: skip
+        print(f"\ncontact of the recommended path within its 90 % band: "
+              f"{interval(inside, lambda s: s[1] / s[0])} of {inside[:, 0].sum():.0f}")  # fmt: skip
+
+
+def interval(sums: np.ndarray, figure: Callable[[np.ndarray], float], n: int = 1000) -> str:
+    """Figure of the sums of all campaigns (campaign, sum), and its 95 % interval by a bootstrap."""
+    if not sums[:, 0].sum():
+        return ""
+    rows = np.random.default_rng(0).integers(len(sums), size=(n, len(sums)))
+    with np.errstate(all="ignore"):
+        drawn = [figure(one) for one in sums[rows].sum(1)]
+    low, high = np.nanquantile(drawn, (0.025, 0.975))
+    return f"{figure(sums.sum(0)):.2f} [{low:.2f}, {high:.2f}]"
+
+
+def _sums(columns: dict[str, list[float]], among: str) -> np.ndarray:
+    """Sums over the rates of a campaign, see `_within_50` to `_r2`."""
+    y, mean, pit, log_score, seen = (np.array(columns[name], float) for name in NAMES)
+    kept = {"all": seen >= 0.0, "seen": seen == 1.0, "new": seen == 0.0}[among]
+    y, mean, pit, log_score = y[kept], mean[kept], pit[kept], log_score[kept]
+    off = np.abs(pit - 0.5)
+    return np.array([len(y), (off <= 0.25).sum(), (off <= 0.45).sum(), log_score.sum(),
+                     ((y - mean) ** 2).sum(), y.sum(), (y**2).sum()])  # fmt: skip
+
+
+def _within_50(sums: np.ndarray) -> float:
+    return sums[1] / sums[0]
+
+
+def _within_90(sums: np.ndarray) -> float:
+    return sums[2] / sums[0]
+
+
+def _log_score(sums: np.ndarray) -> float:
+    return sums[3] / sums[0]
+
+
+def _r2(sums: np.ndarray) -> float:
+    return 1.0 - sums[4] / (sums[6] - sums[5] ** 2 / sums[0])
 
 
 def _chosen(given: Any) -> list[World]:
@@ -157,7 +226,7 @@ def _chosen(given: Any) -> list[World]:
     if not given.quick:
         return usable
     made = {world.kind: world for world in reversed(usable) if world.is_made}
-    return [replace(made[kind], name=f"{made[kind].name}-small", shape=(5, 5), side=200.0)
+    return [replace(made[kind], name=f"{made[kind].name}-small", shape=(5, 5), cell=40.0)
             for kind in ("right", "aged")]  # fmt: skip
 
 
@@ -166,42 +235,31 @@ def _models(features: Sequence[str]) -> dict[str, PooledTrust]:
     with own_settings():
         none = replace(Priors.of(features), beta0=dist.Beta(1.0, 1000.0))
     return {
-        "default": PooledTrust(place=PlaceEffect()),
-        "no memory": PooledTrust(none, place=PlaceEffect()),
-        "no places": PooledTrust(),
+        "default": PooledTrust(effects=(PlaceEffect(), RobotEffect())),
+        "no memory": PooledTrust(none, effects=(PlaceEffect(), RobotEffect())),
+        "no robots": PooledTrust(effects=(PlaceEffect(),)),
+        "no places": PooledTrust(effects=(RobotEffect(),)),
+        "neither": PooledTrust(),
     }
 
 
-def _of_model(model: PooledTrust, missions: Sequence[Mission], workspace: Workspace) -> xr.Dataset:
-    """Scores of a model's posteriors after each mission; the last predicts nothing."""
-    posteriors: list[xr.DataTree] = []
-    for j in range(len(missions) - 1):
-        posteriors.append(
-            fit(missions[: j + 1], model, "exact", workspace=workspace, whole=False, check=False,
-                earlier=posteriors[-1] if posteriors else None, progress=False)
-        )  # fmt: skip
-    return score(posteriors, missions)
+def _band(campaign: Campaign) -> tuple[float, float, Sequence[Cell]]:
+    """Ends of the 90 % band of contact lost on the path that would be recommended, and the path."""
+    path = campaign.recommend().path
+    planner = campaign.planner.with_observation(campaign.learner.observation)  # without the hazard
+    low, high = planner.evaluate(path, campaign.posterior).value_band
+    return -high, -low, path
 
 
-def _of_predictor(
-    predictor: Predictor, missions: Sequence[Mission], like: xr.Dataset
-) -> xr.Dataset:
-    """Scores of normal predictions, of rates as in the scores of a model."""
-    scores = like.copy(deep=True)
-    for j in scores["mission"].values:
-        mission = missions[j]
-        y, rows = (
-            mission.contact_rate,
-            {"mission": j, "bound": np.arange(1, len(mission.bounds) + 1)},
-        )
-        path = mission.path[: len(mission.bounds) + 1]
-        mean, sd = predictor.predict(missions[:j], path)
-        log_score = stats.norm.logpdf(y, mean, sd)
-        if like.attrs["log_score_of"] == "ticks":
-            log_score = log_score - np.log(mission.n_ticks)
-        columns = {"mean": mean, "pit": stats.norm.cdf(y, mean, sd), "log_score": log_score}
-        for name, values in columns.items():
-            scores[name].loc[rows] = np.where(np.isnan(y), np.nan, values)
+def _of_normal(mean: np.ndarray, sd: np.ndarray, ahead: Mission, like: xr.Dataset) -> xr.Dataset:
+    """Scores of normal predictions of a mission, of rates as in the scores of a model."""
+    scores, y = like.copy(deep=True), ahead.contact_rate
+    log_score = stats.norm.logpdf(y, mean, sd)
+    if like.attrs["log_score_of"] == "ticks":
+        log_score = log_score - np.log(ahead.n_ticks)
+    columns = {"mean": mean, "pit": stats.norm.cdf(y, mean, sd), "log_score": log_score}
+    for name, values in columns.items():
+        scores[name].values[0] = np.where(np.isnan(y), np.nan, values)
     return scores
 
 
@@ -222,9 +280,9 @@ def _sight(mission: Mission) -> np.ndarray:
     return mission.awareness[..., index].mean(-1)
 
 
-def _bounds(mission: Mission) -> Iterable[tuple[Any, Any]]:
-    cells = [tuple(cell) for cell in mission.path[: len(mission.bounds) + 1]]
-    return itertools.pairwise(cells)
+def _bounds(mission: Mission) -> np.ndarray:
+    """Move, row and column of the bounds run, (bound, 3)."""
+    return bounds_along(mission.path)[: len(mission.bounds)]
 
 
 if __name__ == "__main__":

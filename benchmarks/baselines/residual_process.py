@@ -71,18 +71,23 @@ class ResidualProcess(PathPolicy):
         """Process given all missions; fitted once for each number of rates."""
         n = len(self.rates)
         if self._fitted is None or self._fitted[0] != n:
-            optimizer = "fmin_l_bfgs_b" if n >= _LEAST else None
-            process = GaussianProcessRegressor(
-                _KERNEL, optimizer=optimizer, n_restarts_optimizer=1, random_state=0
-            )
-            if n:
-                bounds = np.array([bound for bound, _ in self.rates])
-                errors = np.array([rate - sight[bound] for bound, rate in self.rates])
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # of hyperparameters at their limits
-                    process.fit(places(bounds), errors)
-            self._fitted = n, process
+            bounds = np.array([bound for bound, _ in self.rates]).reshape(-1, 3)
+            errors = np.array([rate - sight[bound] for bound, rate in self.rates])
+            self._fitted = n, fitted(bounds, errors)
         return self._fitted[1]
+
+
+def fitted(bounds: np.ndarray, errors: np.ndarray) -> GaussianProcessRegressor:
+    """Process given errors of line of sight (error,) at bounds (error, 3), which may be none."""
+    optimizer = "fmin_l_bfgs_b" if len(errors) >= _LEAST else None
+    process = GaussianProcessRegressor(
+        _KERNEL, optimizer=optimizer, n_restarts_optimizer=1, random_state=0
+    )
+    if len(errors):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of hyperparameters at their limits
+            process.fit(places(bounds), errors)
+    return process
 
 
 def places(bounds: np.ndarray) -> np.ndarray:

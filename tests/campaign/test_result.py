@@ -112,6 +112,7 @@ def test_a_loaded_result_plans_alike(result, tmp_path):
     assert (loaded.believed is None) == (result.believed is None)
     assert loaded.plan.path == result.plan.path
     np.testing.assert_array_equal(loaded.plan.bands, result.plan.bands)
+    assert loaded.plan.value_band == result.plan.value_band
     assert loaded.maps(n_draws=50).equals(result.maps(n_draws=50))
 
 

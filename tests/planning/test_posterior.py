@@ -9,6 +9,7 @@ from trustbo.inference import sample_prior
 from trustbo.models import HierarchicalTrust, PooledTrust
 from trustbo.planning import Planner, problem, roll_trust
 from trustbo.planning.graph import NoPathError
+from trustbo.planning.objectives import OBJECTIVES
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import along
 
@@ -93,6 +94,17 @@ def test_the_path_posterior_is_the_share_of_best_paths(workspace, draws):
         for cell in planner.plan(draws.draw(d)).path:
             count[cell] += 1
     np.testing.assert_allclose(share.values, count / 200)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_the_band_of_a_value_is_of_the_values_of_draws(workspace, draws, objective):
+    planner = Planner(workspace, (3, 0), (0, 3), objective)
+    path = planner.plan(draws.mean()).path
+    values = [planner.evaluate(path, draws.draw(d)).value for d in range(200)]
+    assert planner.evaluate(path, draws.draw(0)).value_band is None
+    np.testing.assert_allclose(
+        planner.evaluate(path, draws).value_band, np.quantile(values, (0.05, 0.95)), rtol=1e-12
+    )
 
 
 def test_bands_are_quantiles_of_rolled_trust(workspace, draws):

@@ -239,7 +239,7 @@ class Campaign(Displayed):
 
     def _accept(self, plan: Plan, started: float) -> Plan:
         """Store a plan as the next one to run."""
-        bands = self.planner_now().bands(plan.path, self.belief)
+        given = self.planner_now().evaluate(plan.path, self.belief)
         now = time.perf_counter()
         self._asked = now - started, now
         if plan.infeasible and plan.p_fail is not None:
@@ -250,7 +250,9 @@ class Campaign(Displayed):
                 "it, or none was found.",
                 stacklevel=4,
             )
-        self.state.suggested = accepted = replace(plan, bands=bands)
+        self.state.suggested = accepted = replace(
+            plan, bands=given.bands, value_band=given.value_band
+        )
         if self.storage is not None:
             self.storage.write(self.state, None)
         return accepted

@@ -172,7 +172,8 @@ class Result(Displayed):
         best = self.planner.plan(mean)
         if list(best.path) != self.path:  # another version may find one of equal value
             best = self.planner.evaluate(self.path, mean)
-        return replace(best, bands=self.planner.bands(best.path, self.posterior))
+        given = self.planner.evaluate(best.path, self.posterior)
+        return replace(best, bands=given.bands, value_band=given.value_band)
 
     def maps(self, *, n_draws: int | None = None, seed: int = 0) -> xr.Dataset:
         """Compute every map of the planning cells after the last mission, for GIS and figures.

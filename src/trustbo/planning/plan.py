@@ -46,6 +46,8 @@ class Plan(Displayed):
         risk: Chance of each bound to end the mission, None without a hazard.
         infeasible: Whether its chance to fail exceeds `max_failure`: the path was given, or is the
             safest where no admissible path respects the limit.
+        value_band: Ends of the 90 % band of the value over draws of the parameters, at the chance
+            to fail expected; None where the plan is for one draw. Noise of rates is not in it.
     """
 
     path: tuple[Cell, ...]
@@ -64,6 +66,7 @@ class Plan(Displayed):
     workspace: Workspace
     risk: PathRisk | None = None
     infeasible: bool = False
+    value_band: tuple[float, float] | None = None
 
     def _card(self) -> Card:
         best = "no path is better" if self.exact else f"at most {self.bound:.3g} can be had"
@@ -71,9 +74,12 @@ class Plan(Displayed):
             best = "given, or a policy's choice: value and trust are the means"
         elif self.infeasible:
             best = "none of the safest paths is better; none keeps within max_failure"
+        within = ""
+        if self.value_band is not None:
+            within = ", {:.3g} to {:.3g} in 90 % of the draws".format(*self.value_band)
         rows = [
             ("path", f"{len(self.path) - 1} bounds, {self.length:.0f} m"),
-            ("value", f"{self.value:.3g} ({self.objective})"),
+            ("value", f"{self.value:.3g} ({self.objective})" + within),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
@@ -152,6 +158,8 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
         values["success_index"] = values.pop("success")
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
+    if record.get("value_band"):
+        values["value_band"] = tuple(record["value_band"])
     if record.get("risk"):  # unknown to version 0.1
         values["risk"] = PathRisk.from_record(record["risk"])
     values["path"] = tuple((row, col) for row, col in record["path"])

@@ -71,12 +71,16 @@ def evaluate(
     draws = roll(trust_dynamics(along, z, "min", x0))
     draws = draws.reshape(-1, *draws.shape[-2:])
     trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
-    team = trust.mean(1) if problem.team == "mean" else trust.min(1)
+    value_of, cost = OBJECTIVES[objective.name], problem.cost_of_failure(cells)
+    team, teams = (t.mean(-1) if problem.team == "mean" else t.min(-1) for t in (trust, draws))
     if objective.name in ("stationary", "lost_contact"):
         dynamics = trust_dynamics(along, z, problem.team, x0)
-        value = OBJECTIVES[objective.name](path_trust(dynamics, objective, length, cap=cap)).mean()
+        values = value_of(path_trust(dynamics, objective, length, cap=cap))
+        value = values.mean()
     else:
-        value = OBJECTIVES[objective.name](PathTrust(team, team, objective.length_weight * length))
+        values, value = (
+            value_of(PathTrust(t, t, objective.length_weight * length)) for t in (teams, team)
+        )
     risk = None if problem.risk is None else problem.risk.along(cells)
     return Plan(
         path=path,
@@ -84,7 +88,7 @@ def evaluate(
         length=length,
         trust=trust,
         bands=_bands(draws),
-        value=float(value) - problem.cost_of_failure(cells),
+        value=float(value) - cost,
         success_index=float(np.exp(-softplus(-team).sum())),
         objective=objective.name,
         exact=False,
@@ -95,6 +99,7 @@ def evaluate(
         workspace=problem.workspace,
         risk=risk,
         infeasible=risk is not None and not problem.is_within_risk(cells),
+        value_band=_value_band(np.atleast_1d(values) - cost),
     )
 
 
@@ -103,3 +108,11 @@ def _bands(trust: np.ndarray) -> np.ndarray:
     if len(trust) == 1:
         return np.repeat(trust, len(QUANTILES), axis=0)
     return np.quantile(trust, QUANTILES, axis=0)
+
+
+def _value_band(values: np.ndarray) -> tuple[float, float] | None:
+    """Ends of the 90 % band of values over draws; None for one draw."""
+    if len(values) == 1:
+        return None
+    low, high = np.quantile(values, (QUANTILES[0], QUANTILES[-1]))
+    return float(low), float(high)
