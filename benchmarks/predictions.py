@@ -83,20 +83,26 @@ class RunningMean:
 
 
 class ResidualProcess:
-    """Gaussian process over bounds of the error of line of sight; robots are alike in it."""
+    """Gaussian process over bounds of the error of line of sight, mean over robots.
+
+    Robots vary about it by the variance that they had in the bounds driven.
+    """
 
     def predict(self, missions: Sequence[Mission], ahead: Mission) -> tuple[np.ndarray, np.ndarray]:
         """See `Predictor.predict`."""
-        bounds, errors = [], []
-        for mission in missions:
-            error = mission.contact_rate - _sight(mission)
-            for k, i in np.argwhere(~np.isnan(error)):
-                bounds.append(_bounds(mission)[k])
-                errors.append(error[k, i])
-        process = residual_process.fitted(np.array(bounds), np.array(errors))
+        errors = np.concatenate([mission.contact_rate - _sight(mission) for mission in missions])
+        measured = ~np.isnan(errors).all(1)
+        errors = errors[measured]
+        team = np.nanmean(errors, axis=1)
+        free = max((~np.isnan(errors)).sum() - len(team), 1)
+        among = np.nansum((errors - team[:, None]) ** 2) / free
+        bounds = np.concatenate([_bounds(mission) for mission in missions])[measured]
+        process = residual_process.fitted(bounds, team)
         mean, sd = process.predict(residual_process.places(_bounds(ahead)), return_std=True)
         sight = _sight(ahead)
-        return sight + mean[:, None], np.broadcast_to(sd[:, None], sight.shape)
+        return sight + mean[:, None], np.broadcast_to(
+            np.hypot(sd, among**0.5)[:, None], sight.shape
+        )
 
 
 PREDICTORS: dict[str, Callable[[], Predictor]] = {

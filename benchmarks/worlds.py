@@ -7,6 +7,8 @@ All worlds x 4 courses x methods, 15 missions each; called again, it goes on whe
 other parts too: the tables are those of the chosen parts. BoTorch and Ax are left out where they
 are not installed.
 `--targets` runs the objective and path class of the targets instead, mean contact on shortest+2.
+`--report` runs nothing, and prints the tables of what is in `--out`, for the worlds and courses
+that the default campaign has run.
 """
 
 from importlib.util import find_spec
@@ -25,7 +27,7 @@ from baselines import (
 )
 from common import arguments, parsed
 
-from trustbo.study import run_worlds, worlds, worlds_table
+from trustbo.study import load_study, run_worlds, worlds, worlds_table
 from trustbo.study.methods import BASELINE_ROWS
 from trustbo.study.table import as_text, differences, worse_than
 
@@ -48,6 +50,16 @@ METHODS: dict[str, Any] = {
 """Methods by the names of their rows."""
 PACKAGES = {"BoTorch EI": "botorch", "BoTorch Thompson": "botorch", "Ax": "ax"}
 """Packages that methods need."""
+KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams", "four-ways",
+         "robots", "days", "foul", "change", "jammer", "physics")  # fmt: skip
+CASES = ("robots", "days", "change", "jammer")
+"""Kinds of which each case has a table."""
+COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 15", "regret now",
+           "lost while learning", "missions to 1 %", "arrive", "seconds"]  # fmt: skip
+OF_CASES = ["regret after 3", "regret after 8", "regret after 15", "regret now",
+            "lost while learning"]  # fmt: skip
+OF_DIFFERENCES = ["pairs", "regret after 15", "regret now", "lost while learning",
+                  "missions to 1 %", "seconds"]  # fmt: skip
 
 
 def main():
@@ -63,7 +75,11 @@ def main():
     parser.add_argument("--max-bounds", default="shortest+4")
     parser.add_argument("--targets", action="store_true")
     parser.add_argument("--serial", action="store_true", help="one campaign after the other")
+    parser.add_argument("--report", action="store_true", help="tables alone, of --out")
     given = parsed(parser)
+    if given.report:
+        report(load_study(given.out))
+        return
     objective, max_bounds = given.objective, given.max_bounds
     if given.targets:
         objective, max_bounds = "mean", "shortest+2"
@@ -86,23 +102,35 @@ def main():
         max_bounds=max_bounds, quick=given.quick, executor="serial" if given.serial else "loky",
         **courses,
     )  # fmt: skip
-    report(results, f"{objective}, {max_bounds}")
+    report(results)
 
 
-def report(results: xr.Dataset, title: str):
-    """Print tables of all worlds, of each kind, and of the differences."""
+def report(results: xr.Dataset):
+    """Print tables of all worlds, kinds and cases, and of the differences."""
+    rows = results[["world", "course", "method", "seed"]].to_dataframe()
+    if OURS in set(rows["method"]):
+        ours = rows[rows["method"] == OURS].set_index(["world", "course", "seed"]).index
+        rows = rows[rows.set_index(["world", "course", "seed"]).index.isin(ours)]
+    order = [name for name in METHODS if name in set(rows["method"])]
+    rows = rows.assign(rank=rows["method"].map(order.index)).sort_values("rank", kind="stable")
+    results = results.isel(run=rows.index.to_numpy())
     kinds = results["kind"].values
-    for kind in ("all", *np.unique(kinds)):
-        runs = results if kind == "all" else results.isel(run=kinds == kind)
-        n = len(np.unique(runs["world"].values))
-        print(f"\n{kind} (worlds: {n}), {title}\n\n{as_text(worlds_table(runs))}")
-    methods = set(results["method"].values.tolist())
-    if OURS not in methods or len(methods) < 2:
+    for kind in ("all worlds", *KINDS):
+        runs = results if kind == "all worlds" else results.isel(run=kinds == kind)
+        if runs.sizes["run"]:
+            n = len(np.unique(runs["world"].values))
+            print(f"\n**{kind}** ({n} worlds)\n\n{as_text(worlds_table(runs)[COLUMNS])}")
+    runs = results.isel(run=np.isin(kinds, CASES))
+    for case in np.unique(runs["case"].values):
+        one = runs.isel(run=runs["case"].values == case)
+        print(f"\n**{case}**: {', '.join(np.unique(one['world'].values))}\n")
+        print(as_text(worlds_table(one)[OF_CASES]))
+    if len(order) < 2 or order[0] != OURS:
         return
     for by in ((), ("kind",)):
         table = differences(results, OURS, by)
-        print(f"\n{OURS} less each other method, same world, course and seed\n\n{as_text(table)}\n")
-        print("\n".join(worse_than(table)))
+        print(f"\n{OURS} less each other method, same world, course and seed\n")
+        print(f"{as_text(table[OF_DIFFERENCES])}\n\n" + "\n".join(worse_than(table)))
 
 
 if __name__ == "__main__":

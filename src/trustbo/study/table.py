@@ -275,7 +275,7 @@ def as_text(table: pd.DataFrame) -> str:
                 continue
             places = 1 if "regret" in name or "missions" in name else 2
             value, low, high = (
-                f"{row[name, what]:.{places}f}" for what in ("value", "low", "high")
+                f"{row[name, what]:z.{places}f}" for what in ("value", "low", "high")
             )
             cells.append(f"{value} [{low}, {high}]")
         lines.append(" | ".join([_label(key), *cells]))
