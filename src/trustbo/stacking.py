@@ -82,8 +82,19 @@ def fill_awareness(mission: Mission, awareness: np.ndarray) -> Mission:
     """
     if not np.isnan(mission.awareness).any():
         return mission
+    return replace_awareness(
+        mission,
+        [
+            np.where(np.isnan(b.awareness), awareness[k], np.nan)
+            for k, b in enumerate(mission.bounds)
+        ],
+    )
+
+
+def replace_awareness(mission: Mission, awareness: Sequence[np.ndarray] | np.ndarray) -> Mission:
+    """Replace awareness of a mission by what is not NaN of that given, (bound, robot, feature)."""
     bounds = tuple(
-        replace(b, awareness=np.where(np.isnan(b.awareness), awareness[k], b.awareness))
+        replace(b, awareness=np.where(np.isnan(awareness[k]), b.awareness, awareness[k]))
         for k, b in enumerate(mission.bounds)
     )
     return replace(mission, bounds=bounds)

@@ -70,6 +70,27 @@ def test_unmeasured_awareness_comes_from_the_map(workspace):
     )
 
 
+def test_where_the_map_is_trusted_missions_are_learned_from_with_it(workspace):
+    # Awareness is measured lower than the map has it, everywhere: plans go by the map, and must
+    # predict what was measured on the path.
+    lower = Workspace.from_awareness(0.5 * workspace.awareness.values)
+    simulator = ModelSimulator(lower)
+    blind, told = (Campaign(workspace, *ENDS, sampler="exact", seed=1) for _ in range(2))
+    for j in range(4):
+        mission = simulator.run(told.ask().path, seed=j)
+        told.tell(mission)
+        unmeasured = [
+            replace(b, awareness=np.full_like(b.awareness, np.nan)) for b in mission.bounds
+        ]
+        blind.tell(replace(mission, bounds=tuple(unmeasured)))
+    np.testing.assert_array_equal(
+        told.missions[3].awareness, workspace.along(told.missions[3].path)
+    )
+    assert told.posterior["posterior"].equals(blind.posterior["posterior"])
+    assert told.recommend().value == blind.recommend().value
+    np.testing.assert_array_equal(told.state.measured[3].awareness, mission.awareness)
+
+
 def test_another_team_s_mission_is_refused(workspace):
     campaign = Campaign(workspace, *ENDS)
     mission = Mission.from_arrays([(3, 0), (2, 1)], np.full((1, 2, 2), 0.5), np.full((1, 2), 0.5))

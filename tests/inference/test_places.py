@@ -738,3 +738,9 @@ def test_priors_from_earlier_campaigns_have_the_moments_of_an_equal_mixture(lear
     other.attrs["model"] = "HierarchicalTrust"  # sampled in no time
     with pytest.raises(TrustboError, match="takes posteriors of PooledTrust"):
         tb.inference.prior_from([other])
+
+
+@pytest.mark.parametrize("name", ["cells", "bounds", "shared"])
+def test_a_switch_of_effects_of_places_is_true_or_false(name):
+    with pytest.raises(TrustboError, match=rf"PlaceEffect.{name} must be True or False; got \[1\]"):
+        PlaceEffect(**{name: [1]})

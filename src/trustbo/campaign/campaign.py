@@ -41,7 +41,7 @@ from trustbo.planning import Plan, Planner, Policy
 from trustbo.planning.policies import resolve_policy
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
-from trustbo.stacking import fill_awareness
+from trustbo.stacking import fill_awareness, replace_awareness
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 from trustbo.workspace.moves import along, moves_along, require_on_grid
@@ -262,7 +262,8 @@ class Campaign(Displayed):
     ) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
-        Awareness that the mission did not measure (NaN) is taken from the map, or from the belief.
+        It is learned from with the awareness of the map; with a belief about the awareness, with
+        what robots measured, filled in from the belief.
         Robots and features may be in any order of their names.
 
         Args:
@@ -289,13 +290,13 @@ class Campaign(Displayed):
     def _take(self, mission: Mission, extra: dict[str, float]) -> None:
         """Write a mission to disk, then learn from it."""
         plan, trust_map, seed = self.ask(), self.trust_map(), self.seed_of("fit")
-        filled = fill_awareness(mission, self.known_along(mission.path))
+        learned = self.as_learned(mission)
         started = time.perf_counter()
         if self.storage is not None:
             extras = [*(entry.extra for entry in self.state.entries), extra]
             self.storage.write_measured([*self.state.measured, mission], extras)
         seconds = {"seconds_plan": self._asked[0], "seconds_run": started - self._asked[1]}
-        entry = self.state.add(mission, filled, plan, trust_map, extra, **seconds)
+        entry = self.state.add(mission, learned, plan, trust_map, extra, **seconds)
         self.learner.take(self.state, seed)
         entry.row["seconds_fit"] = time.perf_counter() - started
         self._go_on()
@@ -425,6 +426,17 @@ class Campaign(Displayed):
         cells = require_on_grid(path, self.workspace.grid.shape)
         moves_along(cells)
         return np.swapaxes(along(self.planner_now().mean_awareness, cells), 0, 1)
+
+    def as_learned(self, mission: Mission) -> Mission:
+        """Return a mission with the awareness that it is learned from.
+
+        It is what plans go by. Where the map is trusted, that is the map's: weights fitted to what
+        robots measured would be applied to other numbers, and plans be off by the difference. With
+        a belief, it is what robots measured, filled in from the belief.
+        """
+        known = self.known_along(mission.path)
+        trusted = self.learner.awareness is None
+        return (replace_awareness if trusted else fill_awareness)(mission, known)
 
     # --- results ---
 

@@ -54,8 +54,9 @@ class CampaignOptions:
             the posterior before, which is not exact.
         forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
             environment is followed; for `"refit"` with Gaussian observations.
-        awareness: Trust in the awareness map: map (blind) or belief (missions correct it). Under
-            `"belief"`, or a given `AwarenessBelief`, policies draw from it too.
+        awareness: Trust in the awareness map: map (blind; missions are learned from with it too) or
+            belief (missions correct it). Under `"belief"`, or a given `AwarenessBelief`, policies
+            draw from it too.
         hazard: Priors of the chance that a bound fails. A `hazard.Hazard`, or some of its fields
             by name.
         n_chains: Number of chains of NUTS; draws of other samplers are divided among them.

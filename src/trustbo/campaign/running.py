@@ -17,7 +17,6 @@ from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Truth
 from trustbo.simulation.protocol import Simulator, require_bounds, require_call, takes
-from trustbo.stacking import fill_awareness
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -137,8 +136,12 @@ def run_replanning(campaign: "Campaign", simulator: Any, plan: Plan, **start: An
             planner = campaign.planner_now().onward(path[: k + 1])
             crossed = path[k - 1], bound.cell
             driven = Mission(crossed, (bound,), bound.status)
-            filled = fill_awareness(driven, campaign.known_along(crossed))
-            live.update(filled.awareness[0], bound.contact_rate, crossed, n_ticks=bound.n_ticks)
+            live.update(
+                campaign.as_learned(driven).awareness[0],
+                bound.contact_rate,
+                crossed,
+                n_ticks=bound.n_ticks,
+            )
             path = [*path[:k], *better_rest(planner, live, path[k:])]
         k += 1
     getattr(simulator, "close", lambda: None)()

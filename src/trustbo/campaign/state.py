@@ -49,7 +49,7 @@ class Entry:
     """One recorded mission.
 
     Attributes:
-        mission: Mission, its awareness filled in where it was not measured.
+        mission: Mission with the awareness that it is learned from, see `Campaign.as_learned`.
         measured: The same mission as measured.
         plan: Plan that it was asked for with.
         trust_map: Trust map that it was planned on, dims (row, col).

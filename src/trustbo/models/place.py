@@ -56,6 +56,9 @@ class PlaceEffect:
     length_scale_sd: float = 0.5
 
     def __post_init__(self) -> None:
+        for name in ("cells", "bounds", "shared"):
+            if not isinstance(value := getattr(self, name), bool | np.bool_):
+                raise TrustboError(f"PlaceEffect.{name} must be True or False; got {value!r}.")
         if not (self.cells or self.bounds):
             raise TrustboError(
                 "PlaceEffect needs an effect of cells or of bounds; for neither, give place=None."

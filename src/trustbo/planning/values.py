@@ -75,8 +75,12 @@ def evaluate(
     team, teams = (t.mean(-1) if problem.team == "mean" else t.min(-1) for t in (trust, draws))
     if objective.name in ("stationary", "lost_contact"):
         dynamics = trust_dynamics(along, z, problem.team, x0)
-        values = value_of(path_trust(dynamics, objective, length, cap=cap))
-        value = values.mean()
+        value = value_of(path_trust(dynamics, objective, length, cap=cap)).mean()
+        # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path
+        # loses less than nothing.
+        values = value_of(path_trust(dynamics, objective, length, cap=False))
+        if objective.name == "lost_contact":
+            values = np.minimum(values, -objective.length_weight * length)
     else:
         values, value = (
             value_of(PathTrust(t, t, objective.length_weight * length)) for t in (teams, team)
