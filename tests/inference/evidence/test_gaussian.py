@@ -84,6 +84,22 @@ def test_the_evidence_is_that_of_the_joint_normal(name, memory):
         np.testing.assert_allclose(found, expected, rtol=1e-10)
 
 
+@pytest.mark.parametrize("lag", [0.0, 1.0])
+@pytest.mark.parametrize("name", ["weights", "places and robots"])
+def test_robots_of_separate_memory_and_changes_of_trust_have_the_joint_normal_too(name, lag):
+    """With gaps, of which robots share some, and drifts that are no column."""
+    rng, effects = np.random.default_rng(3), EFFECTS[name]
+    slots, groups = gathered(walking_missions(1, 5, missing=0.3), effects)
+    theta = random_theta(effects, rng, 5)
+    theta["beta0"] = rng.uniform(0.0, 1.1, (5, slots.n_robots))
+    theta["drift"] = 0.2 * rng.standard_normal((5, *slots.y.shape))
+    found = Gaussian(slots, groups, X0, apart=True, lag=lag).log_density(theta)
+    for t in range(5):
+        drift = Further(sparse.csr_array(theta["drift"][t].reshape(-1, 1)), 0.0, mean=1.0)
+        dense = Dense(slots, [*groups, drift], point(theta, t), X0, lag=lag)
+        np.testing.assert_allclose(found[t], dense.log_density(), rtol=1e-10)
+
+
 @pytest.mark.parametrize("memory", ["level", "deviation"])
 @pytest.mark.parametrize("name", EFFECTS)
 def test_the_evidence_in_jax_is_that_in_numpy(name, memory):
@@ -213,16 +229,17 @@ def test_an_unknown_memory_is_refused():
 
 
 class Further(NamedTuple):
-    """One more column, of a coefficient N(0, sd^2)."""
+    """One more column, of a coefficient N(mean, sd^2)."""
 
     columns: sparse.csr_array
     sd: float
+    mean: float = 0.0
     joined = ()
     fades = False
 
     def prior(self, theta):
         shape = len(theta["beta0"]), 1
-        return Prior(np.zeros(shape), np.full(shape, self.sd))
+        return Prior(np.full(shape, self.mean), np.full(shape, self.sd))
 
     def name(self, c, theta, rng):
         return {}

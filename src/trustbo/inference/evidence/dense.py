@@ -23,9 +23,11 @@ class Dense:
         theta: Theta,
         x0: tuple[float, float] = (0.5, 0.5),
         memory: str = "level",
+        lag: float = 0.0,
     ) -> None:
-        """Form the joint normal; `theta` has one point."""
-        (beta0,), (delta_w,), (delta_v,) = (theta[n] for n in ("beta0", "delta_w", "delta_v"))
+        """Form the joint normal; `theta` has one point, of beta0 maybe (point, robot)."""
+        (delta_w,), (delta_v,) = (theta[name] for name in ("delta_w", "delta_v"))
+        of_robot = np.resize(theta["beta0"][0], slots.n_robots)
         n_chains, K = slots.y.shape
         U = np.concatenate([group.columns.toarray() for group in groups], axis=1)
         m = U.shape[1]
@@ -34,8 +36,9 @@ class Dense:
         of_noise = np.zeros((n_chains, K, n_chains, K + 1))
         for c, u in enumerate(U.reshape(n_chains, K, m)):
             last_mean, last_c, last_noise = x0[0], np.zeros(m), np.zeros((n_chains, K + 1))
-            last_noise[c, 0] = x0[1]
+            last_noise[c, 0], beta0 = x0[1], of_robot[slots.robot[c]]
             for k in range(K):
+                before = last_mean, last_c, last_noise
                 last_mean, last_c, last_noise = (
                     beta0 * last_mean,
                     beta0 * last_c,
@@ -47,7 +50,10 @@ class Dense:
                     last_mean -= 0.0 if k else beta0 * x0[0]
                 last_noise = last_noise.copy()
                 last_noise[c, k + 1] = delta_w
-                mean[c, k], of_c[c, k], of_noise[c, k] = last_mean, last_c, last_noise
+                mean[c, k], of_c[c, k], of_noise[c, k] = (
+                    now - lag * then
+                    for now, then in zip((last_mean, last_c, last_noise), before, strict=True)
+                )
         priors = [group.prior(theta) for group in groups]
         self.prior_mean = np.concatenate([np.broadcast_to(p.mean, p.sd.shape)[0] for p in priors])
         self.prior_cov = np.zeros((m, m))

@@ -2,12 +2,13 @@
 
 A chain (mission, robot) has x_k = beta0 x_{k-1} + u_k + w_k ("level"), or the same of x - u with
 u_0 = E x_0 ("deviation": what lasts is the departure from what effects expect), u = U c, and rates
-y_k = x_k + v_k. Given theta, y = M U c + mean + noise, M = T = (I - beta0 Lag)^-1 or M = I, and the
-noise's covariance is V = L L'. The steps, named at the lines of the code:
+y_k = x_k + v_k, or x_k - x_{k-1} + v_k where they measure changes. Given theta, y = M U c + mean +
+noise, M = D T, T = (I - beta0 Lag)^-1, D = I - lag Lag, or M = I, and the noise's covariance is V =
+L L'. The steps, named at the lines of the code:
 
-1. Impulse filter: a scalar Kalman filter of unit impulses gives N = L^-1 T, a missing rate being a
-   row of zeros, and E = L^-1 = N (I - beta0 Lag). With C = N (level) or E (deviation), L^-1 M U =
-   C U. Chains with the same gaps are of one kind and share these.
+1. Impulse filter: a scalar Kalman filter of unit impulses gives N = L^-1 D T, a missing rate being
+   a row of zeros, and E = L^-1. With C = N (level) or E (deviation), L^-1 M U = C U. Chains with
+   the same gaps, of robots of one beta0, are of one kind and share these.
 2. Gram: A = sum_chains U' S U with S = C'C. The sums of products of columns by pair of bounds, G,
    do not depend on theta and add up over missions, each times its weight: A = G . S is one sparse
    product for all theta.
@@ -54,6 +55,9 @@ class Gaussian:
         groups: Sequence[Group],
         x0: tuple[float, float] = (0.5, 0.5),
         memory: str = "level",
+        *,
+        apart: bool = False,
+        lag: float = 0.0,
     ) -> None:
         """Sum products of columns over missions.
 
@@ -62,17 +66,21 @@ class Gaussian:
             groups: Columns of all effects.
             x0: Mean and sd of trust before the first bound.
             memory: `"level"`, trust is carried on, or `"deviation"` from what effects expect.
+            apart: Whether theta has a beta0 of each robot, (point, robot).
+            lag: 1 where rates measure the change of trust, else 0.
         """
-        self.slots, self.groups, self.x0 = slots, tuple(groups), x0
+        self.slots, self.groups, self.x0, self.lag = slots, tuple(groups), x0, lag
         self.level = require_choice("memory", memory, MEMORIES) == "level"
         seen = ~np.isnan(slots.y)
-        self.seen, self.kind = np.unique(seen, axis=0, return_inverse=True)
-        self.kind = self.kind.ravel()
+        robot = slots.robot if apart else np.zeros_like(slots.robot)
+        kinds, kind = np.unique(np.column_stack([robot, seen]), axis=0, return_inverse=True)
+        self.robot, self.seen, self.kind = kinds[:, 0], kinds[:, 1:] > 0, kind.ravel()
         self.n_measured = float(slots.weight @ seen.sum(1))
         self.mass = np.bincount(self.kind, slots.weight, len(self.seen))
         self.y = np.where(seen, slots.y, 0.0)
         self._first = np.cumsum([0, *(group.columns.shape[1] for group in groups)]).tolist()
-        U = sparse.hstack([group.columns for group in groups], format="csr")
+        none = sparse.csr_array((slots.y.size, 0))
+        U = sparse.hstack([none, *(group.columns for group in groups)], format="csr")
         ahead = np.cumsum(seen[:, ::-1], axis=1)[:, ::-1] > 0  # up to the last rate of a chain
         U: Columns = sparse.csr_array(sparse.diags_array(ahead.ravel().astype(float)) @ U)
         U.eliminate_zeros()
@@ -136,7 +144,7 @@ class Gaussian:
         for i in self._chunks(len(theta["beta0"])):
             some = _take(theta, i)
             factors = self._factors(some)
-            N, E, _ = impulses(some, self.x0[1], self.seen)
+            N, E, _ = self._impulses(some)
             C = N if self.level else E
             S = np.swapaxes(C, 2, 3) @ C
             R, _ = self._residual(some, N, E, factors.prior.mean)
@@ -229,7 +237,7 @@ class Gaussian:
         n, f = len(theta["beta0"]), self.n_fading
         m = len(self.order) - f
         prior = self._prior(theta)
-        N, E, log_det = impulses(theta, self.x0[1], self.seen)
+        N, E, log_det = self._impulses(theta)
         C = N if self.level else E
         S = np.swapaxes(C, 2, 3) @ C
         P = np.zeros((n, m + 1, m + 1))
@@ -249,6 +257,16 @@ class Gaussian:
         log_p -= 0.5 * (early.log_det + diagonal[:, -1] ** 2) + np.log(diagonal[:, :-1]).sum(1)
         return _Factors(np.where(failed, np.nan, log_p), P, early, prior)
 
+    def _impulses(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `impulses`."""
+        noises = theta["delta_w"][:, None], theta["delta_v"][:, None]
+        return impulses(self._beta0(theta), *noises, self.x0[1], self.seen, self.lag)
+
+    def _beta0(self, theta: Theta) -> np.ndarray:
+        """Memory (point, kind), or (point, 1) where robots share it."""
+        beta0 = theta["beta0"]
+        return beta0[:, None] if beta0.ndim == 1 else beta0[:, self.robot]
+
     def _prior(self, theta: Theta) -> Prior:
         """Prior of all columns, in their order; the roots are of the columns joined."""
         prior, _ = prior_of(self.groups, theta)
@@ -261,13 +279,16 @@ class Gaussian:
         n, (n_chains, K) = len(mean), self.y.shape
         on = np.flatnonzero((mean != 0.0).any(0))
         expected = (self.U[:, on] @ mean[:, on].T).T.reshape(n, n_chains, K)
+        expected = expected + theta.get("drift", 0.0)
+        start = np.broadcast_to(self._beta0(theta) * self.x0[0], (n, len(self.seen)))[..., None]
         R, misfit = np.empty((n, n_chains, K)), np.zeros(n)
         for q in range(len(self.seen)):
             mine = np.flatnonzero(self.kind == q)
             C = N[:, q] if self.level else E[:, q]
             r = self.y[mine] @ np.swapaxes(E[:, q], 1, 2) - expected[:, mine] @ np.swapaxes(C, 1, 2)
             if self.level:
-                r -= (theta["beta0"] * self.x0[0])[:, None, None] * N[:, q, None, :, 0]
+                r -= (start[:, q] * N[:, q, :, 0])[:, None]
+                r += self.lag * self.x0[0] * E[:, q, None, :, 0]
             weight = self.slots.weight[mine, None]
             misfit += (weight * r**2).sum((1, 2))
             R[:, mine] = (weight * r) @ C
@@ -338,9 +359,9 @@ def joined_columns(groups: Sequence[Group]) -> list[slice]:
 
 def prior_of(groups: Sequence[Group], theta: Theta) -> tuple[Prior, list[slice]]:
     """Prior of the columns of all groups, and the columns that its roots are of."""
-    priors = [group.prior(theta) for group in groups]
-    mean = np.concatenate([p.mean for p in priors], axis=1)
-    sd = np.concatenate([p.sd for p in priors], axis=1)
+    priors, none = [group.prior(theta) for group in groups], np.zeros((len(theta["delta_w"]), 0))
+    mean = np.concatenate([none, *(p.mean for p in priors)], axis=1)
+    sd = np.concatenate([none, *(p.sd for p in priors)], axis=1)
     return Prior(mean, sd, [root for p in priors for root in p.roots]), joined_columns(groups)
 
 
@@ -356,37 +377,49 @@ def named_effects(
 
 
 def impulses(
-    theta: Theta, x0_sd: float, seen: np.ndarray
+    b: np.ndarray,
+    delta_w: np.ndarray,
+    delta_v: np.ndarray,
+    x0_sd: float,
+    seen: np.ndarray,
+    lag: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Step 1: N and E (point, kind, bound, bound) and log |V| (point, kind).
 
     Args:
-        theta: Hyperparameters beta0, delta_w, delta_v, each (point,).
+        b: Memory beta0, (point, kind) or (point, 1).
+        delta_w: Process noise, (point, 1).
+        delta_v: Measurement noise, (point, 1).
         x0_sd: Sd of trust before the first bound.
         seen: Mask of the measured rates (kind, bound).
+        lag: 1 where rates measure the change of trust, else 0.
     """
-    n, (n_kinds, K) = len(theta["beta0"]), seen.shape
-    b, Q, R = (
-        theta["beta0"][:, None],
-        theta["delta_w"][:, None] ** 2,
-        theta["delta_v"][:, None] ** 2,
-    )
+    n, (n_kinds, K) = len(b), seen.shape
+    Q, R = delta_w**2, delta_v**2
     N, gain = np.zeros((n, n_kinds, K, K)), np.zeros((n, n_kinds, K))
-    m, P = np.zeros((n, n_kinds, K)), np.broadcast_to((b * x0_sd) ** 2 + Q, (n, n_kinds))
+    # Response of the rate to come, variances of trust before it, and after it without that rate.
+    m, last, P = np.zeros((n, n_kinds, K)), x0_sd**2, (b * x0_sd) ** 2 + Q
+    P = np.broadcast_to(P, (n, n_kinds))
     log_det = np.zeros((n, n_kinds))
     for k in range(K):
-        F = P + R
-        gain[..., k] = np.where(seen[:, k], P / F, 0.0)
+        F = P + R + lag * (lag - 2.0 * b) * last
+        gain[..., k] = np.where(seen[:, k], (P - lag * b * last) / F, 0.0)
         left = np.where(seen[:, k], R / F, 1.0)
+        over = np.where(seen[:, k], lag / F, 0.0) if lag else 0.0
         m[..., k] = 1.0
         N[..., k, : k + 1] = m[..., : k + 1] * np.where(seen[:, k], F**-0.5, 0.0)[..., None]
-        m[..., : k + 1] *= (b * left)[..., None]
+        m[..., :k] *= (b * left + over * Q)[..., None]
+        m[..., k] = (b - lag) * (left + (lag - b) * over * last)
         log_det += np.where(seen[:, k], np.log(F), 0.0)
-        P = b * b * P * left + Q
+        more = over * lag * last * Q
+        last, P = P * left + more, b * b * P * left + b * b * more + Q
     E = np.zeros_like(N)
     E[..., :-1] = N[..., 1:] * (-b[..., None] * gain[..., :-1])[..., None, :]
     diagonal = np.arange(K)
     E[..., diagonal, diagonal] = N[..., diagonal, diagonal]
+    if lag:  # trust after a bound is in the rate of the next
+        for k in reversed(range(K - 1)):
+            E[..., k] += lag * gain[..., k, None] * E[..., k + 1]
     return N, E, log_det
 
 
