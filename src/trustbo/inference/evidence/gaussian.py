@@ -115,7 +115,7 @@ class Gaussian:
     ) -> tuple[dict[str, np.ndarray], None]:
         """See `Evidence.draw`; no weights are needed."""
         c = self.coefficients(theta, count, rng)
-        of_draw = {name: np.repeat(values, count) for name, values in theta.items()}
+        of_draw = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
         return named_effects(self.groups, c, of_draw, rng), None
 
     def scan(

@@ -34,7 +34,13 @@ class Sites:
     exact = False
 
     def __init__(
-        self, slots: Slots, groups: Sequence[Group], family: Family, x0: tuple[float, float]
+        self,
+        slots: Slots,
+        groups: Sequence[Group],
+        family: Family,
+        x0: tuple[float, float],
+        *,
+        apart: bool = False,
     ) -> None:
         """Make chains of the columns of all effects.
 
@@ -43,11 +49,14 @@ class Sites:
             groups: Columns of all effects.
             family: Family of observations.
             x0: Mean and sd of trust before the first bound.
+            apart: Whether theta has a beta0 of each robot, (point, robot).
         """
         self.slots, self.groups, self.x0 = slots, tuple(groups), np.array(x0, dtype=float)
         U: Columns = sparse.hstack([group.columns for group in groups], format="csr")
         self.n_columns = U.shape[1]
         self.chains, self.sites = _chains(slots, U, family)
+        if apart:
+            self.chains = self.chains._replace(robot=slots.robot)
         self._chunk = max(1, int(_MEMORY / self.n_columns**2))
         self._nu = max(8.0, 3.0 * self.n_columns)  # more where a heavy tail would cost evenness
 
@@ -84,7 +93,7 @@ class Sites:
 
         fixed = self._nu, self.chains, self.sites, SWEEPS
         c, log_weight = draw_weighted(points(), count, *fixed, rng)
-        of_draw = {name: np.repeat(values, count) for name, values in theta.items()}
+        of_draw = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
         named = named_effects(self.groups, c, of_draw, rng)
         return named, log_weight + 0.5 * np.repeat(log_dets, count)
 
@@ -102,7 +111,7 @@ class Sites:
             P[:, i, i] = np.swapaxes(half, 1, 2) @ half
             log_det -= 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
         beta0, *noises = (np.ascontiguousarray(theta[n]) for n in ("beta0", "delta_w", "delta_v"))
-        return (beta0[:, None], *noises, self.x0, P, prior.mean), log_det
+        return (beta0.reshape(n, -1), *noises, self.x0, P, prior.mean), log_det
 
 
 def _chains(slots: Slots, U: Columns, family: Family) -> tuple[joint.Chains, np.ndarray]:

@@ -25,7 +25,7 @@ def gather(model: TrustModel, batch: MissionBatch, weight: np.ndarray | None = N
 
 def split_robots(model: TrustModel, batch: MissionBatch) -> list[MissionBatch]:
     """Split missions by robot where robots have nothing in common; else leave them together."""
-    if model.robot_sets == "all":
+    if model.robot_sets != "each":
         return [batch]
     n_robots = batch.contact_rate.shape[2]
     return [MissionBatch(*(a[:, :, i : i + 1] for a in batch)) for i in range(n_robots)]

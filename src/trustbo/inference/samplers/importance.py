@@ -72,7 +72,7 @@ class ScoreTarget(Protocol):
         """Gaussian fit at the best mode."""
         ...
 
-    def recentre(self, z: np.ndarray) -> None:
+    def recentre(self, z: np.ndarray) -> object:
         """Re-expand the approximate density around a point (score,)."""
         ...
 

@@ -5,7 +5,7 @@ log p(rates | theta); all else is drawn given theta. A model and a family of obs
 one of each.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.sites import Sites
 from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
+from trustbo.inference.samplers.per_robot import PerRobot
 from trustbo.inference.samplers.student import Proposal, Spanning, Student
 from trustbo.models.effects.effect import Effect, Slots, Theta
 from trustbo.models.effects.weights import Weights
@@ -33,6 +34,11 @@ class Scores(Protocol):
     """Coordinates of hyperparameters: standard normal, but for the second (`scores.log_prior`)."""
 
     @property
+    def fixed(self) -> bool:
+        """Whether `recentre` leaves the coordinates unchanged."""
+        ...
+
+    @property
     def n_scores(self) -> int:
         """Number of coordinates."""
         ...
@@ -46,11 +52,24 @@ class Scores(Protocol):
         """Hyperparameters by name of scores (point, score)."""
         ...
 
+    def log_prior(self, z: np.ndarray) -> np.ndarray:
+        """Log prior density of scores (point,)."""
+        ...
+
+    def recentre(self, z: np.ndarray, log_density: Callable[[Theta], np.ndarray]) -> np.ndarray:
+        """Choose coordinates for the posterior around a point z (score,); z in these.
+
+        Args:
+            z: Scores.
+            log_density: Log density of the rates at each theta.
+        """
+        ...
+
 
 class Shared:
     """Scores of beta0 and the noises, which all robots share, and of the effects' scales."""
 
-    n_core = 3
+    fixed, n_core = True, 3
 
     def __init__(self, priors: Priors, effects: Sequence[Effect], memory: str = "level") -> None:
         """Take the priors; `memory` as in `evidence.gaussian`."""
@@ -60,6 +79,14 @@ class Shared:
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """See `Scores.theta`."""
         return self.with_core(scores.beta0_and_noises(self.priors, z), z)
+
+    def log_prior(self, z: np.ndarray) -> np.ndarray:
+        """See `Scores.log_prior`."""
+        return scores.log_prior(z)
+
+    def recentre(self, z: np.ndarray, log_density: Callable[[Theta], np.ndarray]) -> np.ndarray:
+        """The point itself."""
+        return z
 
     def with_core(self, core: Any, z: Any) -> dict[str, Any]:
         """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
@@ -77,13 +104,15 @@ class Shared:
 class Posterior:
     """Log posterior density of scores, and draws of all else; see `importance.ScoreTarget`."""
 
-    n_pilot, widths = 256, (1.25, 1.1)
+    widths = 1.25, 1.1
 
     def __init__(self, coordinates: Scores, evidence: Evidence, spread: float) -> None:
         """Take the scores and an evidence; `spread` is the sd of the measured rates."""
         self.scores, self.evidence, self._spread = coordinates, evidence, spread
-        alone = coordinates.n_scores == coordinates.n_core  # few coefficients: draws are cheap
-        self.n_final = 1024 if alone and not evidence.exact else 512
+        alone = coordinates.n_scores == coordinates.n_core  # few coefficients: points are cheap
+        self.n_pilot, self.n_final = (
+            (1024, 4096) if alone and evidence.exact else (256, 1024 if alone else 512)
+        )
         self.n_corrected = None if evidence.exact else 1000 if alone else 500
 
     @property
@@ -95,9 +124,9 @@ class Posterior:
         """Log posterior density, not divided by the evidence; shape (point,)."""
         out = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # far out, scores over- and underflow: no density there
-            theta, log_prior = self.scores.theta(z), scores.log_prior(z)
+            theta, log_prior = self.scores.theta(z), self.scores.log_prior(z)
             noise = np.hypot(theta["delta_w"], theta["delta_v"])
-            possible = np.isfinite(np.stack([*theta.values(), log_prior])).all(0)
+            possible = np.isfinite(np.column_stack([*theta.values(), log_prior])).all(1)
             possible &= (noise > _LEAST_NOISE) & (noise < _LARGEST_NOISE) & (theta["rest"] != 0.0)
             some = np.flatnonzero(possible)
             out[some] = self.evidence.log_density(_take(theta, some)) + log_prior[some]
@@ -109,11 +138,12 @@ class Posterior:
         size = np.log(np.clip(self._spread / 0.2, 1e-2, 3.0))
         start[:, 1] = size - np.array([0.3, 1.0, 1.8, 2.6])
         best = start[self.log_density(start).argmax()]
-        for _ in range(1 if self.evidence.exact else _ROUNDS):
+        for _ in range(_ROUNDS):
             last, best = best, self._mode(best)
-            if np.abs(best - last).max() < _STILL:
+            fixed = self.scores.fixed and self.evidence.exact
+            if fixed or np.abs(best - last).max() < _STILL:
                 break
-            self.recentre(best)
+            best = self.recentre(best)
         hessian = derivatives(self.log_density, best[None])[1][0]
         if not np.isfinite(hessian).all():
             return Student(best, np.eye(len(best)))
@@ -135,9 +165,10 @@ class Posterior:
         value = np.minimum(value, 1e10)
         return float(value[0]), (value[1:] - value[0]) / h
 
-    def recentre(self, z: np.ndarray) -> None:
-        """See `Evidence.recentre`."""
+    def recentre(self, z: np.ndarray) -> np.ndarray:
+        """See `Evidence.recentre` and `Scores.recentre`."""
         self.evidence.recentre(self.scores.theta(z[None]))
+        return self.scores.recentre(z, self.evidence.log_density)
 
     def defensive(self, proposal: Student) -> Proposal:
         """Fitted memory and noises; the prior for the scores of effects' scales.
@@ -159,25 +190,42 @@ class Posterior:
         """Hyperparameters and effects at the points of sorted indices; see `ScoreTarget.draw`."""
         unique, count = np.unique(chosen, return_counts=True)
         theta = self.scores.theta(z[unique])
-        named = {name: np.repeat(values, count) for name, values in theta.items()}
+        named = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
         del named["rest"]
         effects, log_weight = self.evidence.draw(theta, count, rng)
         if log_weight is not None:
-            log_weight = log_weight + scores.log_prior(z[chosen]) - log_p[chosen]
+            log_weight = log_weight + self.scores.log_prior(z[chosen]) - log_p[chosen]
         return named | effects, log_weight
 
 
 def posterior_of(
-    priors: Priors, family: Family, effects: Sequence[Effect], slots: Slots
+    priors: Priors,
+    family: Family,
+    effects: Sequence[Effect],
+    slots: Slots,
+    *,
+    by_robot: bool = False,
+    lag: float = 0.0,
 ) -> Posterior:
-    """Posterior of weights and other effects, by the evidence of a family of observations."""
-    effects = [Weights(priors), *effects]
+    """Posterior of weights and other effects, by the evidence of a family of observations.
+
+    Args:
+        priors: Priors of the weights and of all scores.
+        family: Family of observations.
+        effects: Effects but the weights.
+        slots: Rates of all chains.
+        by_robot: Whether each robot has weights and a beta0 of a common distribution.
+        lag: 1 where rates measure the change of trust, else 0.
+    """
+    effects = [Weights(priors, by_robot), *effects]
     groups, x0 = [e.group(slots) for e in effects], (float(priors.x0_mean), float(priors.x0_sd))
     if family.integrates_out:
-        evidence = Gaussian(slots, groups, x0)
+        evidence = Gaussian(slots, groups, x0, apart=by_robot, lag=lag)
     else:
-        evidence = Sites(slots, groups, family, x0)
-    return Posterior(Shared(priors, effects), evidence, float(np.nanstd(slots.y)))
+        evidence = Sites(slots, groups, family, x0, apart=by_robot)
+    of_robots = PerRobot(priors, slots.n_robots, slots.z.shape[2]) if by_robot else None
+    coordinates = of_robots or Shared(priors, effects)
+    return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))
 
 
 def _take(theta: Theta, points: np.ndarray) -> dict[str, np.ndarray]:

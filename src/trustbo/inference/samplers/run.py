@@ -8,7 +8,6 @@ import numpy as np
 from jax import Array, random
 
 from trustbo.errors import PosteriorError, TrustboError
-from trustbo.inference.evidence.ep.chains import gather_chains
 from trustbo.inference.evidence.gram_jax import spectrum
 from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.place_marginal import PlaceIndex
@@ -19,9 +18,7 @@ from trustbo.inference.samplers.convergence import MAX_KHAT
 from trustbo.inference.samplers.coupled_target import CoupledTarget
 from trustbo.inference.samplers.drift_target import DriftTarget
 from trustbo.inference.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
-from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
-from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
 from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
@@ -221,32 +218,27 @@ def _targets(
     slots: Slots | None,
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
-    priors, family = model.priors, model.family
     if isinstance(model, DriftTrust):
         return [DriftTarget(model, batch, weight, places)]
-    if slots is None and places is not None:
-        slots = Slots.of(batch, len(weight), (), weight, places)
     if slots is not None:
         return [_by_evidence(model, slots)]
-    if model.partial_pooling is not None and not family.integrates_out:
-        gathered = gather_chains(family, batch, apart=True)
-        return [LatentHierarchicalTarget(*gathered, priors, batch.contact_rate.shape[2])]
-    if model.partial_pooling is not None:
-        return [HierarchicalTarget(gather(model, batch, weight), priors)]
     if is_coupled(model):
         return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
     robots = split_robots(model, batch)
-    return [_by_evidence(model, Slots.of(one, len(weight), (), weight)) for one in robots]
+    return [_by_evidence(model, Slots.of(one, len(weight), (), weight, places)) for one in robots]
 
 
 def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
-    """Posterior of a model of effects, of robots that share its parameters.
+    """Posterior of robots that share parameters, or whose parameters do.
 
     TrustboError: its coefficients have no Gaussian priors.
     """
     if reason := why_not_conjugate(model.priors):
         raise TrustboError(f"effects need other priors: {reason}.")
-    return posterior_of(model.priors, model.family, model.all_effects, slots)
+    by_robot = model.partial_pooling is not None
+    return posterior_of(
+        model.priors, model.family, model.all_effects, slots, by_robot=by_robot, lag=model.lag
+    )
 
 
 def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:

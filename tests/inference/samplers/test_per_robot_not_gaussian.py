@@ -7,12 +7,10 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.inference import complete, diagnostics, fit
-from trustbo.inference.evidence.ep.chains import gather_chains
-from trustbo.inference.evidence.statistics import gather
-from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.inference.samplers.importance import sample_scores
-from trustbo.inference.samplers.latent_hierarchical_target import LatentHierarchicalTarget
+from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.models import HierarchicalTrust
+from trustbo.models.effects.effect import Slots
 from trustbo.stacking import stack_missions
 
 FAMILIES = ("censored", "beta_binomial")
@@ -30,8 +28,8 @@ def missions_of(y, seed=2, n_ticks=N):
 
 
 def target_of(missions, model):
-    gathered = gather_chains(model.family, stack_missions(missions), apart=True)
-    return LatentHierarchicalTarget(*gathered, model.priors, missions[0].contact_rate.shape[1])
+    slots = Slots.of(stack_missions(missions), len(missions))
+    return posterior_of(model.priors, model.family, [], slots, by_robot=True)
 
 
 def test_rates_within_the_limits_have_the_closed_form_s_density():
@@ -41,12 +39,10 @@ def test_rates_within_the_limits_have_the_closed_form_s_density():
     y[1, 2:, 1] = np.nan
     missions = missions_of(y)
     latent = target_of(missions, HierarchicalTrust(observation="censored"))
-    model = HierarchicalTrust(latent.priors)
-    exact = HierarchicalTarget(gather(model, stack_missions(missions)), model.priors)
+    exact = target_of(missions, HierarchicalTrust(latent.scores.priors))
     exact.recentre(np.zeros(10))
-    z = 0.7 * rng.standard_normal((5, 10))
-    theta, _ = exact.constrain(z)
-    found, expected = latent.log_likelihood(theta), exact.log_likelihood(theta)
+    theta = exact.scores.theta(0.7 * rng.standard_normal((5, 10)))
+    found, expected = (each.evidence.log_density(theta) for each in (latent, exact))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 

@@ -10,12 +10,12 @@ from scipy import special, stats
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import complete, diagnostics, fit
-from trustbo.inference.evidence.statistics import gather
 from trustbo.inference.samplers import scores
-from trustbo.inference.samplers.hierarchical_target import HierarchicalTarget
 from trustbo.inference.samplers.importance import sample_scores
+from trustbo.inference.samplers.posterior import posterior_of
 from trustbo.inference.updating import update_statistics
 from trustbo.models import HierarchicalTrust, PlaceEffect, Priors
+from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
 from trustbo.stacking import stack_missions
 
@@ -31,7 +31,8 @@ def small(n_missions=2, n_bounds=3, n_robots=2, seed=0):
 
 
 def target_of(missions, model: TrustModel):
-    return HierarchicalTarget(gather(model, stack_missions(missions)), model.priors)
+    slots = Slots.of(stack_missions(missions), len(missions))
+    return posterior_of(model.priors, model.family, [], slots, by_robot=True)
 
 
 @pytest.mark.parametrize("stationary", [False, True])
@@ -47,18 +48,18 @@ def test_the_density_is_the_dense_joint_normal_s_with_the_priors(stationary):
     target.recentre(np.zeros(9))
     z = 0.7 * rng.standard_normal((4, 9))
     found = target.log_density(z)
-    theta, log_prior = target.constrain(z)
+    theta, log_prior = target.scores.theta(z), target.scores.log_prior(z)
     for t in range(len(z)):
         delta_w, delta_v = theta["delta_w"][t], theta["delta_v"][t]
-        tau, rest = theta["tau"][t], 1.0
+        tau, rest = np.append(theta["tau_beta"][t], theta["tau_b"][t]), 1.0
         if stationary:
-            rest = 1.0 - special.expit(theta["mean"][t])
+            rest = 1.0 - theta["mean_beta0"][t]
         mean_of_mu = rest * np.array([0.2, -0.1, 0.1])
         sd_of_mu = rest * np.array([0.7, 0.5, 0.4])
         X, centre, own, robots = [], [], [], []
         for m in missions:
             for i in range(2):
-                a, n = special.expit(theta["beta0"][t, i]), len(m.contact_rate)
+                a, n = theta["beta0"][t, i], len(m.contact_rate)
                 roll = np.linalg.inv(np.eye(n) - a * np.eye(n, k=-1))
                 X.append(roll @ np.c_[m.awareness[:, i], np.ones(n)])
                 centre.append(roll[:, 0] * a * 0.5)
@@ -81,24 +82,41 @@ def test_coordinates_leave_the_priors_as_they_are():
     z = 0.5 * np.random.default_rng(0).standard_normal(9)
 
     def natural(z):
-        theta, _ = target.constrain(z[None])
+        theta = target.scores.theta(z[None])
+        memory = special.logit(np.append(theta["mean_beta0"], theta["beta0"][0]))
         noises = np.log([theta["delta_w"][0], theta["delta_v"][0]])
-        taus = np.log([theta["tau_beta0"][0], *theta["tau"][0]])
-        return np.concatenate([theta["mean"], theta["beta0"][0], noises, taus])
+        return np.concatenate([memory, noises, np.log(taus(theta))])
+
+    def taus(theta):
+        return np.array([theta["tau_beta0"][0], *theta["tau_beta"][0], theta["tau_b"][0]])
 
     h = 1e-5
     jacobian = np.array([(natural(z + h * e) - natural(z - h * e)) / (2 * h) for e in np.eye(9)])
-    theta, log_prior = target.constrain(z[None])
-    mean, beta0 = theta["mean"][0], theta["beta0"][0]
+    theta, log_prior = target.scores.theta(z[None]), target.scores.log_prior(z[None])
+    mean, beta0 = special.logit(theta["mean_beta0"][0]), special.logit(theta["beta0"][0])
     expected = stats.beta(2, 2).logpdf(special.expit(mean))
     expected += special.log_expit(mean) + special.log_expit(-mean)
     expected += stats.norm.logpdf(beta0, mean, theta["tau_beta0"][0]).sum()
     for name in ("delta_w", "delta_v"):
         expected += stats.halfnorm.logpdf(theta[name][0], scale=0.2) + np.log(theta[name][0])
-    for tau in (theta["tau_beta0"][0], *theta["tau"][0]):
+    for tau in taus(theta):
         expected += stats.halfnorm.logpdf(tau, scale=0.3) + np.log(tau)
     log_det = np.linalg.slogdet(jacobian)[1]
     assert abs(log_prior[0] - expected - log_det) < 1e-6
+
+
+def test_new_coordinates_are_of_the_same_point():
+    """And the density differs by the Jacobian alone, of the mean and of each robot's beta0."""
+    target = target_of(small(), HierarchicalTrust())
+    z = 0.5 * np.random.default_rng(1).standard_normal(9)
+    before, value = target.scores.theta(z[None]), target.log_density(z[None])
+    likelihood = value - target.scores.log_prior(z[None])
+    again = target.recentre(z)
+    assert np.abs(again - z).max() > 0.05
+    for name, values in target.scores.theta(again[None]).items():
+        np.testing.assert_allclose(values, before[name], rtol=1e-9)
+    found = target.log_density(again[None]) - target.scores.log_prior(again[None])
+    np.testing.assert_allclose(found, likelihood, rtol=1e-9)
 
 
 def from_the_prior(missions, n, rng):
