@@ -25,10 +25,12 @@ from trustbo.inference import (
     prior_predictive,
     sbc,
 )
-from trustbo.inference.samplers import drift_target
+from trustbo.inference.samplers import drift_scores
 from trustbo.inference.updating import update_statistics
 from trustbo.models import DriftTrust, PlaceEffect, PooledTrust
 from trustbo.models.drift_form import find_drift
+from trustbo.models.effects.effect import Slots
+from trustbo.stacking import stack_missions
 from trustbo.study.methods import model_of
 
 NOISES = {"delta_w": 0.05, "delta_v": 0.05}
@@ -127,6 +129,20 @@ def test_the_likelihood_is_the_dense_joint_normal(missions, posterior):
     np.testing.assert_allclose(OWN.log_likelihood(params, gaps), expected, rtol=1e-10)
 
 
+def test_the_density_of_scores_is_the_likelihood_at_their_parameters(missions):
+    """Of changes of trust, too; JAX's scan against the evidence, all but the priors of scores."""
+    rng, batch = np.random.default_rng(2), stack_missions(missions)
+    slots = Slots.of(batch, len(missions))
+    for response in ("level", "change"):
+        model = DriftTrust(saturating, OWN.parameters, response=response)
+        target = drift_scores.DriftPosterior.of(model, batch, slots)
+        z = 0.5 * rng.standard_normal((3, target.n_scores))
+        params = model.params(target.scores.named(z), 2)
+        found = target.log_density(z) - target.scores.log_prior(z)
+        expected = model.log_likelihood(params, missions).sum(1)
+        np.testing.assert_allclose(found, expected, rtol=1e-10)
+
+
 def test_trust_and_likelihood_of_a_posterior_are_those_of_its_draws(missions, posterior):
     """NumPy's recursions, of the drift as an intercept of each bound, against JAX's."""
     params = params_of(posterior)
@@ -180,7 +196,7 @@ def test_a_posterior_is_around_its_truth_and_read_by_arviz(posterior, missions):
 
 @pytest.mark.slow  # its programs compile for this alone
 def test_with_places_a_linear_drift_has_the_pooled_posterior_too(missions):
-    """Dense factors in JAX against normal equations in numba; tolerances as above."""
+    """A drift that is no column against weights that are; tolerances as above."""
     own = fit(missions[:2], DriftTrust(linear, LINEAR.parameters, place=PlaceEffect()), seed=3)
     exact = fit(missions[:2], PooledTrust(place=PlaceEffect()), seed=3)
     assert own.attrs["sampler"] == "exact"
@@ -198,11 +214,11 @@ def test_with_places_a_linear_drift_has_the_pooled_posterior_too(missions):
 
 
 def test_the_next_mission_compiles_nothing(missions, posterior):
-    before = drift_target._log_likelihood._cache_size()
+    before = drift_scores._compiled_drifts._cache_size()
     fit(missions[:5], OWN, seed=2, whole=False)
     other = {**OWN.parameters, "top": dist.HalfNormal(2.0)}  # numbers of priors are data
     fit(missions, DriftTrust(saturating, other), seed=2, whole=False)
-    assert drift_target._log_likelihood._cache_size() == before
+    assert drift_scores._compiled_drifts._cache_size() == before
 
 
 def test_statements_of_numpyro_make_a_hierarchy(missions):

@@ -36,7 +36,7 @@ class CoupledTarget:
     n_pilot, widths = 2048, (1.05, 1.1)
     n_final = 8192
     """Points of the last proposal."""
-    n_corrected = None
+    n_corrected, compiles = None, True
 
     def __init__(self, model: CoupledTrust, batch: MissionBatch, weight: np.ndarray) -> None:
         """Take missions and their weights.
@@ -78,6 +78,10 @@ class CoupledTarget:
         size = z[:, self._ends[1] : self._ends[2]]
         of_sizes = 2.0 * size - 0.5 * np.exp(2.0 * size) + 0.5 * size**2 + scores.LOG_ROOT_2PI
         return scores.log_normal_density(z) + of_sizes.sum(1)
+
+    def takes(self, start: Student) -> bool:
+        """See `ScoreTarget.takes`: one of as many scores."""
+        return len(start.center) == self.n_scores
 
     def first(self) -> Student:
         """Gaussian fit at the mode that a quasi-Newton search finds."""

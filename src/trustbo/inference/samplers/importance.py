@@ -41,8 +41,17 @@ _MORE, _MORE_LAST = 3, 12  # times that uneven draws are added to; that refused 
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
 
+class UnevenWeightsError(Exception):
+    """The exact sampler's weights are too uneven, or leave out a mode."""
+
+
 class ScoreTarget(Protocol):
     """Posterior of scores, with everything else drawn given them."""
+
+    @property
+    def compiles(self) -> bool:
+        """Whether the first density takes seconds to compile."""
+        ...
 
     @property
     def n_pilot(self) -> int:
@@ -66,6 +75,10 @@ class ScoreTarget(Protocol):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density of scores (point, score), perhaps approximate; shape (point,)."""
+        ...
+
+    def takes(self, start: Student) -> bool:
+        """Whether the proposal of an earlier posterior serves as the first one."""
         ...
 
     def first(self) -> Student:
@@ -128,6 +141,8 @@ def sample_scores(
         start: Proposal of an earlier posterior to begin with.
         watch: Observer of the stages.
     """
+    if start is not None and not target.takes(start):  # of another team, or of other effects
+        start = None
     # Matrices are small: a second BLAS thread costs more than it brings.
     with one_blas_thread():
         points, proposal = _weigh(target, seed, start, watch)

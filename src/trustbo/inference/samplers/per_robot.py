@@ -68,6 +68,10 @@ class PerRobot:
             "rest": 1.0 - mean,
         }
 
+    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """See `Scores.named`."""
+        return {name: values for name, values in self.theta(z).items() if name != "rest"}
+
     def log_prior(self, z: np.ndarray) -> np.ndarray:
         """See `Scores.log_prior`."""
         memory, n = self._memory(z), 3 + self._n_tau

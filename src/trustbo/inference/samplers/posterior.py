@@ -49,7 +49,11 @@ class Scores(Protocol):
         ...
 
     def theta(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Hyperparameters by name of scores (point, score)."""
+        """Hyperparameters that the evidence takes, by name, of scores (point, score)."""
+        ...
+
+    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Parameters of the model among them, by name."""
         ...
 
     def log_prior(self, z: np.ndarray) -> np.ndarray:
@@ -80,6 +84,10 @@ class Shared:
         """See `Scores.theta`."""
         return self.with_core(scores.beta0_and_noises(self.priors, z), z)
 
+    def named(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """See `Scores.named`."""
+        return {name: values for name, values in self.theta(z).items() if name != "rest"}
+
     def log_prior(self, z: np.ndarray) -> np.ndarray:
         """See `Scores.log_prior`."""
         return scores.log_prior(z)
@@ -104,7 +112,7 @@ class Shared:
 class Posterior:
     """Log posterior density of scores, and draws of all else; see `importance.ScoreTarget`."""
 
-    widths = 1.25, 1.1
+    widths, compiles = (1.25, 1.1), False
 
     def __init__(self, coordinates: Scores, evidence: Evidence, spread: float) -> None:
         """Take the scores and an evidence; `spread` is the sd of the measured rates."""
@@ -120,13 +128,18 @@ class Posterior:
         """Number of scores."""
         return self.scores.n_scores
 
+    def takes(self, start: Student) -> bool:
+        """See `ScoreTarget.takes`: one of as many scores."""
+        return len(start.center) == self.n_scores
+
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log posterior density, not divided by the evidence; shape (point,)."""
         out = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # far out, scores over- and underflow: no density there
             theta, log_prior = self.scores.theta(z), self.scores.log_prior(z)
             noise = np.hypot(theta["delta_w"], theta["delta_v"])
-            possible = np.isfinite(np.column_stack([*theta.values(), log_prior])).all(1)
+            flat = [values.reshape(len(z), -1) for values in theta.values()]
+            possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
             possible &= (noise > _LEAST_NOISE) & (noise < _LARGEST_NOISE) & (theta["rest"] != 0.0)
             some = np.flatnonzero(possible)
             out[some] = self.evidence.log_density(_take(theta, some)) + log_prior[some]
@@ -190,8 +203,7 @@ class Posterior:
         """Hyperparameters and effects at the points of sorted indices; see `ScoreTarget.draw`."""
         unique, count = np.unique(chosen, return_counts=True)
         theta = self.scores.theta(z[unique])
-        named = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
-        del named["rest"]
+        named = {n: np.repeat(v, count, axis=0) for n, v in self.scores.named(z[unique]).items()}
         effects, log_weight = self.evidence.draw(theta, count, rng)
         if log_weight is not None:
             log_weight = log_weight + self.scores.log_prior(z[chosen]) - log_p[chosen]

@@ -16,9 +16,13 @@ from trustbo.inference.samplers.choice import is_coupled, why_not_scores
 from trustbo.inference.samplers.complaints import complaints_of, complaints_of_modes
 from trustbo.inference.samplers.convergence import MAX_KHAT
 from trustbo.inference.samplers.coupled_target import CoupledTarget
-from trustbo.inference.samplers.drift_target import DriftTarget
+from trustbo.inference.samplers.drift_scores import DriftPosterior
 from trustbo.inference.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
-from trustbo.inference.samplers.importance import ScoreTarget, sample_scores
+from trustbo.inference.samplers.importance import (
+    ScoreTarget,
+    UnevenWeightsError,
+    sample_scores,
+)
 from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
@@ -52,10 +56,6 @@ class Draws(NamedTuple):
     """Effects of robots in missions, robot_effect (chain, draw, mission, robot)."""
     fallback: str = ""
     """Failure of the exact sampler, where NUTS was used for it."""
-
-
-class UnevenWeightsError(Exception):
-    """The exact sampler's weights are too uneven, or leave out a mode."""
 
 
 def draw_posterior(
@@ -172,13 +172,8 @@ def _sample_scores(
 ) -> Draws:
     """Draws by importance sampling of scores: effects, pooling, coupling, or rates not Gaussian."""
     shape = (settings.n_chains, settings.draws)
-    coupled = next((t for t in targets if isinstance(t, CoupledTarget)), None)
-    engine = next((t for t in targets if isinstance(t, Posterior)), None)
-    if start is not None and (sized := coupled or engine) and len(start.center) != sized.n_scores:
-        start = None  # of another team, or of other effects
-    if len(targets) > 1:
-        start = None  # that of the first robot
-    compiles = isinstance(targets[0], CoupledTarget | DriftTarget)
+    start = None if len(targets) > 1 else start  # that of the first robot
+    compiles = targets[0].compiles
     watch.stage(
         f"exact sampler {'compiles, and ' if compiles else ''}seeks the mode", slow=compiles
     )
@@ -187,17 +182,11 @@ def _sample_scores(
     ]
     posteriors = [one.draws for one in sampled]
     _require_even(posteriors)
-    if any(getattr(target, "has_modes", False) for target in targets):
-        raise UnevenWeightsError(
-            "weights do not tell the shares of modes, of which the posterior has more than one"
-        )
     params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
     effects, robots = _pop_effects(params)
-    summary = _summarize(posteriors)
-    if effects or coupled or engine:
-        proposal = sampled[0].proposal
-        summary["proposal_center"] = proposal.center.tolist()
-        summary["proposal_scale"] = proposal.scale.ravel().tolist()
+    summary, proposal = _summarize(posteriors), sampled[0].proposal
+    summary["proposal_center"] = proposal.center.tolist()
+    summary["proposal_scale"] = proposal.scale.ravel().tolist()
     return Draws(params, stats, summary, "exact", places=effects, robots=robots)
 
 
@@ -219,7 +208,8 @@ def _targets(
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
     if isinstance(model, DriftTrust):
-        return [DriftTarget(model, batch, weight, places)]
+        slots = Slots.of(batch, len(weight), (), weight, places)
+        return [DriftPosterior.of(model, batch, slots)]
     if slots is not None:
         return [_by_evidence(model, slots)]
     if is_coupled(model):
