@@ -8,10 +8,11 @@ from jax import random
 from trustbo.inference.place_maps import draw_maps, nowhere, scales_of
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.run import Draws
-from trustbo.inference.sbc import with_robots_drawn
+from trustbo.inference.sbc import with_effects_drawn
 from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, Visited, visited
+from trustbo.stacking import MissionBatch
 from trustbo.workspace.moves import MOVES
 
 _SHAPE = (4, 4)
@@ -57,9 +58,8 @@ class Walks(NamedTuple):
         params = params._replace(  # pyright: ignore
             **{n: m if m is None else m[0] for n, m in zip(_EFFECTS, maps, strict=True)}
         )
-        on_walks, ranked = with_robots_drawn(
-            model, sites, params.on(self.bounds), awareness.shape, seed
-        )
+        batch = MissionBatch(awareness, np.zeros(ticks.shape), ticks)
+        on_walks, ranked = with_effects_drawn(model, sites, params.on(self.bounds), batch, seed)
         with own_settings():
             key = random.key(seed)
         sample = model.simulate(key, on_walks, awareness, ticks)

@@ -17,7 +17,8 @@ from scipy.linalg import solve_triangular
 
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import rho_of
+from trustbo.inference.draws import effects_of
+from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.params import CoupledParams, Params, assemble_params
 from trustbo.models.place import PlaceEffect, Visited, bounds_of, correlation, visited
 from trustbo.stacking import MissionBatch, stack_missions
@@ -100,8 +101,8 @@ def posterior_point(posterior: xr.DataTree) -> tuple[Point, PlaceEffect | None]:
     lag = float(posterior.attrs["response"] == "change")
     record = posterior.attrs.get("place", "none")
     place = None if record == "none" else PlaceEffect(**json.loads(record))
-    rho = rho_of(posterior) if "robots" in posterior.children else None
-    return Point(params, scales, lag, rho), place
+    robots = (e for e in effects_of(posterior) if isinstance(e, RobotEffect))
+    return Point(params, scales, lag, next((e.rho for e in robots), None)), place
 
 
 def joint_normal(point: Point, data: Data) -> Normal:

@@ -22,8 +22,7 @@ from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
-from trustbo.models.effects.effect import Columns, Effect, Slots, Theta
-from trustbo.models.effects.place import Place
+from trustbo.models.effects.effect import Columns, Slots, Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect, bounds_of, visited
 from trustbo.models.pooled import PooledTrust
@@ -171,8 +170,7 @@ def scan_posterior(
     bounds = bounds_of(missions, batch.contact_rate.shape[:2])
     places = visited(bounds, place, batch.contact_rate.shape[2], shape)  # pyright: ignore
     slots = Slots.of(batch, len(missions), features, weight, places)
-    of_places = [] if model.place is None else [Place(**model.place.to_record())]
-    effects: list[Effect] = [*of_places, *model.effects]
+    effects = model.all_effects
 
     def target_of(further: list[Change]) -> Posterior:
         return posterior_of(model.priors, model.family, [*effects, *further], slots)

@@ -1,18 +1,18 @@
 """Parameters from the draws of a posterior."""
 
 import json
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Mission, is_line_of_sight
+from trustbo.data import Mission
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.posterior_tree import require_posterior
-from trustbo.models.effects.robot import next_mission
+from trustbo.models.effects.effect import Effect, NextMission, Slots, Theta, drift_of
 from trustbo.models.params import Params, RobotParams, params_from
 from trustbo.models.place import bounds_of
+from trustbo.models.record import effects_from_record
 from trustbo.stacking import MissionBatch
 
 _DAYS = 20261123  # seed of the next mission's effects: the same posterior has the same bands
@@ -35,37 +35,36 @@ def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
 
     Args:
         posterior: DataTree from `fit`.
-        day: Whether each draw has an effect of each robot drawn for the next mission, a bad day
-            among them, for bands and predictions of rates; by default it has the expected one, for
-            plans. Without effects of robots there is no difference.
+        day: Whether each draw has effects drawn for the next mission, a bad day of a robot among
+            them, for bands and predictions of rates; by default it has the expected ones, for
+            plans. Without effects other than of places there is no difference.
 
     Returns:
         `TrustParams`, `RobotParams`, `CoupledParams` or `DriftParams`, according to the model. With
-        effects of robots, `RobotParams` of the next mission: weights of line of sight have the
-        effect of each robot, in which the last bad day is gone and what stays fades.
+        effects other than of places, `RobotParams` of the next mission: with `RobotEffect`, weights
+        of line of sight have the effect of each robot, in which the last bad day is gone and what
+        stays fades.
 
     Raises:
         TrustboError: No posterior of `fit`; or one with the drift of a `DriftTrust` that this
             process has not made.
     """
     params, sites = _params(require_posterior("params_of", posterior))
-    if "robots" not in posterior.children:
+    effects = effects_of(posterior)
+    if not effects:
         return params
-    d, sd = next_mission(_robot_effect(posterior), sites, rho_of(posterior))
-    if day:
-        d = d + sd[:, None] * np.random.default_rng(_DAYS).standard_normal(d.shape)
-    robots = (len(d), d.shape[1])
+    attrs, features = posterior.attrs, posterior["posterior"].to_dataset()["feature"].values
+    rng = np.random.default_rng(_DAYS) if day else None
+    mission = NextMission(attrs["n_missions"], features.tolist(), attrs["n_robots"], rng)
+    robots, theta = (len(sites["beta0"]), mission.n_robots), theta_of(sites)
     fields = {
         name: np.broadcast_to(sites[name][:, None], robots)
         for name in ("beta0", "b", "delta_w", "delta_v")
     }
-    beta = np.repeat(sites["beta"][:, None], robots[1], axis=1)
-    slope = (1.0 - fields["beta0"]) * d
-    sight = _sight(posterior["posterior"].to_dataset()["feature"].values)
-    if sight:
-        beta[:, :, sight] += slope[..., None] / len(sight)
-    else:
-        fields["b"] = fields["b"] + slope
+    beta = np.repeat(sites["beta"][:, None], mission.n_robots, axis=1)
+    for effect in effects:
+        weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
+        beta, fields["b"] = beta + weights, fields["b"] + intercept
     x0 = {name: getattr(params, name) for name in ("x0_mean", "x0_sd")}
     return RobotParams(beta=beta, **fields, **x0, **params.places)
 
@@ -77,51 +76,60 @@ def params_of_missions(
 
     Effects of their places, and of robots in them, are in the intercepts.
     """
-    params, _ = _params(posterior)
-    params = params.flat()
+    params, sites = _params(posterior)
+    params, effects = params.flat(), effects_of(posterior)
     if params.places:
         params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
-    if "robots" not in posterior.children:
-        return params
-    return with_robots(params, _robot_effect(posterior), missions, batch)
+    values = [values_of(posterior, effect) for effect in effects]
+    return with_effects(params, effects, values, theta_of(sites), slots_of(missions, batch))
 
 
-def with_robots(
-    params: Params, effect: np.ndarray, missions: Sequence[Mission], batch: MissionBatch
+def with_effects(
+    params: Params,
+    effects: Sequence[Effect],
+    values: Sequence[Mapping[str, np.ndarray]],
+    theta: Theta,
+    slots: Slots,
 ) -> Params:
-    """Parameters of missions with effects d (draw, mission, robot) in their intercepts."""
-    sight = _sight(missions[0].features)
-    z = batch.awareness[..., sight].mean(3) if sight else np.ones(batch.contact_rate.shape)
-    d = np.zeros((len(effect), len(z), 1, z.shape[2]))
-    d[:, : effect.shape[1], 0] = effect
-    b = np.asarray(params.b)
-    b = b if b.ndim == 4 else b[:, None, None, None]
-    rest = 1.0 - np.asarray(params.beta0)[:, None, None, None]  # pyright: ignore
-    return params._replace(b=b + rest * d * z)
+    """Parameters of missions with effects, of which `values` are the variables, in the intercept.
+
+    Params, values and theta are of draws, `slots` of every bound of the missions.
+    """
+    for effect, of_effect in zip(effects, values, strict=True):
+        b = np.asarray(params.b)
+        b = b if b.ndim == 4 else b[:, None, None, None]
+        params = params._replace(b=b + drift_of(effect, of_effect, theta, slots))
+    return params
 
 
-def rho_of(posterior: xr.DataTree) -> float:
-    """Correlation of what stays of a robot between missions, see `RobotEffect`."""
-    record = json.loads(posterior.attrs["model_record"])
-    return float(record["effects"][0]["rho"])
+def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
+    """Effects in the model of a posterior, but those of places."""
+    return effects_from_record(json.loads(posterior.attrs.get("model_record", "{}")))
+
+
+def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
+    """Variables of an effect by name, chains joined: leading axis (draw,)."""
+    group = posterior[effect.noun].to_dataset()
+    arrays = {n: group[n].transpose("chain", "draw", *effect.variables[n]).values
+              for n in effect.variables}  # fmt: skip
+    return {name: array.reshape(-1, *array.shape[2:]) for name, array in arrays.items()}
+
+
+def theta_of(sites: Mapping[str, np.ndarray]) -> Theta:
+    """Hyperparameters and `rest` of draws by name."""
+    return {**sites, "rest": 1.0 - sites["beta0"]}
+
+
+def slots_of(missions: Sequence[Mission], batch: MissionBatch) -> Slots:
+    """All bounds of missions that effects other than of places are at."""
+    return Slots.every(batch, len(missions), missions[0].features, None)
 
 
 def _params(posterior: xr.DataTree) -> tuple[Params, dict[str, np.ndarray]]:
-    """Parameters without the effects of robots, and all draws by name."""
+    """Parameters with no effects but those of places, and all draws by name."""
     sites = sites_of(posterior)
     params = params_from(sites, posterior.attrs)
     if "places" not in posterior.children:
         return params, sites
     maps = place_maps_of(posterior["places"].to_dataset(), sites)
     return params._replace(**maps), sites  # pyright: ignore
-
-
-def _robot_effect(posterior: xr.DataTree) -> np.ndarray:
-    """Effects d (draw, mission, robot), chains joined."""
-    effect = posterior["robots"].to_dataset()["robot_effect"]
-    values = effect.transpose("chain", "draw", "mission", "robot").values
-    return values.reshape(-1, *values.shape[2:])
-
-
-def _sight(features: Iterable[Any]) -> list[int]:
-    return [m for m, name in enumerate(features) if is_line_of_sight(str(name))]

@@ -169,13 +169,13 @@ def fit(
         "posterior": {name: sampled.params[name] for name in model.dims},
         "sample_stats": sampled.stats,
         "prior": {name: values[None] for name, values in prior.items()},
-        **({"robots": dict(sampled.robots)} if sampled.robots else {}),
+        **{noun: dict(variables) for noun, variables in sampled.effects.items()},
     }
-    posterior = to_datatree(groups, missions, model.dims | {"robot_effect": ("mission", "robot")})
+    posterior = to_datatree(groups, missions, model.dims, model.effects)
     if places is not None:
         posterior["places"] = xr.DataTree(place_group(sampled.places, places, seed))
     posterior.attrs |= {
-        **_record(model, batch, resolution(ticks)),
+        **_record(model, batch, len(missions), resolution(ticks)),
         **sampled.summary,
         "observation_reason": family_reason,
         "sampler": sampled.sampler,
@@ -231,7 +231,9 @@ class _Drawn(NamedTuple):
     """Reason of the sampler."""
 
 
-def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, object]:
+def _record(
+    model: TrustModel, batch: MissionBatch, n_missions: int, finest: float
+) -> dict[str, object]:
     """Attributes of a posterior: model, data, sampler; `finest` is the resolution of the rates."""
     return {
         "model": type(model).__name__,
@@ -241,6 +243,7 @@ def _record(model: TrustModel, batch: MissionBatch, finest: float) -> dict[str, 
         "model_record": json.dumps(model_to_record(model)),
         **model.marks(batch.awareness.shape[2:]),
         "n_robots": batch.awareness.shape[2],
+        **({"n_missions": n_missions} if model.effects else {}),
         "x0_mean": float(model.priors.x0_mean),
         "x0_sd": float(model.priors.x0_sd),
         "delta_v_floor": finest if model.family.rounds else 0.0,

@@ -37,9 +37,7 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
             correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
             log_det = np.linalg.slogdet(correlation)[1]
             densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
-    if model.place is not None:
-        densities |= model.place.log_prior(sites)
-    for effect in model.effects:
+    for effect in model.all_effects:
         densities |= effect.log_prior(sites)
     densities |= model.own_log_prior(sites)
     return {

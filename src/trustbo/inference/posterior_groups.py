@@ -9,14 +9,20 @@ from jax import random
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
-from trustbo.inference.draws import params_of_missions, rho_of, with_robots
+from trustbo.inference.draws import (
+    effects_of,
+    params_of_missions,
+    slots_of,
+    theta_of,
+    with_effects,
+)
 from trustbo.inference.evidence import kalman_numpy, latent
 from trustbo.inference.evidence.ep import trust
 from trustbo.inference.log_prior import log_prior_group
 from trustbo.inference.place_maps import prior_maps
 from trustbo.inference.posterior_tree import missions_of, require_posterior, to_datatree
 from trustbo.models.backend import own_settings
-from trustbo.models.effects.robot import prior_effect
+from trustbo.models.effects.effect import draw_effects
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params, params_from
@@ -30,12 +36,13 @@ LIKELIHOODS = ("log_likelihood", "mission_log_likelihood")
 _N_TRAJECTORIES = 200
 
 
-_KEPT = ("posterior", "sample_stats", "prior", "places", "robots", "hazard")
+_KEPT = ("posterior", "sample_stats", "prior", "places", "hazard")
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     """Posterior without the groups that grow with the number of missions; see `complete`."""
-    kept = [name for name in _KEPT if name in posterior.children]
+    kept = [*_KEPT, *(effect.noun for effect in effects_of(posterior))]
+    kept = [name for name in kept if name in posterior.children]
     alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
     alone.attrs = posterior.attrs
     return alone
@@ -188,12 +195,11 @@ def _prior_of(posterior: xr.DataTree, missions: Sequence[Mission], batch: Missio
         maps = prior_maps(posterior["places"].to_dataset(), sites)
         params = params._replace(**maps)  # pyright: ignore
         params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
-    if "robots" not in posterior.children:
-        return params
-    shape = tuple(posterior["robots"].sizes[dim] for dim in ("mission", "robot"))
     rng = np.random.default_rng([posterior.attrs["seed"], 4])
-    effect = prior_effect(sites, rho_of(posterior), shape, rng)  # pyright: ignore
-    return with_robots(params, effect, missions, batch)
+    theta, slots = theta_of(sites), slots_of(missions, batch)
+    effects = effects_of(posterior)
+    drawn = [draw_effects(effect, theta, slots, rng) for effect in effects]
+    return with_effects(params, effects, drawn, theta, slots)
 
 
 def _trust_by_numpy(

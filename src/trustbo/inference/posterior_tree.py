@@ -8,6 +8,7 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.models.effects.effect import Effect
 from trustbo.stacking import MissionBatch, stack_missions
 
 _DIMS = {
@@ -40,6 +41,7 @@ def to_datatree(
     groups: dict[str, dict[str, Any]],
     missions: Sequence[Mission],
     site_dims: dict[str, tuple[str, ...]],
+    effects: Sequence[Effect] = (),
 ) -> xr.DataTree:
     """Name the axes, remove the padding, and set values after a mission's end to NaN.
 
@@ -47,6 +49,7 @@ def to_datatree(
         groups: Arrays by group and name, with leading axes (chain, draw) except moments.
         missions: Missions of the posterior.
         site_dims: Axes of the model's parameters.
+        effects: Effects of the model, whose variables are in some groups.
     """
     observed = stack_missions(missions, pad=False)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
@@ -60,16 +63,16 @@ def to_datatree(
         "follower": list(missions[0].robots[1:]),
         "feature": list(missions[0].features),
     }
+    dims_of = _DIMS | site_dims
+    for effect in effects:
+        dims_of |= effect.variables
+        coords |= effect.coords
     tree = {}
     for group, arrays in groups.items():
         draw = arrays.pop("draw", None)
         variables, used, shape = {}, set(), (0, 0)
         for name, array in arrays.items():
-            dims = (
-                ("mission",)
-                if group.endswith("log_likelihood")
-                else (_DIMS | site_dims).get(name, ())
-            )
+            dims = ("mission",) if group.endswith("log_likelihood") else dims_of.get(name, ())
             kept = array[(..., *(slice(len(coords[d])) for d in dims))]
             if "bound" in dims:
                 kept = np.where(ended, np.nan, kept)

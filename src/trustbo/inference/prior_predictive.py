@@ -56,8 +56,8 @@ def prior_predictive(
         raise ShapeError(f"awareness must be (mission, bound, robot, feature); got {z.shape}.")
     if model.effects:
         raise TrustboError(
-            "effects of robots are of fitted missions: fit them, and take the posterior's group "
-            "prior_predictive; or give a model without them."
+            f"effects of {model.effects[0].noun} are of fitted missions: fit them, and take the "
+            "posterior's group prior_predictive; or give a model without them."
         )
     if model.place is not None:
         raise TrustboError(
@@ -148,8 +148,9 @@ def _effect_draws(model: TrustModel, n_draws: int, seed: int) -> dict[str, np.nd
     drawn = {}
     if model.place is not None:
         drawn |= model.place.draw(n_draws, np.random.default_rng([seed, 1]))
+    rng = np.random.default_rng([seed, 2])
     for effect in model.effects:
-        drawn |= effect.draw(n_draws, np.random.default_rng([seed, 2]))
+        drawn |= effect.draw(n_draws, rng)
     return drawn
 
 

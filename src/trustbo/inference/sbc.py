@@ -12,13 +12,13 @@ from tqdm import tqdm
 
 from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, read_record, write_text
+from trustbo.inference.draws import theta_of
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.run import Draws, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models.backend import own_settings
-from trustbo.models.effects.effect import Slots, Theta
-from trustbo.models.effects.robot import prior_effect
+from trustbo.models.effects.effect import Slots, Theta, draw_effects, drift_of
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
 from trustbo.models.place import Visited
@@ -124,7 +124,9 @@ def sbc(
         draws, _ = draw_posterior(
             model, sampler, settings, seed + j, batch, places=places, slots=slots, check=False
         )
-        found = draws.params | {n: d[:, :, [0, -1], [0, -1]] for n, d in draws.robots.items()}
+        found = dict(draws.params)
+        for variables in draws.effects.values():
+            found |= {name: _ends(d, 2) for name, d in variables.items()}
         if design is not None:
             found = found | design.effects(model, draws, seed + j)
         rank = {}
@@ -144,7 +146,8 @@ def _simulate(
     """Parameters and contact rates drawn from the prior, by name."""
     sites = draw_sites(model, awareness.shape[2:], 1, seed)
     params = model.params(sites, awareness.shape[3]).draw(0)
-    params, ranked = with_robots_drawn(model, sites, params, awareness.shape, seed)
+    batch = MissionBatch(awareness, np.zeros(ticks.shape), ticks)
+    params, ranked = with_effects_drawn(model, sites, params, batch, seed)
     with own_settings():
         key = random.key(seed)
     rates = model.simulate(key, params, awareness, ticks).contact_rate
@@ -152,28 +155,34 @@ def _simulate(
     return values | ranked | {"contact_rate": rates}
 
 
-def with_robots_drawn(
-    model: TrustModel, sites: Theta, params: Params, shape: tuple[int, ...], seed: int
+def with_effects_drawn(
+    model: TrustModel, sites: Theta, params: Params, batch: MissionBatch, seed: int
 ) -> tuple[Params, dict[str, np.ndarray]]:
-    """Parameters with effects of robots from the prior, if the model has them, and those ranked.
+    """Parameters with effects from the prior, but those of places, and the ranked ones of these.
 
-    Ranked are that of the first robot in the first mission, and that of the last in the last. No
-    feature is a line of sight, so that an effect is a constant of its mission.
+    Ranked are the first number of each variable, and the last. No feature is a line of sight.
 
     Args:
         model: Trust model.
         sites: Parameters, leading axis (draw,) of length 1.
         params: The same without it, the intercept perhaps of each (mission, bound, robot).
-        shape: Missions, bounds, robots and features.
+        batch: Missions.
         seed: Seed of the effects.
     """
+    theta, rng, ranked = theta_of(sites), np.random.default_rng([seed, 4]), {}
+    slots = Slots.every(batch, len(batch.awareness), (), None)
     for effect in model.effects:
-        rng = np.random.default_rng([seed, 4])
-        d = prior_effect(sites, effect.rho, (shape[0], shape[2]), rng)[0]
-        rest = 1.0 - np.asarray(sites["beta0"])[0]
-        b = np.broadcast_to(np.asarray(params.b), shape[:3]) + rest * d[:, None]
-        return params._replace(b=b), {"robot_effect": d[[0, -1], [0, -1]]}
-    return params, {}
+        values = draw_effects(effect, theta, slots, rng)
+        drift = drift_of(effect, values, theta, slots)[0]
+        params = params._replace(b=np.asarray(params.b) + drift)
+        ranked |= {name: _ends(d, 1)[0] for name, d in values.items()}
+    return params, ranked
+
+
+def _ends(d: np.ndarray, n_leading: int) -> np.ndarray:
+    """First and last number behind the leading axes, or the one there is."""
+    flat = d.reshape(*d.shape[:n_leading], -1)
+    return flat[..., np.unique([0, flat.shape[-1] - 1])]
 
 
 def _label(name: str, index: tuple[int, ...]) -> str:

@@ -17,7 +17,7 @@ from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
-from trustbo.models.effects.effect import Slots
+from trustbo.models.effects.effect import Effect, Slots
 from trustbo.models.effects.place import Place
 from trustbo.models.effects.sampled import sampled_drift
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
@@ -60,7 +60,7 @@ class TrustModel(Displayed, ABC):
     observation: str = "gaussian"
     response: str = "level"
     place: PlaceEffect | None = None
-    effects: ClassVar[tuple[Any, ...]] = ()  # see `PooledTrust`
+    effects: ClassVar[tuple[Effect, ...]] = ()  # see `PooledTrust`
 
     def __post_init__(self) -> None:
         require_choice("observation", self.observation, (AUTO, *FAMILIES))
@@ -112,8 +112,8 @@ class TrustModel(Displayed, ABC):
         return {name: () for effect in self.all_effects for name in effect.names}
 
     @property
-    def all_effects(self) -> list[Any]:
-        """Effects of places and of robots, as columns of the evidence."""
+    def all_effects(self) -> list[Effect]:
+        """All effects, those of places first, as columns of the evidence."""
         place = [] if self.place is None else [Place(**self.place.to_record())]
         return [*place, *self.effects]
 
@@ -420,7 +420,7 @@ class TrustModel(Displayed, ABC):
         if not self.family.integrates_out:
             return "its observations are not Gaussian"
         if self.why_not_exact or self.place or self.effects:
-            return self.why_not_exact or f"{'places' if self.place else 'robots'} have effects"
+            return self.why_not_exact or f"{self._effects[0]} have effects"
         if self.robot_sets is None:
             return "its robots share some parameters only, or influence each other"
         return None
@@ -441,7 +441,7 @@ class TrustModel(Displayed, ABC):
                 "rates measure changes" if self.lag else "robots with nothing else in common"
             )
         if self.effects and self.lag:
-            return "it has effects of robots, and rates measure changes"
+            return f"it has effects of {self._effects[0]}, and rates measure changes"
         return None
 
     def _card(self) -> Card:
@@ -477,7 +477,7 @@ class TrustModel(Displayed, ABC):
 
     @property
     def _effects(self) -> list[str]:
-        return ["places"] * (self.place is not None) + ["robots"] * len(self.effects)
+        return ["places"] * (self.place is not None) + [e.noun for e in self.effects]
 
     def describe(self) -> str:
         """Text of the model's name and options."""

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from jax import Array
 
 from trustbo.errors import TrustboError
-from trustbo.models.effects.robot import RobotEffect
+from trustbo.models.effects.effect import EFFECTS, Effect
 from trustbo.models.model import TrustModel, register, sample
 from trustbo.models.params import TrustParams
 from trustbo.models.place import PlaceEffect
@@ -19,30 +20,32 @@ class PooledTrust(TrustModel):
 
     Attributes:
         effects: Effects that add to trust: `PlaceEffect()`, of which `place` is the short form, and
-            `RobotEffect()`, of each robot in each mission, which is for Gaussian rates.
+            `RobotEffect()`, of each robot in each mission, and any that is registered.
 
     Raises:
         TrustboError: An effect is unknown, or of a kind that the model already has.
     """
 
-    effects: tuple[RobotEffect, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
+    effects: tuple[Effect, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self) -> None:
-        effects = (self.effects,) if isinstance(self.effects, RobotEffect) else tuple(self.effects)
-        for effect in effects:
-            if not isinstance(effect, PlaceEffect | RobotEffect):
-                raise TrustboError(
-                    f"effects must be of PlaceEffect() and RobotEffect(); got {effect!r}."
-                )
+        one = isinstance(self.effects, PlaceEffect | Effect)
+        effects: tuple[Any, ...] = (self.effects,) if one else tuple(self.effects)
+        kinds = [type(effect).__name__ for effect in effects]
+        if unknown := [e for e in effects if not isinstance(e, (PlaceEffect, *EFFECTS.values()))]:
+            raise TrustboError(
+                f"effects must be of PlaceEffect() and {', '.join(f'{n}()' for n in EFFECTS)}, "
+                f"or of a class that is registered; got {unknown[0]!r}."
+            )
         places = [effect for effect in effects if isinstance(effect, PlaceEffect)]
-        robots = tuple(effect for effect in effects if isinstance(effect, RobotEffect))
-        if len(places) + (self.place is not None) > 1 or len(robots) > 1:
+        if len(places) + (self.place is not None) > 1 or len(set(kinds)) < len(kinds):
             raise TrustboError(
                 f"effects must be of different kinds; got {effects!r} and place={self.place!r}."
             )
         if places:
             object.__setattr__(self, "place", PlaceEffect(**places[0].to_record()))
-        object.__setattr__(self, "effects", robots)
+        others = tuple(effect for effect in effects if not isinstance(effect, PlaceEffect))
+        object.__setattr__(self, "effects", others)
         super().__post_init__()
 
     def sample_params(self, n_robots: int, n_features: int) -> TrustParams:

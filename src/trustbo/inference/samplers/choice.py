@@ -63,7 +63,7 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     if model.effects:
         raise TrustboError(
             f"no sampler can treat {model.describe()}: {reason}. Give a model without effects of "
-            "robots, or other priors."
+            f"{model.effects[0].noun}, or other priors."
         )
     return ("nuts" if model.family.integrates_out else "joint"), reason
 

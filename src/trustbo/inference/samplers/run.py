@@ -52,8 +52,8 @@ class Draws(NamedTuple):
     """Innovations of latent trust, with the same leading axes, if it was sampled."""
     places: Mapping[str, np.ndarray] = {}
     """Effects of visited places, see `place_maps.place_group`."""
-    robots: Mapping[str, np.ndarray] = {}
-    """Effects of robots in missions, robot_effect (chain, draw, mission, robot)."""
+    effects: Mapping[str, Mapping[str, np.ndarray]] = {}
+    """Variables (chain, draw, ...) of the model's other effects, by noun and name."""
     fallback: str = ""
     """Failure of the exact sampler, where NUTS was used for it."""
 
@@ -183,20 +183,20 @@ def _sample_scores(
     posteriors = [one.draws for one in sampled]
     _require_even(posteriors)
     params, stats = _join(posteriors, shape, per_robot=model.robot_sets == "each")
-    effects, robots = _pop_effects(params)
+    places, effects = _pop_effects(model, params)
     summary, proposal = _summarize(posteriors), sampled[0].proposal
     summary["proposal_center"] = proposal.center.tolist()
     summary["proposal_scale"] = proposal.scale.ravel().tolist()
-    return Draws(params, stats, summary, "exact", places=effects, robots=robots)
+    return Draws(params, stats, summary, "exact", places=places, effects=effects)
 
 
 def _pop_effects(
-    params: dict[str, np.ndarray],
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Effects of places and of robots, taken out of parameters by name."""
+    model: TrustModel, params: dict[str, np.ndarray]
+) -> tuple[dict[str, np.ndarray], dict[str, dict[str, np.ndarray]]]:
+    """Effects of places by name, and others by noun and name, taken out of parameters."""
     places = {name: params.pop(name) for name in ("place", "place_bound") if name in params}
-    robots = {name: params.pop(name) for name in ("robot_effect",) if name in params}
-    return places, robots
+    effects = {e.noun: {name: params.pop(name) for name in e.variables} for e in model.effects}
+    return places, effects
 
 
 def _targets(
@@ -307,10 +307,10 @@ def _sample_nuts_of_scores(
         rng = np.random.default_rng([seed, 3, retries])
         drawn, _ = posterior.draw(flat, np.zeros(n), np.arange(n), rng)
         params = {name: values.reshape(*shape, *values.shape[1:]) for name, values in drawn.items()}
-        places, robots = _pop_effects(params)
+        places, effects = _pop_effects(model, params)
         stats["tree_depth"] = np.ceil(np.log2(stats["n_steps"] + 1)).astype(int)
         summary = {"retries": retries}
-        draws = Draws(params, stats, summary, "nuts", places=places, robots=robots)
+        draws = Draws(params, stats, summary, "nuts", places=places, effects=effects)
         return draws, complaints_of(params, stats) if check else []
 
     return _retried(attempt, settings, watch, collapse=False)

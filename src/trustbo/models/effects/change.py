@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpyro.distributions import Distribution
 from scipy import sparse
 
-from trustbo.models.effects.effect import Columns, Prior, Slots, Theta
+from trustbo.models.effects.effect import Columns, Effect, Independent, Slots
 from trustbo.models.effects.fingerprint import fingerprints
 
 Kind = Literal["all", "robot", "area"]
@@ -26,7 +25,7 @@ SIDES = 2, 2  # missions that meet the profile before and after a start, at leas
 
 
 @dataclass(frozen=True)
-class Change:
+class Change(Effect):
     """Change of one profile from one mission on: an effect without hyperparameters.
 
     Attributes:
@@ -38,21 +37,12 @@ class Change:
     kind: Kind
     where: tuple[int, ...]
     from_mission: int
-    names = ()
 
-    def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
-        """No hyperparameters."""
-        return {}
-
-    def hyperpriors(self) -> dict[str, Distribution]:
-        """No priors of hyperparameters."""
-        return {}
-
-    def group(self, slots: Slots) -> "ChangeColumn":
+    def group(self, slots: Slots) -> Independent:
         """See `Effect.group`."""
         kind, where = KINDS.index(self.kind), np.array([*self.where, 0, 0, 0][:3])
         values = _profile(slots, kind, where) * (slots.mission >= self.from_mission)[:, None]
-        return ChangeColumn(sparse.csr_array(values.reshape(-1, 1)), SDS[kind])
+        return Independent(sparse.csr_array(values.reshape(-1, 1)), "change", SDS[kind])
 
     def met(self, cells: np.ndarray) -> np.ndarray:
         """Whether bounds into cells (..., 2) belong to the area; all do of other kinds."""
@@ -69,24 +59,6 @@ class Change:
             "area": lambda row, col, radius: f"area within {radius} of ({row}, {col})",
         }[self.kind](*self.where)
         return f"{what}, from mission {self.from_mission}"
-
-
-class ChangeColumn(NamedTuple):
-    """Profile of a change from its first mission on."""
-
-    columns: Columns
-    sd: float
-    joined = ()
-    fades = False
-
-    def prior(self, theta: Theta) -> Prior:
-        """Normal, in units of stationary trust."""
-        sd = np.abs(theta["rest"])[:, None] * self.sd
-        return Prior(np.zeros_like(sd), sd)
-
-    def name(self, c: np.ndarray, theta: Theta, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Size d of the change, change (draw,)."""
-        return {"change": c[:, 0] / theta["rest"]}
 
 
 class Candidates(NamedTuple):
@@ -166,17 +138,12 @@ def cells_of(slots: Slots) -> np.ndarray:
     return np.where(unit[..., None] >= 0, slots.places.units[unit, 2:], -1)
 
 
-def _sight(slots: Slots) -> np.ndarray:
-    """Predicted contact (chain, bound), 1 where no feature predicts it."""
-    return slots.z[:, :, list(slots.sight)].mean(2) if slots.sight else np.ones(slots.y.shape)
-
-
 def _profile(slots: Slots, kind: int, where: np.ndarray) -> np.ndarray:
     """Profile (chain, bound) of a kind in all missions."""
     if KINDS[kind] == "area":
         cells = cells_of(slots)
         return 1.0 * (_within(cells - where[:2], where[2]) & (cells[..., 0] >= 0))
-    return _sight(slots) * ((kind == 0) | (slots.robot == where[0]))[:, None]
+    return slots.line_of_sight * ((kind == 0) | (slots.robot == where[0]))[:, None]
 
 
 def _within(gap: np.ndarray, radius: int | np.ndarray) -> np.ndarray:
@@ -193,7 +160,7 @@ def _entries(slots: Slots) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarr
     n_robots, K = slots.n_robots, slots.y.shape[1]
     seen = ~np.isnan(slots.y)
     ahead = (np.cumsum(seen[:, ::-1], axis=1)[:, ::-1] > 0).ravel()  # up to the last rate
-    sight = _sight(slots).ravel()
+    sight = slots.line_of_sight.ravel()
     lit = np.flatnonzero(ahead & (sight != 0.0))
     slot, value = [lit, lit], [sight[lit], sight[lit]]
     which = [np.zeros_like(lit), 1 + slots.robot[lit // K]]

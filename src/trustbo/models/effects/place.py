@@ -18,7 +18,7 @@ from scipy.linalg import helmert
 
 from trustbo.errors import TrustboError
 from trustbo.models.backend import namespace
-from trustbo.models.effects.effect import Columns, Prior, Slots, Theta, hypot, share_of
+from trustbo.models.effects.effect import Columns, Effect, Prior, Slots, Theta, hypot, share_of
 from trustbo.models.place import PlaceEffect, Visited, matern
 from trustbo.models.priors_numpy import half_normal
 
@@ -27,7 +27,7 @@ _LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
 
 
 @dataclass(frozen=True)
-class Place(PlaceEffect):
+class Place(PlaceEffect, Effect):  # pyright: ignore[reportIncompatibleVariableOverride]
     """Effect of a place, see `PlaceEffect`, as an effect among others."""
 
     def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:

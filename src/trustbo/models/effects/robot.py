@@ -8,21 +8,31 @@ independent between robots with covariance over missions
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-import numpyro.distributions as dist
 from scipy import sparse
 
 from trustbo.errors import TrustboError, require_positive
-from trustbo.models.backend import namespace, own_settings
-from trustbo.models.effects.effect import Columns, Fading, Prior, Slots, Theta, hypot, share_of
-from trustbo.models.priors_numpy import half_normal, log_prob
+from trustbo.models.backend import namespace
+from trustbo.models.effects.effect import (
+    Columns,
+    Effect,
+    Fading,
+    NextMission,
+    Prior,
+    Slots,
+    Theta,
+    hypot,
+    register,
+    share_of,
+)
 
 
+@register
 @dataclass(frozen=True)
-class RobotEffect:
+class RobotEffect(Effect):
     """Effect of a robot in a mission, proportional to its line of sight.
 
     Without a feature that predicts line of sight, the effect is a constant of the mission.
@@ -40,6 +50,8 @@ class RobotEffect:
     tau_day: float = 0.2
     rho: float = 0.9
     names = ("tau_slow", "tau_day")
+    noun = "robots"
+    variables: ClassVar = {"robot_effect": ("mission", "robot")}
 
     def __post_init__(self) -> None:
         for name in self.names:
@@ -47,42 +59,29 @@ class RobotEffect:
         if not 0.0 < self.rho < 1.0:
             raise TrustboError(f"RobotEffect.rho must be between 0 and 1; got {self.rho!r}.")
 
-    def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
-        """See `Effect.scales`."""
-        values = half_normal(scores, np.array([self.tau_slow, self.tau_day]))
-        return dict(zip(self.names, values.T, strict=True))
-
-    def draw(self, n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draws of the hyperparameters from their prior, each (draw,), by name."""
-        return self.scales(rng.standard_normal((n, 2)))
-
-    def hyperpriors(self) -> dict[str, dist.Distribution]:
-        """Priors of the hyperparameters, by name."""
-        return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
-
-    def log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Log prior density of the hyperparameters of draws, by name."""
-        with own_settings():
-            priors = self.hyperpriors()
-        return {name: log_prob(prior, sites[name]) for name, prior in priors.items()}
-
     def group(self, slots: Slots) -> "RobotColumns":
         """See `Effect.group`."""
-        sight = slots.z[:, :, list(slots.sight)].mean(2) if slots.sight else np.ones(slots.y.shape)
         index = slots.robot * slots.n_missions + slots.mission
         size = slots.n_robots * slots.n_missions
         where = np.repeat(index, slots.y.shape[1])
         start = np.arange(len(where) + 1)
-        columns = sparse.csr_array((sight.ravel(), where, start), shape=(len(where), size))
+        columns = sparse.csr_array(
+            (slots.line_of_sight.ravel(), where, start), shape=(len(where), size)
+        )
         return RobotColumns(columns, self.rho, (slots.n_robots, slots.n_missions))
 
     def in_short(self) -> str:
         """Text of what the effect is of."""
         return "of robots by mission"
 
-    def to_record(self) -> dict[str, Any]:
-        """Fields by name, for JSON."""
-        return asdict(self)
+    def ahead(
+        self, values: Mapping[str, np.ndarray], theta: Theta, mission: NextMission
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Effect.ahead`."""
+        d, sd = next_mission(values["robot_effect"], theta, self.rho)
+        if mission.rng is not None:
+            d = d + sd[:, None] * mission.rng.standard_normal(d.shape)
+        return mission.by_sight(theta["rest"][:, None] * d)
 
 
 class RobotColumns(NamedTuple):
@@ -113,6 +112,11 @@ class RobotColumns(NamedTuple):
         d = (c / theta["rest"][:, None]).reshape(len(c), *self.shape)
         return {"robot_effect": np.swapaxes(d, 1, 2)}
 
+    def coefficients(self, values: Mapping[str, np.ndarray], theta: Theta) -> np.ndarray:
+        """See `ModelGroup.coefficients`."""
+        d = np.swapaxes(values["robot_effect"], 1, 2)
+        return theta["rest"][:, None] * d.reshape(len(d), -1)
+
 
 def next_mission(effect: np.ndarray, theta: Theta, rho: float) -> tuple[np.ndarray, np.ndarray]:
     """Mean (draw, robot) and sd (draw,) of d in the mission that follows those of some draws.
@@ -128,16 +132,6 @@ def next_mission(effect: np.ndarray, theta: Theta, rho: float) -> tuple[np.ndarr
     gain = np.linalg.solve(C, k[..., None])[..., 0]
     left = np.maximum(1.0 - (gain * k).sum(1), 0.0)
     return np.einsum("nm,nmi->ni", gain, effect), scale * np.sqrt(left)
-
-
-def prior_effect(
-    theta: Theta, rho: float, shape: tuple[int, int], rng: np.random.Generator
-) -> np.ndarray:
-    """Draws of d from the prior, (draw, mission, robot), for missions and robots `shape`."""
-    scale, fading = _correlation(theta, rho, shape[0])
-    return scale[:, None, None] * (
-        np.linalg.cholesky(fading.correlation()) @ rng.standard_normal((len(scale), *shape))
-    )
 
 
 def _correlation(theta: Theta, rho: float, n_missions: int) -> tuple[np.ndarray, Fading]:

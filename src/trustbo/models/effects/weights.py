@@ -4,9 +4,16 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpyro.distributions import Distribution
 
-from trustbo.models.effects.effect import Columns, Prior, Slots, Theta, dense_columns, share_of
+from trustbo.models.effects.effect import (
+    Columns,
+    Effect,
+    Prior,
+    Slots,
+    Theta,
+    dense_columns,
+    share_of,
+)
 from trustbo.models.priors import Priors
 from trustbo.models.priors_numpy import of_coefficients
 
@@ -14,7 +21,7 @@ _LEAST = 1e-8  # share of robots' differences in a variance: EP inverts the corr
 
 
 @dataclass(frozen=True)
-class Weights:
+class Weights(Effect):
     """Effect of features and of a constant, under the priors of `beta` and `b`, both Normal.
 
     With `by_robot` these are the priors of the means mu of the coefficients c_i of each robot,
@@ -23,15 +30,6 @@ class Weights:
 
     priors: Priors
     by_robot: bool = False
-    names = ()
-
-    def scales(self, scores: np.ndarray) -> dict[str, np.ndarray]:
-        """No hyperparameters."""
-        return {}
-
-    def hyperpriors(self) -> dict[str, Distribution]:
-        """No hyperparameters."""
-        return {}
 
     def group(self, slots: Slots) -> "FeatureColumns | FeatureColumnsByRobot":
         """See `Effect.group`."""
