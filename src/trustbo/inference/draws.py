@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,13 +22,17 @@ _DAYS = 20261123  # seed of the next mission's effects: the same posterior has t
 def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """All draws of a posterior by name, chains joined: leading axis (draw,)."""
     draws = posterior["posterior"].to_dataset()
-    n = draws.sizes["chain"] * draws.sizes["draw"]
-    # In one layout, whether just sampled or read from a file: sums over draws then round alike, and
-    # a resumed campaign has the same bits.
-    arrays = {
-        str(name): array.transpose("chain", "draw", ...).values for name, array in draws.items()
-    }
-    return {name: np.ascontiguousarray(a).reshape(n, *a.shape[2:]) for name, a in arrays.items()}
+    return {str(name): _joined(array) for name, array in draws.items()}
+
+
+def _joined(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
+    """Draws (draw, ...) with chains joined, other axes in an order, by default the given one.
+
+    In one layout, whether just sampled or read from a file: sums over draws then round alike, and a
+    resumed campaign has the same bits.
+    """
+    values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
+    return values.reshape(-1, *values.shape[2:])
 
 
 def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
@@ -110,9 +115,7 @@ def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     """Variables of an effect by name, chains joined: leading axis (draw,)."""
     group = posterior[effect.noun].to_dataset()
-    arrays = {n: group[n].transpose("chain", "draw", *effect.variables[n]).values
-              for n in effect.variables}  # fmt: skip
-    return {name: array.reshape(-1, *array.shape[2:]) for name, array in arrays.items()}
+    return {name: _joined(group[name], effect.variables[name]) for name in effect.variables}
 
 
 def theta_of(sites: Mapping[str, np.ndarray]) -> Theta:

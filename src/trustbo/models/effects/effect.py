@@ -5,6 +5,7 @@ robot in one mission; a slot is one bound of a chain. A new effect is a class af
 its columns at the slots of some missions one with the members of `Group`.
 """
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -172,6 +173,11 @@ class Effect(ABC):
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
     """Labels of axes other than those of missions, robots and features."""
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, list):  # of a file; a model's settings are hashed
+                object.__setattr__(self, name, tuple(value))
+
     @abstractmethod
     def group(self, slots: Slots) -> Group:
         """Columns at the slots of some missions; of a model's effect, a `ModelGroup`."""
@@ -214,8 +220,8 @@ class Effect(ABC):
         return f"of {self.noun}"
 
     def to_record(self) -> dict[str, Any]:
-        """Fields by name, for JSON."""
-        return asdict(self)  # pyright: ignore[reportArgumentType]
+        """Fields by name, as JSON has them: a tuple is a list."""
+        return json.loads(json.dumps(asdict(self)))  # pyright: ignore[reportArgumentType]
 
 
 class ModelGroup(Group, Protocol):
