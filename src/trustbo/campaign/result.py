@@ -24,7 +24,8 @@ from trustbo.errors import TrustboError, require_pair
 from trustbo.files import FilePath
 from trustbo.hazard.model import measures_of
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import params_of, place_maps
+from trustbo.inference import memory, params_of, place_maps
+from trustbo.inference.memory import Memory
 from trustbo.planning import Plan, Planner
 from trustbo.workspace import Workspace
 
@@ -83,6 +84,8 @@ class Result(Displayed):
         ]
         if "alarms" in self.__dict__:  # a scan takes seconds: no display begins one
             rows.append(("changes", " ".join(sentences_of(self.alarms)) or "none"))
+        if "memory" in self.__dict__:
+            rows.append(("memory", str(self.memory)))
         return summary_of(
             f"Result: {n} mission{'s' * (n != 1)}", rows, self.workspace, self.settings,
             self.history, lambda: self.trust_map, lambda: self.path,
@@ -127,6 +130,17 @@ class Result(Displayed):
                 model, whose rates may not be Gaussian, or have custom priors.
         """
         return alarms_of(self.posterior, self.missions, self.workspace)
+
+    @cached_property
+    def memory(self) -> Memory:
+        """Whether trust carries over from one bound to the next, see `inference.memory`.
+
+        Computed when first asked for, in a second; the summary shows it from then on.
+
+        Raises:
+            TrustboError: Nothing could be learned yet; or memory cannot be weighed under the model.
+        """
+        return memory(self.posterior, self.missions, self.workspace)
 
     def table(self) -> pd.DataFrame:
         """Table with a row for each mission, labelled by its number, from 1; also `history.csv`.

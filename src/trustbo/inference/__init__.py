@@ -10,6 +10,7 @@ from trustbo.inference.draws import params_of
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
+from trustbo.inference.memory import memory
 from trustbo.inference.place_maps import place_maps
 from trustbo.inference.posterior_groups import complete
 from trustbo.inference.prior_from import prior_from
@@ -28,6 +29,7 @@ __all__ = [
     "diagnostics",
     "fit",
     "loo",
+    "memory",
     "params_of",
     "place_maps",
     "prior_from",

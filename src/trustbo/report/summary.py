@@ -30,7 +30,7 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
 
     The `plan` is that of the result; a running campaign passes it, and has no time for changes.
     """
-    changes = [_changes(result)] if plan is None else []
+    changes = [_changes(result), _memory(result)] if plan is None else []
     plan = result.plan if plan is None else plan
     return [
         Fact("The campaign", f"{_where(result)} {_missions(result)}"),
@@ -139,6 +139,15 @@ def _changes(result: Result) -> Fact:
     if alarms.empty:
         return Fact("Changes", "No change of a robot or an area is more probable than none.")
     return Fact("Changes", " ".join(sentences_of(alarms)), good=False)
+
+
+def _memory(result: Result) -> Fact:
+    """State whether trust carries over between bounds, or why this was not weighed."""
+    try:
+        finding = str(result.memory)
+    except TrustboError as error:
+        return Fact("Memory", f"Not weighed: {error}")
+    return Fact("Memory", f"{finding[0].upper()}{finding[1:]}.")
 
 
 def _end(result: Result) -> str:

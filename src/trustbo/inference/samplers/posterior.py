@@ -109,6 +109,14 @@ class Shared:
         return theta
 
 
+class Memoryless(Shared):
+    """Scores with beta0 = 0: the first one is of nothing, so that the evidence lacks it."""
+
+    def with_core(self, core: Any, z: Any) -> dict[str, Any]:
+        """See `Shared.with_core`."""
+        return super().with_core(core * np.array([0.0, 1.0, 1.0]), z)
+
+
 class Posterior:
     """Log posterior density of scores, and draws of all else; see `importance.ScoreTarget`."""
 
@@ -218,6 +226,7 @@ def posterior_of(
     *,
     by_robot: bool = False,
     lag: float = 0.0,
+    carries: bool = True,
 ) -> Posterior:
     """Posterior of weights and other effects, by the evidence of a family of observations.
 
@@ -228,6 +237,8 @@ def posterior_of(
         slots: Rates of all chains.
         by_robot: Whether each robot has weights and a beta0 of a common distribution.
         lag: 1 where rates measure the change of trust, else 0.
+        carries: Whether trust carries over from one bound to the next; else beta0 = 0, which all
+            robots share.
     """
     effects = [Weights(priors, by_robot), *effects]
     groups, x0 = [e.group(slots) for e in effects], (float(priors.x0_mean), float(priors.x0_sd))
@@ -235,8 +246,10 @@ def posterior_of(
         evidence = Gaussian(slots, groups, x0, apart=by_robot, lag=lag)
     else:
         evidence = Sites(slots, groups, family, x0, apart=by_robot)
-    of_robots = PerRobot(priors, slots.n_robots, slots.z.shape[2]) if by_robot else None
-    coordinates = of_robots or Shared(priors, effects)
+    if by_robot:
+        coordinates = PerRobot(priors, slots.n_robots, slots.z.shape[2])
+    else:
+        coordinates = (Shared if carries else Memoryless)(priors, effects)
     return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))
 
 
