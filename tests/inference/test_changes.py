@@ -113,14 +113,20 @@ def test_probabilities_are_in_proportion_to_prior_odds_and_evidences():
     assert sum(weighed.by_kind().values()) == pytest.approx(1.0 - weighed.p_none)
 
 
-def test_weights_relative_to_a_change_are_means_of_ratios():
+@pytest.mark.parametrize("n", [4, 20])  # all draws weigh every candidate, or the first 4 of 20
+def test_weights_relative_to_a_change_are_means_of_ratios(n):
     slots, effects = slots_of(changing_missions(0, n_missions=5)), [Weights(PRIORS), Place()]
-    candidates, theta, evidence = Candidates.of(slots), random_theta(5), evidence_of(slots, effects)
+    candidates, theta, evidence = Candidates.of(slots), random_theta(n), evidence_of(slots, effects)
     a, b = evidence.scan(theta, candidates.columns, candidates.run)
     a, b = a[:, candidates.first], b[:, candidates.first]
     t = theta["rest"][:, None] * candidates.sd
     bf = np.exp(t**2 * b**2 / (2 + 2 * t**2 * a)) / np.sqrt(1 + t**2 * a)
     ratio = np.exp(candidates.log_odds) * (bf / bf[:, [3]])
+    all_of_first = ratio[:4].sum() + (1.0 / bf[:4, 3]).sum()
+    unlikely = ratio[:4].max(0) <= np.exp(-7.0) * all_of_first
+    unlikely[3] = False  # it is the believed one
+    assert unlikely.any()
+    ratio[4:, unlikely] = ratio[:4, unlikely].mean(0)
     total = ratio.sum(1) + 1.0 / bf[:, 3]
     weighed = weigh(evidence, theta, candidates, 3)
     np.testing.assert_allclose(weighed.p, ratio.sum(0) / total.sum(), rtol=1e-10)
@@ -220,6 +226,8 @@ def test_changes_of_a_posterior_are_those_of_its_missions():
     assert first["probability"] > 0.5
     with pytest.raises(TrustboError, match="holds parameters alone: give the missions"):
         tb.inference.changes(alone)
+    with pytest.raises(TrustboError, match=f"of {len(missions)} missions; got {len(missions) - 1}"):
+        tb.inference.changes(posterior, missions[1:])
     np.testing.assert_array_equal(
         tb.inference.changes(alone, missions)["probability"], table["probability"]
     )

@@ -21,6 +21,7 @@ from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.posterior_tree import missions_of, require_posterior
 from trustbo.inference.samplers.importance import sample_scores
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
+from trustbo.inference.samplers.student import proposal_of
 from trustbo.models.effects.change import KINDS, Candidates, Change
 from trustbo.models.effects.effect import Columns, Slots, Theta
 from trustbo.models.model import TrustModel
@@ -33,6 +34,8 @@ from trustbo.workspace import Workspace
 
 ALARM = 0.9  # probability of a change
 N_DRAWS = 24  # of theta in a scan
+_FIRST = 4  # draws by which every candidate is weighed
+_FAR = 7.0  # nats less than all together, from which on further draws do not weigh a candidate
 _MOST_FITS = 3  # with one change or another
 _LISTED = 1e-3  # probability of a change in a table
 
@@ -152,6 +155,16 @@ def scan_posterior(
         )
     missions = missions_of(posterior) if missions is None else list(missions)
     missions = missions if workspace is None else [workspace.fill(m) for m in missions]
+    n_fitted = len(missions)
+    if "constant_data" in posterior.children:
+        n_fitted = posterior["constant_data"].sizes["mission"]
+    elif "missions" in attrs:
+        n_fitted = len(np.atleast_1d(attrs["missions"]))
+    if len(missions) != n_fitted:
+        raise TrustboError(
+            f"the posterior is of {n_fitted} missions; got {len(missions)}. Give those that it was "
+            'fitted to, of a campaign those of posterior.attrs["missions"].'
+        )
     features = missions[0].features
     if model is None:
         model = model_from_record(json.loads(attrs["model_record"]), features=features)
@@ -176,11 +189,16 @@ def scan_posterior(
         return posterior_of(model.priors, model.family, [*effects, *further], slots)
 
     target = target_of([])
+    names = "beta0", "delta_w", "delta_v", *(name for e in effects for name in e.names)
 
     def draw_theta(change: Change | None) -> Theta:
-        given = target if change is None else target_of([change])
-        params = sample_scores(given, N_DRAWS, seed).draws.params
-        names = "beta0", "delta_w", "delta_v", *(name for e in effects for name in e.names)
+        if change is None:
+            drawn = posterior["posterior"].to_dataset().stack(sample=("chain", "draw"))
+            chosen = np.random.default_rng(seed).permutation(drawn.sizes["sample"])[:N_DRAWS]
+            params = {name: drawn[name].values[chosen] for name in names}
+        else:
+            start = proposal_of(posterior)
+            params = sample_scores(target_of([change]), N_DRAWS, seed, start).draws.params
         return {name: params[name] for name in names} | {"rest": 1.0 - params["beta0"]}
 
     evidence = cast(Gaussian, target.evidence)  # that of rates that integrate out
@@ -198,16 +216,36 @@ def weigh(
         candidates: Changes to weigh.
         believed: Index of the candidate whose column theta was drawn with; None for no change.
     """
-    rest, first = np.abs(theta["rest"])[:, None], candidates.first
-    a, b = (ab[:, first] for ab in evidence.scan(theta, candidates.columns, candidates.run))
-    variance = (rest * candidates.sd) ** 2
-    log_bf = 0.5 * (variance * b**2 / (1.0 + variance * a) - np.log1p(variance * a))
-    log_w = np.concatenate([np.zeros((len(a), 1)), log_bf + candidates.log_odds], axis=1)
+    rest = np.abs(theta["rest"])[:, None]
+    n, n_candidates = len(rest), len(candidates.first)
+    log_w = np.concatenate([np.zeros((n, 1)), np.full((n, n_candidates), -np.inf)], axis=1)
+    a, b = np.zeros((2, n, n_candidates))
+
+    def scan(draws: slice, kept: np.ndarray) -> None:
+        some = {name: values[draws] for name, values in theta.items()}
+        a[draws, kept], b[draws, kept] = _scanned(evidence, some, candidates, kept)
+        variance = (rest[draws] * candidates.sd) ** 2
+        misfit = variance * b[draws] ** 2 / (1.0 + variance * a[draws])
+        log_bf = 0.5 * (misfit - np.log1p(variance * a[draws]))
+        log_w[draws, 1 + kept] = (log_bf + candidates.log_odds)[:, kept]
+        if believed is not None:
+            log_w[draws] -= log_bf[:, believed, None]
+
+    # The first draws weigh all candidates, further ones those that count; the weight of the others
+    # is their mean over the first.
+    scan(slice(0, _FIRST), np.arange(n_candidates))
+    first = log_w[:_FIRST]
+    likely = first[:, 1:].max(0) > logsumexp(first) - _FAR
     if believed is not None:
-        log_w -= log_bf[:, believed, None]
+        likely[believed] = True
+    if n > _FIRST:
+        scan(slice(_FIRST, n), np.flatnonzero(likely))
+    of_draw = log_w[:, 1:].copy()
+    log_w[_FIRST:, 1:][:, ~likely] = logsumexp(first[:, 1:][:, ~likely], axis=0) - np.log(_FIRST)
+    variance = (rest * candidates.sd) ** 2
     total = logsumexp(log_w)
     p = np.exp(logsumexp(log_w, axis=0) - total)
-    share = np.exp(log_w[:, 1:] - logsumexp(log_w[:, 1:], axis=0))  # of a draw, by candidate
+    share = np.exp(of_draw - logsumexp(of_draw, axis=0))  # of a draw, by candidate
     posterior = 1.0 / (a + 1.0 / variance)
     mean = posterior * b / rest
     effect = (share * mean).sum(0)
@@ -215,6 +253,17 @@ def weigh(
     largest = float(np.exp(logsumexp(log_w, axis=1).max() - total))
     change = None if believed is None else candidates.change(believed)
     return Weighed(candidates, p[1:], float(p[0]), effect, sd, largest, change)
+
+
+def _scanned(
+    evidence: Scanned, theta: Theta, candidates: Candidates, kept: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Products of `Scanned.scan` of some candidates, each (point, candidate kept)."""
+    first = candidates.first[kept]
+    needed = np.isin(candidates.run, candidates.run[first])
+    a, b = evidence.scan(theta, candidates.columns[:, needed], candidates.run[needed])
+    where = (np.cumsum(needed) - 1)[first]
+    return a[:, where], b[:, where]
 
 
 def find_changes(

@@ -25,7 +25,7 @@ from trustbo.inference.samplers.choice import (
 )
 from trustbo.inference.samplers.run import Draws, UnevenWeightsError, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
-from trustbo.inference.samplers.student import Student
+from trustbo.inference.samplers.student import proposal_of
 from trustbo.inference.samplers.watching import Watch
 from trustbo.models.backend import VERSIONS
 from trustbo.models.effects.effect import Slots
@@ -148,7 +148,7 @@ def fit(
         floored = model.at_resolution(ticks)
         prior = draw_sites(floored, batch.awareness.shape[2:], _N_PRIOR, seed + 2)
         start, slots = (
-            _proposal(earlier),
+            proposal_of(earlier),
             _slots(model, chosen, missions, batch, weight, places),
         )
         watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
@@ -285,15 +285,6 @@ def _slots(
     if not needs_evidence(model, sampler):
         return None
     return Slots.of(batch, len(missions), missions[0].features, weight, places)
-
-
-def _proposal(earlier: xr.DataTree | None) -> Student | None:
-    """Proposal that an earlier posterior was drawn by."""
-    if earlier is None or "proposal_center" not in earlier.attrs:
-        return None
-    center = np.atleast_1d(earlier.attrs["proposal_center"]).astype(float)
-    scale = np.reshape(earlier.attrs["proposal_scale"], (len(center), len(center)))
-    return Student(center, scale.astype(float))
 
 
 def _weigh_rates(batch: MissionBatch, weight: np.ndarray) -> TickWeights:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
+import xarray as xr
 from scipy import special, stats
 from scipy.linalg import solve_triangular
 
@@ -111,3 +112,12 @@ def log_mixture(components: Sequence[Proposal], sizes: Sequence[int], z: np.ndar
     shares = np.log(np.asarray(sizes, dtype=float) / sum(sizes))
     terms = [s + component.log_density(z) for s, component in zip(shares, components, strict=True)]
     return np.logaddexp.reduce(terms, axis=0)
+
+
+def proposal_of(posterior: xr.DataTree | None) -> Student | None:
+    """Proposal that a posterior was drawn by; None for no posterior, or one of another sampler."""
+    if posterior is None or "proposal_center" not in posterior.attrs:
+        return None
+    center = np.atleast_1d(posterior.attrs["proposal_center"]).astype(float)
+    scale = np.reshape(posterior.attrs["proposal_scale"], (len(center), len(center)))
+    return Student(center, scale.astype(float))
