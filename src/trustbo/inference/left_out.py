@@ -22,7 +22,6 @@ from trustbo.inference.samplers.weights import smoothed_weights
 from trustbo.models.effects.effect import Slots
 from trustbo.models.model import TrustModel
 from trustbo.models.place import bounds_of, visited
-from trustbo.models.pooled import PooledTrust
 from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 
@@ -54,7 +53,7 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         One for each mission; None where the model has no effects, or where only approximations
         integrate these out (rates not Gaussian, a custom drift).
     """
-    exact = isinstance(model, PooledTrust) and model.family.integrates_out
+    exact = model.robot_sets == "all" and model.family.integrates_out
     if not model.all_effects or not exact or model.why_not_exact is not None:
         return None
     missions, weight = missions_of(posterior), weights_of(posterior)

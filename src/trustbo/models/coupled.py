@@ -175,18 +175,9 @@ class CoupledTrust(TrustModel):
         return self.robots_are_apart
 
     @property
-    def why_not_exact(self) -> str | None:
-        """See `TrustModel.why_not_exact`: coupled robots need Gaussian rates."""
-        if self.robots_are_apart:
-            return super().why_not_exact
-        if not self.family.integrates_out:
-            return "its robots influence each other, and its observations are not Gaussian"
-        return None
-
-    @property
-    def robot_sets(self) -> str | None:
-        """Statistics of each robot where nothing couples them."""
-        return "each" if self.robots_are_apart else None
+    def robot_sets(self) -> str:
+        """See `TrustModel.robot_sets`."""
+        return "each" if self.robots_are_apart else "coupled"
 
 
 def _matrix(diagonal: Any, off_diagonal: Any) -> Any:

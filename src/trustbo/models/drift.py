@@ -155,12 +155,15 @@ class DriftTrust(TrustModel):
         axes = sites | arguments
         return {"beta0": (), **axes, "delta_w": (), "delta_v": (), **self.place_dims}
 
+    @property
+    def robot_sets(self) -> str:
+        """See `TrustModel.robot_sets`."""
+        return "drift"
+
     @cached_property
     def why_not_exact(self) -> str | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Reason against normal scores: rates not Gaussian, or a prior without quantiles."""
-        if not self.family.integrates_out:
-            return "its drift is a function of your own, and its observations are not Gaussian"
-        return self._why_no_scores
+        return super().why_not_exact or self._why_no_scores
 
     @cached_property
     def _why_no_scores(self) -> str | None:

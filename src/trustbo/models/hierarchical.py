@@ -86,6 +86,11 @@ class HierarchicalTrust(TrustModel):
         )
 
     @property
+    def robot_sets(self) -> str:
+        """See `TrustModel.robot_sets`."""
+        return "pooled"
+
+    @property
     def partial_pooling(self) -> "HierarchicalTrust":
         """The model itself."""
         return self

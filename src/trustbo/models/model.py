@@ -34,6 +34,30 @@ if TYPE_CHECKING:
     from trustbo.models.hierarchical import HierarchicalTrust
 
 RESPONSES = ("level", "change")
+_REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
+    (
+        ("drift",),
+        {"not Gaussian"},
+        "its drift is a function of your own, and its observations are not Gaussian",
+    ),
+    (
+        ("coupled",),
+        {"not Gaussian"},
+        "its robots influence each other, and its observations are not Gaussian",
+    ),
+    ((), {"not propagated"}, "expectation propagation does not know its observations"),
+    (("other",), set(), "its robots share some parameters only, or influence each other"),
+    (("pooled",), {"places"}, "it has effects of places, and robots partially pooled"),
+    (
+        ("all", "each", "pooled"),
+        {"not Gaussian", "changes"},
+        "it measures changes of trust, and its observations are not Gaussian",
+    ),
+    (("all", "each"), {"places", "changes"}, "it has effects of places, and rates measure changes"),
+    (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
+    ((), {"other", "changes"}, "it has effects of {0}, and rates measure changes"),
+)
+"""Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
 
 
@@ -118,12 +142,14 @@ class TrustModel(Displayed, ABC):
         return [*place, *self.effects]
 
     @property
-    def robot_sets(self) -> str | None:
-        """Robots that sufficient statistics are gathered of together: `"all"`, or `"each"` alone.
+    def robot_sets(self) -> str:
+        """Kind of the robots' parameters, by which samplers choose scores and an evidence.
 
-        None where there are no such statistics: the exact sampler cannot treat the model.
+        `"all"` robots share them, `"each"` has separate ones; these two have sufficient statistics.
+        Those of `"pooled"` robots have a common distribution, `"coupled"` robots influence each
+        other, `"drift"` is a custom function. Only NUTS takes any `"other"`.
         """
-        return None
+        return "other"
 
     @property
     def priors_are_independent(self) -> bool:
@@ -421,28 +447,25 @@ class TrustModel(Displayed, ABC):
             return "its observations are not Gaussian"
         if self.why_not_exact or self.place or self.effects:
             return self.why_not_exact or f"{self._effects[0]} have effects"
-        if self.robot_sets is None:
+        if self.robot_sets not in ("all", "each"):
             return "its robots share some parameters only, or influence each other"
         return None
 
     @property
     def why_not_exact(self) -> str | None:
         """Reason why the exact sampler cannot treat the model; None if it can."""
-        if not (self.family.integrates_out or self.family.propagates):
-            return "expectation propagation does not know its observations"
-        if self.robot_sets is None and self.partial_pooling is None:
-            return "its robots share some parameters only, or influence each other"
-        if self.partial_pooling is not None and self.place is not None:
-            return "it has effects of places, and robots partially pooled"
-        if not self.family.integrates_out and self.lag:
-            return "it measures changes of trust, and its observations are not Gaussian"
-        if self.place is not None and (self.robot_sets == "each" or self.lag):
-            return "it has effects of places, and " + (
-                "rates measure changes" if self.lag else "robots with nothing else in common"
-            )
-        if self.effects and self.lag:
-            return f"it has effects of {self._effects[0]}, and rates measure changes"
-        return None
+        family, sets = self.family, self.robot_sets
+        traits = {
+            "not Gaussian": not family.integrates_out,
+            "not propagated": not (family.integrates_out or family.propagates),
+            "changes": bool(self.lag),
+            "places": self.place is not None,
+            "other": bool(self.effects),
+        }
+        mine = {name for name, has in traits.items() if has}
+        reasons = (why for of, what, why in _REFUSED if sets in (of or (sets,)) and what <= mine)
+        reason = next(reasons, None)
+        return reason and reason.format(*self._effects)
 
     def _card(self) -> Card:
         rows = [

@@ -74,7 +74,7 @@ class PooledTrust(TrustModel):
 
     @property
     def robot_sets(self) -> str:
-        """Statistics of all robots together."""
+        """See `TrustModel.robot_sets`."""
         return "all"
 
     @property

@@ -207,7 +207,7 @@ def test_where_coefficients_do_not_integrate_out_nuts_is_taken_and_says_why():
     assert chosen == "nuts"
     assert reason.startswith("it needs the prior of coupling to be a Normal distribution; got")
     with pytest.raises(TrustboError, match='sampler "exact": it needs the prior of coupling'):
-        target_of(small(), heavy)
+        resolve_sampler(heavy, "exact")
     censored = CoupledTrust(observation="censored")
     expected = "its robots influence each other, and its observations are not Gaussian"
     assert resolve_sampler(censored, "auto") == ("joint", expected)

@@ -207,6 +207,9 @@ def test_what_it_cannot_treat_is_refused():
         fit(missions, change, "exact")
     with pytest.raises(TrustboError, match="places, and robots partially pooled"):
         fit(missions, HierarchicalTrust(place=PlaceEffect()), "exact")
+    heavy = HierarchicalTrust(Priors(beta=dist.StudentT(3.0, 0.0, 0.5)))
+    with pytest.raises(TrustboError, match=r"it needs the prior of beta to be a Normal.*StudentT"):
+        fit(missions, heavy, "exact")
     with pytest.raises(TrustboError, match="has no sufficient statistics: its robots share some"):
         update_statistics(HierarchicalTrust(), None, missions)
 

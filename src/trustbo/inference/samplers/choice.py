@@ -3,10 +3,7 @@
 from trustbo.errors import TrustboError, require_choice
 from trustbo.inference.samplers.exact import why_not_conjugate
 from trustbo.inference.samplers.scores import why_no_quantiles
-from trustbo.models.coupled import CoupledTrust
-from trustbo.models.drift import DriftTrust
 from trustbo.models.model import TrustModel
-from trustbo.models.pooled import PooledTrust
 
 SAMPLERS = ("auto", "exact", "nuts", "joint")
 
@@ -15,13 +12,16 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
     """Refuse a sampler that cannot treat the model.
 
     Raises:
-        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` gives a reason; or it
-            is `"joint"`, and trust integrates out.
+        TrustboError: The sampler is `"exact"`, and `TrustModel.why_not_exact` or a prior gives a
+            reason; or it is `"joint"`, and trust integrates out.
     """
     if sampler == "exact" and (reason := model.why_not_exact):
         raise TrustboError(
             f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
         )
+    if sampler == "exact" and (reason := why_not_priors(model)):
+        remedy = "Give others" if model.effects else 'Use sampler="nuts", which takes any'
+        raise TrustboError(f'sampler "exact": {reason}. {remedy}.')
     if sampler in ("nuts", "joint") and model.effects and (reason := why_not_scores(model)):
         raise TrustboError(f'sampler "{sampler}" cannot treat {model.describe()}: {reason}.')
     if sampler == "joint" and model.family.integrates_out:
@@ -40,25 +40,11 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
     require_sampler(model, require_choice("sampler", sampler, SAMPLERS))
     if sampler != "auto":
         return sampler, "asked for"
-    pooling = model.partial_pooling is not None
-    custom_drift, coupled = isinstance(model, DriftTrust), is_coupled(model)
-    by_scores = (
-        model.place
-        or model.effects
-        or pooling
-        or custom_drift
-        or coupled
-        or not model.family.integrates_out
-    )
-    reason = model.why_not_exact or (
-        None if custom_drift else why_not_conjugate(model.priors, coupled=coupled)
-    )
-    reason = reason or (
-        why_no_quantiles(model.priors, partial_pooling=pooling) if by_scores else None
-    )
+    reason = model.why_not_exact or why_not_priors(model)
     if reason is None:
         by = "" if model.family.integrates_out else " by expectation propagation, and weights"
-        what = "trust integrates out" if custom_drift else "trust and coefficients integrate out"
+        linear = model.robot_sets != "drift"
+        what = "trust and coefficients integrate out" if linear else "trust integrates out"
         return "exact", f"{what}{by}"
     if model.effects:
         raise TrustboError(
@@ -75,9 +61,24 @@ def why_not_scores(model: TrustModel) -> str | None:
     """
     if reason := model.why_not_exact:
         return reason
-    if not isinstance(model, PooledTrust) or not model.family.integrates_out:
+    if model.robot_sets != "all" or not model.family.integrates_out:
         return "its robots do not share all parameters, or its observations are not Gaussian"
-    return why_not_conjugate(model.priors) or why_no_quantiles(model.priors, partial_pooling=False)
+    return why_not_conjugate(model.priors) or why_no_quantiles(model.priors)
+
+
+def why_not_priors(model: TrustModel) -> str | None:
+    """Reason why a model's priors do not suit its evidence or scores; None if they do."""
+    sets, linear = model.robot_sets, model.robot_sets != "drift"
+    coupled, pooled = sets == "coupled", sets == "pooled"
+    if linear and (reason := why_not_conjugate(model.priors, coupled=coupled)):
+        return reason
+    return None if by_sums(model) else why_no_quantiles(model.priors, partial_pooling=pooled)
+
+
+def by_sums(model: TrustModel) -> bool:
+    """Whether the exact sampler needs no more of missions than their sums (`evidence.gram`)."""
+    alone = model.place is None and not model.effects
+    return alone and model.family.integrates_out and model.robot_sets in ("all", "each")
 
 
 def needs_evidence(model: TrustModel, sampler: str) -> bool:
@@ -100,8 +101,3 @@ def faster_than_nuts(model: TrustModel) -> str:
     if resolve_sampler(model, "auto")[0] == "exact":
         return 'sampler "exact" takes seconds'
     return "fewer draws or chains take less"
-
-
-def is_coupled(model: TrustModel) -> bool:
-    """Whether robots influence each other."""
-    return isinstance(model, CoupledTrust) and not model.robots_are_apart

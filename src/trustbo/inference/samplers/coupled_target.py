@@ -14,7 +14,6 @@ Kurowicka and Joe 2009).
 import numpy as np
 from scipy import optimize, special
 
-from trustbo.errors import TrustboError
 from trustbo.inference.evidence.coupled_marginal import (
     Dynamics,
     Sequences,
@@ -22,7 +21,6 @@ from trustbo.inference.evidence.coupled_marginal import (
     integrate,
 )
 from trustbo.inference.samplers import scores
-from trustbo.inference.samplers.exact import why_not_conjugate
 from trustbo.inference.samplers.laplace import laplace
 from trustbo.inference.samplers.student import Student
 from trustbo.models.coupled import CoupledTrust
@@ -39,14 +37,8 @@ class CoupledTarget:
     n_corrected, compiles = None, True
 
     def __init__(self, model: CoupledTrust, batch: MissionBatch, weight: np.ndarray) -> None:
-        """Take missions and their weights.
-
-        Raises:
-            TrustboError: A prior is not conjugate.
-        """
+        """Take missions and their weights."""
         priors, ordered = model.priors, model.inter_robot == "ordered"
-        if reason := why_not_conjugate(priors, coupled=True):
-            raise TrustboError(f'sampler "exact": {reason}. Use sampler="nuts", which takes any.')
         _, _, n, n_features = batch.awareness.shape
         self.priors, self.n, self.n_features, self.ordered = priors, n, n_features, ordered
         n_inputs = n * n_features + 1

@@ -7,17 +7,17 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from jax import Array, random
 
-from trustbo.errors import PosteriorError, TrustboError
+from trustbo.errors import PosteriorError
 from trustbo.inference.evidence.gram_jax import spectrum
 from trustbo.inference.evidence.latent import Latents
 from trustbo.inference.evidence.place_marginal import PlaceIndex
 from trustbo.inference.evidence.statistics import gather, split_robots
-from trustbo.inference.samplers.choice import is_coupled, why_not_scores
+from trustbo.inference.samplers.choice import by_sums, why_not_scores
 from trustbo.inference.samplers.complaints import complaints_of, complaints_of_modes
 from trustbo.inference.samplers.convergence import MAX_KHAT
 from trustbo.inference.samplers.coupled_target import CoupledTarget
 from trustbo.inference.samplers.drift_scores import DriftPosterior
-from trustbo.inference.samplers.exact import ExactDraws, sample_exact, why_not_conjugate
+from trustbo.inference.samplers.exact import ExactDraws, sample_exact
 from trustbo.inference.samplers.importance import (
     ScoreTarget,
     UnevenWeightsError,
@@ -31,8 +31,6 @@ from trustbo.inference.samplers.student import Student
 from trustbo.inference.samplers.target import NutsData
 from trustbo.inference.samplers.watching import SILENT, Watch
 from trustbo.models.backend import own_settings
-from trustbo.models.coupled import CoupledTrust
-from trustbo.models.drift import DriftTrust
 from trustbo.models.effects.effect import Slots
 from trustbo.models.effects.place import split_units
 from trustbo.models.model import TrustModel
@@ -97,7 +95,7 @@ def draw_posterior(
     failure = ""
     if sampler == "exact":
         try:
-            if not (places or slots) and model.family.integrates_out and model.robot_sets:
+            if by_sums(model):
                 return _sample_exact(model, settings, seed, batch, weight), []
             targets = _targets(model, batch, weight, places, slots)
             return _sample_scores(model, settings, seed, targets, start, watch), []
@@ -207,28 +205,27 @@ def _targets(
     slots: Slots | None,
 ) -> list[ScoreTarget]:
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
-    if isinstance(model, DriftTrust):
-        slots = Slots.of(batch, len(weight), (), weight, places)
-        return [DriftPosterior.of(model, batch, slots)]
-    if slots is not None:
-        return [_by_evidence(model, slots)]
-    if is_coupled(model):
-        return [CoupledTarget(cast(CoupledTrust, model), batch, weight)]
-    robots = split_robots(model, batch)
-    return [_by_evidence(model, Slots.of(one, len(weight), (), weight, places)) for one in robots]
+    robots = [batch] if slots is not None else split_robots(model, batch)
+    chains = [slots or Slots.of(one, len(weight), (), weight, places) for one in robots]
+    target_of = _TARGETS.get(model.robot_sets, _by_evidence)
+    return [target_of(model, batch, weight, of_robot) for of_robot in chains]
 
 
-def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
-    """Posterior of robots that share parameters, or whose parameters do.
-
-    TrustboError: its coefficients have no Gaussian priors.
-    """
-    if reason := why_not_conjugate(model.priors):
-        raise TrustboError(f"effects need other priors: {reason}.")
-    by_robot = model.partial_pooling is not None
+def _by_evidence(
+    model: TrustModel, batch: MissionBatch, weight: np.ndarray, slots: Slots
+) -> Posterior:
+    """Posterior of robots whose coefficients are columns."""
     return posterior_of(
-        model.priors, model.family, model.all_effects, slots, by_robot=by_robot, lag=model.lag
-    )
+        model.priors, model.family, model.all_effects, slots,
+        by_robot=model.robot_sets == "pooled", lag=model.lag,
+    )  # fmt: skip
+
+
+_TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget]] = {
+    "drift": lambda model, batch, _, slots: DriftPosterior.of(model, batch, slots),
+    "coupled": lambda model, batch, weight, _: CoupledTarget(model, batch, weight),
+}
+"""Scores and evidence of models by `TrustModel.robot_sets`; `_by_evidence` of all others."""
 
 
 def _summarize(posteriors: list[ExactDraws]) -> dict[str, Any]:
@@ -298,7 +295,7 @@ def _sample_nuts_of_scores(
     check: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
-    posterior = _by_evidence(model, slots)
+    posterior = posterior_of(model.priors, model.family, model.all_effects, slots)
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
         z, stats = run_nuts_of_scores(tried, seed + 7919 * retries, posterior, watch)

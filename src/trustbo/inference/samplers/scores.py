@@ -78,7 +78,7 @@ def noise(prior: Distribution, size: np.ndarray) -> np.ndarray:
     return _by_numpyro(base, below + (1.0 - below) * special.erf(size / np.sqrt(2.0)))
 
 
-def why_no_quantiles(priors: Priors, *, partial_pooling: bool) -> str | None:
+def why_no_quantiles(priors: Priors, *, partial_pooling: bool = False) -> str | None:
     """Reason why priors have no scores: one has no quantiles. None if all have."""
     for name in ("beta0", "delta_w", "delta_v", *("tau",) * partial_pooling):
         prior = getattr(priors, name)
