@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from joint_normal import Dense
 from missions import walking_missions
 from references import dense_log_likelihood
 from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference.evidence.dense import Dense
 from trustbo.inference.evidence.gaussian import Gaussian
 from trustbo.inference.evidence.gaussian_jax import GaussianJax, Sums
 from trustbo.inference.evidence.statistics import gather
