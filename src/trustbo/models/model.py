@@ -55,7 +55,7 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
     ),
     (("all", "each"), {"places", "changes"}, "it has effects of places, and rates measure changes"),
     (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
-    ((), {"other", "changes"}, "it has effects of {0}, and rates measure changes"),
+    ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
 )
 """Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
 _STREAM = 0x6D697373  # of `simulate`, among all that a seed gives
@@ -460,7 +460,7 @@ class TrustModel(Displayed, ABC):
             "not propagated": not (family.integrates_out or family.propagates),
             "changes": bool(self.lag),
             "places": self.place is not None,
-            "other": bool(self.effects),
+            "effects": bool(self.effects),
         }
         mine = {name for name, has in traits.items() if has}
         reasons = (why for of, what, why in _REFUSED if sets in (of or (sets,)) and what <= mine)
