@@ -79,10 +79,11 @@ def test_nuts_draws_from_the_posterior_of_the_exact_sampler(missions):
     require_same_moments(nuts, exact, 0.2, 1.2)
 
 
-def test_the_numpyro_model_has_the_same_evidence(missions):
+@pytest.mark.parametrize("memory", ["level", "deviation"])
+def test_the_numpyro_model_has_the_same_evidence(missions, memory):
     """Given hyperparameters, coefficients are Gaussian: Laplace's formula is exact for them."""
     missions = missions[:3]
-    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()], memory=memory)
     batch = stack_missions(missions)
     fitted = model.for_features(FEATURES).at_resolution(weigh_ticks(batch, np.ones(8)))
     places = visited(bounds_of(missions, batch.contact_rate.shape[:2]), PlaceEffect(), 3)
@@ -107,7 +108,9 @@ def test_the_numpyro_model_has_the_same_evidence(missions):
     slope = np.asarray(slope)
     highest = float(value) + 0.5 * slope @ np.linalg.solve(-hessian, slope)
     volume = 0.5 * len(flat) * np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(-hessian)[1]
-    point = {name: np.array([v]) for name, v in theta.items()} | {"rest": np.array([0.7])}
+    point = {name: np.array([v]) for name, v in theta.items()} | {
+        "rest": np.array([0.7 if memory == "level" else 1.0])
+    }
     expected = evidence.log_density(point)[0]
     np.testing.assert_allclose(highest + volume - prior, expected, rtol=1e-8)
 

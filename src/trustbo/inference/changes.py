@@ -169,7 +169,12 @@ def scan_posterior(
     if model is None:
         model = model_from_record(json.loads(attrs["model_record"]), features=features)
     model = model.observing(attrs["observation"])
-    if not isinstance(model, PooledTrust) or not model.family.integrates_out or model.lag:
+    if (
+        not isinstance(model, PooledTrust)
+        or not model.family.integrates_out
+        or model.lag
+        or (model.memory != "level")
+    ):
         raise TrustboError(
             "changes are weighed under PooledTrust for Gaussian rates of trust; got "
             f'{model.describe()}. Fit the missions with PooledTrust(observation="gaussian").'

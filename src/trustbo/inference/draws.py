@@ -10,8 +10,15 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.posterior_tree import require_posterior
-from trustbo.models.effects.effect import Effect, NextMission, Slots, Theta, drift_of
-from trustbo.models.params import Params, RobotParams, params_from
+from trustbo.models.effects.effect import (
+    Effect,
+    NextMission,
+    Slots,
+    Theta,
+    drift_of,
+    rest_of,
+)
+from trustbo.models.params import DeviationRobotParams, Params, RobotParams, params_from
 from trustbo.models.place import bounds_of
 from trustbo.models.record import effects_from_record
 from trustbo.stacking import MissionBatch
@@ -61,7 +68,8 @@ def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
     attrs, features = posterior.attrs, posterior["posterior"].to_dataset()["feature"].values
     rng = np.random.default_rng(_DAYS) if day else None
     mission = NextMission(attrs["n_missions"], features.tolist(), attrs["n_robots"], rng)
-    robots, theta = (len(sites["beta0"]), mission.n_robots), theta_of(sites)
+    memory, robots = memory_of(posterior), (len(sites["beta0"]), mission.n_robots)
+    theta = theta_of(sites, memory)
     fields = {
         name: np.broadcast_to(sites[name][:, None], robots)
         for name in ("beta0", "b", "delta_w", "delta_v")
@@ -71,7 +79,8 @@ def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
         weights, intercept = effect.ahead(values_of(posterior, effect), theta, mission)
         beta, fields["b"] = beta + weights, fields["b"] + intercept
     x0 = {name: getattr(params, name) for name in ("x0_mean", "x0_sd")}
-    return RobotParams(beta=beta, **fields, **x0, **params.places)
+    kind = RobotParams if memory == "level" else DeviationRobotParams
+    return kind(beta=beta, **fields, **x0, **params.places)
 
 
 def params_of_missions(
@@ -86,7 +95,8 @@ def params_of_missions(
     if params.places:
         params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
     values = [values_of(posterior, effect) for effect in effects]
-    return with_effects(params, effects, values, theta_of(sites), slots_of(missions, batch))
+    theta = theta_of(sites, memory_of(posterior))
+    return with_effects(params, effects, values, theta, slots_of(missions, batch))
 
 
 def with_effects(
@@ -112,15 +122,20 @@ def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
     return effects_from_record(json.loads(posterior.attrs.get("model_record", "{}")))
 
 
+def memory_of(posterior: xr.DataTree) -> str:
+    """Memory of the model of a posterior, see `PooledTrust`."""
+    return posterior.attrs.get("memory", "level")
+
+
 def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     """Variables of an effect by name, chains joined: leading axis (draw,)."""
     group = posterior[effect.noun].to_dataset()
     return {name: _joined(group[name], effect.variables[name]) for name in effect.variables}
 
 
-def theta_of(sites: Mapping[str, np.ndarray]) -> Theta:
-    """Hyperparameters and `rest` of draws by name."""
-    return {**sites, "rest": 1.0 - sites["beta0"]}
+def theta_of(sites: Mapping[str, np.ndarray], memory: str) -> Theta:
+    """Hyperparameters and `rest` of draws by name, under the memory of `PooledTrust`."""
+    return {**sites, "rest": rest_of(sites["beta0"], memory)}
 
 
 def slots_of(missions: Sequence[Mission], batch: MissionBatch) -> Slots:

@@ -18,7 +18,7 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.inference.draws import params_of
-from trustbo.inference.evidence.live import Effect, Rates, live_filter
+from trustbo.inference.evidence.live import DeviationFilter, Effect, Rates, live_filter
 from trustbo.inference.posterior_tree import require_posterior
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.model import RESPONSES
@@ -131,6 +131,8 @@ class TrustFilter:
         self._family = FAMILIES[family]
         lag = float(require_choice("response", response or "level", RESPONSES) == "change")
         self._core = live_filter(self.params, lag, n_robots)
+        if isinstance(self._core, DeviationFilter):  # its state lacks the bound before
+            raise TrustboError('TrustFilter takes memory="level"; got parameters of "deviation".')
         if belief is not None:
             require_kind("belief", belief, AwarenessBelief, "give an AwarenessBelief")
         self._maps = None if belief is None else belief.draw(len(kept))

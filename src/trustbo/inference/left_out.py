@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.inference.draws import params_of, sites_of
+from trustbo.inference.draws import params_of, sites_of, theta_of
 from trustbo.inference.fit import fit
 from trustbo.inference.posterior_tree import missions_of
 from trustbo.inference.samplers.posterior import posterior_of
@@ -63,7 +63,7 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
     sites, names = sites_of(posterior), ("beta0", "delta_w", "delta_v", *model.effect_dims)
     points = np.column_stack([sites[name] for name in names])
     points, index = np.unique(points, axis=0, return_inverse=True)
-    theta = dict(zip(names, points.T, strict=True)) | {"rest": 1.0 - points[:, 0]}
+    theta = theta_of(dict(zip(names, points.T, strict=True)), model.memory)
 
     def log_evidence(j: int | None = None, w: float = 1.0) -> np.ndarray:
         """Log evidence at theta, the weight of mission j being w."""
@@ -71,7 +71,8 @@ def by_hyperparameters(posterior: xr.DataTree, model: TrustModel) -> list[LeftOu
         if j is not None:
             counted[j] = w
         slots = Slots.of(batch, len(missions), missions[0].features, counted, places)
-        rates = posterior_of(model.priors, model.family, model.all_effects, slots)
+        effects, memory = model.all_effects, model.memory
+        rates = posterior_of(model.priors, model.family, effects, slots, memory=memory)
         return rates.evidence.log_density(theta)[index]
 
     whole, left_out = log_evidence(), []

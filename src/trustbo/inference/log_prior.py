@@ -27,6 +27,7 @@ def log_prior(model: TrustModel, sites: Mapping[str, np.ndarray]) -> dict[str, n
     """
     terms = model.prior_terms(sites)
     (beta0,) = (values for field, values in terms.values() if field == "beta0")
+    beta0 = beta0 if model.memory == "level" else np.zeros_like(beta0)  # of stationary trust
     densities = {
         label: model.priors.log_density(field, values, beta0)
         for label, (field, values) in terms.items()

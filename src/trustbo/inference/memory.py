@@ -112,7 +112,9 @@ def memory(
         bounds = bounds_of(missions, batch.contact_rate.shape[:2])
         places = visited(bounds, model.place, batch.contact_rate.shape[2])
     slots = Slots.of(batch, len(missions), features, weight, places)
-    target = posterior_of(model.priors, model.family, model.all_effects, slots, carries=False)
+    target = posterior_of(
+        model.priors, model.family, model.all_effects, slots, memory=model.memory, carries=False
+    )
     without = sample_scores(target, _N_DRAWS, seed).draws.log_evidence
     beta0 = np.asarray(posterior["posterior"]["beta0"])
     log_bf = float(attrs["log_evidence"]) - without

@@ -11,6 +11,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.draws import (
     effects_of,
+    memory_of,
     params_of_missions,
     slots_of,
     theta_of,
@@ -196,7 +197,8 @@ def _prior_of(posterior: xr.DataTree, missions: Sequence[Mission], batch: Missio
         params = params._replace(**maps)  # pyright: ignore
         params = params.on(bounds_of(missions, batch.contact_rate.shape[:2]))
     rng = np.random.default_rng([posterior.attrs["seed"], 4])
-    theta, slots = theta_of(sites), slots_of(missions, batch)
+    theta = theta_of(sites, memory_of(posterior))
+    slots = slots_of(missions, batch)
     effects = effects_of(posterior)
     drawn = [draw_effects(effect, theta, slots, rng) for effect in effects]
     return with_effects(params, effects, drawn, theta, slots)

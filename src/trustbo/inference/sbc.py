@@ -14,7 +14,7 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.files import FilePath, read_record, write_text
 from trustbo.inference.draws import theta_of
 from trustbo.inference.prior_predictive import draw_sites
-from trustbo.inference.samplers.choice import resolve_sampler
+from trustbo.inference.samplers.choice import needs_evidence, resolve_sampler
 from trustbo.inference.samplers.run import Draws, draw_posterior
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.models.backend import own_settings
@@ -120,7 +120,8 @@ def sbc(
             simulated = design.simulate(model, awareness, ticks, own)
         batch = MissionBatch(awareness, simulated["contact_rate"], ticks)
         places = None if design is None else design.places(model)
-        slots = Slots.of(batch, shape[0], places=places) if model.effects else None
+        evidence = needs_evidence(model, sampler)
+        slots = Slots.of(batch, shape[0], places=places) if evidence else None
         draws, _ = draw_posterior(
             model, sampler, settings, seed + j, batch, places=places, slots=slots, check=False
         )
@@ -169,7 +170,7 @@ def with_effects_drawn(
         batch: Missions.
         seed: Seed of the effects.
     """
-    theta, rng, ranked = theta_of(sites), np.random.default_rng([seed, 4]), {}
+    theta, rng, ranked = theta_of(sites, model.memory), np.random.default_rng([seed, 4]), {}
     slots = Slots.every(batch, len(batch.awareness), (), None)
     for effect in model.effects:
         values = draw_effects(effect, theta, slots, rng)

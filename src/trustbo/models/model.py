@@ -17,7 +17,7 @@ from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import ShapeError, TrustboError, require_choice
 from trustbo.models.backend import own_settings
-from trustbo.models.effects.effect import Effect, Slots
+from trustbo.models.effects.effect import Effect, Slots, rest_of
 from trustbo.models.effects.place import Place
 from trustbo.models.effects.sampled import sampled_drift
 from trustbo.models.families import AUTO, FAMILIES, Family, choose, family_of
@@ -55,6 +55,11 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
     ),
     (("all", "each"), {"places", "changes"}, "it has effects of places, and rates measure changes"),
     (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
+    (
+        (),
+        {"not Gaussian", "deviation"},
+        "what lasts is a deviation of trust, and its observations are not Gaussian",
+    ),
     ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
 )
 """Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
@@ -85,10 +90,13 @@ class TrustModel(Displayed, ABC):
     response: str = "level"
     place: PlaceEffect | None = None
     effects: ClassVar[tuple[Effect, ...]] = ()  # see `PooledTrust`
+    memory: ClassVar[str] = "level"  # see `PooledTrust`
 
     def __post_init__(self) -> None:
         require_choice("observation", self.observation, (AUTO, *FAMILIES))
         require_choice("response", self.response, RESPONSES)
+        if self.lag and self.memory != "level":
+            raise TrustboError(f'memory "{self.memory}" is for rates that measure trust.')
         if self.lag and not self.family.allows_change:
             raise TrustboError(
                 'response "change" is not a share of ticks: use observation "gaussian" or '
@@ -182,7 +190,7 @@ class TrustModel(Displayed, ABC):
             name: draw(getattr(priors, name), (n, *size), rng)
             for name, size in self.sizes(*shape).items()
         }
-        return priors.of_stationary(drawn)
+        return priors.of_stationary(drawn, rest_of(drawn["beta0"], self.memory))
 
     def check(self, sites: Mapping[str, np.ndarray], shape: tuple[int, int]) -> None:
         """Refuse a model that is invalid at draws from its prior: TrustboError.
@@ -257,8 +265,8 @@ class TrustModel(Displayed, ABC):
         return {name: tuple(length[axis] for axis in axes) for name, axes in dims.items()}
 
     def options(self) -> dict[str, str]:
-        """Options by name, without the priors and the effects."""
-        others = ("priors", "place", "effects")
+        """Options by name, without the priors and the effects, nor the usual memory."""
+        others = ("priors", "place", "effects", *("memory",) * (self.memory == "level"))
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in others}
 
     def params(self, sites: Mapping[str, Any], n_features: int) -> Params:
@@ -268,7 +276,7 @@ class TrustModel(Displayed, ABC):
             sites: Values with the axes of `dims`.
             n_features: Number of features.
         """
-        return assemble_params(sites, self.x0)
+        return assemble_params(sites, self.x0, self.memory)
 
     # --- shared by all models ---
 
@@ -333,7 +341,7 @@ class TrustModel(Displayed, ABC):
             if model.place is not None:
                 places = visited(bounds_of(missions, shape[:2]), model.place, shape[2])
             slots = Slots.of(batch, len(missions), missions[0].features, places=places)
-            drift = sampled_drift(model.all_effects, slots, shape)
+            drift = sampled_drift(model.all_effects, slots, shape, model.memory)
         return partial(model._program, *batch, drift=drift)
 
     def _program(
@@ -449,7 +457,7 @@ class TrustModel(Displayed, ABC):
             return self.why_not_exact or f"{self._effects[0]} have effects"
         if self.robot_sets not in ("all", "each"):
             return "its robots share some parameters only, or influence each other"
-        return None
+        return None if self.memory == "level" else "what lasts is a deviation of trust"
 
     @property
     def why_not_exact(self) -> str | None:
@@ -459,6 +467,7 @@ class TrustModel(Displayed, ABC):
             "not Gaussian": not family.integrates_out,
             "not propagated": not (family.integrates_out or family.propagates),
             "changes": bool(self.lag),
+            "deviation": self.memory != "level",
             "places": self.place is not None,
             "effects": bool(self.effects),
         }

@@ -86,6 +86,10 @@ class ParameterDraws(Displayed):
             beta0 = beta0[..., None]
         return np.broadcast_to(beta0, (*self.leading, n_robots))[..., None] * np.eye(n_robots)
 
+    def expected_transition(self, n_robots: int) -> np.ndarray:
+        """Matrix by which expected trust depends on that before, shape of `transition`."""
+        return self.transition(n_robots)
+
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """Drift without intercept, (..., robot, move, row, col).
 

@@ -1,7 +1,7 @@
 """Parameters of the trust models as tuples of arrays, with leading axes such as (draw,)."""
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -99,6 +99,50 @@ class RobotParams(_Apart, _Trust):
     def increments(self, awareness: np.ndarray) -> np.ndarray:
         """See `ParameterDraws.increments`."""
         return np.einsum("...im,...idrcm->...idrc", np.asarray(self.beta, dtype=float), awareness)
+
+
+class _Deviation(_Apart):
+    """Methods of parameters under which what lasts is the deviation from expected trust.
+
+    x_k = u_k + beta0 (x_{k-1} - u_{k-1}) + w_k with u_0 = E x_0: along a path, trust is carried on
+    under the drift u_k - beta0 u_{k-1}. Its expectation is u_k, without memory.
+    """
+
+    __slots__ = ()
+
+    def _drift(self, awareness: Array) -> Array:
+        u, p = super()._drift(awareness), cast(Any, self)
+        first = jnp.broadcast_to(p.x0_mean, u[:, :1].shape)
+        return u - p.beta0 * jnp.concatenate([first, u[:, :-1]], axis=1)
+
+    def expected_transition(self, n_robots: int) -> np.ndarray:
+        """See `ParameterDraws.expected_transition`."""
+        return np.zeros_like(self.transition(n_robots))
+
+    def with_drift(self, awareness: np.ndarray) -> "TrustParams | RobotParams":
+        """See `ParameterDraws.with_drift`: what is carried on, with the drift as the intercept."""
+        p = cast(Any, self)
+        b, beta0 = np.asarray(p.b), p.beta0.reshape(len(p.beta0), 1, 1, -1)
+        weights = "nim" if self.BY_ROBOT else "nm"
+        u = np.einsum(f"jkim,{weights}->njki", awareness, p.beta)
+        u = u + (b if b.ndim == 4 else b.reshape(len(b), 1, 1, -1))
+        first = np.reshape(p.x0_mean, (-1, 1, 1, 1))
+        first = np.broadcast_to(first, u[:, :, :1].shape)
+        u = u - beta0 * np.concatenate([first, u[:, :, :-1]], axis=2)
+        carried = RobotParams if self.BY_ROBOT else TrustParams
+        return carried(*p._replace(beta=np.zeros_like(p.beta), b=u))
+
+
+class DeviationParams(_Deviation, TrustParams):
+    """`TrustParams` with memory of the deviation from expected trust."""
+
+    __slots__ = ()
+
+
+class DeviationRobotParams(_Deviation, RobotParams):
+    """`RobotParams` with memory of the deviation from expected trust."""
+
+    __slots__ = ()
 
 
 class _Coupled(NamedTuple):
@@ -248,20 +292,25 @@ def params_from(sites: Mapping[str, np.ndarray], about: Mapping[Any, Any]) -> Pa
     """
     x0 = {name: about[name] for name in ("x0_mean", "x0_sd")}
     if "drift" not in about:
-        return assemble_params(sites, x0)
+        return assemble_params(sites, x0, about.get("memory", "level"))
     shared = {name: sites[name] for name in ("beta0", "delta_w", "delta_v")}
     return DriftParams(drift=find_drift(about, sites), **shared, **x0)
 
 
-def assemble_params(sites: Mapping[str, np.ndarray], x0: Mapping[str, float]) -> Params:
-    """Parameters from their sites by name, with leading axis (draw,), and x0_mean and x0_sd."""
+def assemble_params(
+    sites: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
+) -> Params:
+    """Parameters from their sites by name, with leading axis (draw,), and x0_mean and x0_sd.
+
+    `memory`: what trust carries on, see `PooledTrust`.
+    """
     if "gamma" in sites:
         return ordered_params(sites, **x0)
     if "B0" in sites:
         return CoupledParams(**{name: sites[name] for name in CoupledParams._fields[:5]}, **x0)
     values = {name: sites[name] for name in TrustParams._fields[:5]}
     if sites["beta0"].ndim == 1:
-        return TrustParams(**values, **x0)
+        return (TrustParams if memory == "level" else DeviationParams)(**values, **x0)
     for name in ("delta_w", "delta_v"):  # the hierarchical model's are shared
         values[name] = values[name].reshape(len(values[name]), -1)
         values[name] = np.broadcast_to(values[name], sites["beta0"].shape)

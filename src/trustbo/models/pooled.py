@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import jax.numpy as jnp
 from jax import Array
 
-from trustbo.errors import TrustboError
-from trustbo.models.effects.effect import EFFECTS, Effect
+from trustbo.errors import TrustboError, require_choice
+from trustbo.models.effects.effect import EFFECTS, MEMORIES, Effect
 from trustbo.models.model import TrustModel, register, sample
-from trustbo.models.params import TrustParams
+from trustbo.models.params import DeviationParams, TrustParams
 from trustbo.models.place import PlaceEffect
 
 
@@ -21,12 +22,15 @@ class PooledTrust(TrustModel):
     Attributes:
         effects: Effects that add to trust: `PlaceEffect()`, of which `place` is the short form, and
             `RobotEffect()`, of each robot in each mission, and any that is registered.
+        memory: Quantity that lasts between bounds: trust, `"level"`, as in the paper, or its
+            `"deviation"` from what features and effects expect at a bound. For Gaussian rates.
 
     Raises:
         TrustboError: An effect is unknown, or of a kind that the model already has.
     """
 
     effects: tuple[Effect, ...] = ()  # pyright: ignore[reportIncompatibleVariableOverride]
+    memory: str = "level"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __post_init__(self) -> None:
         one = isinstance(self.effects, PlaceEffect | Effect)
@@ -46,16 +50,19 @@ class PooledTrust(TrustModel):
             object.__setattr__(self, "place", PlaceEffect(**places[0].to_record()))
         others = tuple(effect for effect in effects if not isinstance(effect, PlaceEffect))
         object.__setattr__(self, "effects", others)
+        require_choice("memory", self.memory, MEMORIES)
         super().__post_init__()
 
     def sample_params(self, n_robots: int, n_features: int) -> TrustParams:
         """Sample statements of beta0, beta, b, delta_w and delta_v."""
         priors = self.priors
         beta0 = sample("beta0", priors.beta0)
-        return TrustParams(
+        carried = beta0 if self.memory == "level" else jnp.zeros_like(beta0)
+        kind = TrustParams if self.memory == "level" else DeviationParams
+        return kind(
             beta0=beta0,
-            beta=sample("beta", priors.weights(beta0), (n_features,)),
-            b=sample("b", priors.intercept(beta0)),
+            beta=sample("beta", priors.weights(carried), (n_features,)),
+            b=sample("b", priors.intercept(carried)),
             delta_w=sample("delta_w", priors.delta_w),
             delta_v=sample("delta_v", priors.delta_v),
             x0_mean=priors.x0_mean,
@@ -64,7 +71,8 @@ class PooledTrust(TrustModel):
 
     def level(self, sites: Mapping[str, Array], mean_y: Array, mean_z: Array) -> dict[str, Array]:
         """See `TrustModel.level`."""
-        return {"b": sites["beta0"] * mean_y + sites["beta"] @ mean_z}
+        carried = sites["beta0"] * mean_y if self.memory == "level" else 0.0
+        return {"b": carried + sites["beta"] @ mean_z}
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

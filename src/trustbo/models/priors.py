@@ -193,11 +193,16 @@ class Priors(Displayed):
             means[name] = np.broadcast_to(np.where(np.isfinite(value), value, 0.0), shape)
         return self.of_stationary(means)
 
-    def of_stationary(self, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Convert `beta` and `b` of stationary trust to weights and intercept."""
+    def of_stationary(
+        self, values: dict[str, np.ndarray], rest: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
+        """Convert `beta` and `b` of stationary trust to weights and intercept.
+
+        `rest` is the drift by which stationary trust rises by 1, by default 1 - beta0.
+        """
         if not self.stationary:
             return values
-        rest = 1.0 - values["beta0"]
+        rest = 1.0 - values["beta0"] if rest is None else rest
         return values | {"beta": values["beta"] * rest[..., None], "b": values["b"] * rest}
 
     def describe(self) -> dict[str, str]:

@@ -100,11 +100,13 @@ def trust_dynamics(
     sd = np.broadcast_to(sd.mean(-1) if params.BY_ROBOT else sd, leading)
     if params.BY_ROBOT or team == "min":
         views = np.eye(n_robots) if team == "min" else np.full((1, n_robots), 1.0 / n_robots)
-        return Dynamics(params.transition(n_robots), drift(params, z, moves), start, views, sd)
+        transition = params.expected_transition(n_robots)
+        return Dynamics(transition, drift(params, z, moves), start, views, sd)
     # The mean over robots obeys the same equation.
     z = z.mean(-5, keepdims=True) if n_robots > 1 and params.LINEAR else z
     u = drift(params, z, moves).mean(-4, keepdims=True)  # robots may differ in effects of places
-    return Dynamics(params.transition(1), u, start.mean(-1, keepdims=True), np.eye(1), sd)
+    start = start.mean(-1, keepdims=True)
+    return Dynamics(params.expected_transition(1), u, start, np.eye(1), sd)
 
 
 def drift(params: Params, awareness: ArrayLike, moves: np.ndarray | None = None) -> np.ndarray:

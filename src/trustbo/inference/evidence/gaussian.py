@@ -38,9 +38,17 @@ from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
 from trustbo.errors import require_choice
 from trustbo.inference.evidence.fading import Eliminated, Sets, eliminate, spread
 from trustbo.inference.evidence.scan import Sums, take_projections, weigh_chains
-from trustbo.models.effects.effect import Columns, Fading, Group, Prior, Slots, Theta, dense_root
+from trustbo.models.effects.effect import (
+    MEMORIES,
+    Columns,
+    Fading,
+    Group,
+    Prior,
+    Slots,
+    Theta,
+    dense_root,
+)
 
-MEMORIES = ("level", "deviation")
 _NUMBERS = 1e6  # kept at once, of all points of a chunk: about the cache
 
 

@@ -5,7 +5,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from trustbo.models.families import Family
-from trustbo.models.params import CoupledParams, DriftParams, Params, RobotParams, TrustParams
+from trustbo.models.params import (
+    CoupledParams,
+    DeviationParams,
+    DeviationRobotParams,
+    DriftParams,
+    Params,
+    RobotParams,
+    TrustParams,
+)
 from trustbo.models.state_space import kalman
 
 Moments = tuple[np.ndarray, np.ndarray]
@@ -102,6 +110,32 @@ class ApartFilter:
         return (of_robots * z).sum(-1) + self._b
 
 
+class DeviationFilter(ApartFilter):
+    """Robots of which the deviation of trust from its expectation lasts, and is the state.
+
+    Rates are of trust, that of a bound being the state and the bound's drift.
+    """
+
+    def start(self) -> Moments:
+        """See `ApartFilter.start`."""
+        mean, var = super().start()
+        return np.zeros_like(mean), var
+
+    def predict(
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, effect: Effect = 0.0
+    ) -> Moments:
+        """See `ApartFilter.predict`."""
+        trust, ahead = super().predict(mean, var, z, effect)
+        return trust - self._drift(z) - effect, ahead
+
+    def update(
+        self, mean: np.ndarray, var: np.ndarray, z: np.ndarray, rates: Rates, effect: Effect = 0.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See `ApartFilter.update`."""
+        trust, ahead, log_density = super().update(mean, var, z, rates, effect)
+        return trust - self._drift(z) - effect, ahead, log_density
+
+
 class DriftFilter(ApartFilter):
     """Robots with a custom drift."""
 
@@ -190,4 +224,6 @@ def live_filter(params: Params, lag: float, n_robots: int) -> ApartFilter | Coup
     """Build the filter of one bound under parameters with the leading axis (draw,)."""
     if isinstance(params, CoupledParams):
         return CoupledFilter(params, lag, n_robots)
+    if isinstance(params, DeviationParams | DeviationRobotParams):
+        return DeviationFilter(params, lag, n_robots)
     return (DriftFilter if isinstance(params, DriftParams) else ApartFilter)(params, lag, n_robots)

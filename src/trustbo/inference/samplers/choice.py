@@ -19,10 +19,11 @@ def require_sampler(model: TrustModel, sampler: str) -> None:
         raise TrustboError(
             f'sampler "exact" cannot treat {model.describe()}: {reason}. Use sampler="auto".'
         )
+    alone = model.effects or model.memory != "level"  # the evidence alone has these
     if sampler == "exact" and (reason := why_not_priors(model)):
-        remedy = "Give others" if model.effects else 'Use sampler="nuts", which takes any'
+        remedy = "Give others" if alone else 'Use sampler="nuts", which takes any'
         raise TrustboError(f'sampler "exact": {reason}. {remedy}.')
-    if sampler in ("nuts", "joint") and model.effects and (reason := why_not_scores(model)):
+    if sampler in ("nuts", "joint") and alone and (reason := why_not_scores(model)):
         raise TrustboError(f'sampler "{sampler}" cannot treat {model.describe()}: {reason}.')
     if sampler == "joint" and model.family.integrates_out:
         raise TrustboError(
@@ -46,6 +47,11 @@ def resolve_sampler(model: TrustModel, sampler: str) -> tuple[str, str]:
         linear = model.robot_sets != "drift"
         what = "trust and coefficients integrate out" if linear else "trust integrates out"
         return "exact", f"{what}{by}"
+    if model.memory != "level":
+        raise TrustboError(
+            f'no sampler can treat {model.describe()}: {reason}. Give memory="level", or others of '
+            "these."
+        )
     if model.effects:
         raise TrustboError(
             f"no sampler can treat {model.describe()}: {reason}. Give a model without effects of "
@@ -77,13 +83,13 @@ def why_not_priors(model: TrustModel) -> str | None:
 
 def by_sums(model: TrustModel) -> bool:
     """Whether the exact sampler needs no more of missions than their sums (`evidence.gram`)."""
-    alone = model.place is None and not model.effects
+    alone = model.place is None and not model.effects and model.memory == "level"
     return alone and model.family.integrates_out and model.robot_sets in ("all", "each")
 
 
 def needs_evidence(model: TrustModel, sampler: str) -> bool:
     """Whether a sampler integrates effects out by the evidence of all of them."""
-    if model.effects:
+    if model.effects or model.memory != "level":
         return True
     return sampler != "joint" and model.place is not None and why_not_scores(model) is None
 

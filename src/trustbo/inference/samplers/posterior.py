@@ -18,7 +18,7 @@ from trustbo.inference.samplers import scores
 from trustbo.inference.samplers.laplace import derivatives, inverse_hessian
 from trustbo.inference.samplers.per_robot import PerRobot
 from trustbo.inference.samplers.student import Proposal, Spanning, Student
-from trustbo.models.effects.effect import Effect, Slots, Theta
+from trustbo.models.effects.effect import Effect, Slots, Theta, rest_of
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import Family
 from trustbo.models.priors import Priors
@@ -99,7 +99,7 @@ class Shared:
     def with_core(self, core: Any, z: Any) -> dict[str, Any]:
         """Hyperparameters of scores, given beta0 and the noises (point, 3), in NumPy or JAX."""
         beta0, delta_w, delta_v = core.T
-        rest = 1.0 - beta0 if self.memory == "level" else np.ones(len(z))
+        rest = rest_of(beta0, self.memory)
         theta = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v, "rest": rest}
         start = self.n_core
         for effect in self.effects:
@@ -226,6 +226,7 @@ def posterior_of(
     *,
     by_robot: bool = False,
     lag: float = 0.0,
+    memory: str = "level",
     carries: bool = True,
 ) -> Posterior:
     """Posterior of weights and other effects, by the evidence of a family of observations.
@@ -237,19 +238,20 @@ def posterior_of(
         slots: Rates of all chains.
         by_robot: Whether each robot has weights and a beta0 of a common distribution.
         lag: 1 where rates measure the change of trust, else 0.
-        carries: Whether trust carries over from one bound to the next; else beta0 = 0, which all
-            robots share.
+        memory: That of `PooledTrust`.
+        carries: Whether anything lasts from one bound to the next; else beta0 = 0, which all robots
+            share.
     """
     effects = [Weights(priors, by_robot), *effects]
     groups, x0 = [e.group(slots) for e in effects], (float(priors.x0_mean), float(priors.x0_sd))
     if family.integrates_out:
-        evidence = Gaussian(slots, groups, x0, apart=by_robot, lag=lag)
+        evidence = Gaussian(slots, groups, x0, memory, apart=by_robot, lag=lag)
     else:
         evidence = Sites(slots, groups, family, x0, apart=by_robot)
     if by_robot:
         coordinates = PerRobot(priors, slots.n_robots, slots.z.shape[2])
     else:
-        coordinates = (Shared if carries else Memoryless)(priors, effects)
+        coordinates = (Shared if carries else Memoryless)(priors, effects, memory)
     return Posterior(coordinates, evidence, float(np.nanstd(slots.y)))
 
 

@@ -217,7 +217,7 @@ def _by_evidence(
     """Posterior of robots whose coefficients are columns."""
     return posterior_of(
         model.priors, model.family, model.all_effects, slots,
-        by_robot=model.robot_sets == "pooled", lag=model.lag,
+        by_robot=model.robot_sets == "pooled", lag=model.lag, memory=model.memory,
     )  # fmt: skip
 
 

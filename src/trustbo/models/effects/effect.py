@@ -27,6 +27,9 @@ Theta = Mapping[str, np.ndarray]
 """Hyperparameters by name, each (point,): beta0, delta_w, delta_v, those of effects, and `rest`,
 the drift by which stationary trust rises by 1: 1 - beta0 where trust itself is carried on."""
 
+MEMORIES = ("level", "deviation")
+"""Lasting from one bound to the next: trust, or its deviation from what effects expect."""
+
 Columns = Any
 """A `scipy.sparse.csr_array`, whose stubs have neither shape nor products."""
 
@@ -312,6 +315,11 @@ def draw_effects(
     for columns, root in zip(group.joined, prior.roots, strict=True):
         e[:, columns] = np.einsum("nij,nj->ni", dense_root(root), e[:, columns])
     return group.name(prior.mean + prior.sd * e, theta, rng)
+
+
+def rest_of(beta0: Any, memory: str) -> Any:
+    """Drift by which stationary trust rises by 1, of the shape of beta0."""
+    return 1.0 - beta0 if memory == "level" else 0.0 * beta0 + 1.0
 
 
 def dense_root(root: Any) -> Any:

@@ -10,11 +10,11 @@ import numpyro.distributions as dist
 from jax import Array
 from jax.experimental.sparse import BCOO
 
-from trustbo.models.effects.effect import Effect, Slots, dense_root
+from trustbo.models.effects.effect import Effect, Slots, dense_root, rest_of
 
 
 def sampled_drift(
-    effects: Sequence[Effect], slots: Slots, shape: tuple[int, int, int]
+    effects: Sequence[Effect], slots: Slots, shape: tuple[int, int, int], memory: str = "level"
 ) -> Callable[[Array], Array]:
     """A function of beta0 that samples the drift by effects, shape (mission, bound, robot).
 
@@ -22,6 +22,7 @@ def sampled_drift(
         effects: Effects.
         slots: Rates by chain.
         shape: Missions, bounds and robots.
+        memory: Memory of the model, see `PooledTrust`.
     """
     groups = [effect.group(slots) for effect in effects]
     columns = [BCOO.from_scipy_sparse(group.columns) for group in groups]
@@ -34,7 +35,8 @@ def sampled_drift(
             priors = effect.hyperpriors()
             theta: Any = {name: numpyro.sample(name, p) for name, p in priors.items()}
             theta = {name: value[None] for name, value in theta.items()}
-            prior = group.prior(theta | {"beta0": beta0[None], "rest": 1.0 - beta0[None]})
+            rest = rest_of(beta0[None], memory)
+            prior = group.prior(theta | {"beta0": beta0[None], "rest": rest})
             white = dist.Normal(0.0, 1.0).expand((U.shape[1],)).to_event(1)
             c: Any = numpyro.sample(f"white_{'_'.join(priors)}", white)
             for joined, root in zip(group.joined, prior.roots, strict=True):
