@@ -1,6 +1,6 @@
 """Effects of places on trust, and the index of the places that missions visited."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_positive
-from trustbo.models.backend import namespace, own_settings
-from trustbo.models.priors_numpy import log_prob
+from trustbo.models.backend import namespace
 from trustbo.workspace.moves import MOVES, bounds_along
 
 N_MOVES = len(MOVES[8])
@@ -94,12 +93,6 @@ class PlaceEffect:
             "tau_e": dist.HalfNormal(self.tau_e),
         }
         return {name: priors[name] for name in self.names}
-
-    def log_prior(self, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Log prior density of the hyperparameters of draws, by name."""
-        with own_settings():
-            priors = self.hyperpriors()
-        return {name: log_prob(prior, sites[name]) for name, prior in priors.items()}
 
     def in_short(self) -> str:
         """Places that have effects, and whether robots share them."""
