@@ -12,6 +12,7 @@ that the default campaign has run.
 """
 
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,10 @@ from baselines import (
 )
 from common import arguments, parsed
 
-from trustbo.study import load_study, run_worlds, worlds, worlds_table
+from trustbo.study import run_worlds, worlds, worlds_table
 from trustbo.study.methods import BASELINE_ROWS
-from trustbo.study.table import as_text, differences, worse_than
+from trustbo.study.store import Store
+from trustbo.study.table import as_text, differences, to_dataset, worse_than
 
 OURS = "trustbo"
 METHODS: dict[str, Any] = {
@@ -78,7 +80,7 @@ def main():
     parser.add_argument("--report", action="store_true", help="tables alone, of --out")
     given = parsed(parser)
     if given.report:
-        report(load_study(given.out))
+        report(kept(given.out))
         return
     objective, max_bounds = given.objective, given.max_bounds
     if given.targets:
@@ -103,6 +105,13 @@ def main():
         **courses,
     )  # fmt: skip
     report(results)
+
+
+def kept(folder: Path) -> xr.Dataset:
+    """Results of all runs that a folder holds, of whatever parts."""
+    store = Store(folder)
+    records = {file.stem: store.read(file.stem) for file in (folder / "runs").glob("*.json")}
+    return to_dataset(records, {key: record["labels"] for key, record in records.items()})
 
 
 def report(results: xr.Dataset):
