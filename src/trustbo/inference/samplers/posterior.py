@@ -27,6 +27,7 @@ _LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6
 _FARTHEST = 7.0  # score that a search of the mode tries
 _ENOUGH = 1e-2  # nats that a further step of the search must gain
 _ROUNDS, _STILL = 3, 0.1  # rounds of the search and of sites; step of a score taken as none
+_MANY = 8  # scores whose moments take more points
 _WIDEST = 0.3  # precision of a score, at least: the prior's is 1
 
 
@@ -126,9 +127,9 @@ class Posterior:
         """Take the scores and an evidence; `spread` is the sd of the measured rates."""
         self.scores, self.evidence, self._spread = coordinates, evidence, spread
         alone = coordinates.n_scores == coordinates.n_core  # few coefficients: points are cheap
-        self.n_pilot, self.n_final = (
-            (1024, 4096) if alone and evidence.exact else (256, 1024 if alone else 512)
-        )
+        cheap, many = alone and evidence.exact, coordinates.n_scores > _MANY
+        self.n_pilot = 1024 if cheap else 512 if many else 256
+        self.n_final = 4096 if cheap else 1024 if alone else 512
         self.n_corrected = None if evidence.exact else 1000 if alone else 500
 
     @property
