@@ -16,11 +16,11 @@ import numpy as np
 from scipy import sparse
 
 from trustbo.inference.evidence.ep import joint
+from trustbo.inference.evidence.ep.chains import chains_of
 from trustbo.inference.evidence.ep.draws import draw_weighted
 from trustbo.inference.evidence.gaussian import named_effects, prior_of
 from trustbo.models.effects.effect import Columns, Group, Slots, Theta, dense_root
 from trustbo.models.families import Family
-from trustbo.models.families.terms import AT_ONE, GAUSSIAN, count_tables
 
 _LEAST = 1e-4  # sd of a coefficient
 _NOISE = 1e-6  # sd of a noise
@@ -124,21 +124,4 @@ def _chains(slots: Slots, U: Columns, family: Family) -> tuple[joint.Chains, np.
         column[i, : len(of_chain)] = of_chain
         u[i, :, : len(of_chain)] = U[i * K : i * K + K][:, of_chain].toarray()
     n_ticks = np.full(slots.y.shape, np.nan) if slots.n_ticks is None else slots.n_ticks
-    terms, seen = family.terms(slots.y, n_ticks), ~np.isnan(slots.y)
-    gaussian, late = terms.kind == GAUSSIAN, terms.kind >= AT_ONE
-    y, length = np.where(seen, slots.y, 0.0), K - np.argmax(seen[:, ::-1], axis=1)
-    chains = joint.Chains(
-        y,
-        terms.kind,
-        terms.case,
-        u,
-        column,
-        np.zeros(n_chains, dtype=int),
-        length,
-        np.where(late.any(1), np.argmax(late, axis=1), length),
-        np.stack([gaussian.sum(1), (np.where(gaussian, y, 0.0) ** 2).sum(1)], axis=1),
-        np.zeros(slots.y.shape),
-        terms.counts,
-        count_tables(terms.counts),
-    )
-    return chains, np.stack([terms.lam, terms.eta])
+    return chains_of(family, slots.y, n_ticks, u, column)

@@ -5,28 +5,58 @@ import numpy as np
 from trustbo.inference.evidence.ep.joint import Chains
 from trustbo.models.families import Family
 from trustbo.models.families.terms import AT_ONE, GAUSSIAN, count_tables
-from trustbo.parallel import plain
 from trustbo.stacking import MissionBatch
 
 
-def gather_chains(
+def chains_of(
     family: Family,
-    batch: MissionBatch,
-    *,
-    whole: np.ndarray | None = None,
-    apart: bool = False,
+    y: np.ndarray,
+    n_ticks: np.ndarray,
+    u: np.ndarray,
+    column: np.ndarray,
+    length: np.ndarray | None = None,
 ) -> tuple[Chains, np.ndarray]:
-    """Chains of a batch, and the sites to begin with, (2, chain, bound).
+    """Chains of rates, of robots that share beta0, and the sites to begin with, (2, chain, bound).
+
+    Args:
+        family: Family of observations.
+        y: Rates (chain, bound), NaN where not measured.
+        n_ticks: Ticks of that shape.
+        u: Drift that each of a chain's coefficients gives, (chain, bound, column).
+        column: Indices of these coefficients, (chain, column).
+        length: Bounds of each chain; by default up to its last rate.
+    """
+    terms, seen = family.terms(y, n_ticks), ~np.isnan(y)
+    gaussian, late = terms.kind == GAUSSIAN, terms.kind >= AT_ONE
+    rates = np.where(seen, y, 0.0)
+    ends = y.shape[1] - np.argmax(seen[:, ::-1], axis=1) if length is None else length
+    chains = Chains(
+        rates,
+        terms.kind,
+        terms.case,
+        np.ascontiguousarray(u),
+        np.ascontiguousarray(column),
+        np.zeros(len(y), dtype=int),
+        ends,
+        np.where(late.any(1), np.argmax(late, axis=1), ends),
+        np.stack([gaussian.sum(1), (np.where(gaussian, rates, 0.0) ** 2).sum(1)], axis=1),
+        np.zeros(y.shape),
+        terms.counts,
+        count_tables(terms.counts),
+    )
+    return chains, np.stack([terms.lam, terms.eta])
+
+
+def gather_chains(
+    family: Family, batch: MissionBatch, whole: np.ndarray | None = None
+) -> tuple[Chains, np.ndarray]:
+    """Chains of a batch whose coefficients are (weights, intercept), and the sites to begin with.
 
     Args:
         family: Family of observations.
         batch: Missions, padded with NaN.
         whole: Bounds of each mission, (mission,): chains have these lengths, and those without a
             rate are kept; by default they end at their last rate.
-        apart: Whether each robot has separate beta0, weights and intercept.
-
-    Returns:
-        Chains whose gamma is (weights, intercept), where robots are apart of one after the other.
     """
     n_robots = batch.contact_rate.shape[2]
     # One row per mission and robot: (chain, bound[, column]).
@@ -34,28 +64,7 @@ def gather_chains(
     n_ticks = np.swapaxes(np.broadcast_to(batch.n_ticks, batch.contact_rate.shape), 1, 2)
     z = np.swapaxes(batch.awareness, 1, 2).reshape(*y.shape, -1)
     u = np.concatenate([z, np.ones_like(z[..., :1])], axis=-1)
-    seen = ~np.isnan(y)
-    kept = np.flatnonzero(seen.any(1)) if whole is None else np.arange(len(y))
-    robot = kept % n_robots if apart else np.zeros(len(kept), dtype=int)
-    column = plain(u.shape[-1] * robot[:, None] + np.arange(u.shape[-1]))
-    drift = u[kept]
-    length = y.shape[1] - np.argmax(seen[kept][:, ::-1], axis=1)
-    if whole is not None:
-        length = np.repeat(whole, n_robots)
-    terms = family.terms(y[kept], n_ticks.reshape(y.shape)[kept])
-    gaussian, late = terms.kind == GAUSSIAN, terms.kind >= AT_ONE
-    chains = Chains(
-        np.where(seen[kept], y[kept], 0.0),
-        terms.kind,
-        terms.case,
-        np.ascontiguousarray(drift),
-        np.ascontiguousarray(column),
-        robot,
-        length,
-        np.where(late.any(1), np.argmax(late, axis=1), length),
-        np.stack([gaussian.sum(1), (np.where(gaussian, y[kept], 0.0) ** 2).sum(1)], axis=1),
-        np.zeros((len(kept), y.shape[1])),
-        terms.counts,
-        count_tables(terms.counts),
-    )
-    return chains, np.stack([terms.lam, terms.eta])
+    kept = np.arange(len(y)) if whole is not None else np.flatnonzero((~np.isnan(y)).any(1))
+    column = np.tile(np.arange(u.shape[2]), (len(kept), 1))
+    length = None if whole is None else np.repeat(whole, n_robots)
+    return chains_of(family, y[kept], n_ticks.reshape(y.shape)[kept], u[kept], column, length)
