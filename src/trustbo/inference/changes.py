@@ -173,7 +173,7 @@ def scan_posterior(
         not isinstance(model, PooledTrust)
         or not model.family.integrates_out
         or model.lag
-        or (model.memory != "level")
+        or model.memory != "level"
     ):
         raise TrustboError(
             "changes are weighed under PooledTrust for Gaussian rates of trust; got "
