@@ -164,27 +164,43 @@ def scored(world: World, course: str, n: int) -> dict[str, Any]:
 
 
 def show(records: Sequence[dict[str, Any]]) -> None:
-    """Print tables for all worlds and each kind."""
+    """Print a table of all worlds, by bounds seen and new, and one by kind."""
+    print(f"\n{len({r['world'] for r in records})} worlds, {len(records)} campaigns\n")
+    table = Table("method", "bounds", "rates", "within 50 %", "within 90 %", "log score, nats",
+                  "default's more", "R2", first=16)  # fmt: skip
+    for among in AMONG:
+        sums = _by_method(records, among)
+        for name, one in sums.items():
+            cells = [interval(one, share) for share in (_within_50, _within_90, _log_score)]
+            more = "" if name == "default" else _more(sums, name)
+            table.row(name, among, f"{one[:, 0].sum():.0f}", *cells, more, interval(one, _r2))
     kinds = list(dict.fromkeys(r["kind"] for r in records))
-    for title, members in [("all kinds", kinds), *((kind, [kind]) for kind in kinds)]:
+    others = list(records[0]["methods"])[1:]
+    print("\nThe default by kind, its band of the contact lost on the recommended path, and its "
+          "log score less that of others\n")  # fmt: skip
+    table = Table("kind", "worlds", "within 50 %", "within 90 %", "path within 90 %", *others)
+    for title, members in [("all", kinds), *((kind, [kind]) for kind in kinds)]:
         mine = [r for r in records if r["kind"] in members]
-        print(f"\n{title}: {len({r['world'] for r in mine})} worlds, {len(mine)} campaigns\n")
-        table = Table("method", "bounds", "rates", "within 50 %", "within 90 %",
-                      "log score, nats", "default's more", "R2", first=16)  # fmt: skip
-        for among in AMONG:
-            sums = {name: np.array([_sums(r["methods"][name], among) for r in mine])
-                    for name in mine[0]["methods"]}  # fmt: skip
-            for name, one in sums.items():
-                cells = [interval(one, share) for share in (_within_50, _within_90, _log_score)]
-                more = "" if name == "default" else interval(
-                    np.hstack([sums["default"], one]),
-                    lambda both: _log_score(both[:7]) - _log_score(both[7:]),
-                )  # fmt: skip
-                table.row(name, among, f"{one[:, 0].sum():.0f}", *cells, more, interval(one, _r2))
-        inside = np.array([[len(v), sum(low <= lost <= high for low, high, lost in v)]
-                           for v in (r["values"] for r in mine)], float)  # fmt: skip
-        print(f"\ncontact of the recommended path within its 90 % band: "
-              f"{interval(inside, lambda s: s[1] / s[0])} of {inside[:, 0].sum():.0f}")  # fmt: skip
+        sums = _by_method(mine, "all")
+        paths = np.array([[len(v), sum(low <= lost <= high for low, high, lost in v)]
+                          for v in (r["values"] for r in mine)], float)  # fmt: skip
+        table.row(title, len({r["world"] for r in mine}), interval(sums["default"], _within_50),
+                  interval(sums["default"], _within_90), interval(paths, lambda s: s[1] / s[0]),
+                  *(_more(sums, name) for name in others))  # fmt: skip
+
+
+def _by_method(records: Sequence[dict[str, Any]], among: str) -> dict[str, np.ndarray]:
+    """Sums of each campaign (campaign, sum), by method; see `_sums`."""
+    return {
+        name: np.array([_sums(r["methods"][name], among) for r in records])
+        for name in records[0]["methods"]
+    }
+
+
+def _more(sums: dict[str, np.ndarray], name: str) -> str:
+    """Log score of the default less that of another method."""
+    both = np.hstack([sums["default"], sums[name]])
+    return interval(both, lambda b: _log_score(b[:7]) - _log_score(b[7:]))
 
 
 def interval(sums: np.ndarray, figure: Callable[[np.ndarray], float], n: int = 1000) -> str:

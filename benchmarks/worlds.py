@@ -28,6 +28,7 @@ from baselines import (
 )
 from common import arguments, parsed
 
+from trustbo.files import to_json
 from trustbo.study import run_worlds, worlds, worlds_table
 from trustbo.study.methods import BASELINE_ROWS
 from trustbo.study.store import Store
@@ -108,9 +109,11 @@ def main():
 
 
 def kept(folder: Path) -> xr.Dataset:
-    """Results of all runs that a folder holds, of whatever parts."""
+    """Results of all runs that a folder holds, of whatever parts; of equal labels the newest."""
     store = Store(folder)
-    records = {file.stem: store.read(file.stem) for file in (folder / "runs").glob("*.json")}
+    files = sorted((folder / "runs").glob("*.json"), key=lambda file: file.stat().st_mtime)
+    newest = {to_json(store.read(file.stem)["labels"]): file.stem for file in files}
+    records = {key: store.read(key) for key in newest.values()}
     return to_dataset(records, {key: record["labels"] for key, record in records.items()})
 
 

@@ -1,12 +1,12 @@
 """Draws docs/figures/worlds.png: regret of what methods recommend, by kind of world.
 
-    python scripts/worlds_figure.py FOLDER FILE.png [--together]
+    python scripts/worlds_figure.py FOLDER FILE.png
 
-From a folder of `benchmarks/worlds.py`. With `--together`, all kinds of worlds are in one panel, as
-in docs/figures/worlds_outsider.png.
+From a folder of `benchmarks/worlds.py`.
 """
 
 import sys
+from pathlib import Path
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -14,7 +14,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from trustbo.study import load_study
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+from worlds import kept
 
 mpl.use("Agg")
 KINDS = {
@@ -38,14 +39,11 @@ STYLES = {
 def main() -> None:
     """Draw the panels."""
     folder, file = sys.argv[1:3]
-    together = "--together" in sys.argv
-    kinds = {"all worlds": sum(KINDS.values(), ())} if together else KINDS
-    results = complete(load_study(folder))
-    shape, size = ((1, 1), (5, 3.4)) if together else ((2, 3), (9, 5.4))
+    results = complete(kept(Path(folder)))
     figure, axes = plt.subplots(
-        *shape, figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
+        2, 3, figsize=(9, 5.4), sharex=True, sharey=True, layout="constrained"
     )
-    for ax, (title, chosen) in zip(axes.flat, kinds.items(), strict=True):
+    for ax, (title, chosen) in zip(axes.flat, KINDS.items(), strict=True):
         n = draw(ax, {name: curves(results, name, chosen) for name in STYLES})
         ax.set_title(f"{title} ({n})", fontsize=9, loc="left")
     for ax in axes[-1]:
@@ -54,18 +52,19 @@ def main() -> None:
         ax.set_ylabel("regret, % of the best contact", fontsize=9)
     handles = axes[0, 0].get_legend_handles_labels()
     figure.legend(
-        *handles, loc="outside lower center", ncols=2 if together else 3, frameon=False, fontsize=9
+        *handles, loc="outside lower center", ncols=len(STYLES), frameon=False, fontsize=9
     )
     figure.savefig(file, dpi=85)
 
 
 def draw(ax: Axes, regrets: dict[str, np.ndarray]) -> int:
-    """Draw the median and the middle half of each, (run, mission); return the number of runs."""
+    """Draw medians, and the middle half of ours, (run, mission); return the number of runs."""
     for name, regret in regrets.items():
         color, line = STYLES[name]
         mission = np.arange(regret.shape[1])
         low, middle, high = np.quantile(np.maximum(regret, 0.0), [0.25, 0.5, 0.75], axis=0)
-        ax.fill_between(mission, low, high, color=color, alpha=0.18, linewidth=0)
+        if name == "trustbo":
+            ax.fill_between(mission, low, high, color=color, alpha=0.18, linewidth=0)
         ax.plot(mission, middle, linestyle=line, color=color, label=name, linewidth=1.8)
     ax.set_yscale("symlog", linthresh=1.0, linscale=0.7)
     ax.set_yticks([0, 0.5, 1, 3, 10, 30], ["0", "0.5", "1", "3", "10", "30"])
