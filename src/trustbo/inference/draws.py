@@ -39,7 +39,7 @@ def _joined(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
     resumed campaign has the same bits.
     """
     values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
-    return values.reshape(-1, *values.shape[2:])
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also of none
 
 
 def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:

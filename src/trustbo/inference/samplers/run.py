@@ -207,13 +207,12 @@ def _targets(
     """Posterior of the scores of all robots, or of each where they have nothing in common."""
     robots = [batch] if slots is not None else split_robots(model, batch)
     chains = [slots or Slots.of(one, len(weight), (), weight, places) for one in robots]
-    target_of = _TARGETS.get(model.robot_sets, _by_evidence)
-    return [target_of(model, batch, weight, of_robot) for of_robot in chains]
+    if (target_of := _TARGETS.get(model.robot_sets)) is not None:
+        return [target_of(model, batch, weight, of_robot) for of_robot in chains]
+    return [_by_evidence(model, of_robot) for of_robot in chains]
 
 
-def _by_evidence(
-    model: TrustModel, batch: MissionBatch, weight: np.ndarray, slots: Slots
-) -> Posterior:
+def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
     """Posterior of robots whose coefficients are columns."""
     return posterior_of(
         model.priors, model.family, model.all_effects, slots,
@@ -295,7 +294,7 @@ def _sample_nuts_of_scores(
     check: bool,
 ) -> tuple[Draws, list[str]]:
     """Draws of scores by NUTS, of all else given them by the evidence; see `_sample_nuts`."""
-    posterior = posterior_of(model.priors, model.family, model.all_effects, slots)
+    posterior = _by_evidence(model, slots)
 
     def attempt(tried: NutsSettings, retries: int) -> tuple[Draws, list[str]]:
         z, stats = run_nuts_of_scores(tried, seed + 7919 * retries, posterior, watch)
