@@ -55,7 +55,7 @@ PACKAGES = {"BoTorch EI": "botorch", "BoTorch Thompson": "botorch", "Ax": "ax"}
 """Packages that methods need."""
 KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams", "four-ways",
          "robots", "days", "foul", "change", "jammer", "physics")  # fmt: skip
-CASES = ("robots", "days", "change", "jammer")
+CASES = ("canopy", "robots", "days", "change", "jammer")
 """Kinds of which each case has a table."""
 COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 15", "regret now",
            "lost while learning", "missions to 1 %", "arrive", "seconds"]  # fmt: skip
