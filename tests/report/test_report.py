@@ -199,6 +199,17 @@ def test_the_summary_says_what_is_recommended_and_how_sure_that_is(page, result)
     assert "k-hat" in facts["Posteriors"].text
 
 
+def test_the_value_has_its_band_over_draws(result):
+    low, high = result.plan.value_band
+    assert f"({number(low)} to {number(high)} in 90 % of the draws)" in facts_of(result)[2].text
+
+
+def test_changes_and_memory_that_cannot_be_weighed_say_why(hostile):
+    facts = {fact.name: fact for fact in facts_of(hostile)}
+    for name in ("Changes", "Memory"):
+        assert re.match(r"Not weighed: .*PooledTrust.*got CoupledTrust", facts[name].text)
+
+
 @pytest.mark.parametrize(
     ("rhat", "ess", "divergences", "good"),
     [

@@ -177,7 +177,8 @@ def scan_posterior(
     ):
         raise TrustboError(
             "changes are weighed under PooledTrust for Gaussian rates of trust; got "
-            f'{model.describe()}. Fit the missions with PooledTrust(observation="gaussian").'
+            f"{model.describe()}, memory of {model.memory}. Fit the missions with "
+            'PooledTrust(observation="gaussian").'
         )
     batch = stack_missions(missions)
     weight = np.ones(len(batch.contact_rate))

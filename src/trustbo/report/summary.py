@@ -77,7 +77,10 @@ def _value(result: Result) -> str:
     meaning = _MEANS[name]
     if result.settings.get("length_weight"):
         meaning += ", less the toll on its length"
-    return f"{number(result.value)}, {meaning} (objective {name})."
+    within = ""
+    if (band := result.plan.value_band) is not None:
+        within = f" ({number(band[0])} to {number(band[1])} in 90 % of the draws)"
+    return f"{number(result.value)}{within}, {meaning} (objective {name})."
 
 
 def _exactness(plan: Plan) -> str:
