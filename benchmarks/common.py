@@ -6,9 +6,12 @@ import json
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from trustbo.study.world import World
 
 
 def arguments(
@@ -81,6 +84,17 @@ def median_seconds(work: Callable[[], object], n: int = 5) -> float:
     return statistics.median(timed(work)[0] for _ in range(n))
 
 
+def median_processor_seconds(work: Callable[[], object], n: int = 3) -> float:
+    """The same of processor seconds, which other work on the machine lengthens less."""
+    work()
+    seconds = []
+    for _ in range(n):
+        started = time.process_time()
+        work()
+        seconds.append(time.process_time() - started)
+    return statistics.median(seconds)
+
+
 def verdict(met: bool) -> str:
     """Word for a target that is met or missed."""
     return "yes" if met else "NO"
@@ -139,3 +153,32 @@ def add_record(file: Path, record: object) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a") as stream:
         stream.write(json.dumps(record) + "\n")
+
+
+def records_of(
+    file: Path,
+    worlds: "Iterable[World]",
+    courses: Sequence[str],
+    n: int,
+    measure: "Callable[[World, str, int], dict[str, Any]]",
+) -> list[dict[str, Any]]:
+    """Records of a campaign of n missions for each course and world; what is kept is not redone.
+
+    Args:
+        file: File of JSON lines, of records with "world", "course" and "n".
+        worlds: Worlds.
+        courses: Names of courses.
+        n: Missions of a campaign.
+        measure: Drives one campaign; its record.
+    """
+    names = {world.name: world for world in worlds}
+    done = {(r["world"], r["course"], r["n"]) for r in read_records(file)}
+    for course in courses:
+        for name, world in names.items():
+            if (name, course, n) not in done:
+                add_record(file, measure(world, course, n))
+                print(f"{name}, {course}", flush=True)
+    return [
+        r for r in read_records(file)
+        if r["n"] == n and r["world"] in names and r["course"] in courses
+    ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 Run: python benchmarks/places.py [times|nuts|absent|terrains|sights|stopping ...] [--data DIR]
 
-- times: refits and draws, median of five, one core, beside NUTS on the same marginal (the peer).
+- times: refits and draws by effects and family, medians of three, one core; NUTS (the peer).
 - nuts: means and sds of twelve seeds together, beside long NUTS (the peer); fifteen minutes.
 - absent: truths without effects of places; regret with them in the model and without.
 - terrains: priors from campaigns on the other terrains, leave-one-terrain-out.
@@ -15,14 +15,16 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from functools import partial
+
 import arviz as az
 import numpy as np
-from common import Table, arguments, median_seconds, parsed, timed
+from common import Table, arguments, median_processor_seconds, parsed, timed
 from scipy.stats import binomtest
 
 import trustbo as tb
 from trustbo.inference import params_of, prior_from
-from trustbo.models import PlaceEffect, PooledTrust, TrustParams
+from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.simulation import ModelSimulator, Truth
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, REAL
@@ -30,6 +32,12 @@ from trustbo.terrain import synthetic_terrain
 from trustbo.workspace.sight import Sight
 
 PLACES = PooledTrust(place=PlaceEffect())
+BOTH = {"place": PlaceEffect(), "effects": [RobotEffect()]}
+MODELS = {
+    "places": PLACES,
+    "places and robots": PooledTrust(**BOTH),
+    "places and robots, censored": PooledTrust(**BOTH, observation="censored"),
+}
 TARGETS = {"objective": "mean", "max_bounds": "shortest+2"}
 
 
@@ -87,26 +95,33 @@ def campaign(world, workspace, course, n, seed, **options):
 
 
 def times(given):
-    print("seconds\n")
-    table = Table("missions", "visited bounds", "cold", "warm, one more", "1000 draws of all")
-    for name, side, n, random_ends, missing in (
-        ("10 x 10, 15", 10, 15, False, 0.0),
-        ("10 x 10, 15, 15 % of rates missing", 10, 15, False, 0.15),
-        ("10 x 10, 60", 10, 60, False, 0.0),
-        ("10 x 10, 60, random ends", 10, 60, True, 0.0),
-        ("30 x 30, 40, corner to corner", 30, 40, False, 0.0),
+    print("processor seconds\n")
+    table = Table(
+        "missions", "effects", "visited bounds", "cold", "warm, one more", "1000 draws of all",
+        "k-hat", "Kish size",
+    )  # fmt: skip
+    for name, side, n, random_ends, missing, models in (
+        ("10 x 10, 15", 10, 15, False, 0.0, MODELS),
+        ("10 x 10, 15, 15 % of rates missing", 10, 15, False, 0.15, ["places"]),
+        ("10 x 10, 60", 10, 60, False, 0.0, ["places", "places and robots"]),
+        ("10 x 10, 60, random ends", 10, 60, True, 0.0, ["places"]),
+        ("30 x 30, 40, corner to corner", 30, 40, False, 0.0, ["places"]),
     )[: 1 if given.quick else None]:
         workspace, missions = driven(side, n, random_ends, missing)
         fitted = {"workspace": workspace, "sampler": "exact", "whole": False}
-        earlier = tb.fit(missions[:-1], PLACES, **fitted)
-        cold = median_seconds(lambda m=missions, g=fitted: tb.fit(m, PLACES, **g), 3)
-        warm = median_seconds(
-            lambda m=missions, g=fitted, e=earlier: tb.fit(m, PLACES, earlier=e, **g), 3
-        )
-        posterior = tb.fit(missions, PLACES, earlier=earlier, **fitted)
-        drawn = median_seconds(lambda p=posterior: params_of(p), 3)
-        n_bounds = posterior["places"].sizes["bound"]
-        table.row(name, n_bounds, *(f"{seconds:.3f}" for seconds in (cold, warm, drawn)))
+        for kind in models:
+            fit = partial(tb.fit, model=MODELS[kind], **fitted)
+            earlier = fit(missions[:-1])
+            cold = median_processor_seconds(lambda m=missions, f=fit: f(m))
+            warm = median_processor_seconds(lambda m=missions, f=fit, e=earlier: f(m, earlier=e))
+            posterior = fit(missions, earlier=earlier)
+            drawn = median_processor_seconds(lambda p=posterior: params_of(p))
+            weights = posterior.attrs["k_hat"], posterior.attrs["kish"]
+            table.row(
+                name, kind, posterior["places"].sizes["bound"],
+                *(f"{seconds:.2f}" for seconds in (cold, warm, drawn)),
+                f"{weights[0]:.2f}", f"{weights[1]:.0f}",
+            )  # fmt: skip
     if given.quick:
         return
     workspace, missions = driven(10, 8, False)

@@ -21,6 +21,10 @@ class Evidence(Protocol):
         """Re-expand an approximate density around one theta, of a leading axis of length 1."""
         ...
 
+    def sharpen(self) -> bool:
+        """Make an approximate density more accurate, at more cost; whether it could."""
+        ...
+
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:

@@ -31,6 +31,7 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from scipy import sparse
 from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore
@@ -48,6 +49,8 @@ from trustbo.models.effects.effect import (
     Theta,
     dense_root,
 )
+
+_compiled = nb.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract"})
 
 _NUMBERS = 1e6  # kept at once, of all points of a chunk: about the cache
 
@@ -117,6 +120,10 @@ class Gaussian:
 
     def recentre(self, theta: Theta) -> None:
         """No-op: the density is exact everywhere."""
+
+    def sharpen(self) -> bool:
+        """See `Evidence.sharpen`: the density is exact."""
+        return False
 
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
@@ -288,18 +295,13 @@ class Gaussian:
         on = np.flatnonzero((mean != 0.0).any(0))
         expected = (self.U[:, on] @ mean[:, on].T).T.reshape(n, n_chains, K)
         expected = expected + theta.get("drift", 0.0)
-        start = np.broadcast_to(self._beta0(theta) * self.x0[0], (n, len(self.seen)))[..., None]
-        R, misfit = np.empty((n, n_chains, K)), np.zeros(n)
-        for q in range(len(self.seen)):
-            mine = np.flatnonzero(self.kind == q)
-            C = N[:, q] if self.level else E[:, q]
-            r = self.y[mine] @ np.swapaxes(E[:, q], 1, 2) - expected[:, mine] @ np.swapaxes(C, 1, 2)
-            if self.level:
-                r -= (start[:, q] * N[:, q, :, 0])[:, None]
-                r += self.lag * self.x0[0] * E[:, q, None, :, 0]
-            weight = self.slots.weight[mine, None]
-            misfit += (weight * r**2).sum((1, 2))
-            R[:, mine] = (weight * r) @ C
+        start = np.zeros(N.shape[:3])
+        if self.level:
+            start = self._beta0(theta)[..., None] * self.x0[0] * N[..., 0]
+            start -= self.lag * self.x0[0] * E[..., 0]
+        R, misfit = np.zeros((n, n_chains, K)), np.zeros(n)
+        C = N if self.level else E
+        _residuals(self.y, expected, start, E, C, self.kind, self.slots.weight, R, misfit)
         return R.reshape(n, -1), misfit
 
     def _whiten(self, P: np.ndarray, prior: Prior) -> None:
@@ -403,32 +405,73 @@ def impulses(
         lag: 1 where rates measure the change of trust, else 0.
     """
     n, (n_kinds, K) = len(b), seen.shape
-    Q, R = delta_w**2, delta_v**2
-    N, gain = np.zeros((n, n_kinds, K, K)), np.zeros((n, n_kinds, K))
-    # Response of the rate to come, variances of trust before it, and after it without that rate.
-    m, last, P = np.zeros((n, n_kinds, K)), x0_sd**2, (b * x0_sd) ** 2 + Q
-    P = np.broadcast_to(P, (n, n_kinds))
-    log_det = np.zeros((n, n_kinds))
-    for k in range(K):
-        F = P + R + lag * (lag - 2.0 * b) * last
-        gain[..., k] = np.where(seen[:, k], (P - lag * b * last) / F, 0.0)
-        left = np.where(seen[:, k], R / F, 1.0)
-        over = np.where(seen[:, k], lag / F, 0.0) if lag else 0.0
-        m[..., k] = 1.0
-        N[..., k, : k + 1] = m[..., : k + 1] * np.where(seen[:, k], F**-0.5, 0.0)[..., None]
-        m[..., :k] *= (b * left + over * Q)[..., None]
-        m[..., k] = (b - lag) * (left + (lag - b) * over * last)
-        log_det += np.where(seen[:, k], np.log(F), 0.0)
-        more = over * lag * last * Q
-        last, P = P * left + more, b * b * P * left + b * b * more + Q
-    E = np.zeros_like(N)
-    E[..., :-1] = N[..., 1:] * (-b[..., None] * gain[..., :-1])[..., None, :]
-    diagonal = np.arange(K)
-    E[..., diagonal, diagonal] = N[..., diagonal, diagonal]
-    if lag:  # trust after a bound is in the rate of the next
-        for k in reversed(range(K - 1)):
-            E[..., k] += lag * gain[..., k, None] * E[..., k + 1]
+    (N, E), log_det = np.zeros((2, n, n_kinds, K, K)), np.zeros((n, n_kinds))
+    b = np.broadcast_to(b, (n, n_kinds))
+    variances = delta_w[:, 0] ** 2, delta_v[:, 0] ** 2, x0_sd**2
+    _impulses(b, *variances, seen, float(lag), N, E, log_det)
     return N, E, log_det
+
+
+@_compiled
+def _impulses(b, Q, R, x0_variance, seen, lag, N, E, log_det):
+    gain = np.empty(seen.shape[1])
+    for t in range(len(b)):
+        for q in range(len(seen)):
+            log_det[t, q] = _filter(b[t, q], Q[t], R[t], x0_variance, seen[q], lag, N[t, q], gain)
+            _whitening(b[t, q], gain, lag, N[t, q], E[t, q])
+
+
+@_compiled
+def _filter(b, Q, R, last, seen, lag, N, gain):
+    """Set N and gains of a chain; its log |V|."""
+    log_det, P = 0.0, b * b * last + Q  # variances of trust: after a rate, before the next
+    m = np.empty(len(seen))  # response of the rate to come
+    for k in range(len(seen)):
+        left, over, gain[k], m[k] = 1.0, 0.0, 0.0, 1.0
+        if seen[k]:
+            F = P + R + lag * (lag - 2.0 * b) * last
+            left, over, gain[k] = R / F, lag / F, (P - lag * b * last) / F
+            log_det += np.log(F)
+            N[k, : k + 1] = m[: k + 1] / np.sqrt(F)
+        m[:k] *= b * left + over * Q
+        m[k] = (b - lag) * (left + (lag - b) * over * last)
+        more = over * lag * last * Q
+        last, P = P * left + more, b * b * (P * left + more) + Q
+    return log_det
+
+
+@_compiled
+def _whitening(b, gain, lag, N, E):
+    """Set E of a chain."""
+    for k in range(len(N)):
+        for i in range(k):
+            E[k, i] = -b * gain[i] * N[k, i + 1]
+        E[k, k] = N[k, k]
+    if lag != 0.0:  # trust after a bound is in the rate of the next
+        for i in range(len(N) - 2, -1, -1):
+            E[:, i] += lag * gain[i] * E[:, i + 1]
+
+
+@_compiled
+def _residuals(y, expected, start, E, C, kind, weight, R, misfit):
+    """R (point, chain, bound) and misfit (point,), see `Gaussian._residual`.
+
+    Expected rates (point, chain, bound) but for the first trust, whose responses (point, kind,
+    bound) are `start`.
+    """
+    n_chains, K = y.shape
+    r = np.empty(K)
+    for t in range(len(expected)):
+        for c in range(n_chains):
+            q = kind[c]
+            for k in range(K):
+                r[k] = -start[t, q, k]
+                for i in range(k + 1):
+                    r[k] += E[t, q, k, i] * y[c, i] - C[t, q, k, i] * expected[t, c, i]
+            for i in range(K):
+                for k in range(i, K):
+                    R[t, c, i] += weight[c] * C[t, q, k, i] * r[k]
+                misfit[t] += weight[c] * r[i] ** 2
 
 
 def _upper(S: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from trustbo.models.families import Family
 
 _LEAST = 1e-4  # sd of a coefficient
 _NOISE = 1e-6  # sd of a noise
-SWEEPS, _SETTLED = 2, 8  # sweeps near the sites' mode, and to find it
+_SWEEPS, _MOST, _SETTLED = 1, 4, 8  # sweeps near the sites' mode, and to find it
 _MEMORY = 4e6  # numbers of precisions at once
 
 
@@ -57,8 +57,9 @@ class Sites:
         self.chains, self.sites = _chains(slots, U, family)
         if apart:
             self.chains = self.chains._replace(robot=slots.robot)
+        self._sweeps = _SWEEPS
         self._chunk = max(1, int(_MEMORY / self.n_columns**2))
-        self._nu = max(8.0, 3.0 * self.n_columns)  # more where a heavy tail would cost evenness
+        self._nu = max(8.0, 2.0 * self.n_columns)  # more where a heavy tail would cost evenness
 
     def log_density(self, theta: Theta) -> np.ndarray:
         """See `Evidence.log_density`."""
@@ -68,7 +69,7 @@ class Sites:
         for i in range(0, len(some), self._chunk):
             points = some[i : i + self._chunk]
             given, log_det = self._given({name: v[points] for name, v in theta.items()})
-            args: tuple[Any, ...] = *given, self.chains, self.sites, SWEEPS
+            args: tuple[Any, ...] = *given, self.chains, self.sites, self._sweeps
             out[points] = joint.log_evidence(*args) + 0.5 * log_det
         return out
 
@@ -78,6 +79,13 @@ class Sites:
         fixed = x0, P[0], mean[0], self.chains, self.sites
         self.sites = joint.settle(beta0[0], delta_w[0], delta_v[0], *fixed, _SETTLED)
 
+    def sharpen(self) -> bool:
+        """See `Evidence.sharpen`: twice as many sweeps."""
+        if self._sweeps == _MOST:
+            return False
+        self._sweeps *= 2
+        return True
+
     def draw(
         self, theta: Theta, count: np.ndarray, rng: np.random.Generator
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -85,13 +93,14 @@ class Sites:
         log_dets = []
 
         def points():
-            for t in range(len(count)):
-                one = {name: values[t : t + 1] for name, values in theta.items()}
-                (beta0, delta_w, delta_v, x0, P, mean), log_det = self._given(one)
-                log_dets.append(log_det[0])
-                yield beta0[0], delta_w[0], delta_v[0], x0, P[0], mean[0]
+            for i in range(0, len(count), self._chunk):
+                some = {name: values[i : i + self._chunk] for name, values in theta.items()}
+                (beta0, delta_w, delta_v, x0, P, mean), log_det = self._given(some)
+                log_dets.extend(log_det)
+                for t in range(len(log_det)):
+                    yield beta0[t], delta_w[t], delta_v[t], x0, P[t], mean[t]
 
-        fixed = self._nu, self.chains, self.sites, SWEEPS
+        fixed = self._nu, self.chains, self.sites, self._sweeps
         c, log_weight = draw_weighted(points(), count, *fixed, rng)
         of_draw = {name: np.repeat(values, count, axis=0) for name, values in theta.items()}
         named = named_effects(self.groups, c, of_draw, rng)

@@ -10,12 +10,13 @@ ten scores are left (`scores`). They are drawn in rounds:
    proposal, until their effective number is fair. Half of the points are drawn from the target's
    defensive proposal: it covers regions that moments miss, such as a second mode far out, or a
    noise's thin tail to 0.
-3. Points of the last rounds and 512 to 4096 more are pooled, the mixture of all their proposals
-   being the density that weights are relative to, and the weights Pareto-smoothed. Where k-hat
-   shows them uneven, more points follow.
+3. Points of the last rounds and 128 to 4096 more are pooled, the mixture of all their proposals
+   being the density that weights are relative to, and the weights Pareto-smoothed. These more are
+   of a Student-t that is skewed as the points are: posteriors of scales reach far towards 0. Where
+   k-hat or the effective number shows weights uneven, further ones follow, of a new fit to all.
 4. Systematic resampling makes points equally weighted. The target draws the coefficients at each;
    where its density was EP's, with weights that average to the ratio of posterior to EP density, by
-   which the draws are resampled once more.
+   which the draws are resampled once more. Uneven ones are drawn again after more sweeps of EP.
 
 Invariant: weights are target over proposal density for any proposals, and unbiased ones in 4 leave
 the posterior exact (importance sampling squared). Their means' product is the evidence.
@@ -35,9 +36,10 @@ from trustbo.parallel import one_blas_thread
 _MAX_ROUNDS, _MAX_FINAL = 4, 3
 _MAX_LAST = 20  # rounds of the last proposal where weights would be refused after fewer
 _FAIR, _LOST = 0.1, 10.0  # effective number of a round's points: share of them; too few to go on
+_ENOUGH, _ROUND = 200.0, 512  # effective number of points; points that make a round of the last
 _RIDGE = 1e-3
 _MANY, _PER_AXIS = 12, 4.0  # axes; effective points for each that moments are taken of
-_MORE, _MORE_LAST = 3, 12  # times that uneven draws are added to; that refused ones are
+_MORE, _MORE_LAST = 3, 24  # times that uneven draws are added to; that refused ones are
 _EVEN = 0.9  # effective share of draws from which on no weight exceeds 1 % of 1000: no tail
 
 
@@ -60,7 +62,7 @@ class ScoreTarget(Protocol):
 
     @property
     def n_final(self) -> int:
-        """Number of points of the last proposal."""
+        """Number of points of each last proposal."""
         ...
 
     @property
@@ -89,6 +91,10 @@ class ScoreTarget(Protocol):
         """Re-expand the approximate density around a point (score,)."""
         ...
 
+    def sharpen(self) -> bool:
+        """Make an approximate density more accurate, at more cost; whether it could."""
+        ...
+
     def defensive(self, proposal: Student) -> Proposal:
         """Defensive proposal for regions that the given one may miss."""
         ...
@@ -111,7 +117,7 @@ class ScoreDraws(NamedTuple):
     proposal: Student
 
 
-class _Points(NamedTuple):
+class Points(NamedTuple):
     """Weighted points of all proposals so far."""
 
     z: np.ndarray
@@ -122,6 +128,7 @@ class _Points(NamedTuple):
 
     @property
     def kish(self) -> float:
+        """Effective number of points."""
         return _kish(self.log_w)
 
 
@@ -145,11 +152,16 @@ def sample_scores(
         start = None
     # Matrices are small: a second BLAS thread costs more than it brings.
     with one_blas_thread():
-        points, proposal = _weigh(target, seed, start, watch)
+        points, proposal = weighted_points(target, seed, start, watch)
         watch.stage("exact sampler draws")
         rng = np.random.default_rng(seed)
         n = min(n_draws, target.n_corrected or n_draws)
-        chosen, params, smoothing = _draw(target, points, n, rng)
+        drawn = None
+        if points.khat < MAX_KHAT or not target.sharpen():
+            drawn = _draw(target, points, n, rng)
+        if drawn is None:
+            return sample_scores(target, n_draws, seed, proposal, watch)
+        chosen, params, smoothing = drawn
     khat, kish, log_evidence = points.khat, points.kish, points.log_evidence
     kept = np.arange(n)
     if smoothing is not None:
@@ -173,17 +185,20 @@ def sample_scores(
 
 
 def _draw(
-    target: ScoreTarget, points: _Points, n: int, rng: np.random.Generator
-) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[np.ndarray, float, float] | None]:
+    target: ScoreTarget, points: Points, n: int, rng: np.random.Generator
+) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[np.ndarray, float, float] | None] | None:
     """Indices of resampled points, parameters there, and their smoothed weights.
 
-    Where n weights are uneven more are drawn: k-hat of few weights is noisy.
+    Where n weights are uneven more are drawn, as k-hat of few weights is noisy; None where an
+    approximate density was sharpened instead.
     """
     chosen = np.sort(systematic(np.exp(points.log_w), n, rng))
     params, log_weight = target.draw(points.z, points.log_p, chosen, rng)
     if log_weight is None:
         return chosen, params, None
     smoothing = smoothed_weights(log_weight)
+    if smoothing[1] >= GOOD_KHAT and target.sharpen():
+        return None
     for k in range(_MORE_LAST):
         enough = smoothing[1] < (GOOD_KHAT if k < _MORE else MAX_KHAT)
         if enough or _kish(smoothing[0]) > _EVEN * len(chosen):
@@ -201,9 +216,9 @@ def _kish(log_w: np.ndarray) -> float:
     return float(np.exp(-np.logaddexp.reduce(2.0 * log_w)))
 
 
-def _weigh(
+def weighted_points(
     target: ScoreTarget, seed: int, start: Student | None, watch: Watch
-) -> tuple[_Points, Student]:
+) -> tuple[Points, Student]:
     """Weighted points, and the Student-t with their moments."""
     cloud = _Cloud(target)
     proposal, warm = start, start is not None
@@ -217,27 +232,37 @@ def _weigh(
         cloud.add(target.defensive(proposal), target.n_pilot // 2, seed + k)
         points = cloud.points()
         proposal = _fitted(points)
+        if points.kish > _FAIR * target.n_pilot:
+            break
         if k == 1 and not warm:  # a proposal by curvature is only a start
             cloud = _Cloud(target)
-        elif points.kish > _FAIR * target.n_pilot:
-            break
         elif k == 2 and points.kish < _LOST and warm:  # the posterior has moved far from the start
             cloud, proposal, warm = _Cloud(target), target.first(), False
-    watch.stage("exact sampler weighs the last points")
-    cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77)
-    points = cloud.points()
-    for k in range(1, _MAX_LAST):
-        if points.khat < (GOOD_KHAT if k < _MAX_FINAL else MAX_KHAT):
-            break
-        watch.stage(f"exact sampler weighs more points, as k-hat is {points.khat:.2f}")
-        proposal = _fitted(points)
-        cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + 77 + k)
-        points = cloud.points()
+    points = _weigh_last(target, cloud, seed + 77, watch)
     return points, Student.of(points.z, points.log_w, 1e-9)
 
 
-def _fitted(points: _Points) -> Student:
-    """Student-t with the moments of weighted points.
+def _weigh_last(target: ScoreTarget, cloud: "_Cloud", seed: int, watch: Watch) -> Points:
+    """Add points of skewed proposals, each fitted to all before, until weights are even."""
+    watch.stage("exact sampler weighs the last points")
+    points, per_round = cloud.points(), max(1, _ROUND // target.n_final)
+    for k in range(_MAX_LAST * per_round):
+        proposal = _fitted(points, skewed=True)
+        cloud.add(proposal.widened(target.widths[1]), target.n_final, seed + k)
+        points = cloud.points()
+        if k + 1 >= _MAX_FINAL * per_round:
+            enough = points.khat < MAX_KHAT
+        else:
+            enough = points.khat < GOOD_KHAT and points.kish > _ENOUGH
+        if enough:
+            break
+        uneven = f"k-hat is {points.khat:.2f}, Kish size {points.kish:.0f}"
+        watch.stage(f"exact sampler weighs more points, as {uneven}")
+    return points
+
+
+def _fitted(points: Points, *, skewed: bool = False) -> Student:
+    """Student-t with the moments of weighted points, the third ones too if `skewed`.
 
     With many axes those of few effective points are far too narrow in some direction: weights are
     then raised to a power below 1, which leaves the moments between the proposals' and the
@@ -247,7 +272,8 @@ def _fitted(points: _Points) -> Student:
     while n_axes > _MANY and _kish(log_w) < _PER_AXIS * n_axes:
         log_w = 0.75 * log_w
         log_w = log_w - np.logaddexp.reduce(log_w)
-    return Student.of(points.z, log_w, _RIDGE)
+    fit = Student.of(points.z, log_w, _RIDGE)
+    return fit.skewed(points.z, log_w) if skewed else fit
 
 
 class _Cloud:
@@ -265,9 +291,9 @@ class _Cloud:
         self._z.append(z)
         self._log_p.append(self._target.log_density(z))
 
-    def points(self) -> _Points:
+    def points(self) -> Points:
         z, log_p = np.concatenate(self._z), np.concatenate(self._log_p)
         raw = log_p - log_mixture(self._proposals, [len(drawn) for drawn in self._z], z)
         if not np.isfinite(raw).any():
-            return _Points(z, log_p, np.full(len(z), -np.log(len(z))), np.inf, -np.inf)
-        return _Points(z, log_p, *smoothed_weights(raw))
+            return Points(z, log_p, np.full(len(z), -np.log(len(z))), np.inf, -np.inf)
+        return Points(z, log_p, *smoothed_weights(raw))

@@ -134,15 +134,14 @@ def derivatives(
     offsets = [np.zeros(d)]
     offsets += [sign * steps[i] for i in range(d) for sign in (1, -1)]
     pairs = [(i, j) for i in range(d) for j in range(i)]
-    for i, j in pairs:
-        offsets += [a * steps[i] + b * steps[j] for a in (1, -1) for b in (1, -1)]
+    offsets += [sign * (steps[i] + steps[j]) for i, j in pairs for sign in (1, -1)]
     f = log_density((z[:, None] + np.array(offsets)).reshape(-1, d)).reshape(n, -1)
     plus, minus = f[:, 1 : 1 + 2 * d : 2], f[:, 2 : 2 + 2 * d : 2]
     with np.errstate(invalid="ignore"):
         gradient = (plus - minus) / (2.0 * h)
         hessian = ((plus - 2.0 * f[:, :1] + minus) / h**2)[:, :, None] * np.eye(d)
         for k, (i, j) in enumerate(pairs):
-            four = f[:, 1 + 2 * d + 4 * k :]
-            mixed = (four[:, 0] - four[:, 1] - four[:, 2] + four[:, 3]) / (4.0 * h**2)
+            both = f[:, 1 + 2 * (d + k)] - 2.0 * f[:, 0] + f[:, 2 + 2 * (d + k)]
+            mixed = 0.5 * (both / h**2 - hessian[:, i, i] - hessian[:, j, j])
             hessian[:, i, j] = hessian[:, j, i] = mixed
     return gradient, hessian

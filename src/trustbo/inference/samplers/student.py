@@ -21,12 +21,35 @@ class Proposal(Protocol):
         ...
 
 
+_SKEWS = np.linspace(-0.9, 0.9, 181)
+
+
+def _mean(skew: np.ndarray) -> np.ndarray:
+    """Mean of a normal number times 1 + skew where it is positive, 1 - skew where not."""
+    return np.sqrt(8.0 / np.pi) * skew
+
+
+def _variance(skew: np.ndarray) -> np.ndarray:
+    """Variance of the same."""
+    return 1.0 + (3.0 - 8.0 / np.pi) * skew**2
+
+
+def _skewness(skew: np.ndarray) -> np.ndarray:
+    """Skewness of the same, which rises with `skew`."""
+    return _mean(skew) * (1.0 + (16.0 / np.pi - 5.0) * skew**2) / _variance(skew) ** 1.5
+
+
 class Student(NamedTuple):
-    """Multivariate Student-t."""
+    """Multivariate Student-t, of skewed axes (Fernandez and Steel 1998).
+
+    With x from a symmetric one, a point is center + scale @ (x (1 + skew sign(x))), the sign being
+    positive with probability (1 + skew) / 2, so that the density is continuous, and that of x.
+    """
 
     center: np.ndarray  # (axis,)
     scale: np.ndarray  # (axis, axis), lower triangular
     nu: float = 8.0
+    skew: np.ndarray | float = 0.0  # (axis,), between -1 and 1
 
     @classmethod
     def of(cls, z: np.ndarray, log_w: np.ndarray, ridge: float = 0.0) -> Self:
@@ -36,6 +59,13 @@ class Student(NamedTuple):
         off = z - mean
         cov = (off * w[:, None]).T @ off + ridge * np.eye(z.shape[1])
         return cls(mean, np.linalg.cholesky(cov))
+
+    def skewed(self, z: np.ndarray, log_w: np.ndarray) -> Self:
+        """Give the whitened axes the skewness of weighted points, mean and scale being kept."""
+        white = solve_triangular(self.scale, (z - self.center).T, lower=True)
+        skew = np.interp(white**3 @ np.exp(log_w), _skewness(_SKEWS), _SKEWS)
+        scale = self.scale / np.sqrt(_variance(skew))
+        return self._replace(center=self.center - scale @ _mean(skew), scale=scale, skew=skew)
 
     def widened(self, factor: float) -> Self:
         """Multiply the scale by a factor."""
@@ -47,12 +77,17 @@ class Student(NamedTuple):
         u = stats.qmc.Sobol(d + 1, scramble=True, rng=seed).random(n)
         u = np.clip(u, 1e-12, 1.0 - 1e-12)
         chi2 = 2.0 * special.gammaincinv(0.5 * self.nu, u[:, d]) / self.nu
-        return self.center + (special.ndtri(u[:, :d]) / np.sqrt(chi2)[:, None]) @ self.scale.T
+        left, right = 1.0 - self.skew, 1.0 + self.skew  # twice the probabilities of the signs
+        negative = u[:, :d] < 0.5 * left
+        p = np.where(negative, u[:, :d] / left, 1.0 - (1.0 - u[:, :d]) / right)
+        white = np.where(negative, left, right) * special.ndtri(p)
+        return self.center + (white / np.sqrt(chi2)[:, None]) @ self.scale.T
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Log density, shape (point,)."""
         d, nu = len(self.center), self.nu
         white = solve_triangular(self.scale, (z - self.center).T, lower=True)
+        white = white / (1.0 + np.sign(white) * np.reshape(self.skew, (-1, 1)))
         return (
             special.gammaln(0.5 * (nu + d))
             - special.gammaln(0.5 * nu)

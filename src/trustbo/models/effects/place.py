@@ -23,6 +23,7 @@ from trustbo.models.place import PlaceEffect, Visited, matern
 from trustbo.models.priors_numpy import half_normal
 
 _JITTER = 1e-12  # of a correlation, times the number of cells: below, rounding decides
+_TOGETHER = 16  # points whose cells are split at once
 _LENGTH_SCALES = 1e-6, 1e6  # cells: outside, cells are independent, or equal
 
 
@@ -60,9 +61,8 @@ class PlaceColumns(NamedTuple):
 
     columns: Columns
     rotation: Columns  # (column, unit), orthogonal
-    cells: tuple[tuple[int, np.ndarray, np.ndarray], ...]
-    """For each robot with separate effects, the first column, the distances between its visited
-    cells (cell, cell), and the roots of their numbers of bounds (cell,)."""
+    cells: "tuple[_Cells, ...]"
+    """One for each robot with separate effects."""
     place: PlaceEffect
     visited: Visited
     fades = False
@@ -83,7 +83,7 @@ class PlaceColumns(NamedTuple):
     @property
     def joined(self) -> list[slice]:
         """Means of the cells of each robot."""
-        return [slice(i, i + len(w)) for i, _, w in self.cells if self.place.cells]
+        return [slice(c.first, c.first + len(c.w)) for c in self.cells if self.place.cells]
 
     def prior(self, theta: Theta) -> Prior:
         """Gaussian process over the cells' means, independent contrasts."""
@@ -96,10 +96,10 @@ class PlaceColumns(NamedTuple):
         tau_s, roots, sds = theta["tau_s"], [], []
         scale = hypot(tau_s, tau_e)
         share = share_of(tau_s, scale)[:, None, None]
-        stops = [first for first, *_ in self.cells[1:]] + [mean.shape[1]]
-        for (first, distance, w), stop in zip(self.cells, stops, strict=True):
-            eye = np.eye(len(w))
-            K = matern(distance, theta["length_scale"][:, None, None])
+        stops = [cells.first for cells in self.cells[1:]] + [mean.shape[1]]
+        for cells, stop in zip(self.cells, stops, strict=True):
+            first, w = cells.first, cells.w
+            eye, K = np.eye(len(w)), cells.correlation(theta["length_scale"])
             C = share * (w[:, None] * w * K) + (1.0 - share + _JITTER * len(w) * w.max() ** 2) * eye
             roots.append(xp.linalg.cholesky(C))
             sds.append(xp.repeat(scale[:, None], len(w), axis=1))
@@ -129,22 +129,44 @@ def split_units(
         return {"place_bound": g}
     s = np.empty((len(g), len(visited.cells)))
     theta_of = np.stack([theta[name] for name in ("tau_s", "length_scale", "tau_e")], axis=1)
-    values, point = np.unique(theta_of, axis=0, return_inverse=True)
-    point, count = point.ravel(), np.bincount(point.ravel())
-    order = np.argsort(point, kind="stable")
-    index = np.empty_like(order)  # of a draw among those of its theta
-    index[order] = np.arange(len(g)) - np.repeat(np.cumsum(count) - count, count)
-    rotation, cells = _rotation(visited)
+    values, point, count = np.unique(theta_of, axis=0, return_inverse=True, return_counts=True)
+    order, start = np.argsort(point.ravel(), kind="stable"), np.cumsum(count) - count
+    rotation, robots = _rotation(visited)
     c = g @ rotation.T
-    for robot, (first, distance, w) in zip(np.unique(visited.cells[:, 0]), cells, strict=True):
-        mean = np.zeros((len(values), count.max(), len(w)))
-        mean[point, index] = c[:, first : first + len(w)]
-        of_robot = visited.cells[:, 0] == robot
-        s[:, of_robot] = _split(mean, w, distance, values, rng)[point, index]
+    by_count = np.argsort(-count)
+    for i in range(0, len(values), _TOGETHER):  # points of about as many draws
+        some = by_count[i : i + _TOGETHER]
+        of_point = np.arange(count[some].max())
+        there = of_point < count[some, None]
+        draw = order[np.where(there, start[some, None] + of_point, 0)]
+        for robot, cells in zip(np.unique(visited.cells[:, 0]), robots, strict=True):
+            mean = c[draw, cells.first : cells.first + len(cells.w)]
+            drawn = _split(mean, cells, values[some], rng)
+            s[draw[there][:, None], np.flatnonzero(visited.cells[:, 0] == robot)] = drawn[there]
     return {"place": s, "place_bound": g - s[:, visited.cell_of]}
 
 
-def _rotation(visited: Visited) -> tuple[Columns, tuple]:
+class _Cells(NamedTuple):
+    """Visited cells of a robot."""
+
+    first: int  # column
+    distance: np.ndarray  # (distinct,), in cells
+    pair: np.ndarray  # (cell, cell), index of the distance between two
+    w: np.ndarray  # (cell,), root of the number of bounds into each
+
+    @classmethod
+    def of(cls, first: int, position: np.ndarray, n_bounds: np.ndarray) -> "_Cells":
+        """Cells at positions (cell, 2)."""
+        gap = np.abs(position[:, None] - position[None])
+        square, pair = np.unique((gap**2).sum(-1), return_inverse=True)
+        return cls(first, np.sqrt(square), pair.reshape(gap.shape[:2]), np.sqrt(n_bounds))
+
+    def correlation(self, length_scale: Any) -> Any:
+        """Correlation of s between cells (point, cell, cell), of length scales (point,)."""
+        return matern(self.distance, length_scale[:, None])[:, self.pair]
+
+
+def _rotation(visited: Visited) -> tuple[Columns, tuple[_Cells, ...]]:
     """Helmert's rotation within each cell (column, unit), and the cells of each robot."""
     rows, cols, values, cells, start = [], [], [], [], 0
     for robot in np.unique(visited.cells[:, 0]):
@@ -160,8 +182,7 @@ def _rotation(visited: Visited) -> tuple[Columns, tuple]:
             rows.append(at_row.ravel())
             cols.append(at_col.ravel())
             values.append(helmert(len(units), full=True).ravel())
-        gap = position[:, None] - position[None]
-        cells.append((start, np.hypot(gap[..., 0], gap[..., 1]), np.sqrt(n_units)))
+        cells.append(_Cells.of(start, position, np.array(n_units)))
         start = contrast
     entries = np.concatenate(rows), np.concatenate(cols)
     shape = start, len(visited.units)
@@ -169,17 +190,17 @@ def _rotation(visited: Visited) -> tuple[Columns, tuple]:
 
 
 def _split(
-    mean: np.ndarray, w: np.ndarray, distance: np.ndarray, theta: np.ndarray,
-    rng: np.random.Generator,
-) -> np.ndarray:  # fmt: skip
+    mean: np.ndarray, cells: _Cells, theta: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """S (point, draw, cell) given means w s + e of cells, by Matheron's rule.
 
     A prior draw is corrected by its misfit; theta is (point, 3).
     """
-    tau_s, length_scale, tau_e = theta.T[:, :, None, None]
-    unit, eye = np.where(tau_s > 0.0, tau_s, 1.0), np.eye(len(w))
+    tau_s, _, tau_e = theta.T[:, :, None, None]
+    w, eye = cells.w, np.eye(len(cells.w))
+    unit = np.where(tau_s > 0.0, tau_s, 1.0)
     ratio = (tau_e / unit) ** 2
-    K = matern(distance, length_scale) + _JITTER * len(w) * eye
+    K = cells.correlation(theta[:, 1]) + _JITTER * len(w) * eye
     s = rng.standard_normal(mean.shape) @ np.swapaxes(np.linalg.cholesky(K), 1, 2)
     off = mean / unit - w * s - np.sqrt(ratio) * rng.standard_normal(mean.shape)
     M = w[:, None] * w * K + ratio * eye
