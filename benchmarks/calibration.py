@@ -61,6 +61,7 @@ def cases():
     yield PooledTrust(response="change"), "nuts", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "nuts", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "nuts", 200, SMALL
+    yield PooledTrust(effects=[PlaceEffect(), RobotEffect()]), "nuts", 200, SMALL
 
 
 def main():

@@ -54,13 +54,18 @@ class CampaignOptions:
             the posterior before, which is not exact.
         forgetting: Weight of a mission relative to the next, in (0, 1]. Below 1, a change of the
             environment is followed; for `"refit"` with Gaussian observations.
+        changes: Rates of an area that has changed: ignore (they stay), mask (those before the
+            change are left out, once it is more probable than not), reset (mask, and places are
+            drawn from the prior with the chance that they changed since the last visit), or auto
+            (mask where the model has effects of places and is of Gaussian rates, else ignore). See
+            `Campaign.alarms`.
         awareness: Trust in the awareness map: map (blind; missions are learned from with it too) or
             belief (missions correct it). Under `"belief"`, or a given `AwarenessBelief`, policies
             draw from it too.
         hazard: Priors of the chance that a bound fails. A `hazard.Hazard`, or some of its fields
             by name.
         n_chains: Number of chains of NUTS; draws of other samplers are divided among them.
-        warmup: Warm-up draws of each chain of NUTS, 300 by default.
+        warmup: Warm-up draws of each chain of NUTS, by default those of `fit`.
         draws: Draws kept of each chain, 1000 by default; 250 of the exact sampler with places.
         target_accept: Acceptance rate of NUTS, .9 by default; towards 1 it takes smaller steps.
         max_tree_depth: Doublings of a trajectory of NUTS at most, 10 by default.
@@ -84,6 +89,9 @@ class CampaignOptions:
     )
     update: str = field(default="refit", metadata=_option(LEARNING, "refit", "moment_matched"))
     forgetting: float = field(default=1.0, metadata=_option(LEARNING))
+    changes: str = field(
+        default="auto", metadata=_option(LEARNING, "auto", "ignore", "mask", "reset")
+    )
     awareness: "str | AwarenessBelief" = field(
         default="map", metadata=_option(LEARNING, "map", "belief")
     )

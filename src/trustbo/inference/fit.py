@@ -39,6 +39,7 @@ from trustbo.stacking import MissionBatch, require_same_team, stack_missions
 from trustbo.workspace import Workspace
 
 _N_PRIOR = 500
+_WARMUP_OF_SCORES = 150
 
 
 def fit(
@@ -87,7 +88,8 @@ def fit(
             of a long run's time. A file, which has no bar, gets a line about a long fit, and one
             about a retry.
         n_chains: Number of chains; the exact sampler's draws are divided among them.
-        warmup: Warm-up draws per chain of NUTS, not kept; 300 by default.
+        warmup: Warm-up draws per chain of NUTS, not kept; 300 by default, 150 with effects of
+            places or robots, where the exact sampler gives the metric.
         draws: Draws kept per chain; 1000 by default.
         target_accept: Acceptance rate that NUTS adapts its steps to: towards 1, steps are
             smaller, and divergences fewer.
@@ -153,8 +155,8 @@ def fit(
         )
         watch.faster = "" if chosen == "exact" else faster_than_nuts(model)
         drawn, complaints = draw_posterior(
-            floored, chosen, settings, seed, batch, weight, places, start, slots, check=check,
-            fallback=fallback, watch=watch,
+            floored, chosen, _length(settings, slots, former or warmup is not None), seed, batch,
+            weight, places, start, slots, check=check, fallback=fallback, watch=watch,
         )  # fmt: skip
         return _Drawn(model, prior, drawn, complaints, drawn.fallback or reason)
 
@@ -193,6 +195,13 @@ def fit(
             )  # fmt: skip
     posterior.attrs["seconds"] = time.perf_counter() - started
     return _require_sound(posterior, complaints)
+
+
+def _length(settings: NutsSettings, slots: Slots | None, given: object) -> NutsSettings:
+    """Settings with the default warm-up of NUTS of scores, unless one was given."""
+    if slots is None or given:
+        return settings
+    return settings._replace(warmup=_WARMUP_OF_SCORES)
 
 
 def _add_weights(posterior: xr.DataTree, weight: np.ndarray) -> None:

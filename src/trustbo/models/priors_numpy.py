@@ -1,8 +1,8 @@
 """Prior densities, draws and floors in NumPy: compiling them would take longer than using them."""
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from functools import cache, partial
+from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
@@ -10,6 +10,7 @@ import numpyro.distributions as dist
 from numpyro.distributions import Distribution, constraints
 from numpyro.distributions.transforms import biject_to
 from scipy import special
+from scipy.interpolate import CubicSpline
 
 from trustbo.errors import TrustboError
 from trustbo.models.backend import call, namespace, own_settings
@@ -55,18 +56,46 @@ def quantile_at(prior: Distribution, score: jax.Array) -> jax.Array:
     return jax.numpy.asarray(one.icdf(share))
 
 
-def half_normal(score: np.ndarray, scale: float | np.ndarray) -> np.ndarray:
+class Table(NamedTuple):
+    """A function of a number by its cubic spline; JAX lacks or slowly compiles many quantiles."""
+
+    knots: np.ndarray  # (knot,), evenly spaced
+    coefficients: np.ndarray  # (4, interval)
+
+    @classmethod
+    def of(
+        cls, function: Callable[[np.ndarray], np.ndarray], low: float, high: float, n: int = 4001
+    ) -> Self:
+        """Table of a function by n values, where these are finite."""
+        x = np.linspace(low, high, n)
+        with np.errstate(all="ignore"):
+            y = function(x)
+        some = np.isfinite(y)
+        return cls(x[some], CubicSpline(x[some], y[some]).c)
+
+    def __call__(self, x: Any) -> Any:
+        """Value at x, constant beyond the knots, in NumPy or JAX; the error is about 1e-12."""
+        xp: Any = namespace(x)
+        knots, c = xp.asarray(self.knots), xp.asarray(self.coefficients)
+        x = xp.clip(x, knots[0], knots[-1])
+        i = xp.floor((x - knots[0]) / (knots[1] - knots[0])).astype(int)
+        i = xp.clip(i, 0, c.shape[1] - 1)
+        d = x - knots[i]
+        return ((c[0, i] * d + c[1, i]) * d + c[2, i]) * d + c[3, i]
+
+
+def half_normal(score: Any, scale: Any) -> Any:
     """Half-normal variable of a score, in NumPy or JAX; accurate in both tails."""
-    xp: Any = namespace(score)
-    functions, erfcinv = (special, special.erfcinv) if xp is np else (jax.scipy.special, _erfcinv)
-    low = functions.erfinv(functions.ndtr(xp.minimum(score, 0.0)))
-    high = erfcinv(functions.ndtr(-xp.maximum(score, 0.0)))
-    return scale * np.sqrt(2.0) * xp.where(score < 0.0, low, high)
+    if namespace(score) is not np:
+        return scale * jax.numpy.exp(_log_half_normal()(score))
+    low = special.erfinv(special.ndtr(np.minimum(score, 0.0)))
+    high = special.erfcinv(special.ndtr(-np.maximum(score, 0.0)))
+    return scale * np.sqrt(2.0) * np.where(score < 0.0, low, high)
 
 
-def _erfcinv(x: Any) -> Any:
-    """Inverse of erfc, which JAX lacks."""
-    return -jax.scipy.special.ndtri(0.5 * x) / np.sqrt(2.0)
+@cache
+def _log_half_normal() -> Table:
+    return Table.of(lambda score: np.log(half_normal(score, 1.0)), -12.0, 12.0)
 
 
 def _normal(x: np.ndarray, loc: float | np.ndarray, scale: float | np.ndarray) -> np.ndarray:

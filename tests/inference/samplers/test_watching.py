@@ -16,11 +16,13 @@ def run(watch, seconds):
     with watch.running(SETTINGS) as seen:
         seen.compiled()
         for n_steps in (500, 8, 8, 8, 8, 8):
-            seen.advanced(seconds / 8 * 10 * n_steps, stats_of(10, n_steps))
+            seen.advanced(seconds / 8 * 10 * 4 * n_steps, stats_of(10, n_steps))
 
 
 def stats_of(n, n_steps=8, n_divergences=1):
-    return {"n_steps": np.full(n, n_steps), "diverging": np.arange(n) < n_divergences}
+    diverging = np.zeros((4, n), dtype=bool)
+    diverging[0, :n_divergences] = True
+    return {"n_steps": np.full((4, n), n_steps), "diverging": diverging}
 
 
 @pytest.mark.parametrize(("place", "said"), [(FILE, 1), (NOWHERE, 0)])
@@ -36,16 +38,16 @@ def test_a_short_run_is_not_announced_nor_one_whose_time_is_known(capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_the_bar_names_the_chain_the_phase_and_divergences_after_the_warm_up(capsys):
+def test_the_bar_names_the_chains_the_phase_and_divergences_after_the_warm_up(capsys):
     with Watch(TERMINAL).running(SETTINGS) as seen:
         for _ in range(5):
-            seen.advanced(0.2, stats_of(520, n_divergences=3))
+            seen.advanced(0.2, stats_of(130, n_divergences=3))
             seen._bar.refresh()
     shown = capsys.readouterr().err
     assert "NUTS, compiling:   0%" in shown
-    assert "NUTS, chain 1 of 4, warm-up:  10%" in shown
-    assert "NUTS, chain 2 of 4, draws:  50%" in shown
-    assert "9 divergences" in shown
+    assert "NUTS, 4 chains, warm-up:  10%" in shown
+    assert "NUTS, 4 chains, draws:  50%" in shown
+    assert "8 steps a draw, 6 divergences" in shown
 
 
 def test_divergences_of_a_piece_across_the_end_of_the_warm_up_are_counted_by_draw(capsys):

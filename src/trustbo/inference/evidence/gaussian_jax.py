@@ -5,7 +5,8 @@ and the derivative of its log determinant and misfit, which the inverse gives, i
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -105,7 +106,9 @@ class GaussianJax:
             jnp.concatenate([jnp.asarray(getattr(prior, name))[0] for prior in priors])[order]
             for name in ("mean", "sd")
         )
-        return mean, sd, [dense_root(root)[0] for prior in priors for root in prior.roots]
+        shared = {id(root): root for prior in priors for root in prior.roots}
+        dense = {name: dense_root(root)[0] for name, root in shared.items()}
+        return mean, sd, [dense[id(root)] for prior in priors for root in prior.roots]
 
     def _residual(
         self, theta: Mapping[str, Array], sums: Sums, N: Array, E: Array, mean: Array
@@ -125,7 +128,13 @@ def impulses(
     theta: Mapping[str, Array], x0_sd: float, seen: Array | np.ndarray
 ) -> tuple[Array, Array, Array]:
     """N and E (kind, bound, bound) and log |V| (kind,), see `gaussian.impulses`; theta (1,)."""
-    b, Q, R = theta["beta0"][0], theta["delta_w"][0] ** 2, theta["delta_v"][0] ** 2
+    core = jnp.stack([theta[name][0] for name in ("beta0", "delta_w", "delta_v")])
+    return _impulses(core, x0_sd, jnp.asarray(seen))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(1,))
+def _impulses(core: Array, x0_sd: float, seen: Array) -> tuple[Array, Array, Array]:
+    b, Q, R = core[0], core[1] ** 2, core[2] ** 2
     n_kinds, K = seen.shape
 
     def step(carry, inputs):
@@ -138,11 +147,30 @@ def impulses(
         return (m * (b * left)[:, None], b * b * P * left + Q), out
 
     start = jnp.zeros((n_kinds, K)), jnp.full(n_kinds, (b * x0_sd) ** 2 + Q)
-    _, (rows, gain, log_F) = lax.scan(step, start, (jnp.asarray(seen).T, jnp.eye(K)))
+    _, (rows, gain, log_F) = lax.scan(step, start, (seen.T, jnp.eye(K)))
     N, gain = jnp.swapaxes(rows, 0, 1), gain.T
     later = jnp.pad(-b * gain[:, None, :-1] * N[:, :, 1:], ((0, 0), (0, 0), (0, 1)))
     E = later + jnp.eye(K) * N
     return N, E, log_F.sum(0)
+
+
+def _with_jacobian(core: Array, x0_sd: float, seen: Array) -> tuple[Any, Any]:
+    """Impulses, and their derivatives: of three numbers, one scan has them, not one more back."""
+
+    def twice(core: Array) -> tuple[Any, Any]:
+        out = _impulses.fun(core, x0_sd, seen)
+        return out, out
+
+    jacobian, out = jax.jacfwd(twice, has_aux=True)(core)
+    return out, jacobian
+
+
+def _of_core(x0_sd: float, jacobian: Any, ahead: Any) -> tuple[Array, None]:
+    terms = [jnp.tensordot(a, J, a.ndim) for a, J in zip(ahead, jacobian, strict=True)]
+    return sum(terms[1:], terms[0]), None
+
+
+_impulses.defvjp(_with_jacobian, _of_core)
 
 
 @jax.custom_vjp
@@ -152,7 +180,7 @@ def minus_two_log(P: Array, h: Array) -> Array:
 
 
 def _factored(P: Array, h: Array) -> tuple[Array, tuple[Array, Array]]:
-    F = jnp.linalg.cholesky(P)
+    F = jnp.linalg.cholesky(P, symmetrize_input=False)
     e = solve_triangular(F, h, lower=True)
     return 2.0 * jnp.log(jnp.diagonal(F)).sum() - e @ e, (F, e)
 

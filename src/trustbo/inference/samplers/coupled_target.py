@@ -94,6 +94,10 @@ class CoupledTarget:
     def recentre(self, z: np.ndarray) -> None:
         """No-op: the density is exact everywhere."""
 
+    def sharpen(self) -> bool:
+        """See `ScoreTarget.sharpen`: the density is exact."""
+        return False
+
     def defensive(self, proposal: Student) -> Student:
         """Defensive proposal: the given one widened."""
         return proposal.widened(1.1)._replace(nu=4.0)

@@ -9,7 +9,8 @@ compiled code would keep the program out of JAX's cache on disk.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -25,7 +26,9 @@ from trustbo.inference.samplers.reparam import Frame, Reparametrisation, reparam
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.target import NutsData, innovations_shape
 from trustbo.inference.samplers.watching import SILENT, Watch
+from trustbo.models.backend import own_settings
 from trustbo.models.model import TrustModel
+from trustbo.parallel import n_cores
 
 _DRAWS_PER_UNKNOWN = 10  # of the warm-up, to learn a covariance from
 _FIRST, _MOST = 1, 100
@@ -100,34 +103,48 @@ def run_nuts(
     with watch.running(settings) as seen:
         length_free = settings._replace(draws=0)  # its programs serve any number of draws
         start = _begin(length_free, key, model, data, complete=complete)
-        runs, advance = [], partial(_advance, length_free._replace(n_chains=0), model, data)
-        # One chain after the other: vectorised chains would all wait for the longest trajectory.
-        for i in range(settings.n_chains):
-            chain, state = jax.tree.map(lambda a, i=i: a[i], (start.chains, start.states))
-            go_on = partial(advance, start.frame, chain, complete=complete)
-            runs.append(run_chain(settings, go_on, state, seen))
-        z, stats = jax.tree.map(lambda *a: np.stack(a), *runs)
+        advance = partial(_advance, length_free._replace(n_chains=0), model, data, start.frame)
+        of_chain = [
+            jax.tree.map(lambda a, i=i: a[i], (start.chains, start.states))
+            for i in range(settings.n_chains)
+        ]
+        go_on = [partial(advance, chain, complete=complete) for chain, _ in of_chain]
+        z, stats = run_chains(settings, go_on, [state for _, state in of_chain], seen)
         finish = partial(_finish, length_free, model, data, complete=complete)
         theta, params, at_modes = finish(start, z["theta"])
     kept = z.get("innovations"), start.frame.linearisation
     return NutsDraws(params, stats, *kept, theta, start.modes, at_modes)
 
 
-def run_chain(
-    settings: NutsSettings, go_on: Callable[..., Any], state: HMCState, seen: Watch
+def run_chains(
+    settings: NutsSettings,
+    go_on: Sequence[Callable[[HMCState, int], Any]],
+    states: Sequence[HMCState],
+    seen: Watch,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Draws of z and statistics of one chain, warm-up left out."""
+    """Draws of z and statistics, each (chain, draw, ...), warm-up left out.
+
+    Chains advance by as many draws each, on all cores. Vectorised, each step would take as long as
+    the longest trajectory of all.
+    """
     pieces, done, total, n = [], 0, settings.warmup + settings.draws, _FIRST
-    jax.block_until_ready(go_on(state, 0))  # compiled before the clock starts
+
+    def advance(step: Callable[[HMCState, int], Any], state: HMCState) -> tuple[HMCState, Any]:
+        with own_settings():  # of each thread
+            state, drawn = jax.block_until_ready(step(state, n))
+        return state, jax.tree.map(lambda a: np.asarray(a)[:n], drawn)
+
+    jax.block_until_ready(go_on[0](states[0], 0))  # compiled before the clock starts
     seen.compiled()
-    while done < total:
-        started, n = time.perf_counter(), min(n, total - done)
-        state, (z, stats) = jax.block_until_ready(go_on(state, n))
-        pieces.append(jax.tree.map(lambda a, n=n: np.asarray(a)[:n], (z, stats)))
-        seconds, done = time.perf_counter() - started, done + n
-        seen.advanced(seconds, pieces[-1][1])
-        n = min(max(int(n * _SECONDS / max(seconds, 1e-6)), 1), 2 * n, _MOST)
-    return jax.tree.map(lambda *a: np.concatenate(a)[settings.warmup :], *pieces)
+    with ThreadPoolExecutor(n_cores()) as pool:
+        while done < total:
+            started, n = time.perf_counter(), min(n, total - done)
+            states, drawn = zip(*pool.map(advance, go_on, states), strict=True)
+            pieces.append(jax.tree.map(lambda *a: np.stack(a), *drawn))
+            seconds, done = time.perf_counter() - started, done + n
+            seen.advanced(seconds, pieces[-1][1])
+            n = min(max(int(n * _SECONDS / max(seconds, 1e-6)), 1), 2 * n, _MOST)
+    return jax.tree.map(lambda *a: np.concatenate(a, axis=1)[:, settings.warmup :], *pieces)
 
 
 @partial(jax.jit, static_argnames=("settings", "complete"))
@@ -182,10 +199,12 @@ def step_on(
     chain: Chain,
     state: HMCState,
     n: Array | int,
+    *,
+    adapt: bool = True,
 ) -> tuple[HMCState, tuple[dict[str, Array], dict[str, Array]]]:
-    """See `_advance`, of any density."""
+    """See `_advance`, of any density; `adapt` as in `kernel`."""
     info = ParamInfo(state.z, state.potential_energy, state.z_grad)  # costs no gradient
-    _, step = kernel(settings, target, chain, info, state.rng_key)
+    _, step = kernel(settings, target, chain, info, state.rng_key, adapt=adapt)
 
     def row(state: HMCState) -> tuple[dict[str, Array], dict[str, Array]]:
         stats = {
@@ -252,8 +271,13 @@ def kernel(
     chain: Chain,
     z: dict[str, Array] | ParamInfo,
     key: Array,
+    *,
+    adapt: bool = True,
 ) -> tuple[HMCState, Callable[[HMCState], HMCState]]:
-    """State of numpyro's NUTS at z, and its step from any state."""
+    """State of numpyro's NUTS at z, and its step from any state.
+
+    `adapt`: whether warm-up learns a metric, if it is long enough.
+    """
 
     # NUTS sees standard normal coordinates. With many unknowns it leaves them so: a covariance
     # learnt from the few hundred draws of a warm-up is then worse than Laplace's.
@@ -262,6 +286,7 @@ def kernel(
 
     sites = z.z if isinstance(z, ParamInfo) else z
     n_unknowns, joint = len(sites["theta"]), "innovations" in sites
+    enough = _DRAWS_PER_UNKNOWN * n_unknowns <= settings.warmup
     # Innovations are close to standard normal by construction: their mass starts as the identity.
     mass = {("theta",): jnp.eye(n_unknowns)}
     if joint:
@@ -274,7 +299,7 @@ def kernel(
         inverse_mass_matrix=mass,
         dense_mass=[("theta",)],  # pyright: ignore[reportArgumentType]
         target_accept_prob=settings.target_accept,
-        adapt_mass_matrix=joint or _DRAWS_PER_UNKNOWN * n_unknowns <= settings.warmup,
+        adapt_mass_matrix=joint or (adapt and enough),
         max_tree_depth=settings.max_tree_depth,
         rng_key=key,
     )

@@ -129,7 +129,7 @@ class Posterior:
         alone = coordinates.n_scores == coordinates.n_core  # few coefficients: points are cheap
         cheap, many = alone and evidence.exact, coordinates.n_scores > _MANY
         self.n_pilot = 1024 if cheap else 512 if many else 256
-        self.n_final = 4096 if cheap else 1024 if alone else 512
+        self.n_final = 4096 if cheap else 1024 if alone else 128
         self.n_corrected = None if evidence.exact else 1000 if alone else 500
 
     @property
@@ -166,10 +166,12 @@ class Posterior:
             if fixed or np.abs(best - last).max() < _STILL:
                 break
             best = self.recentre(best)
-        hessian = derivatives(self.log_density, best[None])[1][0]
-        if not np.isfinite(hessian).all():
+        gradient, hessian = (d[0] for d in derivatives(self.log_density, best[None]))
+        if not (np.isfinite(gradient).all() and np.isfinite(hessian).all()):
             return Student(best, np.eye(len(best)))
-        return Student(best, np.linalg.cholesky(inverse_hessian(np, -hessian, _WIDEST)))
+        cov = inverse_hessian(np, -hessian, _WIDEST)
+        step = cov @ gradient  # of Newton, one sd long at most
+        return Student(best + step / max(1.0, np.sqrt(gradient @ step)), np.linalg.cholesky(cov))
 
     def _mode(self, best: np.ndarray) -> np.ndarray:
         """Mode by BFGS from a point."""
@@ -177,7 +179,7 @@ class Posterior:
         limits[1] = (-_FARTHEST, np.log(_LARGEST_NOISE))
         return minimize(
             self._cost, best, jac=True, method="L-BFGS-B", bounds=limits,
-            options={"ftol": _ENOUGH / max(1.0, -float(self.log_density(best[None])[0])),
+            options={"ftol": _ENOUGH / max(1.0, abs(float(self.log_density(best[None])[0]))),
                      "maxiter": 40},
         ).x  # fmt: skip
 
@@ -191,6 +193,10 @@ class Posterior:
         """See `Evidence.recentre` and `Scores.recentre`."""
         self.evidence.recentre(self.scores.theta(z[None]))
         return self.scores.recentre(z, self.evidence.log_density)
+
+    def sharpen(self) -> bool:
+        """See `Evidence.sharpen`."""
+        return self.evidence.sharpen()
 
     def defensive(self, proposal: Student) -> Proposal:
         """Fitted memory and noises; the prior for the scores of effects' scales.

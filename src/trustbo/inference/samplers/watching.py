@@ -77,10 +77,9 @@ class Watch:
         self._end_stages()
         self._settings, self._draws, self._n_divergences = settings, 0, 0
         self._seconds, self._n_steps = 0.0, np.zeros(0)
-        self._of_chain = settings.warmup + settings.draws
-        self._total, self._estimated = settings.n_chains * self._of_chain, not self._estimates
-        label = f"{self._name}, compiling"
-        with bar_in(self._place, total=self._total, desc=label, unit="draw", leave=False) as bar:
+        self._of_chain, self._estimated = settings.warmup + settings.draws, not self._estimates
+        total, label = settings.n_chains * self._of_chain, f"{self._name}, compiling"
+        with bar_in(self._place, total=total, desc=label, unit="draw", leave=False) as bar:
             self._bar = bar
             yield self
 
@@ -90,27 +89,27 @@ class Watch:
             self._bar.unpause()
 
     def advanced(self, seconds: float, stats: Mapping[str, np.ndarray]) -> None:
-        """Show more draws of the chain, or of the next one.
+        """Show more draws of all chains.
 
         Args:
             seconds: Time that they took.
-            stats: Statistics of each, `n_steps` and `diverging` among them.
+            stats: Statistics of each, (chain, draw), `n_steps` and `diverging` among them.
         """
-        n = len(stats["n_steps"])
-        chain, draw = divmod(self._draws, self._of_chain)
-        phase = "warm-up" if draw < self._settings.warmup else "draws"
-        label = f"{self._name}, chain {chain + 1} of {self._settings.n_chains}, {phase}"
-        self._bar.set_description_str(label, refresh=False)
-        kept = np.arange(draw, draw + n) % self._of_chain >= self._settings.warmup
+        n_chains, n = stats["n_steps"].shape
+        phase = "warm-up" if self._draws < self._settings.warmup else "draws"
+        chains = "1 chain" if n_chains == 1 else f"{n_chains} chains"
+        self._bar.set_description_str(f"{self._name}, {chains}, {phase}", refresh=False)
+        kept = np.arange(self._draws, self._draws + n) >= self._settings.warmup
         self._n_divergences += int((kept & stats["diverging"]).sum())
-        if self._n_divergences:
-            self._bar.set_postfix_str(f"{self._n_divergences} divergences", refresh=False)
-        self._bar.update(n)
+        steps = f"{stats['n_steps'].mean():.0f} steps a draw"
+        divergences = f", {self._n_divergences} divergences" * bool(self._n_divergences)
+        self._bar.set_postfix_str(steps + divergences, refresh=False)
+        self._bar.update(n_chains * n)
         self._draws += n
         if self._estimated:
             return
         self._seconds += seconds
-        self._n_steps = np.append(self._n_steps, stats["n_steps"])
+        self._n_steps = np.append(self._n_steps, stats["n_steps"].mean(0))
         if self._draws >= _TRIAL_DRAWS and self._seconds >= _TRIAL_SECONDS:
             self._estimate()
 
@@ -125,7 +124,8 @@ class Watch:
 
     def _estimate(self) -> None:
         usual = float(np.median(self._n_steps[self._draws // 2 :]))
-        self._estimated, seconds = True, self._seconds / self._n_steps.sum() * usual * self._total
+        self._estimated = True
+        seconds = self._seconds / self._n_steps.sum() * usual * self._of_chain
         if seconds > LONG:
             faster = f" Faster: {self.faster}." if self.faster else ""
             self._print(f"{self._name}: {self._settings}, {about(seconds)}.{faster}")
