@@ -15,7 +15,7 @@ def found():
     rng, path, missions = np.random.default_rng(0), [(0, k) for k in range(7)], []
     for j in range(8):
         z = rng.uniform(size=(6, 2, 2))
-        rates = 0.3 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2)) + 0.1 * (j >= 4)
+        rates = 0.3 + 0.3 * z[..., 0] + 0.03 * rng.standard_normal((6, 2)) + 0.2 * (j >= 4)
         missions.append(tb.Mission.from_arrays(path, z, rates))
     return tb.criticise(tb.fit(missions, whole=False), compare=False)
 

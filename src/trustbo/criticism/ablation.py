@@ -16,10 +16,8 @@ from trustbo.errors import TrustboError
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.posterior_groups import complete
-from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
 from trustbo.models.place import PlaceEffect
-from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 from trustbo.models.record import model_from_record
 
@@ -31,8 +29,8 @@ def ablate(
 ) -> pd.DataFrame:
     """Difference of elpd by component, left out or added; empty without a posterior.
 
-    Rows: a feature left out, places and robots' coefficients in or out, and `prior`, whose `value`
-    is the largest sensitivity of a parameter to its prior. Positive: the fitted model is better.
+    Rows: a feature left out, places in or out, and `prior`, whose `value` is the largest
+    sensitivity of a parameter to its prior. Positive: the fitted model is better.
     """
     rows: dict[str, tuple[float, float, str]] = {}
     if posterior is not None:
@@ -66,37 +64,19 @@ def _rows(
         others["places"] = missions, replace(model, place=PlaceEffect()), "with them"
     else:
         others["places"] = missions, replace(model, place=None), "without them"
-    if len(missions[0].robots) > 1:
-        others["robots"] = missions, *_other_robots(model)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of single influential missions, by k-hat
         fitted = loo(posterior)
-        without_places = fitted
         for name, (data, other, how) in others.items():
             if other.place is not None and model.place is None and not _has_places(missions):
                 continue
-            beside = fitted
             if other.why_not_exact and not model.why_not_exact:  # NUTS would take minutes
-                bare = replace(other, place=None)
-                if other.place is None or model.place is None or bare.why_not_exact:
-                    rows[name] = np.nan, np.nan, f"not compared: {other.why_not_exact}."
-                    continue
-                other, how, beside = bare, f"{how}, both without places", without_places
+                rows[name] = np.nan, np.nan, f"not compared: {other.why_not_exact}."
+                continue
             other_loo = loo(fit(data, other, seed=int(posterior.attrs["seed"]), check=False))
-            without_places = other_loo if name == "places" else without_places
-            gap = np.asarray(beside.elpd_i) - np.asarray(other_loo.elpd_i)  # pyright: ignore
+            gap = np.asarray(fitted.elpd_i) - np.asarray(other_loo.elpd_i)  # pyright: ignore
             rows[name] = _compared(gap, how)
     return rows
-
-
-def _other_robots(model: TrustModel) -> tuple[TrustModel, str]:
-    """Model in which robots are as they are not in a given one, and the difference in words."""
-    if isinstance(model, PooledTrust) and model.effects:
-        return replace(model, effects=()), "without effects of robots"
-    shared = {"priors": model.priors, "response": model.response, "place": model.place}
-    if isinstance(model, PooledTrust):
-        return HierarchicalTrust(**shared), "with coefficients of their own"
-    return PooledTrust(**shared), "with shared coefficients"
 
 
 def _compared(gap: np.ndarray, how: str) -> tuple[float, float, str]:

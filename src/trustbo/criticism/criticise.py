@@ -4,6 +4,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,14 @@ import xarray as xr
 
 from trustbo.criticism.ablation import ablate
 from trustbo.criticism.departures import Departure, departures
-from trustbo.criticism.findings import changes_plans, coverage_row, family_test, finding, verdict_of
+from trustbo.criticism.findings import (
+    LEAST,
+    coverage_row,
+    family_test,
+    finding,
+    size_of,
+    verdict_of,
+)
 from trustbo.criticism.joint_normal import (
     Data,
     Normal,
@@ -22,7 +30,13 @@ from trustbo.criticism.joint_normal import (
 )
 from trustbo.criticism.prior_moments import Coefficients, coefficients_of, test_prior
 from trustbo.criticism.residuals import curves_of, groups_of, table_of_rates
-from trustbo.criticism.robots import effects_of_robots, finding_on_robots
+from trustbo.criticism.robots import (
+    SIZE,
+    effects_of_robots,
+    finding_on_changes,
+    finding_on_robots,
+    with_robots,
+)
 from trustbo.criticism.score import Derivatives, Innovations, Outcome, derivatives, holm
 from trustbo.data import Mission
 from trustbo.display.card import Card, Displayed
@@ -48,7 +62,8 @@ class Criticism(Displayed):
         verdict: Verdict in words.
         fault: Check that explains most of what is wrong, `"none"` if nothing is found.
         table: Row of each check (index `check`): the label with the strongest evidence; its
-            statistic; p, of this check alone; p_adjusted, for the number of checks (Holm); p_after,
+            statistic; its size, and the limit from which on it is a fault, see `criticise`; p, of
+            this check alone; p_adjusted, for the number of checks (Holm); p_after,
             once the fault that explains most is accounted for; and the finding in words. A
             probability below 1e-6, which is extrapolated, is 0.
         rates: Row of each measured rate: mission, bound, robot, row, col, contact_rate, expected
@@ -60,9 +75,9 @@ class Criticism(Displayed):
         curves: PIT (u, its distribution less the uniform one), autocorrelation (lag, in bounds;
             mission_lag) and coverage one mission ahead (level), each with `_low` and `_high` of its
             simultaneous 95 % band.
-        robots: Row of each mission and robot, where the model has effects of robots: its effect as
-            a share of line of sight, sd, the probabilities that it is below -0.1 and above 0.1,
-            and whether it stands out: one of them exceeds 0.95.
+        robots: Row of each mission and robot: its effect as a share of line of sight, less the
+            median of all, sd, the probabilities that it is below -0.1 and above 0.1, and whether it
+            stands out: one of them exceeds 0.95.
         ablation: LOO with and without each component, and prior sensitivity: comparison,
             difference, its standard error and finding; empty without `compare`.
     """
@@ -104,16 +119,20 @@ def criticise(
 ) -> Criticism:
     """Test a fitted model for what may be wrong with it, and name it.
 
-    Checks: effects of places, a robot that differs, a change from some mission on, a response to a
-    feature that bends, a prior in conflict with the rates, correlated noise, and the family of
-    observations. Each is a score test by the standardised residuals of predictions one bound ahead,
-    calibrated by replicates; Holm's method holds the chance of any finding, where the model is
-    right, to 5 %. Each finding is put into the model and the others are tested again: the one that
-    leaves the least evidence is named, of those that leave none the one of least p. Where the model
-    has effects of robots, one that stands out in a mission is named before all else: it is the
-    fault `"robot in a mission"`. A shape
-    of residuals whose skewness is below 0.5 and excess kurtosis below 1 changes no plan, and is no
-    fault, however small its p. Missions are counted from 0, as in the posterior.
+    Robots and changes come first, of a model with effects of robots and places, which is fitted if
+    the posterior is of another: a robot that stands out in a mission, `P(|d| > .1) > .95` for its
+    share d of line of sight, less the team's median, is the fault `"robot in a mission"`; a change
+    of all robots or an area from some mission on, by `inference.changes`, is `"change"`, where its
+    probability exceeds .9 and its size .1.
+
+    Then effects of places, a response to a feature that bends, a prior in conflict with the rates,
+    correlated noise, and the family of observations, each by a score test of the standardised
+    residuals of predictions one bound ahead, calibrated by replicates. A fault is found at 5 % of
+    all these tests together (Holm's method), and is of a size that changes plans or coverage: .05
+    of contact, root mean square over the rates; .2 of the variance, of correlation; .05 of the
+    share of rates in 90 % intervals, of the family. Each fault is put into the model and the others
+    are tested again: the one that leaves the least evidence is named, of those that leave none the
+    one of least p. Missions are counted from 0, as in the posterior.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`. Of observations that are not
@@ -122,8 +141,8 @@ def criticise(
         missions: Missions that it was fitted to, or all of its campaign; needed where it holds no
             data.
         model: Its model, needed for comparisons if its priors are custom.
-        compare: Whether to compare, by LOO, with the model without each feature, and with and
-            without places and separate coefficients of robots: each is a fit.
+        compare: Whether to compare, by LOO, with the model without each feature, and with or
+            without places: each is a fit.
         n_replicates: Number of replicates for p-values and bands.
         seed: Seed of the replicates.
 
@@ -145,15 +164,23 @@ def criticise(
         ) from None
 
 
-def _criticise(
-    posterior: xr.DataTree,
-    missions: list[Mission],
-    model: TrustModel | None,
-    compare: bool,
-    n_replicates: int,
-    seed: int,
-) -> Criticism:
-    """See `criticise`; LinAlgError: rates are all but equal."""
+class _Tested(NamedTuple):
+    """Tests of the residuals of one posterior."""
+
+    data: Data
+    by_parameter: Derivatives
+    draws: np.ndarray
+    innovations: Innovations
+    departures: list[Departure]
+    left_out: dict[str, str]
+    coefficients: Coefficients
+    outcomes: dict[str, Outcome]
+
+
+def _tested(
+    posterior: xr.DataTree, missions: Sequence[Mission], n_replicates: int, seed: int
+) -> _Tested:
+    """Test the residuals; LinAlgError: rates are all but equal."""
     point, place = posterior_point(posterior)
     data = gather(missions, place)
     point = with_start(point, data)
@@ -168,51 +195,76 @@ def _criticise(
     draws = rng.standard_normal((len(data.y), n_replicates))
     innovations = Innovations.of_rates(normal, data.y, by_parameter, draws)
     tests, left_out = departures(missions, data, normal, point, place)
-    family = posterior.attrs.get("criticised_for", "gaussian")
     coefficients = coefficients_of(posterior, point, by_parameter, list(missions[0].features))
     outcomes = _test_all(innovations, tests, coefficients, seed)
+    family = posterior.attrs.get("criticised_for", "gaussian")
     if family != "gaussian":
         del outcomes["family"]
         left_out["family"] = (
             f"residuals are those of Gaussian rates, the posterior is of {family} ones; see "
             "tb.inference.by_rate and az.plot_ppc_pit."
         )
+    return _Tested(
+        data, by_parameter, draws, innovations, tests, left_out, coefficients, outcomes
+    )  # fmt: skip
+
+
+def _criticise(
+    posterior: xr.DataTree,
+    missions: list[Mission],
+    model: TrustModel | None,
+    compare: bool,
+    n_replicates: int,
+    seed: int,
+) -> Criticism:
+    """See `criticise`; LinAlgError: rates are all but equal."""
+    tested = _tested(posterior, missions, n_replicates, seed)
+    outcomes, innovations, coefficients = tested.outcomes, tested.innovations, tested.coefficients
     adjusted = holm(np.array([outcome.p for outcome in outcomes.values()]))
-    wrong = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
-    if not changes_plans(innovations):
-        wrong = [name for name in wrong if name != "family"]
-    # No component of a model accounts for the prior or the family: they leave all others.
-    after: dict[str, dict[str, Outcome]] = {name: {} for name in wrong}
-    for outcome in (outcome for outcome in tests if outcome.name in wrong):
-        wider = _account_for(
-            outcome, outcomes[outcome.name].label, innovations, data, by_parameter, draws
-        )
-        after[outcome.name] = _test_all(
-            wider, [o for o in tests if o is not outcome], coefficients, seed
-        )
-    if "family" in left_out:
-        after = {
-            name: {k: o for k, o in one.items() if k != "family"} for name, one in after.items()
-        }
-    fault = _most_explaining(outcomes, after)
+    by_name = {test.name: test for test in tested.departures}
+    sizes = {
+        name: size_of(one, by_name.get(name), innovations, coefficients)
+        for name, one in outcomes.items()
+    }
+    clear = [name for name, p in zip(outcomes, adjusted, strict=True) if p <= _LEVEL]
+    wrong = [name for name in clear if sizes[name] > LEAST[name]]
+    wider = with_robots(posterior, missions)
+    robots = effects_of_robots(wider)
+    of_team = {
+        "change": finding_on_changes(wider, missions, tested.data),
+        "robot in a mission": finding_on_robots(robots, tested.data),
+    }
+    after = {
+        name: _outcomes_with(departure, label, tested, seed)
+        for name, ((label, *_), departure) in of_team.items()
+        if departure is not None
+    }
+    if fault := next(iter(after), ""):
+        if of_team["change"][0][0] in missions[0].robots:
+            fault = next(reversed(after))  # the same robot, with its missions
+    else:
+        for name in wrong:
+            after[name] = _outcomes_with(by_name.get(name), outcomes[name].label, tested, seed)
+        fault = _most_explaining(outcomes, after)
+    left = after.get(fault, {})
     rows = {}
     for (name, one), p in zip(outcomes.items(), adjusted, strict=True):
         sentence = "nothing found."
-        if name in wrong:
-            sentence = finding(name, one, innovations, data, missions, tests, coefficients)
-        p_after = after[fault][name].p if name in after.get(fault, {}) else np.nan
-        rows[name] = one.label, one.statistic, one.p, p, p_after, sentence
-    rows |= {name: ("", *[np.nan] * 4, f"not tested: {why}") for name, why in left_out.items()}
-    rates = table_of_rates(missions, data, innovations)
-    groups = groups_of(rates, missions, data, innovations)
-    curves, rates["ahead"] = curves_of(data, innovations, coefficients, draws)
+        if name in clear:
+            sentence = finding(name, one, innovations, tested.data, missions, by_name, coefficients)
+            if sizes[name] <= LEAST[name]:
+                sentence += " It is too small to be a fault."
+        p_after = left[name].p if name in left else np.nan
+        size = sizes[name], LEAST[name]
+        rows[name] = one.label, one.statistic, *size, one.p, p, p_after, sentence
+    rows |= {n: ("", *[np.nan] * 6, f"not tested: {why}") for n, why in tested.left_out.items()}
+    rates = table_of_rates(missions, tested.data, innovations)
+    groups = groups_of(rates, missions, tested.data, innovations)
+    curves, rates["ahead"] = curves_of(tested.data, innovations, coefficients, tested.draws)
     rows["coverage"] = coverage_row(curves)
-    robots = effects_of_robots(posterior)
-    if len(robots):
-        label, effect, sentence = finding_on_robots(robots)
-        rows["robot in a mission"] = label, effect, np.nan, np.nan, np.nan, sentence
-        fault = "robot in a mission" if label else fault
-    head = ["label", "statistic", "p", "p_adjusted", "p_after", "finding"]
+    for name, ((label, effect, sentence), _) in of_team.items():
+        rows[name] = label, effect, abs(effect), SIZE, *[np.nan] * 3, sentence
+    head = ["label", "statistic", "size", "limit", "p", "p_adjusted", "p_after", "finding"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=head).rename_axis("check")
     chances = ["p", "p_adjusted", "p_after"]
     table[chances] = table[chances].mask(table[chances] < _LEAST, 0.0)
@@ -237,36 +289,39 @@ def _most_explaining(
 ) -> str:
     """Finding that leaves the least evidence of others once in the model; `"none"` if none.
 
-    `after` has, by finding, the outcomes of the others with it in the model. Of findings that leave
-    no other one, it is that of least p.
+    `after` has, by finding, the outcomes of the others with it in the model: none of the prior and
+    the family, as no component of a model accounts for them. Of findings that leave no other one,
+    it is that of least p.
     """
     enough = np.log(_LEVEL / len(outcomes))
 
     def rank(name: str) -> tuple[float, float]:
-        left = [one.log_p for other, one in {**outcomes, **after[name]}.items() if other != name]
-        return min(*left, enough), -outcomes[name].log_p
+        left = [{**outcomes, **after[name]}[other].log_p for other in after if other != name]
+        return min(*left, enough, enough), -outcomes[name].log_p
 
     return max(after, key=rank, default="none")
 
 
-def _account_for(
-    fault: Departure,
-    label: str,
-    innovations: Innovations,
-    data: Data,
-    by_parameter: Derivatives,
-    draws: np.ndarray,
-) -> Innovations:
-    """Innovations of the model extended by one label of a departure."""
-    normal = innovations.normal
+def _outcomes_with(
+    fault: Departure | None, label: str, tested: _Tested, seed: int
+) -> dict[str, Outcome]:
+    """Outcomes of all other tests with a label of a departure in the model; none without one."""
+    if fault is None:
+        return {}
+    innovations = tested.innovations
+    normal, by_parameter = innovations.normal, tested.by_parameter
     if label in fault.sources:
         U = fault.sources[label]
-        wider = Normal(normal.mean, normal.cov + innovations.size_of(U) * U, normal.carry)
-        return Innovations.of_rates(wider, data.y, by_parameter, draws)
-    columns = normal.carry @ fault.effects[label]
-    names = [*by_parameter.names, *[label] * columns.shape[1]]
-    more = Derivatives(names, np.column_stack([by_parameter.mean, columns]), by_parameter.cov)
-    return Innovations.of_rates(normal, data.y, more, draws)
+        normal = Normal(normal.mean, normal.cov + innovations.size_of(U) * U, normal.carry)
+    else:
+        columns = normal.carry @ fault.effects[label]
+        names = [*by_parameter.names, *[label] * columns.shape[1]]
+        mean = np.column_stack([by_parameter.mean, columns])
+        by_parameter = Derivatives(names, mean, by_parameter.cov)
+    wider = Innovations.of_rates(normal, tested.data.y, by_parameter, tested.draws)
+    others = [test for test in tested.departures if test.name != fault.name]
+    outcomes = _test_all(wider, others, tested.coefficients, seed)
+    return {name: one for name, one in outcomes.items() if name in tested.outcomes}
 
 
 def _checked(posterior: xr.DataTree, missions: Sequence[Mission] | None) -> list[Mission]:

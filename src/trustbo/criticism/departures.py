@@ -2,7 +2,7 @@
 
 A departure is either an effect in the drift, given as columns over the slots (mission, bound,
 robot), or a source of correlation, given as a covariance of the rates. Each has labels, such as
-robots, of which the one with the strongest evidence is named.
+features, of which the one with the strongest evidence is named.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,30 +39,14 @@ def departures(
 ) -> tuple[list[Departure], dict[str, str]]:
     """Alternatives to test, and those that cannot be tested, with the reason."""
     tests, left_out = [], {}
-    mission, _, robot = data.slots.T
-    first = missions[0]
-    local = np.column_stack([np.ones(len(data.slots)), data.z])  # intercept and weights
     if (sources := _places(missions, data, normal, place)) is None:
         left_out["place"] = "paths jump between cells, so that bounds have no places."
     elif sources:
         tests.append(Departure("place", sources=sources))
     else:
         left_out["place"] = "the model has effects of cells and bounds."
-    if data.n_robots == 1:
-        left_out["robot"] = "there is one robot."
-    elif point.params.n_robots is not None:
-        left_out["robot"] = "each robot has coefficients of its own in the model."
-    else:
-        of_robots = {r: local * (robot == i)[:, None] for i, r in enumerate(first.robots)}
-        tests.append(Departure("robot", of_robots))
-    if len(missions) < 4:
-        left_out["change"] = f"{len(missions)} missions are fewer than 4."
-    else:
-        starts = range(2, len(missions) - 1)  # two missions on each side
-        steps = {str(j): local * (mission >= j)[:, None] for j in starts}
-        tests.append(Departure("change", steps, {"drift": _drift(data, normal)}))
     curves = {}
-    for m, feature in enumerate(first.features):
+    for m, feature in enumerate(missions[0].features):
         if len(np.unique(data.z[:, m])) > 2:
             curves[feature] = (data.z[:, m : m + 1] - data.z[:, m].mean()) ** 2
     if curves:
@@ -73,12 +57,16 @@ def departures(
     return tests, left_out
 
 
+def cells_of(missions: Sequence[Mission], data: Data) -> np.ndarray:
+    """Cell entered of each slot, (slot, 2)."""
+    return np.array([missions[j].bounds[k].cell for j, k, _ in data.slots])
+
+
 def cell_columns(
     missions: Sequence[Mission], data: Data
 ) -> tuple[list[tuple[int, int]], np.ndarray]:
     """Cells entered, and the column of each over the slots, (slot, cell)."""
-    cells = np.array([missions[j].bounds[k].cell for j, k, _ in data.slots])
-    entered, index = np.unique(cells, axis=0, return_inverse=True)
+    entered, index = np.unique(cells_of(missions, data), axis=0, return_inverse=True)
     names = [(int(row), int(col)) for row, col in entered]
     return names, (index.ravel()[:, None] == np.arange(len(entered))).astype(float)
 
@@ -121,15 +109,4 @@ def _correlations(data: Data, normal: Normal, point: Point) -> dict[str, np.ndar
     sequence = sequences[data.seen]
     gap = np.abs(np.subtract.outer(bound[data.seen], bound[data.seen]))
     sources["successive bounds"] = _MEMORY**gap * np.equal.outer(sequence, sequence)
-    levels = C @ (sequences[:, None] == np.unique(sequences))
-    sources["a robot's rates of one mission"] = levels @ levels.T
-    of_mission = C @ (mission[:, None] == np.arange(len(data.n_bounds)))
-    sources["rates of one mission"] = of_mission @ of_mission.T
     return sources
-
-
-def _drift(data: Data, normal: Normal) -> np.ndarray:
-    """Covariance of rates by a level that changes gradually from mission to mission."""
-    missions = np.arange(len(data.n_bounds))
-    levels = normal.carry @ (data.slots[:, :1] == missions)
-    return levels @ _MEMORY ** np.abs(np.subtract.outer(missions, missions)) @ levels.T

@@ -1,6 +1,6 @@
 """Findings of tests in words."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,8 @@ from trustbo.display.card import joined
 
 _MOST_CELLS = 3
 _LEVEL = 0.05
-_SKEWNESS, _KURTOSIS = 0.5, 1.0  # of residuals, from which on they matter
+LEAST = {"place": 0.05, "curvature": 0.05, "prior": 0.05, "correlation": 0.2, "family": 0.05}
+"""Size of each departure from which on it is a fault, see `size_of`."""
 
 
 def family_test(innovations: Innovations) -> Outcome:
@@ -28,27 +29,57 @@ def family_test(innovations: Innovations) -> Outcome:
     return judge(["skewness", "tails"], z[:, 0], log_p[:, 0], log_p[:, 1:])
 
 
-def shape_of(innovations: Innovations) -> tuple[float, float]:
-    """Skewness and excess kurtosis of the residuals."""
-    e = innovations.e[:, 0]
-    return float(stats.skew(e)), float(stats.kurtosis(e))
+def size_of(
+    outcome: Outcome,
+    test: Departure | None,
+    innovations: Innovations,
+    coefficients: Coefficients,
+) -> float:
+    """Size of the departure that a test has the strongest evidence of.
+
+    Of places, a bent response and a weight of the wrong sign: root mean square of what they add to
+    the expected rates; of a conflict with the prior: that of the distance of rates expected given
+    those before, by the coefficients' estimates and by the posterior. Of correlation: its share of
+    the variance of a rate given the rates before. Of the family: distance of the share of rates in
+    90 % intervals, one bound ahead, from 90 %.
+
+    Args:
+        outcome: Outcome of the test.
+        test: Departure; None for those that are not, the prior and the family.
+        innovations: Innovations.
+        coefficients: Coefficients, for the prior.
+    """
+    label = outcome.label
+    if label in ("skewness", "tails"):
+        inside = np.abs(innovations.e[:, 0]) <= stats.norm.ppf(0.95)
+        return float(abs(inside.mean() - 0.9))
+    if test is None:
+        mean, _ = estimate(innovations, coefficients)
+        if label.startswith("sign of "):
+            i = coefficients.labels.index(label.removeprefix("sign of "))
+            return float(abs(mean[i]) * coefficients.jacobian[:, i].std())
+        shift = innovations.X[:, coefficients.columns] @ (mean - coefficients.fitted)
+        return float(np.sqrt(((np.diag(innovations.L) * shift) ** 2).mean()))
+    if label in test.effects:
+        (effect,), _ = innovations.estimate(test.effects[label])
+        left = innovations.left_of(test.effects[label])
+        return float(abs(effect) * np.sqrt((left**2).mean()))
+    U = test.sources[label]
+    variance = innovations.size_of(U) * np.diag(U).mean()
+    if test.name == "place":
+        return float(np.sqrt(variance))
+    return float(variance / (variance + (np.diag(innovations.L) ** 2).mean()))
 
 
-def changes_plans(innovations: Innovations) -> bool:
-    """Whether the residuals' shape is far enough from the normal one to matter for plans."""
-    skewness, kurtosis = shape_of(innovations)
-    return abs(skewness) > _SKEWNESS or abs(kurtosis) > _KURTOSIS
-
-
-def coverage_row(curves: xr.Dataset) -> tuple[str, float, float, float, float, str]:
+def coverage_row(curves: xr.Dataset) -> tuple[object, ...]:
     """Row of the coverage of predictions one mission ahead."""
     if "coverage" not in curves:
-        return "", np.nan, np.nan, np.nan, np.nan, "not known: there is one mission."
+        return "", *[np.nan] * 6, "not known: there is one mission."
     share, low, high = (
         float(curves[name].sel(level=0.9)) for name in ("coverage", "coverage_low", "coverage_high")
     )
     where = "within" if low <= share <= high else "outside"
-    return "90 %", share, np.nan, np.nan, np.nan, (
+    return "90 %", share, *[np.nan] * 5, (
         f"{share:.0%} of the rates lie in 90 % intervals given earlier missions, {where} the band "
         f"of {low:.0%} to {min(high, 1.0):.0%}."
     )  # fmt: skip
@@ -60,27 +91,15 @@ def finding(
     innovations: Innovations,
     data: Data,
     missions: Sequence[Mission],
-    tests: Sequence[Departure],
+    tests: Mapping[str, Departure],
     coefficients: Coefficients,
 ) -> str:
     """Sentence on the finding of a test."""
-    mission, _, robot = data.slots.T
-    label, one = outcome.label, np.ones(len(data.slots))
+    label = outcome.label
     if name == "place":
-        return _of_places(label, innovations, data, missions, tests)
-    if name == "robot":
-        here = (robot == missions[0].robots.index(label)) * one
-        shift = _shift(innovations, here)
-        return f"{label} differs from the other robots: {shift} of trust per bound on average."
-    if name == "change":
-        starts = np.arange(2, len(missions) - 1)
-        effect, se = innovations.estimate((mission[:, None] >= starts) * 1.0)
-        start = starts[np.argmax(np.abs(effect / se))] if label == "drift" else int(label)
-        shift = _shift(innovations, (mission >= start) * one)
-        return f"from mission {start} on (counted from 0) trust changes by {shift} per bound."
+        return _of_places(tests[name].sources[label], label, innovations, data, missions)
     if name == "curvature":
-        (test,) = (departure for departure in tests if departure.name == name)
-        (effect,), _ = innovations.estimate(test.effects[label])
+        (effect,), _ = innovations.estimate(tests[name].effects[label])
         bend = "flattens (saturates)" if effect < 0.0 else "steepens"
         return f"the response to {label} bends: it {bend} as {label} grows."
     if name == "prior":
@@ -95,21 +114,20 @@ def finding(
     if name == "correlation":
         return f"noise is correlated: {label} go together beyond what the model says."
     limits = ((data.y <= 0.0) | (data.y >= 1.0)).mean()
-    end = f"; {limits:.0%} of the rates are 0 or 1, try observation='auto'" if limits else ""
-    skewness, kurtosis = shape_of(innovations)
-    shape = f"{label}: skewness {skewness:.2f}, excess kurtosis {kurtosis:.2f}"
+    end = f"; {limits:.0%} of the rates are 0 or 1, try observation='censored'" if limits else ""
+    e = innovations.e[:, 0]
+    shape = f"{label}: skewness {stats.skew(e):.2f}, excess kurtosis {stats.kurtosis(e):.2f}"
     return f"residuals are not normal ({shape}){end}."
 
 
 def _of_places(
+    source: np.ndarray,
     label: str,
     innovations: Innovations,
     data: Data,
     missions: Sequence[Mission],
-    tests: Sequence[Departure],
 ) -> str:
-    (test,) = (departure for departure in tests if departure.name == "place")
-    sd = np.sqrt(innovations.size_of(test.sources[label]))
+    sd = np.sqrt(innovations.size_of(source))
     names, columns = cell_columns(missions, data)
     effect, se = innovations.estimate(columns)
     z = effect / se
@@ -123,24 +141,20 @@ def _of_places(
     return f"{sentence}; cells that stand out: {cells}{more}."
 
 
-def _shift(innovations: Innovations, column: np.ndarray) -> str:
-    (effect,), (se,) = innovations.estimate(column[:, None])
-    return f"{effect:+.3f} +- {se:.3f}"
-
-
 def verdict_of(fault: str, table: pd.DataFrame, wrong: Sequence[str]) -> str:
-    """Verdict in words from the rows of the checks, and those in which something is found."""
+    """Verdict in words from the rows of the checks, and those in which a fault is found."""
     checks = [str(name) for name in table.index]
-    adjusted, after = (table[name].to_numpy(dtype=float) for name in ("p_adjusted", "p_after"))
-    n = int(np.isfinite(adjusted).sum())
+    size, limit, p, after = (
+        table[name].to_numpy(dtype=float) for name in ("size", "limit", "p_adjusted", "p_after")
+    )
     if fault == "none":
-        return f"no fault is found by {n} checks, at a level of 5 % for all together."
+        small = [name for name, one in zip(checks, p, strict=True) if one <= _LEVEL]
+        end = f"; too small to be a fault: {joined(small)}." if small else "."
+        return f"no fault is found by {np.isfinite(size - limit).sum()} checks{end}"
     verdict = f"{fault}: {table['finding'].to_numpy()[checks.index(fault)]}"
     others = [i for i, name in enumerate(checks) if name in wrong and name != fault]
     gone = [checks[i] for i in others if after[i] * len(others) > _LEVEL]
     left = [checks[i] for i in others if not after[i] * len(others) > _LEVEL]
-    if gone:
-        verdict += f" It explains what is found under {joined(gone)}."
-    if left:
-        verdict += f" It does not explain what is found under {joined(left)}."
+    for names, what in ((gone, "It explains"), (left, "It does not explain")):
+        verdict += f" {what} what is found under {joined(names)}." if names else ""
     return verdict

@@ -45,6 +45,11 @@ class Data(NamedTuple):
         return self.batch.awareness[*self.slots.T]
 
     @property
+    def line_of_sight(self) -> np.ndarray:
+        """Predicted contact rate of each slot (slot,), 1 without such a feature."""
+        return self.z[:, list(self.sight)].mean(1) if self.sight else np.ones(len(self.slots))
+
+    @property
     def n_robots(self) -> int:
         """Number of robots."""
         return self.batch.contact_rate.shape[2]
@@ -222,13 +227,14 @@ def _place_cov(carry: np.ndarray, data: Data, scales: Mapping[str, float]) -> np
 def _robot_cov(carry: np.ndarray, data: Data, point: Point) -> np.ndarray:
     mission, _, robot = data.slots.T
     rest = 1.0 - np.asarray(point.params.beta0)  # pyright: ignore[reportAttributeAccessIssue]
-    sight = data.z[:, list(data.sight)].mean(1) if data.sight else np.ones(len(mission))
     missions = np.arange(len(data.n_bounds))
     gap = np.abs(missions[:, None] - missions)
     K = point.scales["tau_slow"] ** 2 * float(point.rho or 0.0) ** gap
     K += point.scales["tau_day"] ** 2 * np.eye(len(missions))
     cov = np.zeros((len(carry), len(carry)))
     for i in range(data.n_robots):
-        effects = carry @ ((rest * sight * (robot == i))[:, None] * (mission[:, None] == missions))
+        effects = carry @ (
+            (rest * data.line_of_sight * (robot == i))[:, None] * (mission[:, None] == missions)
+        )
         cov += effects @ K @ effects.T
     return cov

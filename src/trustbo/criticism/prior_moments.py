@@ -84,15 +84,12 @@ def test_prior(innovations: Innovations, coefficients: Coefficients, seed: int) 
 
     Conflict: the estimate is too far from the prior's mean for the spread of both (Evans and
     Moshonov 2006). Wrong sign: the estimate is beyond 0, on the side away from the prior's mean;
-    where that is 0, awareness is taken to help.
+    where that is 0, either sign is right.
     """
     (mean, cov), n_replicates = estimate(innovations, coefficients), innovations.e.shape[1] - 1
     rng = np.random.default_rng([seed, 1])
-    sign = np.where(
-        np.abs(coefficients.mean) < 0.1 * np.sqrt(np.diag(coefficients.cov)),
-        1.0,
-        np.sign(coefficients.mean),
-    )
+    signed = np.abs(coefficients.mean) >= 0.1 * np.sqrt(np.diag(coefficients.cov))
+    weights = np.flatnonzero(coefficients.is_weight & signed)
     both = cov + coefficients.cov
     sd, se = np.sqrt(np.diag(both)), np.sqrt(np.diag(cov))
     noise = [
@@ -101,10 +98,9 @@ def test_prior(innovations: Innovations, coefficients: Coefficients, seed: int) 
         for C in (both, cov)
     ]
     far = np.column_stack([mean - coefficients.mean, noise[0]]) / sd[:, None]
-    off = np.column_stack([mean, noise[1]]) * (-sign / se)[:, None]
-    off = off[coefficients.is_weight]
+    off = np.column_stack([mean, noise[1]]) * (-np.sign(coefficients.mean) / se)[:, None]
+    off = off[weights]
     log_p = np.concatenate([np.log(2.0) + stats.norm.logsf(np.abs(far)), stats.norm.logsf(off)])
-    weights = np.flatnonzero(coefficients.is_weight)
     labels = [*coefficients.labels, *(f"sign of {coefficients.labels[i]}" for i in weights)]
     statistic = np.concatenate([far, off])[:, 0]
     return judge(labels, statistic, log_p[:, 0], log_p[:, 1:])

@@ -1,74 +1,144 @@
-"""Verdict on robots from their effects in missions: which robot, and since when.
+"""Findings on robots and on changes of the world: which robot, since when, and where.
 
-An effect d of a robot in a mission is a share of its line of sight (`RobotEffect`): an alarm is its
-size, P(|d| > .1) > .95 on one side, not a p-value. A robot is named in all missions, from one on,
-or on single days.
+Both are read from a model with effects of places and robots (`RobotEffect`), fitted here where the
+posterior is of another. An alarm is a size in contact, never a p-value: a robot stands out in a
+mission where P(|d| > .1) > .95 on one side, d its effect, a share of line of sight, less the median
+of all; a change is named where its probability exceeds .9 and its mean .1.
 """
 
+import json
 from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
+from trustbo.criticism.departures import Departure, cells_of
+from trustbo.criticism.joint_normal import Data
+from trustbo.data import Mission
 from trustbo.display.card import joined
+from trustbo.errors import TrustboError
+from trustbo.inference.changes import ALARM, changes
+from trustbo.inference.fit import fit
+from trustbo.models.effects.change import Change
+from trustbo.models.effects.robot import RobotEffect
+from trustbo.models.place import PlaceEffect, bounds_of
+from trustbo.models.pooled import PooledTrust
 
 SIZE = 0.1  # effect from which on a plan may change, in units of stationary trust
 SURE = 0.95
-_MOST = 0.6  # share of missions from the first that stands out on
-_BEFORE = 2  # missions before a start
+
+Finding = tuple[tuple[str, float, str], Departure | None]
+"""Label, effect and sentence, and the departure; without a fault "" and None."""
+
+
+def with_robots(posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+    """Return a posterior of Gaussian rates with effects of robots: the given one if it has them."""
+    if "robots" in posterior.children:
+        return posterior
+    record = posterior.attrs.get("place", "none")
+    place = PlaceEffect() if record == "none" else PlaceEffect(**json.loads(record))
+    try:
+        bounds_of(missions)
+    except TrustboError:  # paths jump between cells
+        place = None
+    response, seed = str(posterior.attrs["response"]), int(posterior.attrs["seed"])
+    model = PooledTrust(effects=(RobotEffect(),), place=place, response=response)
+    return fit(missions, model, seed=seed, draws=250, check=False, whole=False)
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     """Row of each mission and robot: effect, sd, p_worse, p_better and whether it `stands_out`.
 
-    Empty where the model has no effects of robots.
+    Effects are less their median over all rows, as the weight of line of sight fits their level.
     """
-    head = ["mission", "robot", "effect", "sd", "p_worse", "p_better", "stands_out"]
-    if "robots" not in posterior.children:
-        return pd.DataFrame(columns=head)
     d = posterior["robots"]["robot_effect"].transpose("chain", "draw", "mission", "robot")
     draws = d.values.reshape(-1, *d.shape[2:])
+    draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     mission, robot = np.indices(d.shape[2:]).reshape(2, -1)
+    where = {"mission": d["mission"].values[mission], "robot": d["robot"].values[robot]}
+    head = ["effect", "sd", "p_worse", "p_better"]
     columns = draws.mean(0), draws.std(0), (draws < -SIZE).mean(0), (draws > SIZE).mean(0)
-    table = pd.DataFrame(dict(zip(head[2:6], (c.ravel() for c in columns), strict=True)))
-    table.insert(0, "robot", d["robot"].values[robot])
-    table.insert(0, "mission", d["mission"].values[mission])
-    table["stands_out"] = table[["p_worse", "p_better"]].max(axis=1) > SURE
-    return table
+    table = pd.DataFrame(where | dict(zip(head, (c.ravel() for c in columns), strict=True)))
+    return table.assign(stands_out=table[["p_worse", "p_better"]].max(axis=1) > SURE)
 
 
-def finding_on_robots(table: pd.DataFrame) -> tuple[str, float, str]:
-    """Robot that stands out most, its largest effect, and a sentence on all that do."""
-    chosen = table[table["stands_out"]]
-    if chosen.empty:
-        return "", float("nan"), "no robot stands out in a mission."
-    effects: dict[str, np.ndarray] = {
-        str(name): np.asarray(rows["effect"]) for name, rows in chosen.groupby("robot")
-    }
-    robots, stands_out = np.asarray(table["robot"]), np.asarray(table["stands_out"], dtype=bool)
-    missions = np.asarray(table["mission"])
-    names = sorted(effects, key=lambda name: -np.abs(effects[name]).sum())
-    sentences = []
-    for name in names:
-        here = robots == name
-        mean = float(effects[name].mean())
-        size = f"{abs(mean):.2f} {'less' if mean < 0.0 else 'more'} contact in full sight"
-        when = _when(missions[here & stands_out].tolist(), missions[here].tolist())
-        sentences.append(f"{name} has {size} than the team's line of sight says, {when}")
-    first = effects[names[0]]
-    return names[0], float(first[np.abs(first).argmax()]), f"{'; '.join(sentences)}."
+def finding_on_robots(table: pd.DataFrame, data: Data) -> Finding:
+    """Find the robots that stand out most; the sentence is on all that do."""
+    n = data.n_robots
+    names, missions = table["robot"].to_numpy()[:n], table["mission"].to_numpy()[::n]
+    effect, worse, better, stands_out = (
+        table[name].to_numpy().reshape(-1, n)
+        for name in ("effect", "p_worse", "p_better", "stands_out")
+    )
+    alike: dict[tuple[str, str], list[int]] = {}
+    for i in np.flatnonzero(stands_out.any(0)).tolist():
+        less = effect[stands_out[:, i], i].mean() < 0.0
+        when = _when(missions, stands_out[:, i], (worse if less else better)[:, i])
+        alike.setdefault(("less" if less else "more", when), []).append(i)
+    if not alike:
+        return ("", float(np.abs(effect).max()), "no robot stands out in a mission."), None
+    size, labels, sentences = np.abs(effect) * stands_out, [], []
+    for key in sorted(alike, key=lambda key: -size[:, alike[key]].sum()):
+        some, (side, when) = alike[key], key
+        label = "all robots" if len(some) == n > 1 else joined([str(names[i]) for i in some])
+        mean = size[:, some].sum() / stands_out[:, some].sum()
+        have = "has" if len(some) == 1 else "have"
+        labels.append(label)
+        sentences.append(f"{label} {have} {mean:.2f} {side} contact in full sight, {when}")
+    first = alike[min(alike, key=lambda key: -size[:, alike[key]].sum())]
+    most = effect[:, first].flat[size[:, first].argmax()]
+    mission, _, robot = data.slots.T
+    odd = (stands_out[mission, robot] * data.line_of_sight)[:, None] * (robot[:, None] == range(n))
+    sentence = f"{'; '.join(sentences)}, than the team has most often."
+    return (labels[0], float(most), sentence), Departure("robot", {labels[0]: odd})
 
 
-def _when(these: Sequence[int], missions: Sequence[int]) -> str:
-    """Time of some of a robot's missions, counted from 0.
+def _when(missions: np.ndarray, stands_out: np.ndarray, p: np.ndarray) -> str:
+    """Text of the missions, counted from 0, in which a robot stands out.
 
-    Some missions show too little to stand out: three, and most of those from the first on, the last
-    among them, are enough. Two are, where they are all.
+    In all, if it is more probable than not in each; from one on, if it is since, and all since
+    stand out, two at least, or three do. Others are days.
     """
-    left = [j for j in missions if j >= these[0]]
-    most = len(these) > 2 and len(these) >= _MOST * len(left) and these[-1] == left[-1]
-    if most or (len(these) > 1 and len(these) == len(left)):
-        early = len(missions) - len(left) < _BEFORE
-        return "in all missions" if early else f"from mission {these[0]} on"
-    return f"in mission{'s' if len(these) > 1 else ''} {joined([str(j) for j in these])}"
+    healthy = np.flatnonzero(p <= 0.5)
+    start = healthy[-1] + 1 if len(healthy) else 0
+    if start == 0:
+        return "in all missions"
+    if stands_out[start:].sum() < min(max(len(p) - start, 2), 3):
+        start = len(p)
+    days = [str(j) for j in missions[:start][stands_out[:start]]]
+    words = [f"in mission{'s' if len(days) > 1 else ''} {joined(days)}"] if days else []
+    if start < len(p):
+        words.append(f"from mission {missions[start:][stands_out[start:]][0]} on")
+    return joined(words)
+
+
+def finding_on_changes(posterior: xr.DataTree, missions: Sequence[Mission], data: Data) -> Finding:
+    """Find the most probable change of all robots, one or an area, see `inference.changes`."""
+    try:
+        table = changes(posterior, missions).to_dict(orient="records")
+    except TrustboError as error:
+        return ("", np.nan, f"not tested: {error}"), None
+    p = 1.0 - table[0]["probability"]
+    effect = table[1]["effect"] if len(table) > 1 else 0.0
+    if p <= ALARM:
+        return ("", p * effect, f"no change of the world: its probability is {p:.2f}."), None
+    change = Change(table[1]["kind"], table[1]["where"], table[1]["from_mission"])
+    mission, _, robot = data.slots.T
+    column = 1.0 * (mission >= change.from_mission)
+    if change.kind == "area":
+        label = f"cells within {change.where[2]} of {change.where[:2]}"
+        who, unit = f"bounds into {label} have", "contact"
+        column *= change.met(cells_of(missions, data))
+    else:
+        label, who, unit = "all robots", "all robots have", "contact in full sight"
+        column *= data.line_of_sight
+    if change.kind == "robot":
+        label = missions[0].robots[change.where[0]]
+        who, column = f"{label} has", column * (robot == change.where[0])
+    side = "less" if effect < 0.0 else "more"
+    sentence = f"from mission {change.from_mission} on {who} {abs(effect):.2f} {side} {unit}"
+    sentence += f" (probability of a change {p:.2f})."
+    if abs(effect) <= SIZE:
+        return ("", effect, f"{sentence} It is too small to be a fault."), None
+    return (label, effect, sentence), Departure("change", {label: column[:, None]})

@@ -106,6 +106,11 @@ class Innovations:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.nan_to_num(left.T @ self.e[:, 0] / size), 1.0 / np.sqrt(size)
 
+    def left_of(self, columns: np.ndarray) -> np.ndarray:
+        """Columns over the slots as effects on the rates that no parameter has, (rate, column)."""
+        D = solve_triangular(self.L, self.normal.carry @ columns, lower=True)
+        return self.L @ (D - self.basis @ (self.basis.T @ D))
+
     def size_of(self, U: np.ndarray) -> float:
         """Most likely variance of a source of correlation, in units of U."""
         values, vectors = np.linalg.eigh(_whiten(self.L, U))

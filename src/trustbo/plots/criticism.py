@@ -17,8 +17,8 @@ from trustbo.plots.places import BETTER_WORSE
 from trustbo.plots.style import SMALL, Style, StyleOptions, theme
 
 _LEVEL = 0.05
-_LEAST_P = 1e-6
-"""Lower limit of the axis of p."""
+_LEAST_SHARE, _MOST_SHARE = 0.02, 20.0
+"""Limits of the axis of sizes."""
 _LEAST_WIDTH = 1.8
 """Least width of a panel, inches."""
 _LETTERS = 20
@@ -29,8 +29,8 @@ _KINDS = ("mission", "bound", "robot", "contact")
 def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
     """Draw the tests, residuals and coverage of a criticism.
 
-    Tests with their adjusted p, and once the fault that is named is accounted for (hollow); the
-    distribution of PIT values less the uniform one; coverage one mission ahead; autocorrelation;
+    Checks by their size relative to that of a fault, red where one is found; the distribution of
+    PIT values less the uniform one; coverage one mission ahead; autocorrelation;
     and mean standardised residuals by mission, bound, robot, class of expected contact rate and
     cell, there in units of the band. Grey bands hold a whole panel with a probability of 95 % where
     the model is right; what lies outside is red, and framed on the map of cells.
@@ -63,33 +63,29 @@ def criticism(found: Criticism, **style: Unpack[StyleOptions]) -> np.ndarray:
 def _keys() -> list[Line2D | Patch]:
     colours = theme()
     dot: dict[str, Any] = {"marker": "o", "linestyle": "none", "markersize": 4.5}
-    after: dict[str, Any] = dot | {"markerfacecolor": colours.paper, "markeredgecolor": colours.ink}
     return [
         Line2D([], [], color=colours.ink, label="as expected", **dot),
         Line2D([], [], color=colours.odd, label="stands out", **dot),
-        Line2D([], [], label="once the fault is accounted for", **after),
         Patch(facecolor=colours.band, label="95 % if the model is right"),
     ]
 
 
 def _draw_tests(ax: Axes, criticism: Criticism) -> None:
-    table = criticism.table.loc[np.isfinite(criticism.table["p_adjusted"].to_numpy(dtype=float)), :]
-    p, after = (
-        np.maximum(table[name].to_numpy(dtype=float), _LEAST_P)
-        for name in ("p_adjusted", "p_after")
-    )
-    y = np.arange(len(table))[::-1]
-    names = [str(name) for name in table.index]
-    ax.axvspan(_LEAST_P / 2.0, _LEVEL, color=theme().band, linewidth=0.0)
-    ax.hlines(y, p, np.where(np.isfinite(after), after, p), color=theme().quiet, linewidth=0.8)
-    ax.scatter(after, y, s=18, facecolor=theme().paper, edgecolor=theme().ink, zorder=3)
-    ax.scatter(p, y, s=22, color=np.where(p <= _LEVEL, theme().odd, theme().ink), zorder=4)
-    ax.set(xscale="log", xlim=(_LEAST_P / 2.0, 1.6), ylim=(-0.7, len(table) - 0.3))
-    bold = ["bold" if name == criticism.fault else "normal" for name in names]
+    columns = ("size", "limit", "p_adjusted")
+    size, limit, p = (criticism.table[name].to_numpy(dtype=float) for name in columns)
+    drawn = np.isfinite(size) & np.isfinite(limit)
+    share = np.clip(size / limit, _LEAST_SHARE, _MOST_SHARE)[drawn]
+    names = criticism.table.index.to_numpy()[drawn]
+    labelled = criticism.table["label"].to_numpy()[drawn] != ""
+    stands_out = labelled & (share > 1.0) & ~(p[drawn] > _LEVEL)
+    y = np.arange(len(share))[::-1]
+    ax.axvspan(_LEAST_SHARE / 2.0, 1.0, color=theme().band, linewidth=0.0)
+    ax.scatter(share, y, s=22, color=np.where(stands_out, theme().odd, theme().ink), zorder=4)
+    ax.set(xscale="log", xlim=(_LEAST_SHARE / 1.5, 1.5 * _MOST_SHARE), ylim=(-0.7, len(y) - 0.3))
     ax.set_yticks(y, names)
-    for label, weight in zip(ax.get_yticklabels(), bold, strict=True):
-        label.set_fontweight(weight)
-    ax.set_xlabel("adjusted p (grey: found at 5 %)", fontsize=SMALL)
+    for label, name in zip(ax.get_yticklabels(), names, strict=True):
+        label.set_fontweight("bold" if name == criticism.fault else "normal")
+    ax.set_xlabel("size / that of a fault (grey: smaller)", fontsize=SMALL)
 
 
 def _draw_curves(pit: Axes, cover: Axes, correlation: Axes, curves: xr.Dataset) -> None:

@@ -124,15 +124,20 @@ def criticism_table(criticism: Criticism) -> Table:
     """Tabulate the tests of a criticism."""
     table = criticism.table
     p, after = (map(_p, table[name].to_numpy(dtype=float)) for name in ("p_adjusted", "p_after"))
+    size, limit = (
+        [NONE if np.isnan(value) else number(value, 2) for value in table[name].to_numpy(float)]
+        for name in ("size", "limit")
+    )
     words = (map(str, column) for column in (table.index, table["label"], table["finding"]))
     names, labels, findings = words
-    rows = list(zip(names, labels, p, after, findings, strict=True))
+    rows = list(zip(names, labels, size, limit, p, after, findings, strict=True))
     return Table(
-        "Tests of what may be wrong with the model: the label with the strongest evidence, p "
-        "adjusted for the number of tests, and p once the fault that is named is accounted for.",
-        ("check", "label", "adjusted p", "p after", "finding"),
+        "Tests of what may be wrong with the model: the label with the strongest evidence, its "
+        "size in contact and that from which on it is a fault, p adjusted for the number of "
+        "tests, and p once the fault that is named is accounted for.",
+        ("check", "label", "size", "limit", "adjusted p", "p after", "finding"),
         rows,
-        text_columns=(1, 4),
+        text_columns=(1, 6),
     )
 
 
