@@ -38,6 +38,12 @@ from trustbo.study.table import as_text, differences, to_dataset, worse_than
 OURS = "trustbo"
 METHODS: dict[str, Any] = {
     OURS: {"model": "robots", "policy": "optimistic"},
+    "trustbo, no masks": {
+        "model": "robots",
+        "policy": "optimistic",
+        "options": {"changes": "ignore"},
+    },
+    "trustbo, reset": {"model": "robots", "policy": "optimistic", "options": {"changes": "reset"}},
     "trustbo, places": {"model": "places", "policy": "optimistic"},
     "trustbo, no places": {"model": "pooled", "policy": "greedy"},
     "running mean": running_mean.greedy,

@@ -1,4 +1,4 @@
-"""Alarms of a campaign: changes of the world that are more probable than not."""
+"""Alarms of a campaign: large changes of the world that are more probable than not."""
 
 from collections.abc import Sequence
 
@@ -26,6 +26,8 @@ def alarms_of(
 ) -> pd.DataFrame:
     """Tabulate the changes that are together more probable than not, the most probable first.
 
+    Changes of less than a tenth of contact are none.
+
     Args:
         posterior: Posterior of a campaign, with the numbers of its missions.
         missions: All missions of the campaign.
@@ -39,9 +41,10 @@ def alarms_of(
     learned = [missions[j] for j in numbers]
     weighed = scan_posterior(posterior, learned, workspace, model=model)
     candidates, names, rows = weighed.candidates, workspace.team.names, []
-    order = np.argsort(-weighed.p, kind="stable")
-    before = np.cumsum(weighed.p[order]) - weighed.p[order]
-    for i in order[before <= _PROBABLE] if weighed.p_none < 1.0 - _PROBABLE else ():
+    p = np.where(weighed.large, weighed.p, 0.0)
+    order = np.argsort(-p, kind="stable")
+    before = np.cumsum(p[order]) - p[order]
+    for i in order[before <= _PROBABLE] if p.sum() > _PROBABLE else ():
         change, start = candidates.change(i), candidates.earliest[candidates.first[i]]
         where = names[change.where[0]] if change.kind == "robot" else change.where
         ties = "; ".join(_text(tie, names, numbers) for tie in candidates.ties(i))

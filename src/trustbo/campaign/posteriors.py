@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.damage import naming_what_is_left
+from trustbo.campaign.masking import masked, masks_of
 from trustbo.campaign.migrate import is_whole
 from trustbo.data import Mission
 from trustbo.errors import DamagedFileError
@@ -95,7 +96,8 @@ def whole_posterior(
     if is_whole(stored):
         return stored
     numbers = np.atleast_1d(stored.attrs["missions"]).astype(int)
-    whole = complete(stored, [missions[j] for j in numbers], model=model)
+    learned = masked([missions[j] for j in numbers], numbers.tolist(), masks_of(stored))
+    whole = complete(stored, learned, model=model)
     groups = {name: group.to_dataset() for name, group in whole.children.items()}
     for name, group in groups.items():
         if "mission" in group.dims:

@@ -29,10 +29,12 @@ from trustbo.models.place import PlaceEffect, bounds_of, visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.record import model_from_record
 from trustbo.models.ticks import weigh_ticks
+from trustbo.parallel import one_blas_thread
 from trustbo.stacking import stack_missions
 from trustbo.workspace import Workspace
 
 ALARM = 0.9  # probability of a change
+LARGE = 0.1  # effect on stationary trust, from which on a change counts: a tenth of contact
 N_DRAWS = 24  # of theta in a scan
 _FIRST = 4  # draws by which every candidate is weighed
 _FAR = 7.0  # nats less than all together, from which on further draws do not weigh a candidate
@@ -68,6 +70,15 @@ class Weighed(NamedTuple):
     def best(self) -> int:
         """Index of the most probable candidate."""
         return int(self.p.argmax())
+
+    @property
+    def large(self) -> np.ndarray:
+        """Whether each candidate's effect counts, (candidate,): rates drift by less, and show it.
+
+        A path that is driven again and again has rates that differ by .02, and a change of .04 that
+        matters to no plan is then certain.
+        """
+        return np.abs(self.effect) > LARGE
 
     @property
     def alarm(self) -> bool:
@@ -272,6 +283,7 @@ def _scanned(
     return a[:, where], b[:, where]
 
 
+@one_blas_thread()
 def find_changes(
     evidence: Scanned, candidates: Candidates, draw_theta: Callable[[Change | None], Theta]
 ) -> Weighed:
