@@ -19,7 +19,7 @@ import numpy as np
 import numpyro.distributions as dist
 import xarray as xr
 from baselines import residual_process
-from common import Table, add_record, arguments, parsed, read_records
+from common import Table, arguments, parsed, records_of
 from scipy import stats
 
 from trustbo.campaign.campaign import Campaign
@@ -121,15 +121,7 @@ def main():
     given = parsed(parser)
     chosen, file = _chosen(given), given.out / "scores.jsonl"
     courses, n = (given.courses[:1], 4) if given.quick else (given.courses, given.missions)
-    done = {(r["world"], r["course"], r["n"]) for r in read_records(file)}
-    for course in courses:
-        for world in chosen:
-            if (world.name, course, n) not in done:
-                add_record(file, scored(world, course, n))
-                print(f"{world.name}, {course}", flush=True)
-    names = {world.name for world in chosen}
-    show([r for r in read_records(file)
-          if r["n"] == n and r["world"] in names and r["course"] in courses])  # fmt: skip
+    show(records_of(file, chosen, courses, n, scored))
 
 
 def scored(world: World, course: str, n: int) -> dict[str, Any]:
