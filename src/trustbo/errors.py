@@ -85,6 +85,17 @@ def require_positive(what: str, value: object) -> float:
     return number
 
 
+def require_not_negative(what: str, value: object) -> float:
+    """Return `value` as a float if it is a finite number of 0 or more, else raise TrustboError."""
+    try:
+        number = float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, str) or not 0.0 <= number < math.inf:
+        raise TrustboError(f"{what} must be 0 or more, and finite; got {value!r}.")
+    return number
+
+
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
     """Return `value` if it is of a class, or one of a union; TrustboError with a remedy if not."""
     if not isinstance(value, kind):

@@ -16,10 +16,11 @@ from trustbo.simulation.sensing import detections
 from trustbo.team import Robot, Team
 from trustbo.terrain import read_terrain, synthetic_terrain
 from trustbo.workspace import Sight, Workspace
+from trustbo.workspace.formation import SPACING
 from trustbo.workspace.line_of_sight import N_SAMPLES, bound_features, geometry
 from trustbo.workspace.moves import MOVES, existing_bounds
 from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
-from trustbo.workspace.posts import SPACING
+from trustbo.workspace.sight import detection_probability, optics
 
 A, C, NEXT = (3, 0), (2, 1), (1, 2)
 
@@ -144,10 +145,100 @@ def test_posts_are_near_apart_and_the_best_there_are(wooded):
     posts = wooded.posts(A, C)
     assert posts.shape == (2, 2)
     ground = wooded.ground.posts
-    assert (np.linalg.norm(posts - ground.waypoint(A), axis=1) <= wooded.formation_radius).all()
+    assert (np.linalg.norm(posts - ground.waypoint(A), axis=1) <= wooded.formation.radius).all()
     assert np.linalg.norm(posts[0] - posts[1]) >= SPACING
     assert all(wooded.grid.cell_at(*post) == A for post in posts)
     assert (wooded.posts(A, (3, 1)) != posts).any()
+
+
+@pytest.fixture(scope="module")
+def seeing(wooded):
+    return Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, posts="way", stops="sight")
+
+
+def sight_along(workspace, cell, next_cell, post):
+    """Mean sight from a post of the lead's way, at points even in length; without a discount."""
+    ground = workspace.ground.posts
+    way = ground.lead_way(cell, next_cell)
+    aims = way[np.linspace(0, len(way) - 1, 12).astype(int)]
+    lidar = optics(workspace.team.robots[0], workspace.team.lead)
+    eyes = np.repeat(post[None], len(aims), 0)
+    return detection_probability(ground.surface, workspace.sights[0], eyes, aims, lidar).mean()
+
+
+def test_posts_by_the_way_see_more_of_it(wooded, seeing):
+    """Each on its own stops; in the mean over bounds, for sight after and before counts too."""
+    seen = [
+        np.mean([sight_along(w, a, c, post)
+                 for a, c in bounds_of(w)[1] for post in w.posts(a, c)])
+        for w in (wooded, seeing)
+    ]  # fmt: skip
+    assert seen[1] > seen[0] + 0.05
+    line_of_sight = [
+        w.bound_awareness.sel(feature="line_of_sight").mean() for w in (wooded, seeing)
+    ]
+    assert line_of_sight[1] > line_of_sight[0] + 0.05
+
+
+def test_posts_by_the_way_are_on_safe_ground_apart_and_linked(seeing):
+    ground = seeing.ground.posts
+    slope = np.arctan(np.hypot(*ground.surface.gradient))
+    for a, c in bounds_of(seeing)[1]:
+        posts = seeing.posts(a, c)
+        assert (np.linalg.norm(posts - ground.waypoint(a), axis=1) <= 26.0).all()
+        assert np.linalg.norm(posts[0] - posts[1]) >= 3.0  # 4 m, by whole pixels
+        pixels = ground.surface.nearest(*posts.T)
+        assert (slope[pixels] <= 0.7 * seeing.team.max_slope).all()
+        assert all(way is not None for way in seeing.ways(a, c))
+    assert any(seeing.grid.cell_at(*post) != a for a, c in bounds_of(seeing)[1]
+               for post in seeing.posts(a, c))  # fmt: skip
+
+
+def test_stops_by_sight_stay_in_their_cell_near_the_centre_s(wooded, seeing):
+    moved = 0
+    for row, col in np.argwhere(seeing.passable.values).tolist():
+        stop = seeing.ground.posts.waypoint((row, col))
+        assert seeing.grid.cell_at(*stop) == (row, col)
+        distance = np.linalg.norm(stop - wooded.ground.posts.waypoint((row, col)))
+        assert distance <= 17.0  # 16 m, by whole pixels
+        moved += distance > 0.0
+    assert moved > 4
+
+
+def test_equal_robots_keep_their_sides(seeing):
+    ground = seeing.ground.posts
+    for a, c in bounds_of(seeing)[1]:
+        east, north = ground.waypoint(c) - ground.waypoint(a)
+        to_right = seeing.posts(a, c) @ np.array([north, -east])
+        assert to_right[0] <= to_right[1]
+
+
+def test_a_discount_brings_posts_nearer(wooded, seeing):
+    near = Workspace.from_terrain(
+        wooded.terrain, (4, 4), wooded.team, posts="way", stops="sight", sight_discount=0.1
+    )
+    distance = [
+        np.mean([np.linalg.norm(w.posts(a, c) - w.ground.posts.waypoint(a), axis=1)
+                 for a, c in bounds_of(w)[1]])
+        for w in (seeing, near)
+    ]  # fmt: skip
+    assert distance[1] < distance[0]
+
+
+def test_the_rules_of_posts_survive_a_file_and_missions_lose_less(wooded, seeing):
+    again = workspace_from_tree(workspace_to_tree(seeing))
+    assert again.formation == seeing.formation
+    np.testing.assert_array_equal(again.posts(A, C), seeing.posts(A, C))
+    tree = workspace_to_tree(wooded)
+    del tree.attrs["formation"]
+    tree.attrs["formation_radius"] = 5.0  # as version 0.2 wrote it
+    assert workspace_from_tree(tree).formation.radius == 5.0
+    rates = [
+        np.mean([b.contact_rate.mean() for m in
+                 KinematicSimulator(w).run_batch([A, C, NEXT, (0, 3)], range(4)) for b in m.bounds])
+        for w in (wooded, seeing)
+    ]  # fmt: skip
+    assert rates[1] > rates[0]
 
 
 def test_ways_lead_from_post_to_post(wooded):
@@ -202,7 +293,7 @@ def test_several_sights_are_several_features(wooded):
 def test_a_workspace_of_bounds_survives_a_file(wooded):
     again = workspace_from_tree(workspace_to_tree(wooded))
     np.testing.assert_array_equal(again.bound_awareness, wooded.bound_awareness)
-    assert (again.sights, again.formation_radius) == (wooded.sights, wooded.formation_radius)
+    assert (again.sights, again.formation) == (wooded.sights, wooded.formation)
     np.testing.assert_array_equal(again.posts(A, C), wooded.posts(A, C))
 
 
@@ -268,6 +359,9 @@ def test_a_fit_on_a_workspace_fills_the_line_of_sight(wooded):
         ({"sight": "fog"}, "unknown sight mode 'fog'"),
         ({"sight": []}, r"or several; got \[\]"),
         ({"formation_radius": 1.0}, "formation_radius must be at least 2 m"),
+        ({"posts": "wya"}, "unknown posts 'wya'"),
+        ({"stops": "center"}, "unknown stops 'center'"),
+        ({"sight_discount": -0.1}, "sight_discount must be 0 or more, and finite; got -0.1"),
         ({"features": {"line_of_sight": ["slope"]}}, "'line_of_sight' is the name of a feature of"),
     ],
 )

@@ -123,7 +123,7 @@ class KinematicSimulator(DescribedSimulator):
             "crown_base": self.sight.crown_base,
             "tick": self.tick,
             "bounding": self.bounding,
-            "formation_radius": self.workspace.formation_radius,
+            "formation": dataclasses.asdict(self.workspace.formation),
             "bound_timeout": self.bound_timeout,
             "lost_contact_after": self.lost_contact_after,
             "threats": [dataclasses.asdict(threat) for threat in self.threats],

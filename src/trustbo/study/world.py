@@ -145,14 +145,14 @@ class World:
         rows, cols = self.shape
         return _made(seed, (rows * self.cell, cols * self.cell))
 
-    def workspace(self, *, bounds: bool = True) -> Workspace:
-        """Workspace on what is assumed; `bounds` as for `Workspace.from_terrain`."""
+    def workspace(self, **options: Any) -> Workspace:
+        """Workspace on what is assumed, with options of `Workspace.from_terrain`."""
         assumed = replace(
             self, name="", kind="", sight=self.assumed or self.sight, assumed=None,
             team=self.assumed_team or self.team, assumed_team=None, events=(),
             connectivity=8, simulate="kinematic",
         )  # fmt: skip
-        return _workspace(assumed, bounds)
+        return _workspace(assumed, tuple(sorted(options.items())))
 
     def true_events(self) -> tuple[Event, ...]:
         """Events with their centres in CRS metres."""
@@ -282,11 +282,11 @@ def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
 
 
 @lru_cache(maxsize=4)
-def _workspace(assumed: World, bounds: bool) -> Workspace:
+def _workspace(assumed: World, given: tuple[tuple[str, Any], ...]) -> Workspace:
     """Workspace on the terrain, sight and team of a world."""
     ground = assumed.true_terrain()
     ground = aged(ground) if assumed.aged else ground
-    options: dict[str, Any] = {"sight": assumed.sight, "bounds": bounds}
+    options: dict[str, Any] = {"sight": assumed.sight, **dict(given)}
     return Workspace.from_terrain(ground, assumed.shape, assumed.team, **options)
 
 

@@ -21,18 +21,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from trustbo.data import Cell
 from trustbo.team import Robot, Team
-from trustbo.workspace.routes import speed_share
-from trustbo.workspace.sight import Sight, detection_probability, optics
+from trustbo.workspace.moves import MOVES
+from trustbo.workspace.routes import at_times
+from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
 from trustbo.workspace.surface import Surface
 from trustbo.workspace.ways import Ways
 
 N_SAMPLES = 16
 """Times in each phase at which sight is computed."""
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_AHEAD = 0.5  # cosine of the largest turn that is expected where turns lead to other posts
 
 
 class Geometry(NamedTuple):
@@ -41,28 +41,33 @@ class Geometry(NamedTuple):
     ways: list[np.ndarray]  # of the lead, (point, 2) each
     posts: np.ndarray  # (bound, robot, 2), from which T2 watches the lead
     ends: np.ndarray  # (bound, sample, robot, 2), to which T2 closes up
+    is_wide: bool  # whether T2's posts are far from the lead's stops
 
 
 def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarray) -> Geometry:
     """Collect posts and ways of bounds (a, c) between cells that are `passable`, (row, col)."""
     posts = ways.posts
     of_lead, starts, ends = [], [], []
+    least = _AHEAD if posts.is_wide else -1.0 - _AHEAD
     for a, c in bounds:
         route = ways.lead(a, c)
         straight = np.stack([posts.waypoint(a), posts.waypoint(c)])
         of_lead.append(straight if route is None else route)
         starts.append(posts.watching(a, c))
-        ahead = [posts.watching(c, b) for b in _onward(passable, a, c)]
+        ahead = [posts.watching(c, b) for b in _onward(passable, a, c, least)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
-    return Geometry(of_lead, np.array(starts), np.array(ends))
+    return Geometry(of_lead, np.array(starts), np.array(ends), posts.is_wide)
 
 
-def _onward(passable: np.ndarray, a: Cell, c: Cell) -> list[Cell | None]:
-    """Cells that a path may go on to, without a U-turn; None if there is none."""
-    (rows, cols), near = passable.shape, [-1, 0, 1]
-    cells = [(c[0] + i, c[1] + j) for i in near for j in near if i or j]
-    inside = [b for b in cells if b != a and 0 <= b[0] < rows and 0 <= b[1] < cols]
-    return [b for b in inside if passable[b]] or [None]
+def _onward(passable: np.ndarray, a: Cell, c: Cell, least: float) -> list[Cell | None]:
+    """Cells that a path goes on to, if it can by turns of that cosine at least; None if none."""
+    (rows, cols), move = passable.shape, np.subtract(c, a)
+    cells = [(c[0] + down, c[1] + right) for down, right in MOVES[8]]
+    free = [b for b in cells if 0 <= b[0] < rows and 0 <= b[1] < cols and passable[b]]
+    turn = {b: np.subtract(b, c) @ move / np.linalg.norm(np.subtract(b, c)) for b in free}
+    onward: list[Cell | None] = [b for b in free if b != a]
+    ahead = [b for b in onward if b and turn[b] >= least * np.linalg.norm(move)]
+    return list(ahead or onward) or [None]
 
 
 def bound_features(
@@ -76,16 +81,22 @@ def bound_features(
     flat = np.concatenate(given.ways)
     first = np.cumsum([0, *(len(way) for way in given.ways)])
     stops = flat[first[1:] - 1]  # the lead's, (bound, 2)
-    lead = _at_times(surface, team.lead, flat, first)
+    lead = at_times(surface, team.lead, flat, first, N_SAMPLES)
     share = ((np.arange(N_SAMPLES) + 0.5) / N_SAMPLES)[:, None]
-    drives = [_at_times(surface, robot, flat, first) for robot in team.robots]
+    drives = [at_times(surface, robot, flat, first, N_SAMPLES) for robot in team.robots]
+    wander = jittered(N_SAMPLES) if given.is_wide else 0.0
+    if given.is_wide:  # T2's ways may be much longer or shorter than the lead's
+        bound = np.linalg.norm(stops - flat[first[:-1]], axis=1)
+        gaps = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
+        longer = gaps / np.maximum(bound, 1.0)[:, None]
+        drives = [(route, time * longer[:, i]) for i, (route, time) in enumerate(drives)]
     slowest = np.max([time for _, time in drives], axis=0)
     los, easy = np.empty(given.posts.shape[:2]), np.empty(given.posts.shape[:2])
     for i, (robot, (route, time)) in enumerate(zip(team.robots, drives, strict=True)):
         post = given.posts[:, i, None]
         shift = (1.0 - share) * (post - flat[first[:-1], None])
         track = route + shift + share * (given.ends[:, :, i] - stops[:, None])
-        watched = _seen(surface, sight, robot, team.lead, post, lead[0])
+        watched = _seen(surface, sight, robot, team.lead, post + wander, lead[0])
         closing = _seen(surface, sight, team.lead, robot, stops[:, None], track)
         waiting = _seen(surface, sight, team.lead, robot, stops[:, None], given.ends[:, :, i])
         total = lead[1] * watched + time * closing + (slowest - time) * waiting
@@ -114,52 +125,3 @@ def _mean(values: np.ndarray) -> np.ndarray:
     finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
         return np.where(finite, values, 0.0).sum(1) / finite.sum(1)
-
-
-def _at_times(
-    surface: Surface, robot: Robot, flat: np.ndarray, first: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions of a robot at even times along routes, (bound, sample, 2), and durations, s."""
-    return _resampled(
-        surface.gradient,
-        surface.pixel,
-        surface.origin,
-        flat,
-        first,
-        (robot.speed, robot.max_slope),
-        N_SAMPLES,
-    )
-
-
-@_compiled
-def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
-    """Speed falls with the larger of pitch and roll, as in `simulation.motion`."""
-    rows, cols = gradient.shape[1:]
-    n = len(first) - 1
-    points, duration = np.empty((n, n_samples, 2)), np.empty(n)
-    longest = 0
-    for b in range(n):
-        longest = max(longest, first[b + 1] - first[b])
-    clock = np.empty(longest)
-    for b in range(n):
-        way = flat[first[b] : first[b + 1]]
-        clock[0] = 0.0
-        for k in range(1, len(way)):
-            dx, dy = way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1]
-            length = max(np.hypot(dx, dy), 1e-9)
-            i = min(rows - 1, max(0, int((origin[1] - way[k, 1]) / pixel[0] + 0.5)))
-            j = min(cols - 1, max(0, int((way[k, 0] - origin[0]) / pixel[1] + 0.5)))
-            gx, gy = gradient[0, i, j], gradient[1, i, j]
-            pitch, roll = abs(gx * dx + gy * dy) / length, abs(gy * dx - gx * dy) / length
-            tilt = np.arctan(max(pitch, roll))
-            clock[k] = clock[k - 1] + length / (limits[0] * speed_share(tilt, limits[1]))
-        duration[b] = clock[len(way) - 1]
-        k = 1
-        for s in range(n_samples):
-            t = duration[b] * (s + 0.5) / n_samples
-            while k < len(way) - 1 and clock[k] < t:
-                k += 1
-            share = (t - clock[k - 1]) / max(clock[k] - clock[k - 1], 1e-12)
-            for axis in range(2):
-                points[b, s, axis] = way[k - 1, axis] + share * (way[k, axis] - way[k - 1, axis])
-    return points, duration

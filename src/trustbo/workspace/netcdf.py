@@ -1,15 +1,17 @@
 """Workspaces as trees of arrays, for files."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
+from typing import Any
 
 import xarray as xr
 
 from trustbo.files import to_json
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
+from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.posts import FORMATION_RADIUS
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.workspace import Workspace
 
@@ -29,7 +31,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
         "grid": to_json(asdict(workspace.grid)),
         "team": to_json(asdict(workspace.team)),
         "sights": to_json([asdict(sight) for sight in workspace.sights]),
-        "formation_radius": workspace.formation_radius,
+        "formation": to_json(asdict(workspace.formation)),
     }
     return result
 
@@ -62,5 +64,12 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
         },
         cells.get("bound_awareness"),
         tuple(Sight(**sight) for sight in json.loads(tree.attrs.get("sights", "[]"))),
-        float(tree.attrs.get("formation_radius", FORMATION_RADIUS)),
+        _formation_of(tree.attrs),
     )
+
+
+def _formation_of(attrs: Mapping[Any, Any]) -> Formation:
+    """Formation of a file; those of version 0.2 have its radius alone."""
+    if "formation" in attrs:
+        return Formation(**json.loads(attrs["formation"]))
+    return Formation(radius=float(attrs.get("formation_radius", Formation().radius)))

@@ -1,7 +1,21 @@
-"""Posts: where the lead stops in a cell, and where T2 stands to watch it go to the next.
+"""Stops and posts: where the lead stops in a cell, and where T2 stands to watch it go to the next.
 
-The lead stops at a traversable pixel near the cell's centre, its waypoint. T2 stands around it, at
-most `radius` metres away, each robot where it sees the lead's next waypoint best.
+By the rule "end", T2 stands in the lead's cell where it sees the lead's next stop best.
+
+By the rule "way", all of a bound a -> c counts (docs/concepts.md, "Why bounds"): T2 watches the
+lead's way from its posts in a, then the lead watches from its stop in c how T2 leaves them; and in
+the bound before, it has watched from its stop in a how T2 closed up to them. Of positions p on a
+lattice around the stop, those are taken with the largest
+
+    1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
+
+s the probability of detection under the assumed sight. T2 is within `formation.radius` of the stop,
+also beyond the edge of the cell, on ground that is well below the slope limit and linked to the
+stop over such ground. By the rule "sight", the lead stops where the ways from the cell to the stops
+around are seen best.
+
+Maps lack things that block sight, and farther sight is worth less for it: s is multiplied by
+exp(-discount x distance) here, and nowhere else, so that the path's line of sight is as predicted.
 """
 
 from typing import Any
@@ -10,31 +24,28 @@ import numpy as np
 from scipy import ndimage
 
 from trustbo.data import Cell
-from trustbo.errors import TerrainError, TrustboError, require_positive
-from trustbo.team import Team
+from trustbo.errors import TerrainError
+from trustbo.team import Robot, Team
+from trustbo.workspace.formation import SPACING, Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
-from trustbo.workspace.regions import are_linked, largest_region, linked_to
-from trustbo.workspace.sight import Sight, detection_probability, optics
+from trustbo.workspace.regions import Window, are_linked, largest_region, linked_to
+from trustbo.workspace.routes import Routes, at_times
+from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
 from trustbo.workspace.surface import Surface
 
-SPACING = 2.0
-"""Least distance between two robots of T2, m."""
-FORMATION_RADIUS = 8.0
-"""Largest distance of T2 from the lead's waypoint, m, by default."""
-
-
-def require_formation(radius: float) -> None:
-    """Refuse a formation radius below the robots' least distance: TrustboError."""
-    if require_positive("formation_radius", radius) < SPACING:
-        raise TrustboError(
-            f"formation_radius must be at least {SPACING:g} m, the least distance between two "
-            f"robots; got {radius:g}."
-        )
+_SAFE = 0.7
+"""Steepest ground of posts and of the ways to them, as a share of the slope limit."""
+_STEP, _STOP_RADIUS = 4.0, 16.0  # m: of the lattice; of the lead's stop from the centre's
+_GAP = 0.16  # distance between two robots as a share of the radius, `SPACING` at least
+_NEARER = 1e-3  # of sight, that a metre nearer is worth
+_N_WATCHED = 30  # positions, best seen from the stops, from which the lead's way is looked at
+_N_AIMS = 6  # times on the lead's way at which it is aimed at
+_SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the way to a stop around
 
 
 class Posts:
-    """Waypoints of the lead and posts of T2 in the cells of a grid, x and y in CRS metres."""
+    """Stops of the lead and posts of T2 in the cells of a grid, x and y in CRS metres."""
 
     def __init__(
         self,
@@ -43,19 +54,24 @@ class Posts:
         surface: Surface,
         sight: Sight,
         traversability: np.ndarray,
-        radius: float,
+        formation: Formation,
     ) -> None:
         """Prepare the maps of pixels; `traversability` has shape (row, col) of pixels."""
         self.grid, self.team, self.surface = grid, team, surface
-        self._sight, self._radius = sight, radius
+        self.routes = Routes(surface, clear=formation.is_wide)
+        self._sight, self._formation = sight, formation
+        self.is_wide = formation.is_wide
         self._traversability = _smoothed(traversability, surface.pixel)
         self._standable = largest_region(surface.passable)
-        self._waypoints: dict[Cell, np.ndarray] = {}
+        steep = np.arctan(np.hypot(*surface.gradient))
+        self._safe = self._standable & (steep <= _SAFE * team.max_slope)
+        self._central: dict[Cell, np.ndarray] = {}
+        self._stops: dict[Cell, np.ndarray] = {}
         self._cached: dict[Cell, dict[Cell | None, np.ndarray]] = {}
         # Row and column of the cell that each row and column of pixels belongs to, ascending.
         self._cells = grid.cells_along(*surface.axes)
 
-    def window(self, a: Cell, c: Cell) -> tuple[int, int, int, int]:
+    def window(self, a: Cell, c: Cell) -> Window:
         """Window of pixels of two cells and half a cell around: first and end row, then col."""
         (rows, cols), shape = self.surface.ground.shape, self.grid.shape
         per_row, per_col = rows / shape[0], cols / shape[1]
@@ -77,66 +93,183 @@ class Posts:
         ends = [self.surface.pixel_at(*self.waypoint(cell).tolist()) for cell in (a, c)]
         return are_linked(self.surface.passable, self.window(a, c), ends[0], ends[1])
 
+    def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
+        """Way of the lead from stop to stop, (point, 2); None if there is none."""
+        ends = self.waypoint(a), self.waypoint(c)
+        return self.routes.find(self.team.lead, *ends, self.window(a, c))
+
+    # --- stops of the lead ---
+
     def waypoint(self, cell: Cell) -> np.ndarray:
-        """Stop of the lead in a cell, shape (2,): a traversable pixel near the centre."""
-        if cell not in self._waypoints:
+        """Stop of the lead in a cell, shape (2,): a traversable pixel."""
+        if cell not in self._stops:
+            by_sight = self._formation.stops == "sight"
+            self._stops[cell] = (self._seeing_stop if by_sight else self._central_stop)(cell)
+        return self._stops[cell]
+
+    def _central_stop(self, cell: Cell) -> np.ndarray:
+        """Easy ground near the cell's centre."""
+        if cell not in self._central:
             row, col = self._pixels_of(cell)
             position = self._position(row, col)
             size = np.hypot(self.grid.cell_height, self.grid.cell_width)
             off_center = np.linalg.norm(position - self.grid.center(cell), axis=1) / size
             chosen = np.argmax(self._traversability[row, col] - off_center)
-            self._waypoints[cell] = position[chosen]
-        return self._waypoints[cell]
+            self._central[cell] = position[chosen]
+        return self._central[cell]
+
+    def _seeing_stop(self, cell: Cell) -> np.ndarray:
+        """Position from which the ways of the central stop to those around are seen best."""
+        here = self._central_stop(cell)
+        around = [c for c in self._around(cell) if self._is_in_region(self._central_stop(c))]
+        lattice = self._lattice(cell, here, _STOP_RADIUS)
+        row, col = self.surface.nearest(*lattice.T)
+        inside = (self._cells[0][row] == cell[0]) & (self._cells[1][col] == cell[1])
+        position = np.concatenate([here[None], lattice[inside]])
+        if not around or len(position) == 1:
+            return here
+        goals = np.array([self._central_stop(c) for c in around])
+        aims = (here + _SHARES[:, None, None] * (goals - here)).reshape(-1, 2)
+        lidar = optics(self.team.lead, self.team.robots[0])
+        seen = self._seen(position[:, None], aims, lidar).mean(1)
+        return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
+
+    # --- posts of T2 ---
 
     def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        """Posts of T2 in a cell, shape (robot, 2), from which it watches the next waypoint.
+        """Posts of T2 in a cell, shape (robot, 2), from which it watches the lead's next bound.
 
         Without a next cell, around the lead at the goal.
         """
         posts = self._cached.setdefault(cell, {})
         if next_cell not in posts:  # those of all neighbours cost little more than one
-            rows, cols = self.grid.shape
-            near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
-            inside = [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
-            posts |= self._aimed(cell, list({None: 0} | dict.fromkeys([*inside, next_cell])))
+            around = [c for c in self._around(cell) if self._is_in_region(self.waypoint(c))]
+            ahead = list(dict.fromkeys([None, *around, next_cell]))
+            posts |= dict(zip(ahead, self._aimed(cell, ahead), strict=True))
         return posts[next_cell]
 
-    def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> dict[Cell | None, np.ndarray]:
-        """Posts of T2 by the next cell, of equal sight the closer one, with a least distance."""
+    def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> np.ndarray:
+        """Posts of T2 by the next cell, (next cell, robot, 2), with a least distance."""
         here, robots = self.waypoint(cell), self.team.robots
-        position = self._position(*self._linked(cell))
+        by_end, gap = not self._formation.is_wide, SPACING
+        position = np.empty((0, 2))
+        if not by_end:
+            position = self._lattice(cell, here, self._formation.radius)
+            gap = max(SPACING, _GAP * self._formation.radius)
+        if len(position) < len(robots):
+            position, gap = self._pixels_near(cell, here), SPACING
         distance = np.linalg.norm(position - here, axis=1)
-        near = np.flatnonzero((distance <= self._radius) & (distance >= SPACING))
-        if len(near) < len(robots):  # few passable pixels, or large ones
-            order = np.argsort(distance, kind="stable")
-            near = order[distance[order] > 0.0][: len(robots)]
-            near = near if len(near) else order
-        position, distance = position[near], distance[near]
-        goals = np.stack([here if c is None else self.waypoint(c) for c in ahead])
-        seen = self._seen(position, goals)
+        seen = (self._seen_at_end if by_end else self._seen_in_phases)(cell, ahead, position)
         posts = np.empty((len(ahead), len(robots), 2))
         score = np.empty((len(ahead), len(position)))
         for i in range(len(robots)):
-            score[:] = seen[i] - 1e-3 * distance
+            score[:] = seen[i] - _NEARER * distance
             if i:
                 gaps = np.linalg.norm(position - posts[:, :i, None], axis=-1).min(1)
-                score -= 10.0 * (gaps < SPACING)
+                score -= 10.0 * (gaps < gap)
             posts[:, i] = position[np.argmax(score, axis=1)]
-        return dict(zip(ahead, posts, strict=True))
+        if not by_end:
+            for of_next, c in zip(posts, ahead, strict=True):
+                self._abreast(
+                    of_next, np.array([0.0, 1.0]) if c is None else self.waypoint(c) - here
+                )
+        return posts
 
-    def _seen(self, position: np.ndarray, goals: np.ndarray) -> list[np.ndarray]:
-        """Detection of the lead at each goal from each position, (goal, position) per robot."""
-        sensor = np.tile(position, (len(goals), 1))
-        target = np.repeat(goals, len(position), axis=0)
-        cached: dict[bytes, np.ndarray] = {}
-        rows = []
-        for robot in self.team.robots:
+    def _seen_in_phases(
+        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
+    ) -> list[np.ndarray]:
+        """Sight that counts in both phases, (next cell, position) for each robot."""
+        here, lead = self.waypoint(cell), self.team.lead
+        goals = [here if c is None else self.waypoint(c) for c in ahead]
+        routes = [None if c is None else self.lead_way(cell, c) for c in ahead]
+        routes = [
+            np.stack([here, goal]) if route is None else route
+            for route, goal in zip(routes, goals, strict=True)
+        ]
+        first = np.cumsum([0, *map(len, routes)])
+        aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
+        far = np.linalg.norm(position - here, axis=1)
+        rows: dict[Robot, np.ndarray] = {}
+        for robot in dict.fromkeys(self.team.robots):
+            stops = np.stack([here, *goals])[:, None]
+            closing = 0.25 * self._seen(stops, position, optics(lead, robot))
+            seen = closing[0] + closing[1:]
+            best = np.argsort(_NEARER * far - seen, axis=1, kind="stable")[:, :_N_WATCHED]
+            eyes = position[best][:, :, None] + jittered(_N_AIMS)
+            watched = self._seen(eyes, aims[:, None], optics(robot, lead)).mean(-1)
+            rows[robot] = seen - 1.0  # of positions from which the way was not looked at
+            of_best = np.take_along_axis(seen, best, 1) + 0.5 * watched
+            np.put_along_axis(rows[robot], best, of_best, 1)
+        return [rows[robot] for robot in self.team.robots]
+
+    def _seen_at_end(
+        self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
+    ) -> list[np.ndarray]:
+        """Sight of the lead's next stop, (next cell, position) for each robot."""
+        goals = np.stack([self.waypoint(cell) if c is None else self.waypoint(c) for c in ahead])
+        rows: dict[Robot, np.ndarray] = {}
+        for robot in dict.fromkeys(self.team.robots):
             lidar = optics(robot, self.team.lead)
-            if (key := lidar.tobytes()) not in cached:
-                seen = detection_probability(self.surface, self._sight, sensor, target, lidar)
-                cached[key] = seen.reshape(len(goals), len(position))
-            rows.append(cached[key])
-        return rows
+            rows[robot] = self._seen(position, goals[:, None], lidar)
+        return [rows[robot] for robot in self.team.robots]
+
+    def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
+        """Sort equal robots from left to right, so that they keep their sides: shorter ways."""
+        robots = self.team.robots
+        to_right = posts @ np.array([direction[1], -direction[0]])
+        for robot in dict.fromkeys(robots):
+            members = np.array([i for i, other in enumerate(robots) if other == robot])
+            posts[members] = posts[members[np.argsort(to_right[members], kind="stable")]]
+
+    def _seen(self, eye: np.ndarray, target: np.ndarray, lidar: np.ndarray) -> np.ndarray:
+        """Probability of detection of targets (..., 2), discounted by distance; broadcasts."""
+        eye, target = np.broadcast_arrays(eye, target)
+        rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
+        seen = detection_probability(self.surface, self._sight, *rays, lidar)
+        distance = np.linalg.norm(rays[1] - rays[0], axis=1)
+        seen *= np.exp(-self._formation.discount * distance)
+        return seen.reshape(eye.shape[:-1])
+
+    # --- pixels ---
+
+    def _around(self, cell: Cell) -> list[Cell]:
+        """Neighbours on the grid."""
+        rows, cols = self.grid.shape
+        near = [(cell[0] + down, cell[1] + right) for down, right in MOVES[8]]
+        return [c for c in near if 0 <= c[0] < rows and 0 <= c[1] < cols]
+
+    def _is_in_region(self, position: np.ndarray) -> bool:
+        """Whether a position is in the region that robots can drive in."""
+        return bool(self._standable[self.surface.pixel_at(*position.tolist())])
+
+    def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
+        """Positions around one, (position, 2), linked to it over safe ground near the cell.
+
+        Linked within half a cell around, which the window of every bound contains.
+        """
+        steps = np.arange(-radius, radius + 1e-9, _STEP)
+        offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+        distance = np.linalg.norm(offset, axis=1)
+        offset = offset[(distance <= radius) & (distance >= SPACING)]
+        row, col = (np.rint(i).astype(int) for i in self.surface.to_pixel(*(here + offset).T))
+        window, start = self.window(cell, cell), self.surface.pixel_at(*here.tolist())
+        top, bottom, left, right = window
+        inside = (row >= top) & (row < bottom) & (col >= left) & (col < right)
+        pixels = np.unique(np.stack([row, col], axis=1)[inside], axis=0)
+        linked = linked_to(self._safe, window, start)
+        row, col = pixels[linked[pixels[:, 0] - top, pixels[:, 1] - left]].T
+        return self._position(row, col)
+
+    def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
+        """Positions in a cell that are linked to its stop, at most 0.2's radius from it."""
+        position = self._position(*self._linked(cell))
+        distance = np.linalg.norm(position - here, axis=1)
+        near = np.flatnonzero((distance <= self._formation.radius) & (distance >= SPACING))
+        if len(near) < len(self.team.robots):  # few passable pixels, or large ones
+            order = np.argsort(distance, kind="stable")
+            near = order[distance[order] > 0.0][: len(self.team.robots)]
+            near = near if len(near) else order
+        return position[near]
 
     def require_room(self, cell: Cell) -> None:
         """Refuse a cell without a pixel for each robot: TerrainError that names cell and robot."""
@@ -164,10 +297,7 @@ class Posts:
         return row + top, col + left
 
     def _linked(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of a cell's pixels that are linked to its waypoint.
-
-        Linked within half a cell around, which the window of every bound contains.
-        """
+        """Rows and columns of a cell's pixels that are linked to its stop near the cell."""
         row, col = self._pixels_of(cell)
         start = self.surface.pixel_at(*self.waypoint(cell).tolist())
         window = self.window(cell, cell)

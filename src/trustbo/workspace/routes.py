@@ -2,9 +2,11 @@
 
 import heapq
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
+from scipy import ndimage
 
 from trustbo.parallel import plain
 from trustbo.team import Robot
@@ -12,6 +14,8 @@ from trustbo.workspace.surface import Surface
 
 SLOWEST = 0.1
 """Speed at the slope limit as a share of that on level ground."""
+_CLEARANCE = 1.0  # m from obstacles, that routes keep where they can: robots drive beside them
+_CLOSE = 4.0  # cost of a metre within it
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 
 
@@ -21,10 +25,14 @@ class Routes:
     Robots with one slope limit share them, and missions over one path need few.
     """
 
-    def __init__(self, surface: Surface) -> None:
-        """Prepare the slope, with which a robot's speed falls."""
+    def __init__(self, surface: Surface, *, clear: bool = False) -> None:
+        """Prepare the slope, with which a robot's speed falls; `clear`: keep off obstacles."""
         self._surface = surface
         self._slope = np.arctan(np.hypot(*surface.gradient))
+        self._is_close = np.zeros(surface.passable.shape, dtype=bool)
+        if clear:
+            free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
+            self._is_close = free <= max(_CLEARANCE, *surface.pixel)
         self._paces: dict[float, np.ndarray] = {}
         self._cached: dict[tuple[object, ...], np.ndarray] = {}
 
@@ -60,6 +68,7 @@ class Routes:
         surface = self._surface
         if max_slope not in self._paces:
             pace = 1.0 / speed_share(self._slope, max_slope)
+            pace = np.where(self._is_close, _CLOSE * pace, pace)
             self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
         top, bottom, left, right = window
         cells = _a_star(
@@ -125,3 +134,49 @@ def _a_star(pace, pixel, start, goal):
         cells[k, 0], cells[k, 1] = cell // cols, cell % cols
         cell = came[cell // cols, cell % cols]
     return cells
+
+
+def at_times(
+    surface: Surface, robot: Robot, flat: np.ndarray, first: np.ndarray, n: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions of a robot at n even times along routes, (route, time, 2), and durations, s.
+
+    Routes follow one another in `flat` (point, 2); `first` has the index of the first point of
+    each, and the number of points.
+    """
+    limits = robot.speed, robot.max_slope
+    return _resampled(surface.gradient, surface.pixel, surface.origin, flat, first, limits, n)
+
+
+@_compiled
+def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
+    """Speed falls with the larger of pitch and roll, as in `simulation.motion`."""
+    rows, cols = gradient.shape[1:]
+    n = len(first) - 1
+    points, duration = np.empty((n, n_samples, 2)), np.empty(n)
+    longest = 0
+    for b in range(n):
+        longest = max(longest, first[b + 1] - first[b])
+    clock = np.empty(longest)
+    for b in range(n):
+        way = flat[first[b] : first[b + 1]]
+        clock[0] = 0.0
+        for k in range(1, len(way)):
+            dx, dy = way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1]
+            length = max(np.hypot(dx, dy), 1e-9)
+            i = min(rows - 1, max(0, int((origin[1] - way[k, 1]) / pixel[0] + 0.5)))
+            j = min(cols - 1, max(0, int((way[k, 0] - origin[0]) / pixel[1] + 0.5)))
+            gx, gy = gradient[0, i, j], gradient[1, i, j]
+            pitch, roll = abs(gx * dx + gy * dy) / length, abs(gy * dx - gx * dy) / length
+            tilt = np.arctan(max(pitch, roll))
+            clock[k] = clock[k - 1] + length / (limits[0] * speed_share(tilt, limits[1]))
+        duration[b] = clock[len(way) - 1]
+        k = 1
+        for s in range(n_samples):
+            t = duration[b] * (s + 0.5) / n_samples
+            while k < len(way) - 1 and clock[k] < t:
+                k += 1
+            share = (t - clock[k - 1]) / max(clock[k] - clock[k - 1], 1e-12)
+            for axis in range(2):
+                points[b, s, axis] = way[k - 1, axis] + share * (way[k, axis] - way[k - 1, axis])
+    return points, duration

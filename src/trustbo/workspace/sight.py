@@ -15,6 +15,7 @@ from trustbo.workspace.surface import Surface
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
 
+_JITTER = 0.7  # m
 SIGHT_MODES = {"bare": rays.BARE, "wall": rays.WALL, "transmittance": rays.TRANSMITTANCE}
 
 
@@ -70,6 +71,17 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
         watcher.lidar_range,
         math.sin(watcher.vertical_fov),
     ])  # fmt: skip
+
+
+def jittered(n: int) -> np.ndarray:
+    """Offsets of n sights from a post, (sight, 2), m: even in the disc in which a robot stops.
+
+    It stops within half a metre, and its body tilts there with the ground, and with it the field of
+    view: sight from one exact point would be luck.
+    """
+    k, order = np.arange(n), np.random.default_rng(0).permutation(n)
+    radius, angle = _JITTER * np.sqrt((k + 0.5) / n), 2.4 * k
+    return (radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))[order]
 
 
 def detection_probability(

@@ -7,20 +7,18 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.workspace.posts import Posts
-from trustbo.workspace.routes import Routes
 
 
 class Ways:
     """Ways of a team between its posts; positions are x, y in CRS metres."""
 
     def __init__(self, posts: Posts) -> None:
-        """Prepare the routes over the posts' surface."""
-        self.posts, self.routes = posts, Routes(posts.surface)
+        """Take the routes over the posts' surface."""
+        self.posts, self.routes = posts, posts.routes
 
     def lead(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Way of the lead from waypoint to waypoint, (point, 2); None if there is none."""
-        lead, window = self.posts.team.lead, self.posts.window(a, c)
-        return self.routes.find(lead, self.posts.waypoint(a), self.posts.waypoint(c), window)
+        return self.posts.lead_way(a, c)
 
     def closing(self, a: Cell, c: Cell, next_cell: Cell | None) -> list[np.ndarray | None]:
         """Way of each robot of T2, from where it watched a -> c to where it watches c -> next."""

@@ -31,10 +31,11 @@ from trustbo.workspace.bound_awareness import (
     require_sight,
     sight_features,
 )
+from trustbo.workspace.formation import Formation
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, cell_of
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds, moves_along
-from trustbo.workspace.posts import FORMATION_RADIUS, Posts, require_formation
+from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight, sights_of
 from trustbo.workspace.surface import Surface, surface_of
 from trustbo.workspace.survey import MAX_MISSING, reason_impassable
@@ -59,7 +60,7 @@ class Workspace(Displayed):
             the cell entered, for any move.
         sights: Assumed models of sight; posts go by the first. Empty without a terrain, and in
             files of version 0.1.
-        formation_radius: Largest distance of T2's posts from the lead's waypoint, m.
+        formation: Rules of the lead's stops and of T2's posts.
     """
 
     awareness: xr.DataArray
@@ -71,7 +72,7 @@ class Workspace(Displayed):
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     of_bounds: xr.DataArray | None = None
     sights: tuple[Sight, ...] = ()
-    formation_radius: float = FORMATION_RADIUS
+    formation: Formation = field(default_factory=Formation)
 
     @classmethod
     def from_terrain(
@@ -85,7 +86,10 @@ class Workspace(Displayed):
         observers: ArrayLike | None = None,
         bounds: bool = True,
         sight: Sight | str | Sequence[Sight | str] = "transmittance",
-        formation_radius: float = FORMATION_RADIUS,
+        posts: str = "end",
+        stops: str = "centre",
+        formation_radius: float | None = None,
+        sight_discount: float | None = None,
     ) -> Self:
         """Derive traversability, visibility and line of sight from a DEM and a DSM.
 
@@ -116,7 +120,14 @@ class Workspace(Displayed):
                 visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
                 several, features `line_of_sight_1`, `line_of_sight_2`, ...
-            formation_radius: Largest distance of T2's posts from the lead's waypoint, m.
+            posts: Rule of T2's posts: `"end"`, where it sees the lead's next stop, in the lead's
+                cell; `"way"`, where it sees the lead's whole way and is seen from its stops.
+            stops: Rule of the lead's stops: `"centre"`, near the centre of the cell; `"sight"`,
+                where the ways around are seen best.
+            formation_radius: Largest distance of T2's posts from the lead's stop, m; by default 8,
+                25 of the rule `"way"`.
+            sight_discount: Rate at which sight is taken to fall with distance in the choice of
+                posts and stops, 1/m; by default 0.005, 0 of `"end"` with `"centre"`.
 
         Raises:
             TerrainError: A grid too fine for the raster, an observer off the terrain, a cell
@@ -126,7 +137,7 @@ class Workspace(Displayed):
             TrustboError: No cell is passable, or an unknown scaling, feature or sight.
         """
         terrain, sights = require_terrain(terrain), sights_of(sight)
-        require_formation(formation_radius)
+        formation = Formation.of(posts, stops, formation_radius, sight_discount)
         team = Team.of(team)
         grid = Grid.over(terrain, shape)
         if bounds:
@@ -152,7 +163,7 @@ class Workspace(Displayed):
             pixels=maps.pixels,
             composites=maps.composites,
             sights=sights,
-            formation_radius=formation_radius,
+            formation=formation,
         )
         return workspace._with_line_of_sight() if bounds else workspace
 
@@ -310,7 +321,7 @@ class Workspace(Displayed):
         assumed = (*self.sights, sight or Sight())[0]
         assert self.pixels is not None  # noqa: S101  # there is a surface
         easy = self.pixels[TRAVERSABLE].values if TRAVERSABLE in self.pixels else surface.passable
-        return Ways(Posts(self.grid, self.team, surface, assumed, easy, self.formation_radius))
+        return Ways(Posts(self.grid, self.team, surface, assumed, easy, self.formation))
 
     def posts(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Overwatch points of T2 in cell a while the lead bounds to c, shape (robot, 2).
