@@ -14,7 +14,7 @@ also beyond the edge of the cell, on ground that is well below the slope limit a
 stop over such ground. By the rule "sight", the lead stops where the ways from the cell to the stops
 around are seen best.
 
-Maps lack things that block sight, and farther sight is worth less for it: s is multiplied by
+Maps lack things that block sight, so that sight over a distance is less sure: s is multiplied by
 exp(-discount x distance) here, and nowhere else, so that the path's line of sight is as predicted.
 """
 
