@@ -34,8 +34,9 @@ class ReplaySimulator(DescribedSimulator):
 
         Args:
             missions: Recorded missions.
-            on_missing: Behaviour of `run` if no mission is left on its path: `"error"`, or
-                `"next"` to return the next one on another path (`Campaign.tell` learns from it).
+            on_missing: `"error"` to replay the mission recorded on the path asked for, and to raise
+                if none is left; `"next"` to replay all in their order, whatever their paths
+                (`Campaign.tell` learns from them).
 
         Raises:
             TrustboError: No missions, or an unknown `on_missing`.
@@ -91,7 +92,7 @@ class ReplaySimulator(DescribedSimulator):
         self._left = list(range(len(self.missions)))
 
     def run(self, path: Sequence[Cell], *, seed: int) -> Mission:
-        """Return the next recorded mission on a path.
+        """Return the next recorded mission on a path; with `on_missing="next"`, on any.
 
         Args:
             path: Cells, start first.
@@ -102,9 +103,10 @@ class ReplaySimulator(DescribedSimulator):
                 `on_missing="next"`: none is left at all.
         """
         cells = tuple(require_pair(f"path[{k}]", cell) for k, cell in enumerate(path))
-        same = [j for j in self._left if self.missions[j].path == cells]
-        if not same and self._on_missing == "next":
+        if self._on_missing == "next":  # the order of missions carries what changed with time
             same = self._left
+        else:
+            same = [j for j in self._left if self.missions[j].path == cells]
         if not same:
             recorded = [j for j, mission in enumerate(self.missions) if mission.path == cells]
             raise TrustboError(self._missing(cells, recorded))
