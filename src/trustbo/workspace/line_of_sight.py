@@ -17,6 +17,7 @@ posts: it differs from T2's fastest route by some metres, over which sight hardl
 the search of some 50 routes for each bound.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -61,13 +62,16 @@ def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarr
 
 def _onward(passable: np.ndarray, a: Cell, c: Cell, least: float) -> list[Cell | None]:
     """Cells that a path goes on to, if it can by turns of that cosine at least; None if none."""
-    (rows, cols), move = passable.shape, np.subtract(c, a)
-    cells = [(c[0] + down, c[1] + right) for down, right in MOVES[8]]
-    free = [b for b in cells if 0 <= b[0] < rows and 0 <= b[1] < cols and passable[b]]
-    turn = {b: np.subtract(b, c) @ move / np.linalg.norm(np.subtract(b, c)) for b in free}
-    onward: list[Cell | None] = [b for b in free if b != a]
-    ahead = [b for b in onward if b and turn[b] >= least * np.linalg.norm(move)]
-    return list(ahead or onward) or [None]
+    (rows, cols), (down, right) = passable.shape, (c[0] - a[0], c[1] - a[1])
+    onward: list[Cell | None] = []
+    ahead: list[Cell | None] = []
+    for i, j in MOVES[8]:
+        b = c[0] + i, c[1] + j
+        if b != a and 0 <= b[0] < rows and 0 <= b[1] < cols and passable[b]:
+            onward.append(b)
+            if i * down + j * right >= least * math.hypot(i, j) * math.hypot(down, right):
+                ahead.append(b)
+    return ahead or onward or [None]
 
 
 def bound_features(

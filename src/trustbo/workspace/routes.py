@@ -45,15 +45,16 @@ class Routes:
         positions, shape (point, 2), CRS metres.
         """
         ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
-        key = (*ends, window, robot.max_slope)
+        low, high = sorted(ends)  # the way back is the same
+        key = low, high, window, robot.max_slope
         if key not in self._cached:
-            self._cached[key] = self._search(ends[0], ends[1], window, robot.max_slope)
+            self._cached[key] = self._search(low, high, window, robot.max_slope)
         cached = self._cached[key]
         if not len(cached):
             return None
         if len(cached) == 1:  # a single-pixel route still needs two ends
             return np.stack([start, goal])
-        route = cached.copy()
+        route = cached[:: 1 if ends[0] == low else -1].copy()
         route[0], route[-1] = start, goal
         return route
 

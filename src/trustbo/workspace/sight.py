@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import njit
@@ -73,6 +74,7 @@ def optics(watcher: Robot, watched: Robot) -> np.ndarray:
     ])  # fmt: skip
 
 
+@cache
 def jittered(n: int) -> np.ndarray:
     """Offsets of n sights from a post, (sight, 2), m: even in the disc in which a robot stops.
 
