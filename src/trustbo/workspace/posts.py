@@ -14,8 +14,9 @@ also beyond the edge of the cell, on ground that is well below the slope limit a
 stop over such ground. By the rule "sight", the lead stops where the ways from the cell to the stops
 around are seen best.
 
-Maps lack things that block sight, so that sight over a distance is less sure: s is multiplied by
-exp(-discount x distance) here, and nowhere else, so that the path's line of sight is as predicted.
+Maps lack things that block sight, and have things that do not, so that sight is unsure: a share
+exp(-discount x distance) of what is expected to be seen is, and of the rest a share that falls with
+distance. It is so here, and nowhere else, so that the path's line of sight is as predicted.
 """
 
 from typing import Any
@@ -39,6 +40,7 @@ _SAFE = 0.7
 _STEP, _STOP_RADIUS = 4.0, 16.0  # m: of the lattice; of the lead's stop from the centre's
 _GAP = 0.16  # distance between two robots as a share of the radius, `SPACING` at least
 _NEARER = 1e-3  # of sight, that a metre nearer is worth
+_DOUBT, _DOUBT_REACH = 0.1, 40.0  # share of the unexpected that is seen at 0 m; its reach, m
 _N_WATCHED = 30  # positions, best seen from the stops, from which the lead's way is looked at
 _N_AIMS = 6  # times on the lead's way at which it is aimed at
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the way to a stop around
@@ -222,12 +224,14 @@ class Posts:
             posts[members] = posts[members[np.argsort(to_right[members], kind="stable")]]
 
     def _seen(self, eye: np.ndarray, target: np.ndarray, lidar: np.ndarray) -> np.ndarray:
-        """Probability of detection of targets (..., 2), discounted by distance; broadcasts."""
+        """Probability of detection of targets (..., 2) where maps may be wrong; broadcasts."""
         eye, target = np.broadcast_arrays(eye, target)
         rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
         seen = detection_probability(self.surface, self._sight, *rays, lidar)
         distance = np.linalg.norm(rays[1] - rays[0], axis=1)
-        seen *= np.exp(-self._formation.discount * distance)
+        if self._formation.discount:
+            seen *= np.exp(-self._formation.discount * distance)
+            seen += _DOUBT * np.exp(-distance / _DOUBT_REACH) * (1.0 - seen)
         return seen.reshape(eye.shape[:-1])
 
     # --- pixels ---
