@@ -167,6 +167,20 @@ def test_without_memory_level_and_deviation_are_one_model():
     np.testing.assert_allclose(level, deviation, rtol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["weights", "places and robots"])
+def test_rates_that_are_just_as_expected_have_a_density(name):
+    """Full contact on a line of sight of 1, of weight 1 a priori, without memory."""
+    path, clear = [(0, 0), (0, 1), (1, 2)], np.tile([1.0, 0.0], (2, 3, 1))
+    mission = Mission.from_arrays(
+        path, clear, np.ones((2, 3)), features=("line_of_sight", "slope")
+    )
+    slots, groups = gathered([mission], EFFECTS[name])
+    theta = random_theta(EFFECTS[name], np.random.default_rng(0), 3)
+    theta |= {"beta0": np.zeros(3), "rest": np.ones(3)}
+    expected = [Dense(slots, groups, point(theta, t), X0).log_density() for t in range(3)]
+    np.testing.assert_allclose(Gaussian(slots, groups, X0).log_density(theta), expected, rtol=1e-10)
+
+
 def test_a_mission_of_weight_0_is_not_there():
     missions = walking_missions(5)
     effects = EFFECTS["places and robots"]

@@ -334,7 +334,7 @@ def share_of(sd: Any, whole: Any) -> Any:
     """Share of a variance (sd / whole)^2, 0 where the whole is 0; in NumPy or JAX."""
     xp: Any = namespace(whole)
     some = whole > 0.0
-    return xp.where(some, sd**2 / xp.where(some, whole, 1.0) ** 2, 0.0)
+    return xp.where(some, (sd / xp.where(some, whole, 1.0)) ** 2, 0.0)  # squares may underflow
 
 
 def hypot(a: Any, b: Any) -> Any:
