@@ -228,7 +228,6 @@ def test_hierarchical_robots_lie_between_pooled_and_separate_ones(missions):
     require_trust_followed_in_real_time(hierarchical, HierarchicalTrust(), missions[0])
 
 
-@pytest.mark.slow  # it compiles for long
 def test_a_coupled_posterior_has_the_paper_s_matrices(missions):
     coupled = fit(missions, CoupledTrust())
     assert diagnostics(coupled)["k_hat"] <= 0.7

@@ -134,8 +134,11 @@ def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
 
 
 def theta_of(sites: Mapping[str, np.ndarray], memory: str) -> Theta:
-    """Hyperparameters and `rest` of draws by name, under the memory of `PooledTrust`."""
-    return {**sites, "rest": rest_of(sites["beta0"], memory)}
+    """Hyperparameters and `rest` of draws by name, under the memory of `PooledTrust`.
+
+    Without `rest` where memory is a matrix: no effect is of such a model.
+    """
+    return {**sites, "rest": rest_of(sites["beta0"], memory)} if "beta0" in sites else {**sites}
 
 
 def slots_of(missions: Sequence[Mission], batch: MissionBatch) -> Slots:
