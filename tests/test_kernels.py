@@ -11,10 +11,12 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 REACH_EVERY_KERNEL = (
+    "hazard/test_difficulty.py",
     "planning/search",
     "planning/test_closed_bounds.py",
     "planning/test_risk.py",
     "inference/evidence/test_ep.py",
+    "inference/evidence/test_gaussian.py",
     "inference/samplers/test_coupled_target.py",
     "inference/test_filter.py::test_families_are_followed_to_the_trust_of_a_grid",
     "inference/test_places.py::test_the_marginal_likelihood_is_that_of_a_dense_joint_normal",

@@ -51,7 +51,8 @@ EVENTS = {
 
 @pytest.fixture(scope="module")
 def wooded():
-    return Workspace.from_terrain(hillside(60.0, 90.0), (2, 3))
+    # By posts that see all, vegetation would hide nothing.
+    return Workspace.from_terrain(hillside(60.0, 90.0), (2, 3), posts="end", stops="centre")
 
 
 @pytest.fixture(scope="module")

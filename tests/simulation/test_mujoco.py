@@ -351,11 +351,11 @@ def test_contact_is_what_sight_says_of_the_recorded_poses(wooded, mission):
 
 
 def test_contact_is_lost_beyond_the_lidar_s_range():
-    team = Team(robots=(Robot(lidar_range=12.0),), lead=Robot(lidar_range=12.0))
+    team = Team(robots=(Robot(lidar_range=8.0),), lead=Robot(lidar_range=8.0))
     workspace = workspace_of(np.zeros((60, 60)), team)
     bound = MujocoSimulator(workspace).run(PATH[:2], seed=0).bounds[0]
     gap = np.linalg.norm(bound.poses[:, 0, :2] - bound.poses[:, 1, :2], axis=1)
-    np.testing.assert_array_equal(bound.contact[:, 0], gap <= 12.0)
+    np.testing.assert_array_equal(bound.contact[:, 0], gap <= 8.0)
     assert 0.0 < bound.contact_rate[0] < 1.0
 
 
@@ -410,7 +410,7 @@ def test_gaps_edges_and_other_pixels_are_no_obstacle():
 @pytest.mark.slow  # each tick is many steps of its solver
 def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
     terrain = tb.terrain.read_terrain(*real_terrain("wellington"))
-    workspace = Workspace.from_terrain(terrain, (6, 8))
+    workspace = Workspace.from_terrain(terrain, (6, 8), posts="end", stops="centre")
     simulator = MujocoSimulator(workspace, sight="transmittance")
     result = tb.iterate(
         workspace,
@@ -423,7 +423,8 @@ def test_a_campaign_on_steep_ground_learns_from_physical_failures(real_terrain):
     )
     statuses = [mission.status for mission in result.missions]
     assert len(statuses) == 3
-    assert set(statuses) & {"stuck", "tipped", "collision"}  # 37 degrees steep on average
+    # 37 degrees steep on average: by stops and posts chosen without a look at slopes, robots fail.
+    assert set(statuses) & {"stuck", "tipped", "collision"}
     for mission in result.missions:
         assert ((mission.contact_rate >= 0.0) & (mission.contact_rate <= 1.0)).all()
         assert np.isfinite(mission.awareness).all()

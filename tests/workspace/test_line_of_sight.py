@@ -31,6 +31,12 @@ def wooded():
     return Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2))
 
 
+@pytest.fixture(scope="module")
+def by_end(wooded):
+    """The rules of version 0.2."""
+    return Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, posts="end", stops="centre")
+
+
 def bounds_of(workspace):
     """Bounds as (move, row, col), and as pairs of cells."""
     index = np.argwhere(existing_bounds(workspace.passable.values)).tolist()
@@ -60,11 +66,11 @@ def bumpy(seed):
     return ground
 
 
-def workspace_on(ground, team):
+def workspace_on(ground, team, **rules):
     terrain = synthetic_terrain((60.0, 60.0), seed=0)
     terrain["dem"].values[:] = ground
     terrain["dsm"].values[:] = ground
-    return Workspace.from_terrain(terrain, (3, 3), team, sight="bare")
+    return Workspace.from_terrain(terrain, (3, 3), team, sight="bare", **rules)
 
 
 def test_line_of_sight_is_what_scalar_code_computes():
@@ -95,7 +101,7 @@ def test_line_of_sight_is_what_scalar_code_computes():
 def test_a_higher_sensor_sees_no_less_and_changes_its_robot_alone():
     low = Robot(vertical_fov=np.deg2rad(80.0))
     team = Team(robots=(low,) * 3, lead=low)
-    workspace = workspace_on(bumpy(2), team)
+    workspace = workspace_on(bumpy(2), team, posts="end", stops="centre")  # which hide more
     given = geometry(workspace.ground, bounds_of(workspace)[1], workspace.passable.values)
     higher = Team(robots=(low, replace(low, sensor_height=3.0), low), lead=low)
     level, raised = (
@@ -141,19 +147,14 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
     assert abs((expected - simulated).mean()) < 0.02
 
 
-def test_posts_are_near_apart_and_the_best_there_are(wooded):
-    posts = wooded.posts(A, C)
+def test_posts_are_near_apart_and_the_best_there_are(by_end):
+    posts = by_end.posts(A, C)
     assert posts.shape == (2, 2)
-    ground = wooded.ground.posts
-    assert (np.linalg.norm(posts - ground.waypoint(A), axis=1) <= wooded.formation.radius).all()
+    ground = by_end.ground.posts
+    assert (np.linalg.norm(posts - ground.waypoint(A), axis=1) <= by_end.formation.radius).all()
     assert np.linalg.norm(posts[0] - posts[1]) >= SPACING
-    assert all(wooded.grid.cell_at(*post) == A for post in posts)
-    assert (wooded.posts(A, (3, 1)) != posts).any()
-
-
-@pytest.fixture(scope="module")
-def seeing(wooded):
-    return Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, posts="way", stops="sight")
+    assert all(by_end.grid.cell_at(*post) == A for post in posts)
+    assert (by_end.posts(A, (3, 1)) != posts).any()
 
 
 def sight_along(workspace, cell, next_cell, post):
@@ -166,77 +167,78 @@ def sight_along(workspace, cell, next_cell, post):
     return detection_probability(ground.surface, workspace.sights[0], eyes, aims, lidar).mean()
 
 
-def test_posts_by_the_way_see_more_of_it(wooded, seeing):
+def test_posts_by_the_way_see_more_of_it(by_end, wooded):
     """Each on its own stops; in the mean over bounds, for sight after and before counts too."""
     seen = [
         np.mean([sight_along(w, a, c, post)
                  for a, c in bounds_of(w)[1] for post in w.posts(a, c)])
-        for w in (wooded, seeing)
+        for w in (by_end, wooded)
     ]  # fmt: skip
     assert seen[1] > seen[0] + 0.05
     line_of_sight = [
-        w.bound_awareness.sel(feature="line_of_sight").mean() for w in (wooded, seeing)
+        w.bound_awareness.sel(feature="line_of_sight").mean() for w in (by_end, wooded)
     ]
     assert line_of_sight[1] > line_of_sight[0] + 0.05
 
 
-def test_posts_by_the_way_are_on_safe_ground_apart_and_linked(seeing):
-    ground = seeing.ground.posts
+def test_posts_by_the_way_are_on_safe_ground_apart_linked_and_not_in_the_way(wooded):
+    ground = wooded.ground.posts
     slope = np.arctan(np.hypot(*ground.surface.gradient))
-    for a, c in bounds_of(seeing)[1]:
-        posts = seeing.posts(a, c)
+    for a, c in bounds_of(wooded)[1]:
+        posts = wooded.posts(a, c)
+        gap = np.linalg.norm(ground.lead_way(a, c)[:, None] - posts, axis=-1)
+        assert gap.min() >= SPACING
         assert (np.linalg.norm(posts - ground.waypoint(a), axis=1) <= 26.0).all()
         assert np.linalg.norm(posts[0] - posts[1]) >= 3.0  # 4 m, by whole pixels
         pixels = ground.surface.nearest(*posts.T)
-        assert (slope[pixels] <= 0.7 * seeing.team.max_slope).all()
-        assert all(way is not None for way in seeing.ways(a, c))
-    assert any(seeing.grid.cell_at(*post) != a for a, c in bounds_of(seeing)[1]
-               for post in seeing.posts(a, c))  # fmt: skip
+        assert (slope[pixels] <= 0.7 * wooded.team.max_slope).all()
+        assert all(way is not None for way in wooded.ways(a, c))
+    assert any(wooded.grid.cell_at(*post) != a for a, c in bounds_of(wooded)[1]
+               for post in wooded.posts(a, c))  # fmt: skip
 
 
-def test_stops_by_sight_stay_in_their_cell_near_the_centre_s(wooded, seeing):
+def test_stops_by_sight_stay_in_their_cell_near_the_centre_s(by_end, wooded):
     moved = 0
-    for row, col in np.argwhere(seeing.passable.values).tolist():
-        stop = seeing.ground.posts.waypoint((row, col))
-        assert seeing.grid.cell_at(*stop) == (row, col)
-        distance = np.linalg.norm(stop - wooded.ground.posts.waypoint((row, col)))
+    for row, col in np.argwhere(wooded.passable.values).tolist():
+        stop = wooded.ground.posts.waypoint((row, col))
+        assert wooded.grid.cell_at(*stop) == (row, col)
+        distance = np.linalg.norm(stop - by_end.ground.posts.waypoint((row, col)))
         assert distance <= 17.0  # 16 m, by whole pixels
         moved += distance > 0.0
     assert moved > 4
 
 
-def test_equal_robots_keep_their_sides(seeing):
-    ground = seeing.ground.posts
-    for a, c in bounds_of(seeing)[1]:
+def test_equal_robots_keep_their_sides(wooded):
+    ground = wooded.ground.posts
+    for a, c in bounds_of(wooded)[1]:
         east, north = ground.waypoint(c) - ground.waypoint(a)
-        to_right = seeing.posts(a, c) @ np.array([north, -east])
+        to_right = wooded.posts(a, c) @ np.array([north, -east])
         assert to_right[0] <= to_right[1]
 
 
-def test_a_discount_brings_posts_nearer(wooded, seeing):
-    near = Workspace.from_terrain(
-        wooded.terrain, (4, 4), wooded.team, posts="way", stops="sight", sight_discount=0.1
-    )
+def test_a_discount_brings_posts_nearer(wooded):
+    near = Workspace.from_terrain(wooded.terrain, (4, 4), wooded.team, sight_discount=0.1)
     distance = [
         np.mean([np.linalg.norm(w.posts(a, c) - w.ground.posts.waypoint(a), axis=1)
                  for a, c in bounds_of(w)[1]])
-        for w in (seeing, near)
+        for w in (wooded, near)
     ]  # fmt: skip
     assert distance[1] < distance[0]
 
 
-def test_the_rules_of_posts_survive_a_file_and_missions_lose_less(wooded, seeing):
-    again = workspace_from_tree(workspace_to_tree(seeing))
-    assert again.formation == seeing.formation
-    np.testing.assert_array_equal(again.posts(A, C), seeing.posts(A, C))
-    tree = workspace_to_tree(wooded)
+def test_the_rules_of_posts_survive_a_file_and_missions_lose_less(by_end, wooded):
+    for workspace in (by_end, wooded):
+        again = workspace_from_tree(workspace_to_tree(workspace))
+        assert again.formation == workspace.formation
+        np.testing.assert_array_equal(again.posts(A, C), workspace.posts(A, C))
+    tree = workspace_to_tree(by_end)
     del tree.attrs["formation"]
     tree.attrs["formation_radius"] = 5.0  # as version 0.2 wrote it
-    assert workspace_from_tree(tree).formation.radius == 5.0
+    assert workspace_from_tree(tree).formation == replace(by_end.formation, radius=5.0)
     rates = [
         np.mean([b.contact_rate.mean() for m in
                  KinematicSimulator(w).run_batch([A, C, NEXT, (0, 3)], range(4)) for b in m.bounds])
-        for w in (wooded, seeing)
+        for w in (by_end, wooded)
     ]  # fmt: skip
     assert rates[1] > rates[0]
 
@@ -274,7 +276,7 @@ def test_robots_differ():
     workspace = Workspace.from_terrain(terrain, (4, 4), Team(robots=(Robot(), blind)))
     seen = workspace.bound_awareness.sel(feature="line_of_sight")
     known = np.isfinite(seen.values[0])
-    assert (seen.values[1][known] < seen.values[0][known] + 1e-12).mean() > 0.95
+    assert (seen.values[1][known] < seen.values[0][known] + 1e-12).mean() > 0.9
     assert seen.values[1][known].mean() < seen.values[0][known].mean() - 0.1
 
 
@@ -286,7 +288,8 @@ def test_several_sights_are_several_features(wooded):
     first, wall, clear_air = (workspace.bound_awareness.sel(feature=name) for name in names)
     np.testing.assert_array_equal(first, wooded.bound_awareness.sel(feature="line_of_sight"))
     known = np.isfinite(first.values)
-    assert (wall.values[known] <= first.values[known]).all()
+    # Crowns thinner than a step of a ray weaken what passes, and are no wall.
+    assert (wall.values[known] <= first.values[known] + 0.01).all()
     assert (first.values[known] <= clear_air.values[known]).all()
 
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Self
 
+import numpy as np
+
 from trustbo.errors import TrustboError, require_choice, require_not_negative, require_positive
 
 SPACING = 2.0
@@ -10,6 +12,7 @@ SPACING = 2.0
 POSTS, STOPS = ("end", "way"), ("centre", "sight")
 _RADII = {"end": 8.0, "way": 25.0}
 _DISCOUNT = 0.005  # 1/m
+_DOUBT, _DOUBT_REACH = 0.1, 40.0  # share of the unexpected that is seen at 0 m; its reach, m
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,10 @@ class Formation:
             stops, 1/m: maps lack things that block sight.
     """
 
-    posts: str = "end"
-    stops: str = "centre"
-    radius: float = _RADII["end"]
-    discount: float = 0.0
+    posts: str = "way"
+    stops: str = "sight"
+    radius: float = _RADII["way"]
+    discount: float = _DISCOUNT
 
     @classmethod
     def of(cls, posts: str, stops: str, radius: float | None, discount: float | None) -> Self:
@@ -50,6 +53,17 @@ class Formation:
         if discount is None:
             discount = 0.0 if (posts, stops) == ("end", "centre") else _DISCOUNT
         return cls(posts, stops, radius, require_not_negative("sight_discount", discount))
+
+    def doubted(self, seen: np.ndarray, distance: np.ndarray) -> np.ndarray:
+        """Chance of detection where maps may be wrong; that of the map without a discount.
+
+        A share exp(-discount x distance) of what is expected to be seen is, and of the rest a share
+        that falls with distance.
+        """
+        if not self.discount:
+            return seen
+        kept = seen * np.exp(-self.discount * distance)
+        return kept + _DOUBT * np.exp(-distance / _DOUBT_REACH) * (1.0 - kept)
 
     @property
     def is_wide(self) -> bool:

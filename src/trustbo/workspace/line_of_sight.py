@@ -19,12 +19,14 @@ the search of some 50 routes for each bound.
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from trustbo.data import Cell
 from trustbo.team import Robot, Team
+from trustbo.workspace.formation import Formation
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
@@ -74,14 +76,50 @@ def _onward(passable: np.ndarray, a: Cell, c: Cell, least: float) -> list[Cell |
     return ahead or onward or [None]
 
 
-def bound_features(
-    surface: Surface, sight: Sight, team: Team, given: Geometry, index: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute line of sight and traversability of bounds, each of shape (bound, robot), in [0, 1].
+class Phases(NamedTuple):
+    """Sight at times of both phases of bounds: chances of detection in [0, 1]."""
 
-    Traversability is the mean of the map of pixels `index`, (row, col), along T2's ways; NaN where
-    it has no data.
-    """
+    watched: np.ndarray  # the lead by each robot, (bound, robot, sample)
+    closing: np.ndarray  # each robot by the lead, on its way, (bound, robot, sample)
+    waiting: np.ndarray  # each robot by the lead, at its next post, (bound, robot, sample)
+    lead_time: np.ndarray  # s, (bound,)
+    times: np.ndarray  # s, until each robot has closed up, (bound, robot)
+    tracks: np.ndarray  # ways of T2, (bound, robot, sample, 2)
+
+    def line_of_sight(self) -> np.ndarray:
+        """Share of the time in which a robot and the lead should see each other, (bound, robot)."""
+        watched, closing, waiting = (
+            seen.mean(-1) for seen in (self.watched, self.closing, self.waiting)
+        )
+        lead_time, slowest = self.lead_time[:, None], self.times.max(1)[:, None]
+        total = lead_time * watched + self.times * closing + (slowest - self.times) * waiting
+        return total / (lead_time + slowest)
+
+    def unseen(self, factor: np.ndarray | float = 1.0) -> np.ndarray:
+        """Share of the time in which nobody sees anybody, (..., bound).
+
+        Args:
+            factor: By which contact is less, or more, than sight, (..., bound, robot).
+        """
+        factor = np.asarray(factor)[..., None]
+        lead_time, slowest = self.lead_time[:, None], self.times.max(1)[:, None]
+        of_lead = 1.0 - np.clip(factor * self.watched, 0.0, 1.0)
+        share = (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES
+        arrived = (share * slowest)[:, None] >= self.times[..., None]  # and waits at its post
+        seen = np.where(arrived, self.waiting, self.closing)
+        of_t2 = 1.0 - np.clip(factor * seen, 0.0, 1.0)
+        both = lead_time * of_lead.prod(-2) + slowest * of_t2.prod(-2)
+        return (both / (lead_time + slowest)).mean(-1)
+
+
+def phases(
+    surface: Surface,
+    sight: Sight,
+    team: Team,
+    given: Geometry,
+    formation: Formation | None = None,
+) -> Phases:
+    """Compute sight at times of both phases of bounds, doubted as by a formation."""
     flat = np.concatenate(given.ways)
     first = np.cumsum([0, *(len(way) for way in given.ways)])
     stops = flat[first[1:] - 1]  # the lead's, (bound, 2)
@@ -94,38 +132,56 @@ def bound_features(
         gaps = np.linalg.norm(given.ends - given.posts[:, None], axis=-1).mean(1)
         longer = gaps / np.maximum(bound, 1.0)[:, None]
         drives = [(route, time * longer[:, i]) for i, (route, time) in enumerate(drives)]
-    slowest = np.max([time for _, time in drives], axis=0)
-    los, easy = np.empty(given.posts.shape[:2]), np.empty(given.posts.shape[:2])
-    for i, (robot, (route, time)) in enumerate(zip(team.robots, drives, strict=True)):
+    shape = (*given.posts.shape[:2], N_SAMPLES)
+    watched, closing, waiting = (np.empty(shape) for _ in range(3))
+    tracks = np.empty((*shape, 2))
+    for i, (robot, (route, _)) in enumerate(zip(team.robots, drives, strict=True)):
         post = given.posts[:, i, None]
         shift = (1.0 - share) * (post - flat[first[:-1], None])
-        track = route + shift + share * (given.ends[:, :, i] - stops[:, None])
-        watched = _seen(surface, sight, robot, team.lead, post + wander, lead[0])
-        closing = _seen(surface, sight, team.lead, robot, stops[:, None], track)
-        waiting = _seen(surface, sight, team.lead, robot, stops[:, None], given.ends[:, :, i])
-        total = lead[1] * watched + time * closing + (slowest - time) * waiting
-        los[:, i] = total / (lead[1] + slowest)
-        easy[:, i] = _mean(index[surface.nearest(track[..., 0], track[..., 1])])
-    return los, easy
+        tracks[:, i] = route + shift + share * (given.ends[:, :, i] - stops[:, None])
+        stop, end = stops[:, None], given.ends[:, :, i]
+        seen = partial(_seen, surface, sight, formation)
+        watched[:, i] = seen(robot, team.lead, post + wander, lead[0])
+        closing[:, i] = seen(team.lead, robot, stop, tracks[:, i])
+        waiting[:, i] = seen(team.lead, robot, stop, end)
+    times = np.stack([time for _, time in drives], axis=1)
+    return Phases(watched, closing, waiting, lead[1], times, tracks)
+
+
+def bound_features(
+    surface: Surface, sight: Sight, team: Team, given: Geometry, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Compute line of sight and traversability of bounds, each of shape (bound, robot), in [0, 1].
+
+    Traversability is the mean of the map of pixels `index`, (row, col), along T2's ways; NaN where
+    it has no data.
+    """
+    seen = phases(surface, sight, team, given)
+    easy = index[surface.nearest(seen.tracks[..., 0], seen.tracks[..., 1])]
+    return seen.line_of_sight(), _mean(easy)
 
 
 def _seen(
     surface: Surface,
     sight: Sight,
+    formation: Formation | None,
     watcher: Robot,
     watched: Robot,
     eye: np.ndarray,
     targets: np.ndarray,
 ) -> np.ndarray:
-    """Mean probability of detection over the samples of bounds, shape (bound,)."""
+    """Probability of detection at the samples of bounds, shape (bound, sample)."""
     eye = np.broadcast_to(eye, targets.shape).reshape(-1, 2)
     lidar = optics(watcher, watched)
-    detected = detection_probability(surface, sight, eye, targets.reshape(-1, 2), lidar)
-    return watcher.detection * detected.reshape(targets.shape[:2]).mean(1)
+    targets, shape = targets.reshape(-1, 2), targets.shape[:2]
+    detected = detection_probability(surface, sight, eye, targets, lidar)
+    if formation is not None:
+        detected = formation.doubted(detected, np.linalg.norm(targets - eye, axis=1))
+    return watcher.detection * detected.reshape(shape)
 
 
 def _mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the values that are not NaN, shape (bound,); NaN where none is."""
+    """Mean over the last axis of the values that are not NaN; NaN where none is."""
     finite = np.isfinite(values)
     with np.errstate(invalid="ignore"):
-        return np.where(finite, values, 0.0).sum(1) / finite.sum(1)
+        return np.where(finite, values, 0.0).sum(-1) / finite.sum(-1)

@@ -72,4 +72,4 @@ def _formation_of(attrs: Mapping[Any, Any]) -> Formation:
     """Formation of a file; those of version 0.2 have its radius alone."""
     if "formation" in attrs:
         return Formation(**json.loads(attrs["formation"]))
-    return Formation(radius=float(attrs.get("formation_radius", Formation().radius)))
+    return Formation.of("end", "centre", attrs.get("formation_radius"), None)

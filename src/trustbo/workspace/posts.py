@@ -9,14 +9,14 @@ lattice around the stop, those are taken with the largest
 
     1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
 
-s the probability of detection under the assumed sight. T2 is within `formation.radius` of the stop,
-also beyond the edge of the cell, on ground that is well below the slope limit and linked to the
-stop over such ground. By the rule "sight", the lead stops where the ways from the cell to the stops
-around are seen best.
+s the probability of detection under the assumed sight. T2 is within `formation.radius` of the
+stop, also beyond the edge of the cell, out of the lead's way, on ground that is well below the
+slope limit and linked to the stop over such ground. By the rule "sight", the lead stops where the
+ways from the cell to the stops around are seen best.
 
-Maps lack things that block sight, and have things that do not, so that sight is unsure: a share
-exp(-discount x distance) of what is expected to be seen is, and of the rest a share that falls with
-distance. It is so here, and nowhere else, so that the path's line of sight is as predicted.
+Maps lack things that block sight, and have things that do not, so that sight is doubted
+(`Formation.doubted`) where posts and stops are chosen, and nowhere else: the path's line of sight
+is as predicted.
 """
 
 from typing import Any
@@ -40,7 +40,7 @@ _SAFE = 0.7
 _STEP, _STOP_RADIUS = 4.0, 16.0  # m: of the lattice; of the lead's stop from the centre's
 _GAP = 0.16  # distance between two robots as a share of the radius, `SPACING` at least
 _NEARER = 1e-3  # of sight, that a metre nearer is worth
-_DOUBT, _DOUBT_REACH = 0.1, 40.0  # share of the unexpected that is seen at 0 m; its reach, m
+_IN_THE_WAY = 5.0  # of sight: no other is as bad but standing on another robot
 _N_WATCHED = 30  # positions, best seen from the stops, from which the lead's way is looked at
 _N_AIMS = 6  # times on the lead's way at which it is aimed at
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # of the way to a stop around
@@ -61,7 +61,7 @@ class Posts:
         """Prepare the maps of pixels; `traversability` has shape (row, col) of pixels."""
         self.grid, self.team, self.surface = grid, team, surface
         self.routes = Routes(surface, clear=formation.is_wide)
-        self._sight, self._formation = sight, formation
+        self._sight, self.formation = sight, formation
         self.is_wide = formation.is_wide
         self._traversability = _smoothed(traversability, surface.pixel)
         self._standable = largest_region(surface.passable)
@@ -95,6 +95,15 @@ class Posts:
         ends = [self.surface.pixel_at(*self.waypoint(cell).tolist()) for cell in (a, c)]
         return are_linked(self.surface.passable, self.window(a, c), ends[0], ends[1])
 
+    def is_linked(self, cell: Cell, position: np.ndarray) -> bool:
+        """Whether robots can drive from the stop in a cell to a position near by, (2,)."""
+        row, col = (round(float(i)) for i in self.surface.to_pixel(*position))
+        top, bottom, left, right = window = self.window(cell, cell)
+        if not (top <= row < bottom and left <= col < right):
+            return False
+        start = self.surface.pixel_at(*self.waypoint(cell).tolist())
+        return bool(linked_to(self.surface.passable, window, start)[row - top, col - left])
+
     def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Way of the lead from stop to stop, (point, 2); None if there is none."""
         ends = self.waypoint(a), self.waypoint(c)
@@ -105,7 +114,7 @@ class Posts:
     def waypoint(self, cell: Cell) -> np.ndarray:
         """Stop of the lead in a cell, shape (2,): a traversable pixel."""
         if cell not in self._stops:
-            by_sight = self._formation.stops == "sight"
+            by_sight = self.formation.stops == "sight"
             self._stops[cell] = (self._seeing_stop if by_sight else self._central_stop)(cell)
         return self._stops[cell]
 
@@ -150,32 +159,53 @@ class Posts:
             posts |= dict(zip(ahead, self._aimed(cell, ahead), strict=True))
         return posts[next_cell]
 
+    def candidates(self, cell: Cell, next_cell: Cell | None, n: int) -> np.ndarray:
+        """Up to `n` posts to choose from, (post, 2): those of `watching`, then the next best.
+
+        Next best for the robots on average, at the least distance from all before.
+        """
+        posts = self.watching(cell, next_cell)
+        position, gap = self._standing(cell)
+        score = self._scores(cell, [next_cell], position).mean(0)[0]
+        while len(posts) < n:
+            gaps = np.linalg.norm(position[:, None] - posts, axis=-1).min(1)
+            if not (gaps >= gap).any():
+                break
+            best = np.argmax(np.where(gaps >= gap, score, -np.inf))
+            posts = np.concatenate([posts, position[best, None]])
+        return posts
+
     def _aimed(self, cell: Cell, ahead: list[Cell | None]) -> np.ndarray:
         """Posts of T2 by the next cell, (next cell, robot, 2), with a least distance."""
-        here, robots = self.waypoint(cell), self.team.robots
-        by_end, gap = not self._formation.is_wide, SPACING
-        position = np.empty((0, 2))
-        if not by_end:
-            position = self._lattice(cell, here, self._formation.radius)
-            gap = max(SPACING, _GAP * self._formation.radius)
-        if len(position) < len(robots):
-            position, gap = self._pixels_near(cell, here), SPACING
-        distance = np.linalg.norm(position - here, axis=1)
-        seen = (self._seen_at_end if by_end else self._seen_in_phases)(cell, ahead, position)
-        posts = np.empty((len(ahead), len(robots), 2))
-        score = np.empty((len(ahead), len(position)))
-        for i in range(len(robots)):
-            score[:] = seen[i] - _NEARER * distance
+        here, n_robots = self.waypoint(cell), len(self.team.robots)
+        position, gap = self._standing(cell)
+        posts = np.empty((len(ahead), n_robots, 2))
+        for i, score in enumerate(self._scores(cell, ahead, position)):
             if i:
                 gaps = np.linalg.norm(position - posts[:, :i, None], axis=-1).min(1)
-                score -= 10.0 * (gaps < gap)
+                score = score - 10.0 * (gaps < gap)
             posts[:, i] = position[np.argmax(score, axis=1)]
-        if not by_end:
+        if self.formation.is_wide:
             for of_next, c in zip(posts, ahead, strict=True):
                 self._abreast(
                     of_next, np.array([0.0, 1.0]) if c is None else self.waypoint(c) - here
                 )
         return posts
+
+    def _standing(self, cell: Cell) -> tuple[np.ndarray, float]:
+        """Positions around a stop where T2 may stand, (position, 2), and their least distance."""
+        here = self.waypoint(cell)
+        if self.formation.is_wide:
+            position = self._lattice(cell, here, self.formation.radius)
+            if len(position) >= len(self.team.robots):
+                return position, max(SPACING, _GAP * self.formation.radius)
+        return self._pixels_near(cell, here), SPACING
+
+    def _scores(self, cell: Cell, ahead: list[Cell | None], position: np.ndarray) -> np.ndarray:
+        """Sight from positions, the nearer the better, (robot, next cell, position)."""
+        seen = self._seen_in_phases if self.formation.is_wide else self._seen_at_end
+        distance = np.linalg.norm(position - self.waypoint(cell), axis=1)
+        return np.array(seen(cell, ahead, position)) - _NEARER * distance
 
     def _seen_in_phases(
         self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
@@ -202,7 +232,8 @@ class Posts:
             rows[robot] = seen - 1.0  # of positions from which the way was not looked at
             of_best = np.take_along_axis(seen, best, 1) + 0.5 * watched
             np.put_along_axis(rows[robot], best, of_best, 1)
-        return [rows[robot] for robot in self.team.robots]
+        in_the_way = np.array([_is_near(position, route, far) for route in routes])
+        return [rows[robot] - _IN_THE_WAY * in_the_way for robot in self.team.robots]
 
     def _seen_at_end(
         self, cell: Cell, ahead: list[Cell | None], position: np.ndarray
@@ -229,10 +260,7 @@ class Posts:
         rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
         seen = detection_probability(self.surface, self._sight, *rays, lidar)
         distance = np.linalg.norm(rays[1] - rays[0], axis=1)
-        if self._formation.discount:
-            seen *= np.exp(-self._formation.discount * distance)
-            seen += _DOUBT * np.exp(-distance / _DOUBT_REACH) * (1.0 - seen)
-        return seen.reshape(eye.shape[:-1])
+        return self.formation.doubted(seen, distance).reshape(eye.shape[:-1])
 
     # --- pixels ---
 
@@ -268,7 +296,7 @@ class Posts:
         """Positions in a cell that are linked to its stop, at most 0.2's radius from it."""
         position = self._position(*self._linked(cell))
         distance = np.linalg.norm(position - here, axis=1)
-        near = np.flatnonzero((distance <= self._formation.radius) & (distance >= SPACING))
+        near = np.flatnonzero((distance <= self.formation.radius) & (distance >= SPACING))
         if len(near) < len(self.team.robots):  # few passable pixels, or large ones
             order = np.argsort(distance, kind="stable")
             near = order[distance[order] > 0.0][: len(self.team.robots)]
@@ -311,6 +339,13 @@ class Posts:
     def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
         y, x = self.surface.axes
         return np.stack([x[col], y[row]], axis=-1)
+
+
+def _is_near(position: np.ndarray, route: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Whether positions, `far` from the route's start, are in the way of a robot on it."""
+    reach = np.linalg.norm(route - route[0], axis=1) <= far.max(initial=0.0) + SPACING
+    off = position[:, None] - route[reach]
+    return np.einsum("...i,...i", off, off).min(1) < SPACING**2
 
 
 def _smoothed(values: np.ndarray, pixel: tuple[float, float], width: float = 5.0) -> np.ndarray:

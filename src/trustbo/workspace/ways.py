@@ -22,9 +22,14 @@ class Ways:
 
     def closing(self, a: Cell, c: Cell, next_cell: Cell | None) -> list[np.ndarray | None]:
         """Way of each robot of T2, from where it watched a -> c to where it watches c -> next."""
+        return self.between(a, c, self.posts.watching(a, c), self.posts.watching(c, next_cell))
+
+    def between(
+        self, a: Cell, c: Cell, starts: np.ndarray, goals: np.ndarray
+    ) -> list[np.ndarray | None]:
+        """Way of each robot of T2 in the bound a -> c, from and to positions (robot, 2)."""
         window = self.posts.window(a, c)
-        ends = zip(self.posts.watching(a, c), self.posts.watching(c, next_cell), strict=True)
         return [
             self.routes.find(robot, start, goal, window)
-            for robot, (start, goal) in zip(self.posts.team.robots, ends, strict=True)
+            for robot, start, goal in zip(self.posts.team.robots, starts, goals, strict=True)
         ]

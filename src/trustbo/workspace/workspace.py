@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 from trustbo.data import FEATURES, Cell, Mission, as_names, default_features, is_line_of_sight
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
-from trustbo.errors import ShapeError, TrustboError, require_positive
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_positive
 from trustbo.renamed import former
 from trustbo.stacking import fill_awareness
 from trustbo.team import Team
@@ -39,7 +40,11 @@ from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight, sights_of
 from trustbo.workspace.surface import Surface, surface_of
 from trustbo.workspace.survey import MAX_MISSING, reason_impassable
+from trustbo.workspace.watch import WatchTable
 from trustbo.workspace.ways import Ways
+
+_APART = 2.0
+"""Distance of the points of an overwatch map, m."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,8 +91,8 @@ class Workspace(Displayed):
         observers: ArrayLike | None = None,
         bounds: bool = True,
         sight: Sight | str | Sequence[Sight | str] = "transmittance",
-        posts: str = "end",
-        stops: str = "centre",
+        posts: str = "way",
+        stops: str = "sight",
         formation_radius: float | None = None,
         sight_discount: float | None = None,
     ) -> Self:
@@ -120,12 +125,13 @@ class Workspace(Displayed):
                 visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight, or its mode: `"bare"`, `"wall"` or `"transmittance"`; of
                 several, features `line_of_sight_1`, `line_of_sight_2`, ...
-            posts: Rule of T2's posts: `"end"`, where it sees the lead's next stop, in the lead's
-                cell; `"way"`, where it sees the lead's whole way and is seen from its stops.
-            stops: Rule of the lead's stops: `"centre"`, near the centre of the cell; `"sight"`,
-                where the ways around are seen best.
-            formation_radius: Largest distance of T2's posts from the lead's stop, m; by default 8,
-                25 of the rule `"way"`.
+            posts: Rule of T2's posts: `"way"`, where it sees the lead's whole way and is seen from
+                its stops; `"end"`, that of version 0.2, where it sees the lead's next stop, in the
+                lead's cell.
+            stops: Rule of the lead's stops: `"sight"`, where the ways around are seen best;
+                `"centre"`, that of version 0.2, near the centre of the cell.
+            formation_radius: Largest distance of T2's posts from the lead's stop, m; by default 25,
+                8 of the rule `"end"`.
             sight_discount: Rate at which sight is taken to fall with distance in the choice of
                 posts and stops, 1/m; by default 0.005, 0 of `"end"` with `"centre"`.
 
@@ -308,6 +314,16 @@ class Workspace(Displayed):
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
 
+    @cached_property
+    def watch(self) -> WatchTable | None:
+        """Posts from which bounds can be watched, and what is seen from them by the first sight.
+
+        None without a terrain in memory or an assumed sight.
+        """
+        if self.ground is None or not self.sights:
+            return None
+        return WatchTable(self.ground, self.sights[0])
+
     @property
     def difficulty(self) -> xr.DataArray:
         """Difficulty of bounds, as version 0.2 had it: see `hazard.difficulty.difficulty_of`."""
@@ -333,6 +349,43 @@ class Workspace(Displayed):
         """
         pair = self._require_bound(a, c)
         return None if self.ground is None else self.ground.posts.watching(*pair)
+
+    def overwatch_map(
+        self, bound: tuple[Cell, Cell], *, robot: str | None = None
+    ) -> xr.DataArray | None:
+        """Map how much of a bound one would see: the share of the lead's way seen from each point.
+
+        Args:
+            bound: Cells a and c, neighbours, the lead's way leads from a to c.
+            robot: Name of the robot that watches; by default the first of the team.
+
+        Returns:
+            DataArray (y, x) in [0, 1], points of the raster in CRS metres, 2 m apart or a pixel,
+            within half a cell around the two; NaN where robots cannot stand. It is that of the
+            assumed sight, the first of several, without what is expected to be wrong with it.
+            `rio` has the CRS and writes rasters. None without a terrain or an assumed sight.
+
+        Raises:
+            TrustboError: A cell that is off the grid or impassable, two that are no neighbours, or
+                an unknown robot.
+        """
+        a, c = self._require_bound(*bound)
+        name = self.team.names[0] if robot is None else robot
+        require_choice("robot", name, self.team.names)
+        if (table := self.watch) is None or self.ground is None or self.terrain is None:
+            return None
+        surface, window = self.ground.posts.surface, self.ground.posts.window(a, c)
+        steps = [max(1, round(_APART / side)) for side in surface.pixel]
+        rows, cols = slice(*window[:2], steps[0]), slice(*window[2:], steps[1])
+        y, x = surface.axes[0][rows], surface.axes[1][cols]
+        free = surface.passable[rows, cols]
+        positions = np.stack(np.meshgrid(x, y), axis=-1)
+        shares = np.full(free.shape, np.nan)
+        watcher = self.team.robots[self.team.names.index(name)]
+        shares[free] = table.overwatch(a, c, positions[free], watcher)
+        named = {"long_name": f"share of the lead's way {a} to {c} that {name} sees", "units": "1"}
+        made = xr.DataArray(shares, {"y": y, "x": x}, ("y", "x"), "overwatch", named)
+        return made if self.terrain.rio.crs is None else made.rio.write_crs(self.terrain.rio.crs)
 
     def ways(
         self, a: Cell, c: Cell, next_cell: Cell | None = None
@@ -361,14 +414,36 @@ class Workspace(Displayed):
         moves_along([a, c])
         return a, c
 
-    def along(self, path: Sequence[Cell]) -> np.ndarray:
+    def along(self, path: Sequence[Cell], posts: np.ndarray | None = None) -> np.ndarray:
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
+
+        Args:
+            path: Cells, each a neighbour of the one before.
+            posts: Places of T2 while the lead runs each bound, shape (bound, robot, 2), x and y
+                in CRS metres; by default the posts of the workspace.
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
         """
         cells = [self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
-        return np.swapaxes(along(self.bound_maps, cells), 0, 1)
+        known = np.swapaxes(along(self.bound_maps, cells), 0, 1)
+        return known if posts is None else np.clip(known + self.gain_of(cells, posts), 0.0, 1.0)
+
+    def gain_of(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
+        """Line of sight gained on a path by posts, (bound, robot, feature), over the workspace's.
+
+        0 for other features, and where there is no terrain. Arguments are those of `along`.
+        """
+        gain = np.zeros((len(path) - 1, self.team.n_robots, len(self.features)))
+        if (table := self.watch) is not None and self.of_bounds is not None:
+            cells = tuple(path)
+            rule = np.stack([table.rule(a, c) for a, c in pairwise(cells)])
+            for n, sight in enumerate(self.sights, start=-len(self.sights)):
+                given, usual = (
+                    table.seen_along(cells, p, sight).line_of_sight() for p in (posts, rule)
+                )
+                gain[..., n] = given - usual
+        return gain
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the order of the workspace's.
@@ -392,7 +467,8 @@ class Workspace(Displayed):
     def fill(self, mission: Mission) -> Mission:
         """Fill awareness that a mission did not measure (NaN) with that of its bounds.
 
-        A simulator measures no line of sight; a campaign fills it in by itself.
+        A simulator measures no line of sight; a campaign fills it in by itself. It is that of the
+        mission's posts, where these are not the workspace's.
 
         Raises:
             TrustboError: The mission's path is no path of neighbouring cells on the grid.
@@ -400,7 +476,7 @@ class Workspace(Displayed):
         ordered = self.in_order(mission)
         if not np.isnan(ordered.awareness).any():
             return ordered
-        return fill_awareness(ordered, self.along(ordered.path))
+        return fill_awareness(ordered, self.along(ordered.path, ordered.posts))
 
     def with_bounds(self, values: np.ndarray) -> Self:
         """Return the workspace with awareness of bounds, (robot, move, row, col, feature)."""

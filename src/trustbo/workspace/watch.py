@@ -1,0 +1,114 @@
+"""Watch table: the posts from which bounds can be watched, and what would be seen from them.
+
+Bound by bound, computed when it is asked for, and kept. The posts are those of the workspace's rule
+and the next best (`Posts.candidates`); sight is that of each robot of T2, so that posts can be
+given to robots that differ.
+"""
+
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.team import Robot
+from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, Phases, phases
+from trustbo.workspace.routes import at_times
+from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
+from trustbo.workspace.ways import Ways
+
+N_POSTS = 5
+"""Posts to choose from for each bound, or as many as there are robots."""
+
+
+class Watch(NamedTuple):
+    """Sight in a bound a -> c from each post in a, and of robots on the way to each post in c.
+
+    Doubted, see `Formation.doubted`: it is what posts are chosen by.
+    """
+
+    watched: np.ndarray  # share of the lead's way that a robot sees, (robot, post)
+    closing: np.ndarray  # share of a robot's way that the lead sees, (robot, post, next post)
+    waiting: np.ndarray  # chance that the lead sees a robot at its next post, (robot, next post)
+    lead_time: float  # s
+    times: np.ndarray  # s, of each way, (robot, post, next post)
+
+
+class WatchTable:
+    """Posts of bounds, and what is seen from them; positions are x, y in CRS metres."""
+
+    def __init__(self, ways: Ways, sight: Sight) -> None:
+        """Take posts and ways, and the assumed model of sight."""
+        self._ways, self._sight = ways, sight
+        self._n = max(N_POSTS, len(ways.posts.team.robots))
+        self.posts = cache(self._posts)
+        self.watch = cache(self._watch)
+
+    def along(self, path: tuple[Cell, ...]) -> tuple[list[np.ndarray], list[Watch]]:
+        """Posts in each cell of a path, (post, 2) each, and what is seen in each bound.
+
+        In the last cell T2 stands around the lead, by the workspace's rule: a post for each robot.
+        """
+        after = [*path[2:], None]
+        posts = [self.posts(a, c) for a, c in pairwise((*path, None))]
+        bounds = zip(pairwise(path), after, strict=True)
+        return posts, [self.watch(a, c, b) for (a, c), b in bounds]
+
+    def rule(self, a: Cell, c: Cell) -> np.ndarray:
+        """Posts of the workspace's rule in the bound a -> c, (robot, 2)."""
+        return self._ways.posts.watching(a, c)
+
+    def seen_along(
+        self, path: tuple[Cell, ...], posts: np.ndarray, sight: Sight | None = None
+    ) -> Phases:
+        """Sight at times of both phases of a path's bounds, T2 at posts (bound, robot, 2).
+
+        Under the model of sight of the table, or another.
+        """
+        rule = self._ways.posts
+        ends = np.concatenate([posts[1:], rule.watching(path[-1], None)[None]])
+        ways = [self._lead(a, c) for a, c in pairwise(path)]
+        ends = np.repeat(ends[:, None], N_SAMPLES, axis=1)
+        given = Geometry(ways, posts, ends, rule.is_wide)
+        return phases(rule.surface, sight or self._sight, rule.team, given)
+
+    def _posts(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+        rule = self._ways.posts
+        if next_cell is None:
+            return rule.watching(cell, None)
+        return rule.candidates(cell, next_cell, self._n)
+
+    def _watch(self, a: Cell, c: Cell, next_cell: Cell | None) -> Watch:
+        rule = self._ways.posts
+        starts, ends = self.posts(a, c), self.posts(c, next_cell)
+        pair, robot = (len(starts), len(ends)), len(rule.team.robots)
+        i, j = (index.ravel() for index in np.indices(pair))
+        ends = np.broadcast_to(ends[j, None, None], (len(j), N_SAMPLES, robot, 2))
+        posts = np.repeat(starts[i, None], robot, axis=1)
+        given = Geometry([self._lead(a, c)] * len(i), posts, ends, rule.is_wide)
+        seen = phases(rule.surface, self._sight, rule.team, given, rule.formation)
+
+        def by_pair(values: np.ndarray) -> np.ndarray:
+            return np.moveaxis(values.reshape(*pair, robot), -1, 0)
+
+        watched, closing, waiting = (
+            by_pair(one.mean(-1)) for one in (seen.watched, seen.closing, seen.waiting)
+        )
+        times = by_pair(seen.times)
+        return Watch(watched[..., 0], closing, waiting[:, 0], float(seen.lead_time[0]), times)
+
+    def _lead(self, a: Cell, c: Cell) -> np.ndarray:
+        """Way of the lead, or the straight line where there is none."""
+        way, rule = self._ways.lead(a, c), self._ways.posts
+        return np.stack([rule.waypoint(a), rule.waypoint(c)]) if way is None else way
+
+    def overwatch(self, a: Cell, c: Cell, positions: np.ndarray, robot: Robot) -> np.ndarray:
+        """Share of the lead's way a -> c that a robot sees from positions (..., 2), (...)."""
+        surface, team = self._ways.posts.surface, self._ways.posts.team
+        way = self._lead(a, c)
+        aims, _ = at_times(surface, team.lead, way, np.array([0, len(way)]), N_SAMPLES)
+        eyes = positions[..., None, :] + jittered(N_SAMPLES)
+        eyes, aims = (x.reshape(-1, 2) for x in np.broadcast_arrays(eyes, aims[0]))
+        seen = detection_probability(surface, self._sight, eyes, aims, optics(robot, team.lead))
+        return robot.detection * seen.reshape(*positions.shape[:-1], N_SAMPLES).mean(-1)
