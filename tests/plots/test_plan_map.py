@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
 
 import trustbo as tb
 
@@ -53,3 +54,14 @@ def test_some_bounds_and_what_cannot_be_drawn(plan):
     flat = tb.planning.Planner(bare, (0, 0), (1, 1)).plan(params)
     with pytest.raises(tb.TrustboError, match=r"made with Workspace\.from_terrain of a terrain"):
         tb.plots.plan_map(flat)
+
+
+def test_overwatch_colours_are_the_map_s(plan):
+    whole, panel = tb.plots.plan_map(plan, bounds=[2], overwatch="r1")
+    (mesh,) = [c for c in panel.collections if isinstance(c, QuadMesh)]
+    bound = plan.path[1], plan.path[2]
+    expected = plan.workspace.overwatch_map(bound, robot="r1").values
+    np.testing.assert_array_equal(np.ma.filled(mesh.get_array(), np.nan), expected)
+    assert not [c for c in whole.collections if isinstance(c, QuadMesh)]
+    with pytest.raises(tb.TrustboError, match="unknown robot 'r9'; choose one of r1"):
+        tb.plots.plan_map(plan, bounds=[2], overwatch="r9")

@@ -5,6 +5,8 @@ from typing import Any, Unpack
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -16,13 +18,18 @@ from trustbo.plots.style import Style, StyleOptions, theme
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours of Okabe and Ito (2008), by robot; in grey, markers distinguish robots."""
+_SHARE = Normalize(0.0, 1.0)
 _DASHED = (0, (3, 1.5))
 _ROOM = (0.5, 0.2)
 """Room of a scale bar in its corner, shares of the axes."""
 
 
 def plan_map(
-    plan: Plan, *, bounds: Sequence[int] | None = None, **style: Unpack[StyleOptions]
+    plan: Plan,
+    *,
+    bounds: Sequence[int] | None = None,
+    overwatch: str | None = None,
+    **style: Unpack[StyleOptions],
 ) -> np.ndarray:
     """Draw what robots are to do, an overview of the path, then each bound.
 
@@ -33,13 +40,15 @@ def plan_map(
     Args:
         plan: Plan on a terrain in memory, such as `Result.plan`.
         bounds: Numbers of the bounds to draw, from 1; by default all.
+        overwatch: Name of a robot: colours below each bound show how much of the lead's way it
+            would see from each place, see `Workspace.overwatch_map`.
         **style: Options of `Style`.
 
     Returns:
         Axes, shape (1 + bound,).
 
     Raises:
-        TrustboError: The workspace has no terrain in memory, or there is no such bound.
+        TrustboError: The workspace has no terrain in memory, or there is no such bound or robot.
     """
     require_kind("plots.plan_map", plan, Plan, "give a Plan, such as Result.plan or campaign.ask()")
     options = Style.from_options(style)
@@ -62,10 +71,25 @@ def plan_map(
     for ax, k in zip(others, shown, strict=True):
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
         titles.append(f"bound {k}: {a},{b} to {c},{d}")
+        if overwatch is not None:
+            _draw_overwatch(ax, plan, k - 1, overwatch, options)
         _draw_bound(ax, plan, k - 1)
     made.titles(titles)
     made.legend(_keys(plan.workspace.team.names))
+    if overwatch is not None and shown:
+        label = f"share of the lead's way that {as_text(overwatch)} sees"
+        made.colour_bar(ScalarMappable(_SHARE, options.colours()), label)
     return made.panels
+
+
+def _draw_overwatch(ax: Axes, plan: Plan, k: int, robot: str, options: Style) -> None:
+    """Draw how much of the lead's way in the bound of index k a robot would see from each place."""
+    seen = plan.workspace.overwatch_map((plan.path[k], plan.path[k + 1]), robot=robot)
+    if seen is not None:
+        left, bottom = plan.workspace.grid.corner
+        x, y = seen["x"].values - left, seen["y"].values - bottom
+        colours = {"cmap": options.colours(), "norm": _SHARE, "zorder": 1.5, "rasterized": True}
+        ax.pcolormesh(x, y, seen.values, shading="nearest", alpha=0.85, **colours)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
