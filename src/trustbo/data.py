@@ -129,9 +129,12 @@ class Mission(Displayed):
         status: `"ok"` if the mission reached the goal, else the reason that it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
+        posts: Planned places of the robots while the lead ran each bound of the path, shape
+            (bound, robot, 2), x and y in CRS metres; None where they are those of the workspace.
 
     Raises:
-        ShapeError: Bounds that do not fit the path, or disagree on robots or features.
+        ShapeError: Bounds that do not fit the path, or disagree on robots or features; posts of
+            another shape.
         TrustboError: An unknown status.
     """
 
@@ -140,6 +143,7 @@ class Mission(Displayed):
     status: str = "ok"
     features: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
+    posts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
@@ -170,6 +174,13 @@ class Mission(Displayed):
             if len(labels) != size:
                 raise ShapeError(f"{name} must be {size} names; got {labels}.")
             object.__setattr__(self, name, labels)
+        if self.posts is not None:
+            posts, shape = as_array("posts", self.posts), (len(self.path) - 1, n_robots, 2)
+            if posts.shape != shape:
+                raise ShapeError(
+                    f"posts must be {shape}, (bound, robot, x and y); got {posts.shape}."
+                )
+            object.__setattr__(self, "posts", posts)
 
     def _card(self) -> Card:
         rates = self.contact_rate
@@ -274,8 +285,8 @@ class Mission(Displayed):
         statuses = ["ok"] * last + [status]
         measured = zip(cells[1:], z, y, seconds, statuses, map(float, starts), ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
-        names = (("features", features), ("robots", robots))
-        return cls(cells, bounds, status, *(as_names(what, given) for what, given in names))
+        named = as_names("features", features), as_names("robots", robots)
+        return cls(cells, bounds, status, *named)
 
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
@@ -318,7 +329,8 @@ class Mission(Displayed):
             z = np.pad(b.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
             bounds.append(replace(b, awareness=z[np.ix_(i, m)], **rates, **optional))
         names = {"robots": tuple(robots), "features": tuple(features)}
-        return replace(self, bounds=tuple(bounds), **names)
+        posts = None if self.posts is None else self.posts[:, i]
+        return replace(self, bounds=tuple(bounds), posts=posts, **names)
 
     # Stacked once: every refit reads these of every mission.
 

@@ -3,7 +3,6 @@
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -250,9 +249,7 @@ class Campaign(Displayed):
                 "it, or none was found.",
                 stacklevel=4,
             )
-        self.state.suggested = accepted = replace(
-            plan, bands=given.bands, value_band=given.value_band
-        )
+        self.state.suggested = accepted = plan.with_draws(given)
         if self.storage is not None:
             self.storage.write(self.state, None)
         return accepted
@@ -435,6 +432,9 @@ class Campaign(Displayed):
         a belief, it is what robots measured, filled in from the belief.
         """
         known = self.known_along(mission.path)
+        if mission.posts is not None:
+            gain = self.workspace.gain_of(mission.path, mission.posts)
+            known = np.clip(known + gain, 0.0, 1.0)
         trusted = self.learner.awareness is None
         return (replace_awareness if trusted else fill_awareness)(mission, known)
 

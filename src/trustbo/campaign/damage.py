@@ -37,6 +37,7 @@ _PLAN = {
     "bands": [[[float]]], "value": float, "success": float, "success_index": float,
     "objective": str, "exact": bool, "bound": float, "revisits": int, "engine": str,
     "seconds": float, "infeasible": bool, "value_band": ([float, float], None),
+    "cover": (None, {"unseen": float, "band": [float, float], "by_bound": [float]}),
     "risk": (None, {
         "p_fail": [float], "p_fail_band": [[float]], "p_arrive": float,
         "p_arrive_band": [float, float], "by_cause": {str: [float]}, "p_reach": [float],

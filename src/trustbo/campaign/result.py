@@ -1,7 +1,7 @@
 """Result of a campaign, in memory and on disk."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -187,7 +187,7 @@ class Result(Displayed):
         if list(best.path) != self.path:  # another version may find one of equal value
             best = self.planner.evaluate(self.path, mean)
         given = self.planner.evaluate(best.path, self.posterior)
-        return replace(best, bands=given.bands, value_band=given.value_band)
+        return best.with_draws(given)
 
     def maps(self, *, n_draws: int | None = None, seed: int = 0) -> xr.Dataset:
         """Compute every map of the planning cells after the last mission, for GIS and figures.

@@ -69,6 +69,8 @@ def _run_missions(
 ) -> Iterator[tuple[Plan, Mission]]:
     replans = campaign.options.replan == "bound"
     numbered = takes(runner.reset if replans else runner.run, "mission")
+    successive = getattr(runner, "bounding", "successive") == "successive"
+    to_posts = successive and not replans and takes(runner.run, "posts")
     with Progress(campaign, n_iterations, progress) as shown:
         while True:
             n = len(campaign.missions)
@@ -82,6 +84,8 @@ def _run_missions(
             settings: dict[str, Any] = {"seed": campaign.seed_of("mission")}
             if numbered:  # its world changes
                 settings["mission"] = n
+            if to_posts and plan.own_posts is not None:
+                settings["posts"] = plan.own_posts
             if replans:
                 mission = run_replanning(campaign, runner, plan, **settings)
             else:
@@ -115,7 +119,7 @@ def run_replanning(campaign: "Campaign", simulator: Any, plan: Plan, **start: An
         **start: Arguments of `reset`, such as the seed.
     """
     path, bounds, live = list(plan.path), [], None
-    names = [tuple(map(str, campaign.workspace.awareness[d].values)) for d in ("feature", "robot")]
+    names = campaign.workspace.features, campaign.workspace.team.names
     if (posterior := campaign.state.last_tree) is not None:
         response, observation = campaign.model.response, campaign.learner.observation
         live = TrustFilter(

@@ -39,7 +39,8 @@ def path_frame(
            robot the expected trust after the bound, `trust_<robot>`, and its 5 % and 95 %
            quantiles over the posterior, `trust_<robot>_low` and `_high`, NaN for bound 0; where the
            plan has a risk, `p_fail` of the bound, `p_fail_low` and `_high`, `p_fail_<cause>`, and
-           `p_arrive`, the chance to get as far.
+           `p_arrive`, the chance to get as far; and on a terrain `unseen`, the share of the bound's
+           time in which nobody sees anybody.
     posts  Points where T2 stands while the lead runs a bound: `bound` (from 1), `robot`, `row` and
            `col` of the cell, and `lead_x`, `lead_y`, where the lead stops then.
     ways   Lines: `bound` (from 1), `robot` ("lead" first, which drives first), `length_m`.

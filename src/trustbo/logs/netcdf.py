@@ -180,14 +180,18 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
     awareness = np.full((*shape, len(robots), len(features)), np.nan)
     rates, duration, n_ticks = (np.full((*shape, len(robots)), np.nan) for _ in range(3))
     start, status = np.full(shape, np.nan), np.full(shape, "", dtype=object)
+    posts = np.full((*shape, len(robots), 2), np.nan)
     for j, mission in enumerate(missions):
         n = len(mission.bounds)
         path[j, : len(mission.path)] = mission.path
         awareness[j, :n], rates[j, :n] = mission.awareness, mission.contact_rate
         duration[j, :n], n_ticks[j, :n] = mission.duration, mission.n_ticks
+        if mission.posts is not None:
+            posts[j, : len(mission.posts)] = mission.posts
         start[j, :n] = [bound.t0 for bound in mission.bounds]
         status[j, :n] = [bound.status for bound in mission.bounds]
     dims = ("mission", "bound", "robot")
+    own = {} if np.isnan(posts).all() else {"posts": ((*dims, "xy"), posts, {"units": "m"})}
     return xr.Dataset(
         {
             "path": (("mission", "step", "axis"), path),
@@ -199,6 +203,7 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
             "bound_status": (dims[:2], status.astype(str)),
             "status": (dims[:1], [mission.status for mission in missions]),
             "n_bounds": (dims[:1], [len(mission.bounds) for mission in missions]),
+            **own,
         },
         {"robot": list(robots), "feature": list(features), "axis": ["row", "col"]},
     )
@@ -216,7 +221,9 @@ def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> 
         status, t0 = str(table["bound_status"][j, k]), float(table["start"][j, k])
         poses, contact, states = _ticks_of(ticks, k)
         bounds.append(Bound(path[k + 1], z, y, seconds, status, t0, poses, contact, n, states))
-    return Mission(path, tuple(bounds), str(table["status"][j]), features, robots)
+    posts = table["posts"][j, : len(path) - 1] if "posts" in table else np.full(1, np.nan)
+    own = None if np.isnan(posts).any() else posts
+    return Mission(path, tuple(bounds), str(table["status"][j]), features, robots, own)
 
 
 def _ticks_of(ticks: xr.Dataset | None, k: int) -> tuple[np.ndarray | None, ...]:

@@ -1,9 +1,9 @@
 """A plan: a path, its expected trust, value and exactness, and what robots are to do."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from trustbo.data import Cell, path_text
 from trustbo.display.card import Card, Displayed, arrival
 from trustbo.display.svg import curve_picture
 from trustbo.hazard.risk import PathRisk
+from trustbo.planning.assignment import robots_along
+from trustbo.planning.cover import PathCover
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -48,6 +50,8 @@ class Plan(Displayed):
             safest where no admissible path respects the limit.
         value_band: Ends of the 90 % band of the value over draws of the parameters, at the chance
             to fail expected; None where the plan is for one draw. Noise of rates is not in it.
+        cover: Share of the time in which nobody sees anybody; None where the plan is for one draw,
+            or on no terrain.
     """
 
     path: tuple[Cell, ...]
@@ -67,6 +71,12 @@ class Plan(Displayed):
     risk: PathRisk | None = None
     infeasible: bool = False
     value_band: tuple[float, float] | None = None
+    cover: PathCover | None = None
+
+    def with_draws(self, given: Self) -> Self:
+        """Return the plan with the bands and the cover of another of its path, for many draws."""
+        of_draws = {name: getattr(given, name) for name in ("bands", "value_band", "cover")}
+        return replace(self, **of_draws)
 
     def _card(self) -> Card:
         best = "no path is better" if self.exact else f"at most {self.bound:.3g} can be had"
@@ -86,6 +96,8 @@ class Plan(Displayed):
         if self.p_arrive is not None:
             beyond = "; fails beyond max_failure" if self.infeasible else ""
             rows.append(("chance to arrive", arrival(self.p_arrive, self.p_arrive_band) + beyond))
+        if self.cover is not None:
+            rows.append(("nobody sees anybody", unseen_text(self.cover)))
         if self.engine != "given":
             rows.append(("search", f"{self.engine}, {1e3 * self.seconds:.1f} ms"))
 
@@ -117,6 +129,16 @@ class Plan(Displayed):
         """Ends of the 90 % band of `p_arrive` over draws of the risk; None without draws."""
         return None if self.risk is None else self.risk.p_arrive_band
 
+    @property
+    def unseen(self) -> float | None:
+        """Share of the time in which nobody sees anybody, expected; see `planning.cover`."""
+        return None if self.cover is None else self.cover.unseen
+
+    @property
+    def unseen_band(self) -> tuple[float, float] | None:
+        """Ends of the 90 % band of `unseen` over draws of the parameters."""
+        return None if self.cover is None else self.cover.band
+
     @cached_property
     def waypoints(self) -> np.ndarray | None:
         """Stops of the lead in the cells of the path, shape (cell, 2)."""
@@ -129,7 +151,29 @@ class Plan(Displayed):
         """Posts where T2 stands while the lead runs each bound, shape (bound, robot, 2)."""
         if (ground := self.workspace.ground) is None:
             return None
+        if self.own_posts is not None:
+            return self.own_posts
         return np.stack([ground.posts.watching(a, c) for a, c in pairwise(self.path)])
+
+    @property
+    def own_posts(self) -> np.ndarray | None:
+        """Posts by `robots`, shape (bound, robot, 2); None where they are the workspace's."""
+        if self.robots is None or (table := self.workspace.watch) is None:
+            return None
+        bounds = zip(pairwise(self.path), self.robots, strict=True)
+        return np.stack([table.posts(a, c)[chosen] for (a, c), chosen in bounds])
+
+    @cached_property
+    def robots(self) -> np.ndarray | None:
+        """Post of each robot in each bound, (bound, robot), where the robots differ.
+
+        An index into `workspace.watch.posts(a, c)`, the posts from which the bound from cell a to c
+        can be watched, by `planning.assignment`: the poorer watcher has the post that matters less.
+        Robots differ by their lidars, sizes and speeds, or where the contact expected of one, as a
+        share of what it should see, is below another's by more than `assignment.DIFFERENT`. None
+        where they are alike, in large teams, and without line of sight: posts are the workspace's.
+        """
+        return robots_along(self.workspace, self.path, self.trust)
 
     @cached_property
     def ways(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
@@ -140,14 +184,24 @@ class Plan(Displayed):
         """
         if (ground := self.workspace.ground) is None:
             return None
-        bounds = zip(pairwise(self.path), (*self.path[2:], None), strict=True)
-        return tuple((ground.lead(a, c), *ground.closing(a, c, ahead)) for (a, c), ahead in bounds)
+        assert self.posts is not None  # noqa: S101  # there is a ground
+        at_goal = ground.posts.watching(self.path[-1], None)
+        starts, ends = self.posts, [*self.posts[1:], at_goal]
+        bounds = zip(pairwise(self.path), starts, ends, strict=True)
+        return tuple((ground.lead(*bound), *ground.between(*bound, *way)) for bound, *way in bounds)
+
+
+def unseen_text(cover: PathCover) -> str:
+    """Share of the time in which nobody sees anybody as text, with its 90 % band."""
+    low, high = cover.band
+    return f"{cover.unseen:.1%} of the time, {low:.1%} to {high:.1%} in 90 % of the draws"
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
     """Convert a plan, without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
-    values["risk"] = None if plan.risk is None else plan.risk.to_record()
+    for name in ("risk", "cover"):
+        values[name] = None if values[name] is None else values[name].to_record()
     return {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in values.items()}
 
 
@@ -162,5 +216,7 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
         values["value_band"] = tuple(record["value_band"])
     if record.get("risk"):  # unknown to version 0.1
         values["risk"] = PathRisk.from_record(record["risk"])
+    if record.get("cover"):  # unknown to version 0.2
+        values["cover"] = PathCover.from_record(record["cover"])
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

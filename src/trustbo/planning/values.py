@@ -2,12 +2,14 @@
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
 from trustbo.models.params import Params
+from trustbo.planning.cover import cover_along
 from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
 from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
 from trustbo.planning.paths import AdmissiblePaths
@@ -86,7 +88,7 @@ def evaluate(
             value_of(PathTrust(t, t, objective.length_weight * length)) for t in (teams, team)
         )
     risk = None if problem.risk is None else problem.risk.along(cells)
-    return Plan(
+    plan = Plan(
         path=path,
         positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
         length=length,
@@ -105,6 +107,9 @@ def evaluate(
         infeasible=risk is not None and not problem.is_within_risk(cells),
         value_band=_value_band(np.atleast_1d(values) - cost),
     )
+    if len(draws) == 1 or plan.posts is None:
+        return plan
+    return replace(plan, cover=cover_along(plan.workspace, path, plan.posts, draws))
 
 
 def _bands(trust: np.ndarray) -> np.ndarray:

@@ -10,6 +10,8 @@ from trustbo.errors import TrustboError
 from trustbo.hazard.risk import PathRisk
 from trustbo.inference.samplers.convergence import GOOD_KHAT, MAX_KHAT, MAX_RHAT, MIN_ESS
 from trustbo.planning import Plan
+from trustbo.planning.cover import PathCover
+from trustbo.planning.plan import unseen_text
 from trustbo.report.blocks import Fact
 from trustbo.report.numbers import counted, number
 
@@ -37,6 +39,7 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
         Fact("Recommended", _path(result, plan)),
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
+        *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover))]),
         _soundness(result),
         *changes,
         Fact("Why it ended", _end(result)),
@@ -104,6 +107,14 @@ def _arrival(risk: PathRisk) -> str:
     if len(likeliest) == 1:
         sentence += f" The likeliest cause is {likeliest[0].replace('_', ' ')}."
     return sentence
+
+
+def _cover(cover: PathCover) -> str:
+    worst = int(np.argmax(cover.by_bound))
+    return (
+        f"On it nobody sees anybody {unseen_text(cover)}; longest in bound {worst + 1}, "
+        f"{cover.by_bound[worst]:.1%} of its time."
+    )
 
 
 def _soundness(result: Result) -> Fact:

@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
-from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
+from trustbo.data import Bound, Cell, Mission, as_array
+from trustbo.errors import ShapeError, TrustboError, require_choice, require_positive, require_whole
+from trustbo.planning.plan import Plan
 from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Event, Threat, require_events
 from trustbo.simulation.measure import Measure
@@ -140,33 +142,57 @@ class KinematicSimulator(DescribedSimulator):
         settings = {name: value for name, value in self.describe().items() if name not in every}
         return settings | {"acting": [e.effect for e in self.events if e.acts_in(mission)]}
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
-        """Run a path from start to goal, or until it fails.
+    def run(
+        self,
+        path: Sequence[Cell] | Plan,
+        *,
+        seed: int,
+        mission: int = 0,
+        posts: ArrayLike | None = None,
+    ) -> Mission:
+        """Run a path, or a plan with its posts, from start to goal or until it fails.
 
-        The seed is that of slip and detections: same seed, same mission, on any machine. Events
-        go by the number of the mission, from 0. TrustboError: a cell that is off
-        the grid or impassable, or fewer than two cells.
+        Args:
+            path: Cells, each a neighbour of the last; or a plan.
+            seed: Seed of slip and detections: same seed, same mission, on any machine.
+            mission: Number of the mission, from 0, by which events go.
+            posts: Places of T2 while the lead runs each bound, shape (bound, robot, 2), x and y
+                in CRS metres; by default the plan's, or the workspace's.
+
+        Raises:
+            TrustboError: A cell that is off the grid or impassable, fewer than two cells, or posts
+                of another shape, that cannot be reached near their cell, or in alternate bounding.
         """
-        return self.run_batch(path, [seed], mission=mission)[0]
+        return self.run_batch(path, [seed], mission=mission, posts=posts)[0]
 
     def run_batch(
-        self, path: Sequence[Cell], seeds: Sequence[int], *, mission: int = 0
+        self,
+        path: Sequence[Cell] | Plan,
+        seeds: Sequence[int],
+        *,
+        mission: int = 0,
+        posts: ArrayLike | None = None,
     ) -> list[Mission]:
         """Run a path many times, faster than one by one; each as `run` does with its seed.
 
         Args:
-            path: Cells, each a neighbour of the last.
+            path: See `run`.
             seeds: Seeds of the missions.
             mission: See `run`.
+            posts: See `run`.
 
         Raises:
             TrustboError: See `run`.
         """
+        if isinstance(path, Plan):
+            posts = path.own_posts if posts is None else posts
+            path = path.path
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         if len(cells) < 2:
             raise TrustboError(f"a path needs at least two cells; got {cells}.")
+        given = None if posts is None else self._require_posts(posts, cells)
         self._enter(mission)
-        states = [self._start(cells[0], seed, cells[1]) for seed in seeds]
+        states = [self._start(cells[0], seed, cells[1], given) for seed in seeds]
         bounds: list[list[Bound]] = [[] for _ in states]
         under_way = list(range(len(states)))
         for k, cell in enumerate(cells[1:], start=1):
@@ -178,7 +204,25 @@ class KinematicSimulator(DescribedSimulator):
             if not under_way:
                 break
         names = self.workspace.features, self.workspace.team.names
-        return [Mission(tuple(cells), tuple(run), run[-1].status, *names) for run in bounds]
+        return [Mission(tuple(cells), tuple(run), run[-1].status, *names, given) for run in bounds]
+
+    def _require_posts(self, posts: ArrayLike, path: Sequence[Cell]) -> np.ndarray:
+        """Posts of T2 for each bound, which it can reach."""
+        if self.bounding != "successive":
+            raise TrustboError(f"posts are of successive bounding, not {self.bounding!r}.")
+        given, shape = as_array("posts", posts), (len(path) - 1, len(self.team.robots), 2)
+        if given.shape != shape:
+            raise ShapeError(f"posts must be {shape}, (bound, robot, x and y); got {given.shape}.")
+        ground = self.workspace.ground
+        assert ground is not None  # noqa: S101  # `true_surface` has refused others
+        for k, i in np.ndindex(*shape[:2]):
+            if not ground.posts.is_linked(path[k], given[k, i]):
+                raise TrustboError(
+                    f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} cannot be reached from the "
+                    f"lead's stop in cell {path[k]} over passable ground at most half a cell "
+                    "around it; Workspace.posts has posts that can."
+                )
+        return given
 
     def reset(
         self, start: Cell, seed: int, *, next_cell: Cell | None = None, mission: int = 0
@@ -234,12 +278,13 @@ class KinematicSimulator(DescribedSimulator):
         """
         max_ticks, cell = round(self.bound_timeout / self.tick), way[1]
         state = self._start(way[0], 0, cell) if state is None else state
-        lead, status = self._phase(0, state.poses, state.stops, way, None, max_ticks, rng)
+        stop = self._goals(0, cell, None)
+        lead, status = self._phase(0, state.poses, state.stops, way, stop, max_ticks, rng)
         drives = [Drive(lead, np.ones(len(lead), bool), status, way, state.stops)]
         for next_cell in ahead if status == "ok" else ():
-            left = max_ticks - len(lead)
-            t2, ended = self._phase(1, lead[-1], state.stops, way, next_cell, left, rng)
-            stops = np.concatenate([self._goals(i, cell, next_cell) for i in (0, 1)])
+            left, goals = max_ticks - len(lead), self._goals(1, cell, next_cell)
+            t2, ended = self._phase(1, lead[-1], state.stops, way, goals, left, rng)
+            stops = np.concatenate([stop, goals])
             drives.append(Drive(t2, np.zeros(len(t2), bool), ended, (cell, cell), stops))
         lidars = self.team.lead, *self.team.robots
         independent = all(robot.acquire == robot.drop == 1 for robot in lidars)
@@ -298,13 +343,15 @@ class KinematicSimulator(DescribedSimulator):
 
     # --- one bound ---
 
-    def _start(self, start: Cell, seed: int, next_cell: Cell | None) -> State:
+    def _start(
+        self, start: Cell, seed: int, next_cell: Cell | None, posts: np.ndarray | None = None
+    ) -> State:
         cell = self.workspace.require_cell("start", start)
-        posts = self._ways.posts
-        stops = np.concatenate([posts.waypoint(cell)[None], posts.watching(cell, next_cell)])
+        first = self._goals(1, cell, next_cell) if posts is None else posts[0]
+        stops = np.concatenate([self._goals(0, cell, None), first])
         poses = np.concatenate([stops, np.zeros((len(stops), 1))], axis=1)
-        tracks = new_tracks(len(stops) - 1)
-        return State((cell, cell), poses, stops, 0.0, require_whole("seed", seed, 0), tracks)
+        tracks, seed = new_tracks(len(first)), require_whole("seed", seed, 0)
+        return State((cell, cell), poses, stops, 0.0, seed, tracks, posts)
 
     def _bounds(
         self, states: Sequence[State], k: int, cell: Cell, next_cell: Cell | None
@@ -352,13 +399,16 @@ class KinematicSimulator(DescribedSimulator):
         for mover in turns(self.bounding, k, next_cell is None):
             i, members = (0, slice(0, 1)) if mover == "lead" else (1, slice(1, None))
             way, now = (cells[i], cell), poses[-1][-1]
-            driven, status = self._phase(i, now, stops, way, next_cell, ticks_left, rng)
+            goals = self._goals(i, cell, next_cell)
+            if i and state.posts is not None and k < len(state.posts):
+                goals = state.posts[k]
+            driven, status = self._phase(i, now, stops, way, goals, ticks_left, rng)
             poses.append(driven)
             lead_moves.append(np.full(len(driven), i == 0))
             ticks_left -= len(driven)
             if status != "ok":
                 break
-            cells[i], stops[members] = cell, self._goals(i, cell, next_cell)
+            cells[i], stops[members] = cell, goals
         moves = np.concatenate(lead_moves)
         return Drive(np.concatenate(poses[1:]), moves, status, (cells[0], cells[1]), stops)
 
@@ -373,19 +423,20 @@ class KinematicSimulator(DescribedSimulator):
         now: np.ndarray,
         stops: np.ndarray,
         way: tuple[Cell, Cell],
-        next_cell: Cell | None,
+        goals: np.ndarray,
         max_ticks: int,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, str]:
-        """Drive the lead (i = 0) or T2 while the others stand: poses (tick, 1 + robot, 3), status.
+        """Drive the lead (i = 0) or T2 to goals while the others stand.
 
-        Routes start at the planned posts `stops`, robots at their current poses.
+        Routes start at the planned posts `stops`, robots at their current poses. Returns poses
+        (tick, 1 + robot, 3) and the status.
         """
         if i:
             members, robots, planned = slice(1, None), self.team.robots, self.workspace.team.robots
         else:
             members, robots, planned = slice(0, 1), [self.team.lead], [self.workspace.team.lead]
-        window, goals = self._ways.posts.window(*way), self._goals(i, way[1], next_cell)
+        window = self._ways.posts.window(*way)
         routes: list[np.ndarray | None] = []
         for robot, start, goal, pose in zip(
             planned, stops[members], goals, now[members], strict=True

@@ -35,7 +35,7 @@ class ReplaySimulator(DescribedSimulator):
         Args:
             missions: Recorded missions.
             on_missing: `"error"` to replay the mission recorded on the path asked for, and to raise
-                if none is left; `"next"` to replay all in their order, whatever their paths
+                if none is left; `"next"` to replay all in their order, on any path
                 (`Campaign.tell` learns from them).
 
         Raises:

@@ -2,14 +2,14 @@
 
 import hashlib
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell
+from trustbo.data import Cell, Mission
 from trustbo.display.card import Card, Displayed
 from trustbo.errors import (
     DamagedFileError,
@@ -32,6 +32,7 @@ from trustbo.terrain.dataset import digest_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.location import Location
 
+_N_RUNS = 64
 OBJECTIVES = ("lost_contact", "mean")
 """Objectives for which a truth has a best path."""
 
@@ -64,9 +65,14 @@ class Truth(Displayed):
         workspace: Workspace,
         bounds: BoundTable | ModelContact,
         at_mission: "Callable[[int], Truth] | None" = None,
+        run: Callable[[Plan], list[Mission]] | None = None,
     ) -> None:
-        """Store the contact of bounds; `at(mission)` is the truth of another mission's world."""
+        """Store the contact of bounds; `at(mission)` is the truth of another mission's world.
+
+        `run(plan)` runs missions over a plan with its posts.
+        """
         self.workspace, self.bounds, self._other = workspace, bounds, at_mission
+        self._run = run
         self._best: dict[tuple[Any, ...], tuple[Cell, ...]] = {}
 
     def _card(self) -> Card:
@@ -124,7 +130,8 @@ class Truth(Displayed):
             world = _world(simulator, require_whole("mission", number, 0))
             if (key := to_json(world)) not in cached:
                 table = _table(simulator, number, world, *numbers, folder, progress)
-                cached[key] = cls(workspace, table, of_mission)
+                run = partial(_runs, simulator, number) if takes(simulator.run, "posts") else None
+                cached[key] = cls(workspace, table, of_mission, run)
             return cached[key]
 
         return of_mission(mission)
@@ -169,12 +176,21 @@ class Truth(Displayed):
         return self._best[key]
 
     def value(self, path: Plan | Sequence[Cell]) -> PathContact:
-        """Expected contact of a path, or of a plan's, and its probability to arrive.
+        """Expected contact of a path, or of a plan, and its probability to arrive.
+
+        Of a plan that assigns robots to posts (`Plan.robots`), the mean of 64 missions of the
+        simulator; contact is NaN if none arrives. Of a path, from the table of bounds.
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or no neighbour of the last.
         """
         cells = self._cells(path)
+        if isinstance(path, Plan) and path.own_posts is not None and self._run is not None:
+            missions = self._run(path)
+            arrived = [m.contact_rate.mean(1) for m in missions if m.status == "ok"]
+            rates = np.mean(arrived, axis=0) if arrived else np.full(len(cells) - 1, np.nan)
+            share = len(arrived) / len(missions)
+            return PathContact(float((1.0 - rates).sum()), float(rates.mean()), share)
         rates = self.bounds.contact(cells).mean(1)
         arrives = float(np.prod(1.0 - self.bounds.failure(cells)))
         return PathContact(float((1.0 - rates).sum()), float(rates.mean()), arrives)
@@ -191,7 +207,8 @@ class Truth(Displayed):
 
         100 (contact lost on it - lost on the best) / contact kept on the best, both in bounds; for
         `"mean"` of mean rates. The best path is that of `best`, with the same ends; negative if
-        the path is better than all those admissible.
+        the path is better than all those admissible. Posts are the workspace's on every path: what
+        a plan gains by assigning robots is in `value`, not here.
 
         Raises:
             TrustboError: See `best` and `value`.
@@ -225,6 +242,15 @@ class Truth(Displayed):
 
 def _percent(lacking: float, whole: float) -> float:
     return 100.0 * lacking / whole if whole > 0.0 else np.nan
+
+
+def _runs(simulator: Any, mission: int, plan: Plan) -> list[Mission]:
+    """Missions over a plan with its posts, in the world of a mission."""
+    named = {"mission": mission} if takes(simulator.run, "mission") else {}
+    return [
+        simulator.run(plan.path, seed=seed, posts=plan.own_posts, **named)
+        for seed in range(_N_RUNS)
+    ]
 
 
 def _world(simulator: Any, mission: int) -> tuple[object, int]:

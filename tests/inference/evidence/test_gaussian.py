@@ -171,9 +171,7 @@ def test_without_memory_level_and_deviation_are_one_model():
 def test_rates_that_are_just_as_expected_have_a_density(name):
     """Full contact on a line of sight of 1, of weight 1 a priori, without memory."""
     path, clear = [(0, 0), (0, 1), (1, 2)], np.tile([1.0, 0.0], (2, 3, 1))
-    mission = Mission.from_arrays(
-        path, clear, np.ones((2, 3)), features=("line_of_sight", "slope")
-    )
+    mission = Mission.from_arrays(path, clear, np.ones((2, 3)), features=("line_of_sight", "slope"))
     slots, groups = gathered([mission], EFFECTS[name])
     theta = random_theta(EFFECTS[name], np.random.default_rng(0), 3)
     theta |= {"beta0": np.zeros(3), "rest": np.ones(3)}
