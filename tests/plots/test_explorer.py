@@ -5,6 +5,7 @@ import io
 import json
 import re
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -96,6 +97,23 @@ def test_the_slider_has_a_step_for_each_mission_and_the_recommended_path(explore
     some = [result.planner.evaluate(result.path, params.draw(i)).trust for i in range(1000)]
     five = np.quantile(np.mean(some, axis=2), [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
     close(last["trust"], five)
+
+
+def test_the_recommended_path_has_what_one_would_see_of_its_bounds(record, result):
+    *missions, last = record["steps"]
+    assert all(step["overwatch"] is None for step in missions)
+    workspace, corner = result.workspace, np.array(result.workspace.grid.corner)
+    for (a, c), shown in zip(pairwise(result.path), last["overwatch"], strict=True):
+        x, y = corner[0] + np.array(shown["x"]), corner[1] + np.array(shown["y"])
+        stop = workspace.ground.posts.waypoint(a)
+        assert np.abs(x - stop[0]).max() <= 30.0
+        assert np.abs(y - stop[1]).max() <= 30.0
+        seen = workspace.overwatch_map((a, c)).sel(x=x, y=y, method="nearest").values
+        (percent,) = np.array(shown["percent"])  # of equal robots
+        known = np.where(percent < 0, np.nan, percent / 100.0).reshape(seen.shape)
+        np.testing.assert_allclose(known, seen, atol=0.0051)
+    posts = np.array(last["posts"]) + corner
+    np.testing.assert_allclose(posts, result.plan.posts, atol=0.01)
 
 
 def test_the_map_of_each_step_is_the_one_that_its_path_was_planned_on(layers, record, result):

@@ -12,15 +12,18 @@ from trustbo.inference import params_of, place_maps
 from trustbo.planning.plan import QUANTILES
 from trustbo.planning.posterior import choose_draws
 from trustbo.planning.values import path_trust
-from trustbo.plots.explorer import Layer, Scene, Step
+from trustbo.plots.explorer import Layer, Overwatch, Scene, Step
 from trustbo.plots.places import BETTER_WORSE
 from trustbo.report.numbers import MINUS, counted
+from trustbo.team import Robot
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import bounds_along
 
 _FIVE = (*QUANTILES[:2], 0.5, *QUANTILES[2:])
 _Moments = dict[str, tuple[np.ndarray, np.ndarray]]
 """Mean and sd by name, each (move, row, col)."""
+_REACH = 30.0
+"""Distance from the lead's stop of the points from which what is seen is told, m."""
 _SIGN = "\N{PLUS-MINUS SIGN}"
 
 
@@ -132,7 +135,7 @@ def _last_step(result: Result, bound_maps: _Moments) -> Step:
     params, chosen = choose_draws(params_of(result.posterior, day=True), None, 0)
     along = planner.dynamics(params, draws=chosen).along(path)
     expected = path_trust(along, planner.problem.objective, 0.0, cap=False).trust
-    stops, posts = _planned(path, result.workspace)
+    stops, posts = _planned(path, result.workspace, result.plan.own_posts)
     moves, rows, cols = bounds_along(path).T
     z = planner.mean_awareness[:, moves if planner.mean_awareness.shape[1] > 1 else 0, rows, cols]
     return Step(
@@ -146,7 +149,29 @@ def _last_step(result: Result, bound_maps: _Moments) -> Step:
         np.full(result.trust.shape, np.nan),
         np.quantile(expected, _FIVE, axis=0),
         _numbers(result, path, z.transpose(1, 0, 2), bound_maps),
+        _overwatch(result.workspace, path),
     )
+
+
+def _overwatch(workspace: Workspace, path: Sequence[Cell]) -> list[Overwatch] | None:
+    """What each robot would see of each bound from points around the lead's stop."""
+    if workspace.watch is None or workspace.ground is None:
+        return None
+    left, bottom = workspace.grid.corner
+    found = []
+    for bound in pairwise(path):
+        x, y = workspace.ground.posts.waypoint(bound[0])
+        by_kind: dict[Robot, xr.DataArray] = {}
+        for name, robot in zip(workspace.team.names, workspace.team.robots, strict=True):
+            if robot not in by_kind:
+                seen = workspace.overwatch_map(bound, robot=name)
+                assert seen is not None  # noqa: S101  # there is a table
+                near = {"x": abs(seen["x"] - x) <= _REACH, "y": abs(seen["y"] - y) <= _REACH}
+                by_kind[robot] = seen.isel({axis: np.flatnonzero(n) for axis, n in near.items()})
+        maps = [by_kind[robot] for robot in workspace.team.robots]
+        axes = maps[0]["x"].values - left, maps[0]["y"].values - bottom
+        found.append(Overwatch(*axes, np.stack([one.values for one in maps])))
+    return found
 
 
 def _latent_trust(result: Result, j: int, n_bounds: int) -> np.ndarray:
@@ -164,7 +189,7 @@ def _latent_trust(result: Result, j: int, n_bounds: int) -> np.ndarray:
 
 def _recorded(mission: Mission, workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
     """Recorded stops and posts; those planned for bounds without a record."""
-    stops, posts = _planned(mission.path, workspace)
+    stops, posts = _planned(mission.path, workspace, mission.posts)
     n_robots = len(mission.robots)
     for k, bound in enumerate(mission.bounds):
         if bound.poses is None or not len(bound.poses):
@@ -176,14 +201,19 @@ def _recorded(mission: Mission, workspace: Workspace) -> tuple[np.ndarray, np.nd
     return stops, posts
 
 
-def _planned(path: Sequence[Cell], workspace: Workspace) -> tuple[np.ndarray, np.ndarray | None]:
-    """Stops and posts in m from the lower left corner: centres and None without a terrain."""
+def _planned(
+    path: Sequence[Cell], workspace: Workspace, own: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Stops and posts in m from the lower left corner: centres and None without a terrain.
+
+    Posts are the `own` of a plan, (bound, robot, 2), or else the workspace's.
+    """
     corner = np.array(workspace.grid.corner)
     if (ground := workspace.ground) is None:
         return np.array([workspace.grid.center(cell) for cell in path]) - corner, None
     stops = np.stack([ground.posts.waypoint(cell) for cell in path])
-    posts = np.stack([ground.posts.watching(a, c) for a, c in pairwise(path)])
-    return stops - corner, posts - corner
+    rule = [ground.posts.watching(a, c) for a, c in pairwise(path)]
+    return stops - corner, (np.stack(rule) if own is None else own) - corner
 
 
 def _numbers(

@@ -1,6 +1,6 @@
 """Interactive page of a campaign: layers of the map, missions on a slider, numbers of places."""
 
 from trustbo.plots.explorer.page import Explorer, draw_explorer
-from trustbo.plots.explorer.scene import Layer, Scene, Step
+from trustbo.plots.explorer.scene import Layer, Overwatch, Scene, Step
 
-__all__ = ["Explorer", "Layer", "Scene", "Step", "draw_explorer"]
+__all__ = ["Explorer", "Layer", "Overwatch", "Scene", "Step", "draw_explorer"]

@@ -44,8 +44,9 @@ def draw_map(scene: Scene) -> Any:
 
     The page's script sets its height, so that the map has its proportions at any width.
     Its sources are named `cells` (x, y, value), `bounds` (x0, y0, x1, y1, contact), `ends` (x, y,
-    marker, size), `posts` (x, y, marker, colour), `cell` (x, y), `bound` (x0, y0, x1, y1) and
-    `sight` (the same, colour); its colours `colours` and `contact`.
+    marker, size), `posts` (x, y, marker, colour), `overwatch` (x, y, seen, width, height), `cell`
+    (x, y), `bound` (x0, y0, x1, y1) and `sight` (the same, colour); its colours `colours` and
+    `contact`.
     """
     models, figure = load_bokeh()
     grid = scene.workspace.grid
@@ -63,6 +64,7 @@ def draw_map(scene: Scene) -> Any:
     field = {"field": "value", "transform": mapper}
     drawn = plot.rect("x", "y", source=cells, fill_color=field, line_color=field, **size)
     plot.x_range.renderers = plot.y_range.renderers = [drawn]
+    _draw_overwatch(plot)
     _draw_relief(plot, scene)
     _draw_path(plot)
     focus = {"fill_color": None, "line_color": "#ffffff", "line_width": 2}
@@ -73,6 +75,18 @@ def draw_map(scene: Scene) -> Any:
     bar = models.ColorBar(color_mapper=mapper, height=12, padding=4, background_fill_color=None)
     plot.add_layout(bar, "below")
     return _plain(plot)
+
+
+def _draw_overwatch(plot: Any) -> None:
+    """Draw the share of the lead's way that one would see from points around its stop."""
+    models, _ = load_bokeh()
+    points = _source("overwatch", x=[], y=[], seen=[], width=[], height=[])
+    shares = models.LinearColorMapper(palette=palette("gray"), low=0.0, high=1.0)
+    colour = {"field": "seen", "transform": shares}
+    plot.rect(
+        "x", "y", "width", "height", source=points, fill_color=colour, line_color=None,
+        fill_alpha=0.85, name="overwatch map", visible=False,
+    )  # fmt: skip
 
 
 def _draw_path(plot: Any) -> None:

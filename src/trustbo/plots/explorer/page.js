@@ -57,6 +57,9 @@ async function start() {
   const step = () => scene.steps[number()]
   const values = (one) => one.maps[one.maps.length > 1 ? number() : 0]
   let chosen = null // {cell} or {bound}
+  let moved = {} // positions of posts that were dragged, by "bound robot"
+  let dragged = null // [bound, robot]
+  const post = (k, i) => moved[[k, i]] ?? step().posts[k][i]
 
   function showLayer() {
     const one = layer()
@@ -65,6 +68,43 @@ async function start() {
     fill("cells", {...centres, value: unknown(values(one))})
     at("map-title").textContent = one.label
     showNumbers()
+  }
+
+  const marks = (points) => ({
+    marker: points.map((i) => scene.marks[i][0]), colour: points.map((i) => scene.marks[i][1]),
+  })
+
+  function showPosts() {
+    const stands = (step().posts ?? []).flatMap((robots, k) => robots.map((_, i) => [...post(k, i), i]))
+    const known = stands.filter((p) => p[0] !== null)
+    fill("posts", {x: known.map((p) => p[0]), y: known.map((p) => p[1]), ...marks(known.map((p) => p[2]))})
+  }
+
+  /* Percent of the lead's way in bound k that robot i would see from a position; null where it cannot stand. */
+  function seenFrom(k, i, [x, y]) {
+    const map = step().overwatch[k]
+    const nearest = (values, value) => values.reduce((best, v, j) => (
+      Math.abs(v - value) < Math.abs(values[best] - value) ? j : best), 0)
+    const [c, r] = [nearest(map.x, x), nearest(map.y, y)]
+    const apart = Math.abs(map.x[1] - map.x[0])
+    if (Math.abs(map.x[c] - x) > apart || Math.abs(map.y[r] - y) > apart) return null
+    const percent = map.percent[Math.min(i, map.percent.length - 1)][r * map.x.length + c]
+    return percent < 0 ? null : percent
+  }
+
+  function showOverwatch() {
+    const maps = step().overwatch
+    const k = chosen?.bound
+    const none = {x: [], y: [], seen: [], width: [], height: []}
+    part("overwatch map").visible = Boolean(maps) && k !== undefined && (at("overwatch")?.checked || dragged !== null)
+    if (!part("overwatch map").visible) return fill("overwatch", none)
+    const {x, y, percent} = maps[k]
+    const own = percent[Math.min(dragged?.[1] ?? 0, percent.length - 1)]
+    const points = own.map((p, j) => [x[j % x.length], y[Math.floor(j / x.length)], p / 100]).filter((p) => p[2] >= 0)
+    fill("overwatch", {
+      x: points.map((p) => p[0]), y: points.map((p) => p[1]), seen: points.map((p) => p[2]),
+      width: points.map(() => Math.abs(x[1] - x[0])), height: points.map(() => Math.abs(y[1] - y[0])),
+    })
   }
 
   function showStep() {
@@ -77,11 +117,8 @@ async function start() {
     const rates = Array.from({length: n}, (_, k) => (k < contact.length ? mean(contact[k]) : NaN))
     fill("bounds", {x0: x.slice(0, -1), y0: y.slice(0, -1), x1: x.slice(1), y1: y.slice(1), contact: rates})
     fill("ends", {x: [x[0], x[n]], y: [y[0], y[n]], marker: ["circle", "star"], size: [10, 17]})
-    const marks = (points) => ({
-      marker: points.map((i) => scene.marks[i][0]), colour: points.map((i) => scene.marks[i][1]),
-    })
-    const stands = (posts ?? []).flatMap((robots) => robots.map((xy, i) => [...xy, i])).filter((p) => p[0] !== null)
-    fill("posts", {x: stands.map((p) => p[0]), y: stands.map((p) => p[1]), ...marks(stands.map((p) => p[2]))})
+    moved = {}
+    showPosts()
     const dots = contact.flatMap((robots, k) => robots.map((rate, i) => [k, rate, i])).filter((d) => d[1] !== null)
     const aside = (i) => 0.12 * (i - (scene.robots.length - 1) / 2)
     fill("rates", {
@@ -130,11 +167,17 @@ async function start() {
       pairs.push(["team's trust", `${text(trust[2][k])} (90 %: ${text(trust[0][k])} to ${text(trust[4][k])})`])
     }
     for (const [name, texts] of Object.entries(numbers)) if (texts[k]) pairs.push([name, texts[k]])
+    for (const [i, robot] of (step().overwatch ? scene.robots : []).entries()) {
+      const percent = seenFrom(k, i, post(k, i))
+      const where = [k, i] in moved ? " from where it was moved" : ""
+      pairs.push([`${robot} sees${where}`, percent === null ? "cannot stand there" : `${percent} % of the lead's way`])
+    }
     return pairs
   }
 
   function showNumbers() {
     const {path, stops, posts} = step()
+    showOverwatch()
     const empty = {x0: [], y0: [], x1: [], y1: []}
     if (chosen?.bound !== undefined) {
       const k = chosen.bound
@@ -142,7 +185,8 @@ async function start() {
       at("place").textContent = `Bound ${k + 1}, ${path[k]} to ${path[k + 1]}`
       at("numbers").replaceChildren(table(ofBound(k)))
       fill("bound", {x0: [x0], y0: [y0], x1: [x1], y1: [y1]})
-      const seen = (posts?.[k] ?? []).map((xy, i) => [...xy, scene.marks[i][1]]).filter((p) => p[0] !== null)
+      const robots = (posts?.[k] ?? []).map((_, i) => [...post(k, i), scene.marks[i][1]])
+      const seen = robots.filter((p) => p[0] !== null)
       fill("sight", {
         x0: seen.map((p) => p[0]), y0: seen.map((p) => p[1]), x1: seen.map(() => x1), y1: seen.map(() => y1),
         colour: seen.map((p) => p[2]),
@@ -157,7 +201,8 @@ async function start() {
     if (chosen === null) {
       at("place").textContent = "Numbers"
       const hint = document.createElement("p")
-      hint.textContent = "Point at a cell, or at a bound of the path; on a touch screen, tap it."
+      const drag = step().overwatch ? " Drag a post to read what the robot would see from elsewhere." : ""
+      hint.textContent = `Point at a cell, or at a bound of the path; on a touch screen, tap it.${drag}`
       at("numbers").replaceChildren(hint)
       fill("cell", {x: [], y: []})
       return
@@ -181,7 +226,35 @@ async function start() {
     return Math.hypot(x - x0 - share * dx, y - y0 - share * dy)
   }
 
+  /* Take up the post next to the pointer, within 12 pixels. */
+  function dragFrom({x, y}) {
+    const {posts, overwatch} = step()
+    if (!overwatch || !at("posts")?.checked) return
+    const away = posts.flatMap((robots, k) => robots.map((_, i) => {
+      const [px, py] = post(k, i)
+      return [Math.hypot(px - x, py - y), k, i]
+    })).sort((a, b) => a[0] - b[0])[0]
+    const metres = (map.x_range.end - map.x_range.start) / map.inner_width
+    if (away[0] > 12 * metres) return
+    dragged = away.slice(1)
+    chosen = {bound: dragged[0]}
+    showNumbers()
+  }
+
+  function dragTo({x, y}) {
+    if (dragged === null) return
+    moved[dragged] = [x, y]
+    showPosts()
+    showNumbers()
+  }
+
+  function dragEnd() {
+    dragged = null
+    showOverwatch()
+  }
+
   function pointAtMap({x, y}) {
+    if (dragged !== null) return
     const {stops} = step()
     const near = stops.slice(1).map((stop, k) => away(x, y, stops[k], stop))
     const k = near.indexOf(Math.min(...near))
@@ -215,6 +288,10 @@ async function start() {
     map.on_event(event, pointAtMap)
     chart.on_event(event, pointAtChart)
   }
+  map.on_event("panstart", dragFrom)
+  map.on_event("pan", dragTo)
+  map.on_event("panend", dragEnd)
+  at("overwatch")?.addEventListener("change", showOverwatch)
   at("layer").addEventListener("change", showLayer)
   at("step").addEventListener("input", showStep)
   const toggle = (id, name) => at(id)?.addEventListener("change", (event) => {

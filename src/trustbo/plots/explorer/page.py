@@ -69,6 +69,7 @@ def draw_explorer(scene: Scene) -> Explorer:
             for name, (marker, colour) in zip(record["robots"], marks, strict=True)
         ],
         has_posts=any(step.posts is not None for step in scene.steps),
+        has_overwatch=any(step.overwatch is not None for step in scene.steps),
         has_closed=not bool(scene.workspace.passable.all()),
         left_out=record["left_out"],
         library=Resources(mode="inline", components=["bokeh"], log_level="error").render_js(),

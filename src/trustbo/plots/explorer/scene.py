@@ -52,6 +52,31 @@ class Layer:
 
 
 @dataclass(frozen=True, eq=False)
+class Overwatch:
+    """Share of the lead's way in a bound that one would see from points around its stop.
+
+    Attributes:
+        x: Columns of points, m from the map's lower left corner, (col,).
+        y: Rows of points, (row,).
+        seen: Shares, (robot, row, col); NaN where robots cannot stand.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    seen: np.ndarray
+
+    def record(self) -> dict[str, Any]:
+        """JSON-serialisable maps: one for all robots where they see alike."""
+        alike = np.array_equal(self.seen, np.broadcast_to(self.seen[:1], self.seen.shape), True)
+        maps = self.seen[:1] if alike else self.seen
+        percent = np.where(np.isnan(maps), -1, np.rint(100.0 * np.nan_to_num(maps))).astype(int)
+        return {
+            "x": to_list(self.x.round(2)), "y": to_list(self.y.round(2)),
+            "percent": percent.reshape(len(maps), -1).tolist(),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
 class Step:
     """Path of one step of the slider.
 
@@ -67,6 +92,8 @@ class Step:
         trust: Quantiles of the team's trust after each bound, (quantile, bound), those of
             `QUANTILES` with the median in their middle; NaN where it is not known.
         numbers: Further numbers of each bound as text, by their names; (bound,) each.
+        overwatch: What one would see of each bound, (bound,); None where it is not known. Posts
+            can be moved then.
     """
 
     title: str
@@ -78,6 +105,7 @@ class Step:
     contact: np.ndarray
     trust: np.ndarray
     numbers: dict[str, list[str]] = field(default_factory=dict)
+    overwatch: Sequence[Overwatch] | None = None
 
     def record(self) -> dict[str, Any]:
         """JSON-serialisable step."""
@@ -87,6 +115,7 @@ class Step:
             "path": [list(cell) for cell in self.path], "stops": to_list(self.stops.round(2)),
             "posts": posts, "contact": to_list(self.contact), "trust": to_list(self.trust),
             "numbers": self.numbers,
+            "overwatch": None if self.overwatch is None else [o.record() for o in self.overwatch],
         }  # fmt: skip
 
 
