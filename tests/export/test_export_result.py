@@ -20,12 +20,13 @@ FILES = {
     "geojson": ["path.geojson"],
     "gpx": ["path.gpx"],
     "geopackage": ["path.gpkg"],
+    "overwatch": ["overwatch.tif"],
     "csv": ["missions.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm"],
     "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],
 }
-NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "gpx", "geopackage")
+NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "gpx", "geopackage", "overwatch")
 
 
 def test_every_format_is_written_under_its_name(result, tmp_path):

@@ -85,8 +85,8 @@ Program
   title TEXT: Title of the page.
 Options
   formats NAME: Format, may be repeated: geotiff, cog, netcdf (maps); geojson, gpx, geopackage
-    (the path); csv (path and missions); ros_map, ros1_bag, ros2_bag (cost and path); or all that
-    can be written.
+    (the path); overwatch (what one would see of its bounds); csv (path and missions); ros_map,
+    ros1_bag, ros2_bag (cost and path); or all that can be written.
   export.resolution M: Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side
     where cells are not square.
   origin PLACE: Position in the terrain's CRS that is 0,0 of maps and bags for ROS, as x,y in metres

@@ -16,6 +16,7 @@ from trustbo.export.checks import (
     require_names_for_sql,
 )
 from trustbo.export.frame import Frame, Origin, frame_file, frame_of
+from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import tables_beside, write_path
 from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
@@ -216,6 +217,13 @@ _FORMATS = {
         _write_path,
         on_earth=True,
         require=lambda result: require_names_for_sql(result.workspace.team.names),
+    ),
+    "overwatch": _Format(
+        "how much of each bound of the path one would see from each point, as GeoTIFF",
+        ("overwatch.tif",),
+        lambda content, file: write_overwatch(file, content.result.plan),
+        on_earth=True,
+        require=lambda result: require_overwatch(result.workspace),
     ),
     "csv": _Format(
         "tables of all bounds, of the path, its posts and its ways",

@@ -376,7 +376,11 @@ class Workspace(Displayed):
             return None
         surface, window = self.ground.posts.surface, self.ground.posts.window(a, c)
         steps = [max(1, round(_APART / side)) for side in surface.pixel]
-        rows, cols = slice(*window[:2], steps[0]), slice(*window[2:], steps[1])
+        # All maps are of one lattice, whatever their windows.
+        rows, cols = (
+            slice(-(-first // step) * step, end, step)
+            for first, end, step in zip(window[::2], window[1::2], steps, strict=True)
+        )
         y, x = surface.axes[0][rows], surface.axes[1][cols]
         free = surface.passable[rows, cols]
         positions = np.stack(np.meshgrid(x, y), axis=-1)
