@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from trustbo.campaign.masking import mission_numbers
 from trustbo.data import Mission
 from trustbo.inference.changes import scan_posterior
 from trustbo.models.effects.change import Change
@@ -37,7 +38,7 @@ def alarms_of(
     Raises:
         TrustboError: Changes cannot be weighed under the model, see `inference.changes`.
     """
-    numbers = np.atleast_1d(posterior.attrs["missions"]).astype(int)
+    numbers = np.array(mission_numbers(posterior))
     learned = [missions[j] for j in numbers]
     weighed = scan_posterior(posterior, learned, workspace, model=model)
     candidates, names, rows = weighed.candidates, workspace.team.names, []

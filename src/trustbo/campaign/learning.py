@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.checks import never_to_be_learned
-from trustbo.campaign.masking import Mask, find_mask, masked, masks_of, resolved
+from trustbo.campaign.masking import Mask, find_mask, masked, masks_of, mission_numbers, resolved
 from trustbo.campaign.options import CampaignOptions
 from trustbo.campaign.posteriors import Posterior
 from trustbo.campaign.resetting import chances, with_resets
@@ -145,7 +145,7 @@ class Learner:
         """Set the belief to a posterior after a state, or to the prior if there is none."""
         self.belief = self._prior if tree is None else params_of(tree)
         if tree is not None and state is not None and self.changes == "reset":
-            numbers = np.atleast_1d(tree.attrs["missions"]).astype(int).tolist()
+            numbers = mission_numbers(tree)
             learned = [state.entries[j].mission for j in numbers]
             shape = self.workspace.passable.shape
             chance = chances(learned, numbers, shape, len(state.entries))

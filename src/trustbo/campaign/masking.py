@@ -49,6 +49,11 @@ def masks_of(posterior: xr.DataTree | None) -> list[Mask]:
     return [Mask(*mask.tolist()) for mask in np.reshape(numbers, (-1, 4)).astype(int)]
 
 
+def mission_numbers(posterior: xr.DataTree) -> list[int]:
+    """Numbers in the campaign, from 0, of the missions that a posterior was fitted to."""
+    return np.atleast_1d(posterior.attrs["missions"]).astype(int).tolist()
+
+
 def masked(
     missions: Sequence[Mission], numbers: Sequence[int], masks: Sequence[Mask]
 ) -> list[Mission]:
