@@ -143,7 +143,7 @@ def _draw_groups(ax: Axes, criticism: Criticism, kind: str) -> None:
     if kind in ("robot", "contact"):
         texts = [as_text(str(label)) for label in labels]
         crowded = sum(len(text) + 1 for text in texts) > _LETTERS
-        ax.set_xticks(x, texts, rotation=45.0 * crowded)
+        ax.set_xticks(x, texts, rotation=90.0 * crowded)
     else:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("expected contact rate" if kind == "contact" else kind, fontsize=SMALL)
