@@ -135,7 +135,7 @@ class Mission(Displayed):
     Raises:
         ShapeError: Bounds that do not fit the path, or disagree on robots or features; posts of
             another shape.
-        TrustboError: An unknown status.
+        TrustboError: An unknown status, or posts that are not finite.
     """
 
     path: tuple[Cell, ...]
@@ -175,12 +175,8 @@ class Mission(Displayed):
                 raise ShapeError(f"{name} must be {size} names; got {labels}.")
             object.__setattr__(self, name, labels)
         if self.posts is not None:
-            posts, shape = as_array("posts", self.posts), (len(self.path) - 1, n_robots, 2)
-            if posts.shape != shape:
-                raise ShapeError(
-                    f"posts must be {shape}, (bound, robot, x and y); got {posts.shape}."
-                )
-            object.__setattr__(self, "posts", posts)
+            shape = len(self.path) - 1, n_robots, 2
+            object.__setattr__(self, "posts", require_posts(self.posts, shape))
 
     def _card(self) -> Card:
         rates = self.contact_rate
@@ -225,6 +221,7 @@ class Mission(Displayed):
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
+        posts: ArrayLike | None = None,
     ) -> Self:
         """Make a mission from the arrays of a log.
 
@@ -244,6 +241,8 @@ class Mission(Displayed):
             features: Names of the features; by default traversability, visibility, z3, ...; a
                 workspace with as many features gives z3, ... their names, see `Workspace.in_order`.
             robots: Names of the robots; by default r1, r2, ...
+            posts: Places of the robots while the lead ran each bound of the path, shape (bound,
+                robot, 2), such as `Plan.own_posts`; None where they are those of the workspace.
 
         Raises:
             ShapeError: Axes that do not fit together.
@@ -286,7 +285,8 @@ class Mission(Displayed):
         measured = zip(cells[1:], z, y, seconds, statuses, map(float, starts), ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         named = as_names("features", features), as_names("robots", robots)
-        return cls(cells, bounds, status, *named)
+        places = None if posts is None else as_array("posts", posts)
+        return cls(cells, bounds, status, *named, places)
 
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str] = ()
@@ -363,6 +363,20 @@ class Mission(Displayed):
 def path_text(path: Iterable[Cell]) -> str:
     """Write cells as on the command line: "9,0 8,1"."""
     return " ".join(f"{row},{col}" for row, col in path)
+
+
+def require_posts(posts: ArrayLike, shape: tuple[int, int, int]) -> np.ndarray:
+    """Return posts as an array of that shape, (bound, robot, x and y), all finite."""
+    given = as_array("posts", posts)
+    if given.shape != shape:
+        raise ShapeError(f"posts must be {shape}, (bound, robot, x and y); got {given.shape}.")
+    if not np.isfinite(given).all():
+        k, i = np.argwhere(~np.isfinite(given))[0, :2].tolist()
+        raise TrustboError(
+            f"posts[{k}, {i}] = {given[k, i].tolist()} must be finite; leave out posts= where they "
+            "are those of the workspace."
+        )
+    return given
 
 
 def is_line_of_sight(feature: str) -> bool:

@@ -1,12 +1,14 @@
 """Robots that differ at the posts of a path: beside enumeration, driven, and learned from."""
 
 import itertools
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from trustbo import Campaign, Team, Workspace
+from trustbo.data import Mission
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.logs import read_missions, write_missions
 from trustbo.planning import assignment
@@ -14,6 +16,7 @@ from trustbo.planning.assignment import assign
 from trustbo.simulation import KinematicSimulator, MujocoSimulator, Truth
 from trustbo.team import Robot
 from trustbo.terrain import synthetic_terrain
+from trustbo.workspace.sight import Sight
 from trustbo.workspace.watch import Watch
 
 UNLIKE = Team(robots=(Robot(sensor_height=3.0), Robot(), Robot(detection=0.6, lidar_range=40.0)))
@@ -146,6 +149,19 @@ def test_missions_keep_posts_that_are_not_the_rule_s(unlike, tmp_path):
         replace(own, posts=plan.posts[1:])
 
 
+def test_line_of_sight_under_every_sight_is_that_of_the_posts(wooded):
+    sights = [Sight(), "wall", "bare"]
+    workspace = Workspace.from_terrain(wooded, (4, 4), UNLIKE, sight=sights)
+    path = [START, (2, 1), (1, 2), GOAL]
+    rule = np.stack([workspace.posts(*bound) for bound in itertools.pairwise(path)])
+    swapped = rule[:, [1, 2, 0]]
+    gain = workspace.gain_of(path, swapped)
+    for n, sight in enumerate(sights):
+        alone = Workspace.from_terrain(wooded, (4, 4), UNLIKE, sight=["transmittance", sight])
+        np.testing.assert_array_equal(gain[..., n - 3], alone.gain_of(path, swapped)[..., -1])
+    assert np.abs(gain[..., -3:]).max() > 0.0
+
+
 def test_line_of_sight_is_that_of_the_posts_driven(unlike):
     workspace, simulator, plan = unlike
     own, ruled = simulator.run(plan, seed=0), simulator.run(plan.path, seed=0)
@@ -190,4 +206,52 @@ def test_posts_that_cannot_be_driven_to_are_refused(unlike):
         simulator.run(plan.path, seed=0, posts=off)
     by_turns = KinematicSimulator(workspace, bounding="alternate")
     with pytest.raises(TrustboError, match="posts are of successive bounding, not 'alternate'"):
-        by_turns.run(plan, seed=0)
+        by_turns.run(plan.path, seed=0, posts=plan.posts)
+
+
+def test_a_workspace_that_has_planned_can_be_pickled(unlike):
+    workspace, _, plan = unlike
+    assert plan.posts is not None
+    again = pickle.loads(pickle.dumps(plan))
+    np.testing.assert_array_equal(again.posts, plan.posts)
+    assert pickle.loads(pickle.dumps(workspace)).watch is not None
+
+
+def test_a_campaign_drives_by_the_rule_where_its_posts_cannot_be_reached():
+    steep = synthetic_terrain((200.0, 200.0), seed=5, relief=25.0)
+    planned = Workspace.from_terrain(steep, (4, 4), UNLIKE)
+    less = Team(robots=tuple(replace(r, max_slope=0.3) for r in UNLIKE.robots), names=UNLIKE.names)
+    simulator = KinematicSimulator(Workspace.from_terrain(steep, (4, 4), less))
+    campaign = Campaign(planned, START, GOAL, sampler="exact", seed=0)
+    plan, mission = next(iter(campaign.run(simulator, 1)))
+    reached = simulator.workspace.ground.posts.are_reached(plan.path, plan.own_posts)
+    assert not reached.all()
+    assert mission.posts is None
+
+
+def test_posts_that_no_one_can_have_stood_at_are_refused(unlike):
+    workspace, simulator, plan = unlike
+    mission = simulator.run(plan, seed=0)
+    unknown = plan.posts.copy()
+    unknown[0, 1, 0] = np.nan
+    with pytest.raises(TrustboError, match=r"posts\[0, 1\] = \[nan, .* must be finite"):
+        replace(mission, posts=unknown)
+    swapped = replace(mission, posts=mission.posts[..., ::-1])
+    campaign = Campaign(workspace, START, GOAL, sampler="exact", seed=0)
+    campaign.suggest(plan.path)
+    with pytest.raises(TrustboError, match=r"posts\[0, 0\] = .* is not near cell \(3, 0\)"):
+        campaign.tell(swapped)
+    assert not campaign.missions
+    told = Mission.from_arrays(
+        plan.path, mission.awareness, mission.contact_rate, features=mission.features,
+        robots=mission.robots, posts=plan.own_posts,
+    )  # fmt: skip
+    np.testing.assert_array_equal(
+        campaign.as_learned(told).awareness, campaign.as_learned(mission).awareness
+    )
+
+
+def test_alternate_bounding_drives_a_plan_by_the_rule(unlike):
+    workspace, _, plan = unlike
+    mission = KinematicSimulator(workspace, bounding="alternate").run(plan, seed=0)
+    assert mission.posts is None

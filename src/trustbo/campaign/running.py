@@ -17,6 +17,7 @@ from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.simulation import KinematicSimulator, ReplaySimulator, Truth
 from trustbo.simulation.protocol import Simulator, require_bounds, require_call, takes
+from trustbo.workspace import Workspace
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -84,8 +85,8 @@ def _run_missions(
             settings: dict[str, Any] = {"seed": campaign.seed_of("mission")}
             if numbered:  # its world changes
                 settings["mission"] = n
-            if to_posts and plan.own_posts is not None:
-                settings["posts"] = plan.own_posts
+            if to_posts and (posts := _posts_of(plan, runner)) is not None:
+                settings["posts"] = posts
             if replans:
                 mission = run_replanning(campaign, runner, plan, **settings)
             else:
@@ -102,6 +103,14 @@ def _run_missions(
                 callback(campaign, mission)
             yield plan, mission
         campaign.stop("n_iterations")
+
+
+def _posts_of(plan: Plan, runner: Any) -> np.ndarray | None:
+    """Posts that a plan assigns, if the robots can get there where the simulator drives."""
+    posts, workspace = plan.own_posts, getattr(runner, "workspace", plan.workspace)
+    if posts is None or not isinstance(workspace, Workspace) or workspace.ground is None:
+        return posts
+    return posts if workspace.ground.posts.are_reached(plan.path, posts).all() else None
 
 
 def run_replanning(campaign: "Campaign", simulator: Any, plan: Plan, **start: Any) -> Mission:

@@ -12,6 +12,7 @@ different robots miss independently, given the place, is the assumption of the s
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -52,13 +53,16 @@ def cover_along(
 ) -> PathCover | None:
     """Cover of a path with T2 at posts (bound, robot, 2), for draws of trust (draw, bound, robot).
 
-    None without a terrain in memory or an assumed sight.
+    Trust is that expected with T2 at the workspace's posts, as planners expect it. None without a
+    terrain in memory or an assumed sight.
     """
     if (table := workspace.watch) is None:
         return None
     some = np.unique(np.linspace(0, len(draws) - 1, min(len(draws), N_DRAWS)).astype(int))
-    seen = table.seen_along(path, posts)
-    factor = np.clip(draws[some], 0.0, 1.0) / np.maximum(seen.line_of_sight(), _LEAST)
+    rule = np.stack([table.rule(a, c) for a, c in pairwise(path)])
+    usual = table.seen_along(path, rule)
+    seen = usual if np.array_equal(rule, posts) else table.seen_along(path, posts)
+    factor = np.clip(draws[some], 0.0, 1.0) / np.maximum(usual.line_of_sight(), _LEAST)
     unseen = seen.unseen(factor)  # (draw, bound)
     time = seen.lead_time + seen.times.max(1)
     whole = unseen @ time / time.sum()

@@ -24,7 +24,8 @@ class Plan(Displayed):
     """A path with its expected trust, value and exactness.
 
     What robots are to do, `waypoints`, `posts` and `ways`, is that of successive bounding, in CRS
-    metres; it is the workspace's, computed on demand, and None without a terrain in memory.
+    metres; it is the workspace's, but for robots that differ (`robots`), computed on demand, and
+    None without a terrain in memory. Trust, value and bands are for the workspace's posts.
 
     Attributes:
         path: Cells, start first.

@@ -23,7 +23,7 @@ _FIVE = (*QUANTILES[:2], 0.5, *QUANTILES[2:])
 _Moments = dict[str, tuple[np.ndarray, np.ndarray]]
 """Mean and sd by name, each (move, row, col)."""
 _REACH = 30.0
-"""Distance from the lead's stop of the points from which what is seen is told, m."""
+"""Distance from the lead's stop of the points from which it is shown what is seen, m."""
 _SIGN = "\N{PLUS-MINUS SIGN}"
 
 
@@ -154,7 +154,7 @@ def _last_step(result: Result, bound_maps: _Moments) -> Step:
 
 
 def _overwatch(workspace: Workspace, path: Sequence[Cell]) -> list[Overwatch] | None:
-    """What each robot would see of each bound from points around the lead's stop."""
+    """Share of each bound that robots would see from points around the lead's stop."""
     if workspace.watch is None or workspace.ground is None:
         return None
     left, bottom = workspace.grid.corner

@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Bound, Cell, Mission, as_array
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_positive, require_whole
+from trustbo.data import Bound, Cell, Mission, require_posts
+from trustbo.errors import TrustboError, require_choice, require_positive, require_whole
 from trustbo.planning.plan import Plan
 from trustbo.simulation.bounding import BOUNDING, Drive, State, turns
 from trustbo.simulation.events import Degradation, Event, Threat, require_events
@@ -157,7 +157,7 @@ class KinematicSimulator(DescribedSimulator):
             seed: Seed of slip and detections: same seed, same mission, on any machine.
             mission: Number of the mission, from 0, by which events go.
             posts: Places of T2 while the lead runs each bound, shape (bound, robot, 2), x and y
-                in CRS metres; by default the plan's, or the workspace's.
+                in CRS metres; by default the plan's, or the workspace's, as in alternate bounding.
 
         Raises:
             TrustboError: A cell that is off the grid or impassable, fewer than two cells, or posts
@@ -185,8 +185,8 @@ class KinematicSimulator(DescribedSimulator):
             TrustboError: See `run`.
         """
         if isinstance(path, Plan):
-            posts = path.own_posts if posts is None else posts
-            path = path.path
+            own = path.own_posts if self.bounding == "successive" else None
+            posts, path = own if posts is None else posts, path.path
         cells = [self.workspace.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         if len(cells) < 2:
             raise TrustboError(f"a path needs at least two cells; got {cells}.")
@@ -210,18 +210,15 @@ class KinematicSimulator(DescribedSimulator):
         """Posts of T2 for each bound, which it can reach."""
         if self.bounding != "successive":
             raise TrustboError(f"posts are of successive bounding, not {self.bounding!r}.")
-        given, shape = as_array("posts", posts), (len(path) - 1, len(self.team.robots), 2)
-        if given.shape != shape:
-            raise ShapeError(f"posts must be {shape}, (bound, robot, x and y); got {given.shape}.")
+        given = require_posts(posts, (len(path) - 1, len(self.team.robots), 2))
         ground = self.workspace.ground
         assert ground is not None  # noqa: S101  # `true_surface` has refused others
-        for k, i in np.ndindex(*shape[:2]):
-            if not ground.posts.is_linked(path[k], given[k, i]):
-                raise TrustboError(
-                    f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} cannot be reached from the "
-                    f"lead's stop in cell {path[k]} over passable ground at most half a cell "
-                    "around it; Workspace.posts has posts that can."
-                )
+        for k, i in np.argwhere(~ground.posts.are_reached(path, given)).tolist():
+            raise TrustboError(
+                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} cannot be reached from the "
+                f"lead's stop in cell {path[k]} over passable ground at most half a cell around "
+                "it; Workspace.posts has posts that can."
+            )
         return given
 
     def reset(

@@ -19,6 +19,7 @@ Maps lack things that block sight, and have things that do not, so that sight is
 is as predicted.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -97,12 +98,21 @@ class Posts:
 
     def is_linked(self, cell: Cell, position: np.ndarray) -> bool:
         """Whether robots can drive from the stop in a cell to a position near by, (2,)."""
+        if not np.isfinite(position).all():
+            return False
         row, col = (round(float(i)) for i in self.surface.to_pixel(*position))
         top, bottom, left, right = window = self.window(cell, cell)
         if not (top <= row < bottom and left <= col < right):
             return False
         start = self.surface.pixel_at(*self.waypoint(cell).tolist())
         return bool(linked_to(self.surface.passable, window, start)[row - top, col - left])
+
+    def are_reached(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
+        """Whether robots can drive to posts (bound, robot, 2) from the stops, (bound, robot)."""
+        linked = np.empty(posts.shape[:2], bool)
+        for k, i in np.ndindex(*linked.shape):
+            linked[k, i] = self.is_linked(path[k], posts[k, i])
+        return linked
 
     def lead_way(self, a: Cell, c: Cell) -> np.ndarray | None:
         """Way of the lead from stop to stop, (point, 2); None if there is none."""

@@ -5,7 +5,6 @@ and the next best (`Posts.candidates`); sight is that of each robot of T2, so th
 given to robots that differ.
 """
 
-from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -42,8 +41,9 @@ class WatchTable:
         """Take posts and ways, and the assumed model of sight."""
         self._ways, self._sight = ways, sight
         self._n = max(N_POSTS, len(ways.posts.team.robots))
-        self.posts = cache(self._posts)
-        self.watch = cache(self._watch)
+        # Dicts, which are pickled with the workspace; functions of `functools.cache` are not.
+        self._posts: dict[tuple[Cell, Cell | None], np.ndarray] = {}
+        self._watches: dict[tuple[Cell, Cell, Cell | None], Watch] = {}
 
     def along(self, path: tuple[Cell, ...]) -> tuple[list[np.ndarray], list[Watch]]:
         """Posts in each cell of a path, (post, 2) each, and what is seen in each bound.
@@ -51,7 +51,7 @@ class WatchTable:
         In the last cell T2 stands around the lead, by the workspace's rule: a post for each robot.
         """
         after = [*path[2:], None]
-        posts = [self.posts(a, c) for a, c in pairwise((*path, None))]
+        posts = [self.posts(a, c) for a, c in zip(path, [*path[1:], None], strict=True)]
         bounds = zip(pairwise(path), after, strict=True)
         return posts, [self.watch(a, c, b) for (a, c), b in bounds]
 
@@ -73,13 +73,23 @@ class WatchTable:
         given = Geometry(ways, posts, ends, rule.is_wide)
         return phases(rule.surface, sight or self._sight, rule.team, given)
 
-    def _posts(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
-        rule = self._ways.posts
-        if next_cell is None:
-            return rule.watching(cell, None)
-        return rule.candidates(cell, next_cell, self._n)
+    def posts(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+        """Posts in a cell to watch the bound to the next one from, (post, 2), see `along`."""
+        rule, key = self._ways.posts, (cell, next_cell)
+        if key not in self._posts:
+            at_goal = next_cell is None  # where T2 stands around the lead, a post for each robot
+            n = len(rule.team.robots) if at_goal else self._n
+            self._posts[key] = rule.candidates(cell, next_cell, n)
+        return self._posts[key]
 
-    def _watch(self, a: Cell, c: Cell, next_cell: Cell | None) -> Watch:
+    def watch(self, a: Cell, c: Cell, next_cell: Cell | None) -> Watch:
+        """Sight in the bound a -> c, T2 closing up to its posts for the bound to the next cell."""
+        key = a, c, next_cell
+        if key not in self._watches:
+            self._watches[key] = self._compute(*key)
+        return self._watches[key]
+
+    def _compute(self, a: Cell, c: Cell, next_cell: Cell | None) -> Watch:
         rule = self._ways.posts
         starts, ends = self.posts(a, c), self.posts(c, next_cell)
         pair, robot = (len(starts), len(ends)), len(rule.team.robots)

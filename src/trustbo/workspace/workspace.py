@@ -11,7 +11,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import FEATURES, Cell, Mission, as_names, default_features, is_line_of_sight
+from trustbo.data import (
+    FEATURES,
+    Cell,
+    Mission,
+    as_names,
+    default_features,
+    is_line_of_sight,
+    require_posts,
+)
 from trustbo.display.card import Card, Displayed
 from trustbo.display.svg import map_picture
 from trustbo.errors import ShapeError, TrustboError, require_choice, require_positive
@@ -43,6 +51,8 @@ from trustbo.workspace.survey import MAX_MISSING, reason_impassable
 from trustbo.workspace.watch import WatchTable
 from trustbo.workspace.ways import Ways
 
+_NEAR = 1.0 + 1e-9
+"""Distance of a post from the centre of its cell, in cells: half a cell from its edge."""
 _APART = 2.0
 """Distance of the points of an overwatch map, m."""
 
@@ -418,7 +428,7 @@ class Workspace(Displayed):
         moves_along([a, c])
         return a, c
 
-    def along(self, path: Sequence[Cell], posts: np.ndarray | None = None) -> np.ndarray:
+    def along(self, path: Sequence[Cell], posts: ArrayLike | None = None) -> np.ndarray:
         """Awareness of the bounds of a path, shape (bound, robot, feature), in [0, 1].
 
         Args:
@@ -427,27 +437,46 @@ class Workspace(Displayed):
                 in CRS metres; by default the posts of the workspace.
 
         Raises:
-            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before.
+            ShapeError: Posts of another shape.
+            TrustboError: A cell is off the grid or impassable, or no neighbour of the one before;
+                or a post is not near its cell.
         """
         cells = [self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path)]
         known = np.swapaxes(along(self.bound_maps, cells), 0, 1)
         return known if posts is None else np.clip(known + self.gain_of(cells, posts), 0.0, 1.0)
 
-    def gain_of(self, path: Sequence[Cell], posts: np.ndarray) -> np.ndarray:
+    def gain_of(self, path: Sequence[Cell], posts: ArrayLike) -> np.ndarray:
         """Line of sight gained on a path by posts, (bound, robot, feature), over the workspace's.
 
         0 for other features, and where there is no terrain. Arguments are those of `along`.
+
+        Raises:
+            ShapeError: Posts of another shape.
+            TrustboError: A post that is farther from its cell than half a cell.
         """
-        gain = np.zeros((len(path) - 1, self.team.n_robots, len(self.features)))
+        cells = tuple(self.require_cell(f"path[{k}]", cell) for k, cell in enumerate(path))
+        gain = np.zeros((len(cells) - 1, self.team.n_robots, len(self.features)))
         if (table := self.watch) is not None and self.of_bounds is not None:
-            cells = tuple(path)
+            given = self._require_near(cells, posts)
             rule = np.stack([table.rule(a, c) for a, c in pairwise(cells)])
             for n, sight in enumerate(self.sights, start=-len(self.sights)):
-                given, usual = (
-                    table.seen_along(cells, p, sight).line_of_sight() for p in (posts, rule)
+                seen, usual = (
+                    table.seen_along(cells, p, sight).line_of_sight() for p in (given, rule)
                 )
-                gain[..., n] = given - usual
+                gain[..., n] = seen - usual
         return gain
+
+    def _require_near(self, path: tuple[Cell, ...], posts: ArrayLike) -> np.ndarray:
+        """Refuse posts (bound, robot, 2) that are not near the cells that T2 watches from."""
+        grid, given = self.grid, require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
+        centres = np.array([grid.center(cell) for cell in path[:-1]])[:, None]
+        off = np.abs(given - centres) / (grid.cell_width, grid.cell_height)
+        for k, i in np.argwhere(~(off <= _NEAR).all(-1)).tolist():
+            raise TrustboError(
+                f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {path[k]}, "
+                f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
+            )
+        return given
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the order of the workspace's.

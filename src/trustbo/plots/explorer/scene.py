@@ -92,8 +92,8 @@ class Step:
         trust: Quantiles of the team's trust after each bound, (quantile, bound), those of
             `QUANTILES` with the median in their middle; NaN where it is not known.
         numbers: Further numbers of each bound as text, by their names; (bound,) each.
-        overwatch: What one would see of each bound, (bound,); None where it is not known. Posts
-            can be moved then.
+        overwatch: Share of each bound that one would see, (bound,), so that posts can be moved;
+            None where it is not known.
     """
 
     title: str
