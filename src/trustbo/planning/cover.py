@@ -12,7 +12,6 @@ different robots miss independently, given the place, is the assumption of the s
 """
 
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -59,7 +58,7 @@ def cover_along(
     if (table := workspace.watch) is None:
         return None
     some = np.unique(np.linspace(0, len(draws) - 1, min(len(draws), N_DRAWS)).astype(int))
-    rule = np.stack([table.rule(a, c) for a, c in pairwise(path)])
+    rule = table.rule(path)
     usual = table.seen_along(path, rule)
     seen = usual if np.array_equal(rule, posts) else table.seen_along(path, posts)
     factor = np.clip(draws[some], 0.0, 1.0) / np.maximum(usual.line_of_sight(), _LEAST)

@@ -152,11 +152,9 @@ class Plan(Displayed):
         """Posts where T2 stands while the lead runs each bound, shape (bound, robot, 2)."""
         if (ground := self.workspace.ground) is None:
             return None
-        if self.own_posts is not None:
-            return self.own_posts
-        return np.stack([ground.posts.watching(a, c) for a, c in pairwise(self.path)])
+        return ground.posts.along(self.path) if self.own_posts is None else self.own_posts
 
-    @property
+    @cached_property
     def own_posts(self) -> np.ndarray | None:
         """Posts by `robots`, shape (bound, robot, 2); None where they are the workspace's."""
         if self.robots is None or (table := self.workspace.watch) is None:

@@ -212,8 +212,7 @@ def _planned(
     if (ground := workspace.ground) is None:
         return np.array([workspace.grid.center(cell) for cell in path]) - corner, None
     stops = np.stack([ground.posts.waypoint(cell) for cell in path])
-    rule = [ground.posts.watching(a, c) for a, c in pairwise(path)]
-    return stops - corner, (np.stack(rule) if own is None else own) - corner
+    return stops - corner, (ground.posts.along(path) if own is None else own) - corner
 
 
 def _numbers(

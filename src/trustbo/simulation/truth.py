@@ -246,11 +246,11 @@ def _percent(lacking: float, whole: float) -> float:
 
 def _runs(simulator: Any, mission: int, plan: Plan) -> list[Mission]:
     """Missions over a plan with its posts, in the world of a mission."""
+    seeds, posts = range(_N_RUNS), plan.own_posts
+    if isinstance(simulator, KinematicSimulator):
+        return simulator.run_batch(plan.path, seeds, mission=mission, posts=posts)
     named = {"mission": mission} if takes(simulator.run, "mission") else {}
-    return [
-        simulator.run(plan.path, seed=seed, posts=plan.own_posts, **named)
-        for seed in range(_N_RUNS)
-    ]
+    return [simulator.run(plan.path, seed=seed, posts=posts, **named) for seed in seeds]
 
 
 def _world(simulator: Any, mission: int) -> tuple[object, int]:

@@ -29,7 +29,7 @@ from trustbo.team import Robot, Team
 from trustbo.workspace.formation import Formation
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.routes import at_times
-from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
+from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
 from trustbo.workspace.ways import Ways
 
@@ -53,9 +53,7 @@ def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarr
     of_lead, starts, ends = [], [], []
     least = _AHEAD if posts.is_wide else -1.0 - _AHEAD
     for a, c in bounds:
-        route = ways.lead(a, c)
-        straight = np.stack([posts.waypoint(a), posts.waypoint(c)])
-        of_lead.append(straight if route is None else route)
+        of_lead.append(posts.lead_line(a, c))
         starts.append(posts.watching(a, c))
         ahead = [posts.watching(c, b) for b in _onward(passable, a, c, least)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
@@ -171,13 +169,10 @@ def _seen(
     targets: np.ndarray,
 ) -> np.ndarray:
     """Probability of detection at the samples of bounds, shape (bound, sample)."""
-    eye = np.broadcast_to(eye, targets.shape).reshape(-1, 2)
-    lidar = optics(watcher, watched)
-    targets, shape = targets.reshape(-1, 2), targets.shape[:2]
-    detected = detection_probability(surface, sight, eye, targets, lidar)
+    seen = detection_between(surface, sight, eye, targets, optics(watcher, watched))
     if formation is not None:
-        detected = formation.doubted(detected, np.linalg.norm(targets - eye, axis=1))
-    return watcher.detection * detected.reshape(shape)
+        seen = formation.doubted(seen, np.linalg.norm(targets - eye, axis=-1))
+    return watcher.detection * seen
 
 
 def _mean(values: np.ndarray) -> np.ndarray:

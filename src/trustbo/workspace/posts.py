@@ -20,6 +20,7 @@ is as predicted.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.regions import Window, are_linked, largest_region, linked_to
 from trustbo.workspace.routes import Routes, at_times
-from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
+from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
 
 _SAFE = 0.7
@@ -119,6 +120,11 @@ class Posts:
         ends = self.waypoint(a), self.waypoint(c)
         return self.routes.find(self.team.lead, *ends, self.window(a, c))
 
+    def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
+        """Way of the lead, or the straight line where there is none, (point, 2)."""
+        way = self.lead_way(a, c)
+        return np.stack([self.waypoint(a), self.waypoint(c)]) if way is None else way
+
     # --- stops of the lead ---
 
     def waypoint(self, cell: Cell) -> np.ndarray:
@@ -168,6 +174,10 @@ class Posts:
             ahead = list(dict.fromkeys([None, *around, next_cell]))
             posts |= dict(zip(ahead, self._aimed(cell, ahead), strict=True))
         return posts[next_cell]
+
+    def along(self, path: Sequence[Cell]) -> np.ndarray:
+        """Posts of T2 while the lead runs each bound of a path, (bound, robot, 2)."""
+        return np.stack([self.watching(a, c) for a, c in pairwise(path)])
 
     def candidates(self, cell: Cell, next_cell: Cell | None, n: int) -> np.ndarray:
         """Up to `n` posts to choose from, (post, 2): those of `watching`, then the next best.
@@ -223,11 +233,7 @@ class Posts:
         """Sight that counts in both phases, (next cell, position) for each robot."""
         here, lead = self.waypoint(cell), self.team.lead
         goals = [here if c is None else self.waypoint(c) for c in ahead]
-        routes = [None if c is None else self.lead_way(cell, c) for c in ahead]
-        routes = [
-            np.stack([here, goal]) if route is None else route
-            for route, goal in zip(routes, goals, strict=True)
-        ]
+        routes = [np.stack([here, here]) if c is None else self.lead_line(cell, c) for c in ahead]
         first = np.cumsum([0, *map(len, routes)])
         aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
         far = np.linalg.norm(position - here, axis=1)
@@ -266,11 +272,8 @@ class Posts:
 
     def _seen(self, eye: np.ndarray, target: np.ndarray, lidar: np.ndarray) -> np.ndarray:
         """Probability of detection of targets (..., 2) where maps may be wrong; broadcasts."""
-        eye, target = np.broadcast_arrays(eye, target)
-        rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
-        seen = detection_probability(self.surface, self._sight, *rays, lidar)
-        distance = np.linalg.norm(rays[1] - rays[0], axis=1)
-        return self.formation.doubted(seen, distance).reshape(eye.shape[:-1])
+        seen = detection_between(self.surface, self._sight, eye, target, lidar)
+        return self.formation.doubted(seen, np.linalg.norm(target - eye, axis=-1))
 
     # --- pixels ---
 

@@ -115,6 +115,15 @@ def detection_probability(
     )
 
 
+def detection_between(
+    surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
+) -> np.ndarray:
+    """Probability of detection from eyes to targets, each (..., 2), which broadcast: (...)."""
+    eye, target = np.broadcast_arrays(eye, target)
+    rays = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
+    return detection_probability(surface, sight, *rays, optics).reshape(eye.shape[:-1])
+
+
 @_compiled
 def _ends(ground, gradient, pixel, origin, sensor, target, optics):
     """Row, col and height of both ends of each ray, shape (ray, 6); NaN where out of view.

@@ -5,6 +5,7 @@ and the next best (`Posts.candidates`); sight is that of each robot of T2, so th
 given to robots that differ.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from trustbo.data import Cell
 from trustbo.team import Robot
 from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, Phases, phases
 from trustbo.workspace.routes import at_times
-from trustbo.workspace.sight import Sight, detection_probability, jittered, optics
+from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.ways import Ways
 
 N_POSTS = 5
@@ -55,9 +56,9 @@ class WatchTable:
         bounds = zip(pairwise(path), after, strict=True)
         return posts, [self.watch(a, c, b) for (a, c), b in bounds]
 
-    def rule(self, a: Cell, c: Cell) -> np.ndarray:
-        """Posts of the workspace's rule in the bound a -> c, (robot, 2)."""
-        return self._ways.posts.watching(a, c)
+    def rule(self, path: Sequence[Cell]) -> np.ndarray:
+        """Posts of the workspace's rule along a path, (bound, robot, 2)."""
+        return self._ways.posts.along(path)
 
     def seen_along(
         self, path: tuple[Cell, ...], posts: np.ndarray, sight: Sight | None = None
@@ -68,7 +69,7 @@ class WatchTable:
         """
         rule = self._ways.posts
         ends = np.concatenate([posts[1:], rule.watching(path[-1], None)[None]])
-        ways = [self._lead(a, c) for a, c in pairwise(path)]
+        ways = [self._ways.posts.lead_line(a, c) for a, c in pairwise(path)]
         ends = np.repeat(ends[:, None], N_SAMPLES, axis=1)
         given = Geometry(ways, posts, ends, rule.is_wide)
         return phases(rule.surface, sight or self._sight, rule.team, given)
@@ -96,7 +97,7 @@ class WatchTable:
         i, j = (index.ravel() for index in np.indices(pair))
         ends = np.broadcast_to(ends[j, None, None], (len(j), N_SAMPLES, robot, 2))
         posts = np.repeat(starts[i, None], robot, axis=1)
-        given = Geometry([self._lead(a, c)] * len(i), posts, ends, rule.is_wide)
+        given = Geometry([self._ways.posts.lead_line(a, c)] * len(i), posts, ends, rule.is_wide)
         seen = phases(rule.surface, self._sight, rule.team, given, rule.formation)
 
         def by_pair(values: np.ndarray) -> np.ndarray:
@@ -108,17 +109,11 @@ class WatchTable:
         times = by_pair(seen.times)
         return Watch(watched[..., 0], closing, waiting[:, 0], float(seen.lead_time[0]), times)
 
-    def _lead(self, a: Cell, c: Cell) -> np.ndarray:
-        """Way of the lead, or the straight line where there is none."""
-        way, rule = self._ways.lead(a, c), self._ways.posts
-        return np.stack([rule.waypoint(a), rule.waypoint(c)]) if way is None else way
-
     def overwatch(self, a: Cell, c: Cell, positions: np.ndarray, robot: Robot) -> np.ndarray:
         """Share of the lead's way a -> c that a robot sees from positions (..., 2), (...)."""
         surface, team = self._ways.posts.surface, self._ways.posts.team
-        way = self._lead(a, c)
+        way = self._ways.posts.lead_line(a, c)
         aims, _ = at_times(surface, team.lead, way, np.array([0, len(way)]), N_SAMPLES)
         eyes = positions[..., None, :] + jittered(N_SAMPLES)
-        eyes, aims = (x.reshape(-1, 2) for x in np.broadcast_arrays(eyes, aims[0]))
-        seen = detection_probability(surface, self._sight, eyes, aims, optics(robot, team.lead))
-        return robot.detection * seen.reshape(*positions.shape[:-1], N_SAMPLES).mean(-1)
+        seen = detection_between(surface, self._sight, eyes, aims[0], optics(robot, team.lead))
+        return robot.detection * seen.mean(-1)

@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -458,7 +457,7 @@ class Workspace(Displayed):
         gain = np.zeros((len(cells) - 1, self.team.n_robots, len(self.features)))
         if (table := self.watch) is not None and self.of_bounds is not None:
             given = self._require_near(cells, posts)
-            rule = np.stack([table.rule(a, c) for a, c in pairwise(cells)])
+            rule = table.rule(cells)
             for n, sight in enumerate(self.sights, start=-len(self.sights)):
                 seen, usual = (
                     table.seen_along(cells, p, sight).line_of_sight() for p in (given, rule)

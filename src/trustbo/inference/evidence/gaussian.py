@@ -270,9 +270,8 @@ class Gaussian:
         failed = [dpotrf(one.T, lower=0, clean=0, overwrite_a=1)[1] != 0 for one in P]
         diagonal = np.diagonal(P, axis1=1, axis2=2)
         log_p = -0.5 * (log_det @ self.mass + self.n_measured * np.log(2.0 * np.pi))
-        log_p -= 0.5 * (early.log_det + diagonal[:, -1] ** 2 - 1.0) + np.log(diagonal[:, :-1]).sum(
-            1
-        )
+        quadratic = early.log_det + diagonal[:, -1] ** 2 - 1.0
+        log_p -= 0.5 * quadratic + np.log(diagonal[:, :-1]).sum(1)
         return _Factors(np.where(failed, np.nan, log_p), P, early, prior)
 
     def _impulses(self, theta: Theta) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
