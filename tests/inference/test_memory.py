@@ -214,17 +214,72 @@ def test_what_cannot_treat_deviations_refuses_them(deviations, of_deviations):
     with pytest.raises(TrustboError, match='"deviation" is for rates that measure trust'):
         PooledTrust(memory="deviation", response="change")
     censored = PooledTrust(memory="deviation", observation="censored")
-    for sampler in ("auto", "exact", "nuts", "joint"):
+    for sampler in ("nuts", "joint"):
         with pytest.raises(TrustboError, match="observations are not Gaussian"):
             tb.fit(deviations, censored, sampler)
-    with pytest.raises(TrustboError, match='TrustFilter takes memory="level"'):
-        tb.inference.TrustFilter(of_deviations)
     with pytest.raises(TrustboError, match=r'changes are weighed.*memory="deviation"'):
         tb.inference.changes(of_deviations)
     with pytest.raises(TrustboError, match='criticise takes memory="level"'):
         tb.criticise(of_deviations)
     with pytest.raises(TrustboError, match="what lasts is a deviation of trust"):
         tb.inference.update_statistics(PooledTrust(memory="deviation"), None, deviations)
+
+
+def test_deviations_are_found_in_counts_and_through_limits():
+    """Of 600 rates each: the exact sampler of families that are not Gaussian."""
+    rng = np.random.default_rng(0)
+    for family, scale in (("censored", 1.0), ("beta_binomial", 5.0)):
+        model = PooledTrust(observation=family, memory="deviation")
+        beta = scale * np.array([0.9, -0.4])
+        truth = DeviationParams(0.8, beta, 0.2, scale * 0.15, 0.05, 0.5, 0.5)
+        z = rng.uniform(size=(10, 20, 3, 2))
+        rates = model.simulate(jax.random.key(5), truth, z, n_ticks=100).contact_rate
+        missions = [
+            Mission.from_arrays(None, *zy, n_ticks=np.full((20, 3), 100), features=FEATURES)
+            for zy in zip(z, np.round(rates * 100.0) / 100.0, strict=True)
+        ]
+        fitted = tb.fit(missions, model, whole=False, check=False)
+        assert fitted.attrs["k_hat"] < 0.7
+        for name in ("beta0", "beta"):
+            draws = fitted["posterior"][name]
+            off = np.abs(draws.mean(("chain", "draw")) - getattr(truth, name))
+            assert (off < 4.0 * draws.std(("chain", "draw"))).all(), (family, name)
+        level = tb.fit(missions, PooledTrust(observation=family), whole=False, check=False)
+        assert fitted.attrs["log_evidence"] - level.attrs["log_evidence"] > 5.0
+
+
+def test_a_filter_follows_deviations_as_the_joint_normal_has_them():
+    params = DeviationParams(*(np.asarray(v)[None] for v in (
+        0.7, [0.6, -0.2], 0.15, 0.08, 0.05, 0.4, 0.3)))  # fmt: skip
+    rng = np.random.default_rng(1)
+    z, y = rng.uniform(size=(6, 1, 2)), rng.uniform(size=(6, 1))
+    follow = tb.inference.TrustFilter(params, 1)
+    np.testing.assert_allclose(follow.state, [[0.4], [0.3]])  # x0
+    u = z[:, 0] @ [0.6, -0.2] + 0.15
+    # Deviations d_1, ..., d_6: an AR(1) from d_0 ~ N(0, .3^2).
+    roll = np.linalg.inv(np.eye(6) - 0.7 * np.eye(6, k=-1))
+    cov = roll @ (0.08**2 * np.eye(6) + np.diag([0.3**2 * 0.7**2] + [0.0] * 5)) @ roll.T
+    for k in range(4):
+        state = follow.update(z[k], y[k])
+        seen = slice(k + 1)
+        gain = np.linalg.solve(cov[seen, seen] + 0.05**2 * np.eye(k + 1), cov[seen, k])
+        np.testing.assert_allclose(state.mean, u[k] + gain @ (y[seen, 0] - u[seen]), rtol=1e-9)
+        sd = np.sqrt(cov[k, k] - gain @ cov[seen, k])
+        np.testing.assert_allclose(state.sd, sd, rtol=1e-9)
+    seen, ahead = slice(4), slice(4, 6)
+    gain = np.linalg.solve(cov[seen, seen] + 0.05**2 * np.eye(4), cov[seen, ahead])
+    forecast = follow.predict(z[ahead])
+    expected = u[ahead] + gain.T @ (y[seen, 0] - u[seen])
+    np.testing.assert_allclose(forecast.mean[:, 0], expected, rtol=1e-9)
+    many = tb.inference.TrustFilter(params.map(lambda v, _: np.repeat(v, 4000, axis=0)), 1,
+                                    max_draws=4000)  # fmt: skip
+    for k in range(4):
+        many.update(z[k], y[k])
+    drawn = many.predict(z[ahead]).draws[:, :, 0]
+    left = cov[ahead, ahead] - gain.T @ cov[seen, ahead] + 0.05**2 * np.eye(2)
+    # 5 standard errors of 4000 draws.
+    assert (abs(drawn.mean(0) - expected) < 5.0 * np.sqrt(np.diag(left) / 4000.0)).all()
+    np.testing.assert_allclose(np.cov(drawn.T), left, rtol=0.15)
 
 
 def test_what_has_no_such_evidence_is_refused():

@@ -18,8 +18,9 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.inference.draws import params_of
-from trustbo.inference.evidence.live import DeviationFilter, Effect, Rates, live_filter
-from trustbo.inference.posterior_tree import require_posterior
+from trustbo.inference.evidence.live import Effect, Rates, live_filter
+from trustbo.inference.posterior_tree import of_no_map, require_posterior
+from trustbo.inference.samplers.weights import systematic
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.model import RESPONSES
 from trustbo.models.params import Params, check_params
@@ -50,6 +51,8 @@ class TrustForecast(NamedTuple):
     """5 % quantile of the contact rate."""
     rate_high: np.ndarray
     """95 % quantile of the contact rate."""
+    draws: np.ndarray
+    """Contact rates drawn together for all bounds, of equal weight, (draw, bound, robot)."""
 
 
 class TrustFilter:
@@ -98,8 +101,10 @@ class TrustFilter:
             TrustboError: No posterior, `TrustParams` without `n_robots`, an unknown response or
                 family, or one that is not the posterior's.
         """
+        self._bounded = True
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
+            self._bounded = not of_no_map(posterior)
             recorded = _robots_of(posterior)
             if n_robots is not None and recorded not in (None, n_robots):
                 raise ShapeError(
@@ -131,8 +136,6 @@ class TrustFilter:
         self._family = FAMILIES[family]
         lag = float(require_choice("response", response or "level", RESPONSES) == "change")
         self._core = live_filter(self.params, lag, n_robots)
-        if isinstance(self._core, DeviationFilter):  # its state lacks the bound before
-            raise TrustboError('TrustFilter takes memory="level"; got parameters of "deviation".')
         if belief is not None:
             require_kind("belief", belief, AwarenessBelief, "give an AwarenessBelief")
         self._maps = None if belief is None else belief.draw(len(kept))
@@ -154,11 +157,12 @@ class TrustFilter:
         self._log_weight = np.zeros(n)
         self.weights = np.full(n, 1.0 / n)
         self.n_bounds, self._running = 0, None
+        self._behind: tuple[Any, ...] = ()  # awareness and effect of the bound before
 
     @property
     def state(self) -> TrustState:
         """Trust after the bounds so far, shapes (robot,)."""
-        return self._average(self._mean, self._var)
+        return self._average(self._core.trust(self._mean, *self._behind), self._var)
 
     def update(
         self,
@@ -223,7 +227,8 @@ class TrustFilter:
         mean, var, increment = self._core.update(
             self._mean, self._var, running.z, running.rates(self._family), running.effect
         )
-        return self._average(mean, var, _normalised(self._log_weight + increment))
+        trust = self._core.trust(mean, running.z, running.effect)
+        return self._average(trust, var, _normalised(self._log_weight + increment))
 
     def end_bound(self) -> TrustState:
         """End the bound that runs: its rate is taken in as `update` would.
@@ -236,47 +241,59 @@ class TrustFilter:
         self._commit(running.z, running.effect, running.rates(self._family))
         return self.state
 
-    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
+    def predict(
+        self,
+        awareness: ArrayLike,
+        path: Sequence[Cell] | None = None,
+        *,
+        n_ticks: ArrayLike = 200,
+    ) -> TrustForecast:
         """Trust and contact rates along the bounds to come, none of them measured yet.
 
-        Rates are drawn, one for each parameter draw, in bounds of 200 ticks where these count.
+        Rates are drawn, one for each parameter draw.
 
         Args:
             awareness: Shape (bound, robot, feature); NaN as for `update`.
             path: The cell where the team is and the cells to be entered; needed where places have
                 effects, or awareness is NaN.
+            n_ticks: Ticks of the bounds, (), (bound,) or (bound, robot), where rates are counts.
 
         Returns:
-            Shapes (bound, robot).
+            Shapes (bound, robot), and draws (draw, bound, robot).
 
         Raises:
-            ShapeError: Another number of robots or features.
-            TrustboError: Awareness that is NaN or outside [0, 1], or a path that is missing, of
-                another length, that jumps or that leaves the grid.
+            ShapeError: Another number of robots, features or ticks.
+            TrustboError: Awareness that is NaN or outside [0, 1], ticks that are no whole numbers,
+                or a path that is missing, of another length, that jumps or that leaves the grid.
         """
         mean, var, ahead = self._mean, self._var, []
         given, rng = self._checked(awareness, 3), np.random.default_rng(self.n_bounds)
+        ticks = ticks_ahead(n_ticks, given.shape[:2])
         cells = self._cells(path, len(given))
         zs = [self._filled(z, None if cells is None else cells[k + 1]) for k, z in enumerate(given)]
-        x = self._core.draw(rng, mean, var)
-        for z, effect in zip(zs, self._effects(cells, len(zs)), strict=True):
+        x, drawn = self._core.draw(rng, mean, var), []
+        for z, effect, n in zip(zs, self._effects(cells, len(zs)), ticks, strict=True):
             mean, var = self._core.predict(mean, var, z, effect)
-            x, rates = self._core.roll(rng, self._family, x, z, effect)
+            x, rates = self._core.roll(rng, self._family, x, z, effect, n)
+            drawn.append(rates)
             order = np.argsort(rates, axis=0)
             below = np.cumsum(self.weights[order], axis=0)
             low, high = (np.argmax(below >= share, axis=0) for share in (0.05, 0.95))
             ranked = np.take_along_axis(rates, order, axis=0)
             robots = np.arange(self._n_robots)
             forecast = self.weights @ rates, ranked[low, robots], ranked[high, robots]
-            ahead.append((*self._average(mean, var), *forecast))
-        return TrustForecast(*(np.stack(column) for column in zip(*ahead, strict=True)))
+            trust = self._core.trust(mean, z, effect)
+            ahead.append((*self._average(trust, var), *forecast))
+        columns = (np.stack(column) for column in zip(*ahead, strict=True))
+        chosen = systematic(self.weights, len(self.weights), rng)
+        return TrustForecast(*columns, draws=np.stack(drawn, axis=1)[chosen])
 
     def _commit(self, z: np.ndarray, effect: Effect, rates: Rates) -> None:
         predicted = self._mean, self._var, z, rates, effect
         self._mean, self._var, increment = self._core.update(*predicted)
         self._log_weight += increment
         self.weights = _normalised(self._log_weight)
-        self.n_bounds += 1
+        self.n_bounds, self._behind = self.n_bounds + 1, (z, effect)
 
     def _require_running(self, *, running: bool) -> Any:
         """Running bound, or None; TrustboError unless a bound runs as `running` asks."""
@@ -336,7 +353,8 @@ class TrustFilter:
                 "awareness must not be NaN without a belief=; take unmeasured values from the map: "
                 "campaign.known_along(path), or workspace.along(path), (bound, robot, feature)."
             )
-        require_unit_interval("awareness", z)
+        if self._bounded:
+            require_unit_interval("awareness", z)
         return z
 
     def _by_robot(self, what: str, values: ArrayLike) -> np.ndarray:
@@ -391,6 +409,17 @@ def _of_posterior(posterior: xr.DataTree, name: str, given: str | None) -> str:
     if given not in (None, recorded):
         raise TrustboError(f"the posterior has {name}={recorded!r}; got {given!r}. Leave it out.")
     return recorded
+
+
+def ticks_ahead(n_ticks: ArrayLike, shape: tuple[int, int]) -> np.ndarray:
+    """Ticks of bounds to come as (bound, robot); ShapeError, TrustboError if they are none."""
+    given = as_array("n_ticks", n_ticks)
+    given = given[:, None] if given.ndim == 1 else given
+    if given.ndim > 2 or any(n not in (1, m) for n, m in zip(given.shape, shape, strict=False)):
+        raise ShapeError(f"n_ticks must be (), (bound,) or {shape}; got shape {given.shape}.")
+    if not ((given >= 1.0) & (given == np.round(given))).all():
+        raise TrustboError(f"n_ticks must be whole numbers of ticks from 1; got {given.min():g}.")
+    return np.broadcast_to(given, shape)
 
 
 def _normalised(log_weight: np.ndarray) -> np.ndarray:

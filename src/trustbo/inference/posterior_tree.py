@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Mission
+from trustbo.data import NOWHERE, Mission
 from trustbo.errors import TrustboError
 from trustbo.models.effects.effect import Effect
 from trustbo.stacking import MissionBatch, stack_missions
@@ -96,6 +96,10 @@ def _data_groups(
     for j, mission in enumerate(missions):
         duration[j, : len(mission.bounds)] = mission.duration
         cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
+    starts = [mission.path[0] if mission.has_map else NOWHERE for mission in missions]
+    # Cells tell how many bounds a mission has, but where there are none.
+    n_bounds = [len(mission.bounds) for mission in missions]
+    counted = {} if all(m.has_map for m in missions) else {"n_bounds": (("mission",), n_bounds)}
     dims = ("mission", "bound", "robot")
     labelled = {name: coords[name] for name in dims}
     rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)
@@ -107,12 +111,20 @@ def _data_groups(
             "row": (("mission", "bound"), cell[..., 0]),
             "col": (("mission", "bound"), cell[..., 1]),
             "status": (("mission",), [mission.status for mission in missions]),
-            "start_row": (("mission",), [mission.path[0][0] for mission in missions]),
-            "start_col": (("mission",), [mission.path[0][1] for mission in missions]),
+            "start_row": (("mission",), [row for row, _ in starts]),
+            "start_col": (("mission",), [col for _, col in starts]),
+            **counted,
         },
         labelled | {"feature": coords["feature"]},
     )
     return rates, constant
+
+
+def of_no_map(posterior: xr.DataTree) -> bool:
+    """Whether the posterior's missions, all that it holds, are of logs without a map."""
+    if "constant_data" not in posterior.children:
+        return False
+    return bool((posterior["constant_data"].to_dataset()["row"].values < 0).all())
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
@@ -123,7 +135,9 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
     missions = []
     for j in range(data.sizes["mission"]):
         one = data.isel(mission=j)
-        one = one.isel(bound=one["row"].values >= 0)
+        made = one["row"].values >= 0
+        has_map = bool(made.any())
+        one = one.isel(bound=made if has_map else slice(int(one["n_bounds"])))
         cells = list(zip(one["row"].values, one["col"].values, strict=True))
         # Posteriors of version 0.1 do not hold the first cell.
         start = cells[0]
@@ -132,7 +146,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
         z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
         missions.append(
             Mission.from_arrays(
-                [start, *cells],
+                [start, *cells] if has_map else None,
                 z,
                 y,
                 seconds,

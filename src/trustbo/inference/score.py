@@ -12,6 +12,7 @@ from trustbo.inference.draws import params_of
 from trustbo.inference.evidence.live import Rates, live_filter
 from trustbo.inference.posterior_groups import Conditional
 from trustbo.inference.posterior_tree import missions_of, require_posterior
+from trustbo.inference.samplers.weights import systematic
 from trustbo.models.families import Family
 from trustbo.models.params import Params
 from trustbo.models.place import bounds_of
@@ -32,19 +33,23 @@ def score(
     missions: Sequence[Mission],
     *,
     ahead: int = 1,
+    filtered: bool = False,
     workspace: Workspace | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
     """Score predictions of contact rates along the paths that missions took.
 
     A prediction is the marginal distribution of each rate before the first bound of its mission:
-    over parameter draws and effects of places, with the noises of trust and of rates.
+    over parameter draws and effects of places, with the noises of trust and of rates. With
+    `filtered` it is that before the bound itself, the rates of the mission's earlier bounds known:
+    parameter draws have the weights, and trust the moments, of `TrustFilter`.
 
     Args:
         posterior: Posterior, which predicts all `missions`, none of which it was fitted to; or
             those of a campaign, `Result.posteriors`, the j-th fitted to `missions[: j + 1]`.
         missions: Missions to predict; for a campaign, all of its missions in order.
         ahead: Number of missions ahead that the posteriors of a campaign predict: 1, the next.
+        filtered: Whether rates are predicted one bound ahead, as of a log that goes on.
         workspace: Workspace of the missions, to fill in awareness that they lack, as for `fit`.
         seed: Seed of the draws that rates are compared with, and of randomised PIT values.
 
@@ -80,15 +85,17 @@ def score(
         require_ticks(conditional.family, one)
         rng = np.random.default_rng([seed, j])
         there = _on_path(params, mission)
-        drawn = draw_missions(conditional.family, there, conditional.lag, one.awareness,
-                              one.n_ticks, rng).contact_rate[:, 0]  # fmt: skip
         k = slice(len(mission.bounds))
         y = one.contact_rate[0]
+        log_scores, drawn = _bound_by_bound(conditional, params, mission, one, filtered, rng)
+        if drawn is None:
+            drawn = draw_missions(conditional.family, there, conditional.lag, one.awareness,
+                                  one.n_ticks, rng).contact_rate[:, 0]  # fmt: skip
         columns["mean"][j, k] = np.where(np.isnan(y), np.nan, drawn.mean(0))
         columns["pit"][j, k] = _pit(drawn, y, rng)
-        columns["log_score"][j, k] = _log_scores(conditional, params, mission, one)
+        columns["log_score"][j, k] = log_scores
         quantile[j, k] = np.moveaxis(np.quantile(drawn, QUANTILES, axis=0), 0, -1)
-        made = {bound for other in learned for bound in _bounds(other)}
+        made = {bound for other in learned for bound in _bounds(other) if other.has_map}
         seen[j, k] = [bound in made for bound in _bounds(mission)]
     first = len(missions) - len(pairs)
     family = Conditional.of(latest).family
@@ -165,10 +172,19 @@ def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarr
     return np.where(np.isnan(y), np.nan, pit)
 
 
-def _log_scores(
-    conditional: Conditional, params: Params, mission: Mission, batch: MissionBatch
-) -> np.ndarray:
-    """Log density of each rate averaged over draws, nothing of its mission measured, nats."""
+def _bound_by_bound(
+    conditional: Conditional,
+    params: Params,
+    mission: Mission,
+    batch: MissionBatch,
+    filtered: bool,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Log density of each rate (bound, robot) averaged over draws, nats, and draws of the rates.
+
+    With `filtered` draws are weighted by the rates before, and rates (draw, bound, robot) are drawn
+    given these; otherwise nothing of the mission is measured, and rates are not drawn.
+    """
     z, y, ticks = (a[0] for a in batch)
     family, n_robots = conditional.family, y.shape[1]
     core = live_filter(params, conditional.lag, n_robots)
@@ -176,19 +192,31 @@ def _log_scores(
     if params.places:
         effects = np.moveaxis(params.of_places(bounds_of([mission])[0]), -2, 0)
     (mean, var), log_scores = core.start(), np.full(y.shape, np.nan)
+    log_weight, drawn = np.full(len(mean), -np.log(len(mean))), []
     for k, effect in enumerate(effects):
         for i in np.flatnonzero(~np.isnan(y[k])):
             alone = Rates(family, np.where(np.arange(n_robots) == i, y[k], np.nan), ticks[k])
             density = core.update(mean, var, z[k], alone, effect)[2]
-            log_scores[k, i] = np.logaddexp.reduce(density) - np.log(len(density))
-        mean, var = core.predict(mean, var, z[k], effect)
-    return log_scores + family.log_constant
+            log_scores[k, i] = np.logaddexp.reduce(density + log_weight)
+        if not filtered:
+            mean, var = core.predict(mean, var, z[k], effect)
+            continue
+        x = core.draw(rng, mean, var)
+        rates = core.roll(rng, family, x, z[k], effect, ticks[k])[1]
+        drawn.append(rates[systematic(np.exp(log_weight), len(log_weight), rng)])
+        mean, var, gained = core.update(mean, var, z[k], Rates(family, y[k], ticks[k]), effect)
+        log_weight = log_weight + gained
+        log_weight -= np.logaddexp.reduce(log_weight)
+    log_scores += family.log_constant
+    return log_scores, np.stack(drawn, axis=1) if filtered else None
 
 
-def _bounds(mission: Mission) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def _bounds(mission: Mission) -> list[tuple[tuple[int, ...], ...]]:
     """Directed bounds that a mission made."""
+    if not mission.has_map:
+        return [()] * len(mission.bounds)
     cells = [tuple(cell) for cell in mission.path[: len(mission.bounds) + 1]]
-    return list(itertools.pairwise(cells))
+    return [*itertools.pairwise(cells)]
 
 
 def _dataset(

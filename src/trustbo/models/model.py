@@ -55,11 +55,6 @@ _REFUSED: tuple[tuple[tuple[str, ...], set[str], str], ...] = (
     ),
     (("all", "each"), {"places", "changes"}, "it has effects of places, and rates measure changes"),
     (("each",), {"places"}, "it has effects of places, and robots with nothing else in common"),
-    (
-        (),
-        {"not Gaussian", "deviation"},
-        "what lasts is a deviation of trust, and its observations are not Gaussian",
-    ),
     ((), {"effects", "changes"}, "it has effects of {0}, and rates measure changes"),
 )
 """Models without an evidence: their `robot_sets`, () for any, what they have, and the reason."""
@@ -467,7 +462,6 @@ class TrustModel(Displayed, ABC):
             "not Gaussian": not family.integrates_out,
             "not propagated": not (family.integrates_out or family.propagates),
             "changes": bool(self.lag),
-            "deviation": self.memory != "level",
             "places": self.place is not None,
             "effects": bool(self.effects),
         }

@@ -8,7 +8,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 
-from trustbo.data import Mission
+from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError, require_positive
 from trustbo.models.backend import namespace
 from trustbo.workspace.moves import MOVES, bounds_along
@@ -127,8 +127,9 @@ def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None)
     """Move, row and column of each mission's bounds, (mission, bound, 3), -1 in the padding.
 
     `shape`, missions and bounds, is that with the padding, by default without. TrustboError: a path
-    jumps, so that it has no directed bounds.
+    jumps, so that it has no directed bounds, or a mission has no map.
     """
+    require_map("a model with effects of places", missions)
     if shape is None:
         shape = len(missions), max(len(mission.bounds) for mission in missions)
     bounds = np.full((*shape, 3), -1)

@@ -23,7 +23,8 @@ class PooledTrust(TrustModel):
         effects: Effects that add to trust: `PlaceEffect()`, of which `place` is the short form, and
             `RobotEffect()`, of each robot in each mission, and any that is registered.
         memory: Quantity that lasts between bounds: trust, `"level"`, as in the paper, or its
-            `"deviation"` from what features and effects expect at a bound. For Gaussian rates.
+            `"deviation"` from what features and effects expect at a bound. NUTS has it for
+            Gaussian rates alone.
 
     Raises:
         TrustboError: An effect is unknown, or of a kind that the model already has.

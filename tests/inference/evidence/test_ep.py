@@ -53,13 +53,15 @@ def test_weights_average_to_the_integral_over_trust(family):
         assert np.std(weight) < 0.06
 
 
-def test_a_rate_within_the_limits_is_integrated_exactly_with_the_coefficients():
+@pytest.mark.parametrize("lost", [0.0, 1.0])  # trust lasts, or its deviation from the drift
+def test_a_rate_within_the_limits_is_integrated_exactly_with_the_coefficients(lost):
     """Gaussian terms: the dense joint normal of all rates, coefficients integrated out."""
     rng = np.random.default_rng(3)
     z, y = rng.uniform(size=(4, 5, 2, 2)), rng.uniform(0.2, 0.8, (4, 5, 2))
     y[1, 2, 0] = y[3, 4, 1] = np.nan
     batch = MissionBatch(z, y, np.full(y.shape, np.nan))
     chains, sites = gather_chains(FAMILIES["censored"], batch)
+    chains = chains._replace(lost=lost)
     mean, precision = np.array([0.1, 0.2, -0.1]), np.array([1.0, 4.0, 2.0])
     beta0, Q, R, x0 = 0.7, 0.02, 0.01, (0.5, 0.3)
     point = np.array([[beta0]]), np.sqrt([Q]), np.sqrt([R]), np.array(x0)
@@ -68,8 +70,10 @@ def test_a_rate_within_the_limits_is_integrated_exactly_with_the_coefficients():
     rows, centre, own = [], [], []
     for j in range(4):
         for i in range(2):
-            rows.append(roll @ np.c_[z[j, :, i], np.ones(5)])
-            centre.append(roll[:, 0] * beta0 * x0[0])
+            u = np.c_[z[j, :, i], np.ones(5)]
+            u[1:] -= lost * beta0 * u[:-1].copy()
+            rows.append(roll @ u)
+            centre.append(roll[:, 0] * beta0 * x0[0] * (1.0 - lost))
             own.append(roll @ (Q * np.eye(5)) @ roll.T + R * np.eye(5))
             own[-1] += np.outer(roll[:, 0], roll[:, 0]) * (beta0 * x0[1]) ** 2
     X, flat = np.concatenate(rows), np.swapaxes(y, 1, 2).ravel()

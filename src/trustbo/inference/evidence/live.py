@@ -88,19 +88,31 @@ class ApartFilter:
         ahead = kalman.update(self._beta0, self._Q, var, gain, S - left)
         return mean, ahead, log_density.sum(1)
 
+    def trust(
+        self, mean: np.ndarray, z: np.ndarray | None = None, effect: Effect = 0.0
+    ) -> np.ndarray:
+        """Mean of trust of the mean of the state after a bound of drift z; None, before any."""
+        return mean
+
     def draw(self, rng: np.random.Generator, mean: np.ndarray, var: np.ndarray) -> np.ndarray:
-        """Trust drawn from its moments, (draw, robot)."""
+        """State drawn from its moments, (draw, robot)."""
         return mean + np.sqrt(var) * rng.standard_normal(mean.shape)
 
     def roll(
-        self, rng: np.random.Generator, family: Family, x: np.ndarray, z: np.ndarray, effect: Effect
+        self,
+        rng: np.random.Generator,
+        family: Family,
+        x: np.ndarray,
+        z: np.ndarray,
+        effect: Effect,
+        n_ticks: np.ndarray = _TICKS,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Trust (draw, robot) after a bound, drawn given that before it, and rates of it."""
+        """State (draw, robot) after a bound, drawn given that before it, and rates of it."""
         drift = self._drift(z) + effect
         w, v = rng.standard_normal((2, *x.shape))
         now, sd = self._beta0 * x + drift + np.sqrt(self._Q) * w, np.sqrt(self._R)
         y = self._h * x + drift + np.sqrt(self._Q) * w + sd * v
-        return now, family.draw_rates(rng, now, y, sd, _TICKS)
+        return now, family.draw_rates(rng, now, y, sd, n_ticks)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
         beta = self._p.beta
@@ -134,6 +146,25 @@ class DeviationFilter(ApartFilter):
         """See `ApartFilter.update`."""
         trust, ahead, log_density = super().update(mean, var, z, rates, effect)
         return trust - self._drift(z) - effect, ahead, log_density
+
+    def trust(
+        self, mean: np.ndarray, z: np.ndarray | None = None, effect: Effect = 0.0
+    ) -> np.ndarray:
+        """See `ApartFilter.trust`."""
+        return mean + (self._x0[0][:, None] if z is None else self._drift(z) + effect)
+
+    def roll(
+        self,
+        rng: np.random.Generator,
+        family: Family,
+        x: np.ndarray,
+        z: np.ndarray,
+        effect: Effect,
+        n_ticks: np.ndarray = _TICKS,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `ApartFilter.roll`."""
+        trust, rates = super().roll(rng, family, x, z, effect, n_ticks)
+        return trust - self._drift(z) - effect, rates
 
 
 class DriftFilter(ApartFilter):
@@ -197,13 +228,25 @@ class CoupledFilter:
             J -= gain[:, :, None] * (row * (1.0 - left / S)[:, None])[:, None, :]
         return joint[:, :n], J[:, :n, :n], log_density
 
+    def trust(
+        self, mean: np.ndarray, z: np.ndarray | None = None, effect: Effect = 0.0
+    ) -> np.ndarray:
+        """See `ApartFilter.trust`."""
+        return mean
+
     def draw(self, rng: np.random.Generator, mean: np.ndarray, var: np.ndarray) -> np.ndarray:
         """See `ApartFilter.draw`."""
         factor = np.linalg.cholesky(var + 1e-12 * np.eye(self._n_robots))
         return mean + (factor @ rng.standard_normal((*mean.shape, 1)))[..., 0]
 
     def roll(
-        self, rng: np.random.Generator, family: Family, x: np.ndarray, z: np.ndarray, effect: Effect
+        self,
+        rng: np.random.Generator,
+        family: Family,
+        x: np.ndarray,
+        z: np.ndarray,
+        effect: Effect,
+        n_ticks: np.ndarray = _TICKS,
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `ApartFilter.roll`."""
         n, Delta_v = self._n_robots, np.asarray(self._p.Delta_v)
@@ -213,7 +256,7 @@ class CoupledFilter:
         drift = self._drift(z) + effect
         now, y = joint[:, :n] + drift + w, joint[:, n:] + drift + w + v
         sd = np.sqrt(np.diagonal(Delta_v, axis1=1, axis2=2))
-        return now, family.draw_rates(rng, now, y, sd, _TICKS)
+        return now, family.draw_rates(rng, now, y, sd, n_ticks)
 
     def _drift(self, z: np.ndarray) -> np.ndarray:
         flat = z.reshape(*z.shape[:-2], -1)

@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
+from trustbo.errors import require_choice
 from trustbo.inference.evidence.ep import joint
 from trustbo.inference.evidence.ep.chains import chains_of
 from trustbo.inference.evidence.ep.draws import draw_weighted
 from trustbo.inference.evidence.gaussian import named_effects, prior_of
-from trustbo.models.effects.effect import Columns, Group, Slots, Theta, dense_root
+from trustbo.models.effects.effect import MEMORIES, Columns, Group, Slots, Theta, dense_root
 from trustbo.models.families import Family
 
 _LEAST = 1e-4  # sd of a coefficient
@@ -39,6 +40,7 @@ class Sites:
         groups: Sequence[Group],
         family: Family,
         x0: tuple[float, float],
+        memory: str = "level",
         *,
         apart: bool = False,
     ) -> None:
@@ -49,12 +51,15 @@ class Sites:
             groups: Columns of all effects.
             family: Family of observations.
             x0: Mean and sd of trust before the first bound.
+            memory: `"level"`, trust is carried on, or `"deviation"` from what effects expect.
             apart: Whether theta has a beta0 of each robot, (point, robot).
         """
         self.slots, self.groups, self.x0 = slots, tuple(groups), np.array(x0, dtype=float)
         U: Columns = sparse.hstack([group.columns for group in groups], format="csr")
         self.n_columns = U.shape[1]
         self.chains, self.sites = _chains(slots, U, family)
+        lost = 0.0 if require_choice("memory", memory, MEMORIES) == "level" else 1.0
+        self.chains = self.chains._replace(lost=lost)
         if apart:
             self.chains = self.chains._replace(robot=slots.robot)
         self._sweeps = _SWEEPS

@@ -254,7 +254,7 @@ def posterior_of(
     if family.integrates_out:
         evidence = Gaussian(slots, groups, x0, memory, apart=by_robot, lag=lag)
     else:
-        evidence = Sites(slots, groups, family, x0, apart=by_robot)
+        evidence = Sites(slots, groups, family, x0, memory, apart=by_robot)
     if by_robot:
         coordinates = PerRobot(priors, slots.n_robots, slots.z.shape[2])
     else:

@@ -43,6 +43,7 @@ def chains_of(
         np.zeros(y.shape),
         terms.counts,
         count_tables(terms.counts),
+        0.0,
     )
     return chains, np.stack([terms.lam, terms.eta])
 

@@ -145,9 +145,12 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
                 u[k] = chains.drift[c, k]
                 for j in range(last):
                     u[k] += chains.u[c, k, j] * z[chains.gamma_index[c, j]]
+            of_robot = b0[chains.robot[c]]
+            for k in range(K - 1, -1, -1):  # what trust itself is carried on under
+                u[k] -= chains.lost * of_robot * (u[k - 1] if k else x0[0])
             total += draw_chain(
-                b0[chains.robot[c]], delta_w, delta_v, x0, chains, c, u, table, constant, sites[0],
-                sites[1], ahead, x, choice, rng,
+                of_robot, delta_w, delta_v, x0, chains, c, u, table, constant, sites[0], sites[1],
+                ahead, x, choice, rng,
             )  # fmt: skip
         weight[t] = total
     return weight

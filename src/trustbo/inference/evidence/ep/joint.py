@@ -5,6 +5,7 @@ chains sharing coefficients gamma ~ N(g, P^-1): weights of features, intercepts,
 
     x_1 ~ N(b0 m0 + u_1, b0^2 s0^2 + dw^2),  x_k ~ N(b0 x_{k-1} + u_k, dw^2),  u_k = a_k + U_k gamma
 
+Where the deviation from u lasts, not trust, u_k - b0 u_{k-1} takes the place of u_k, u_0 = m0.
 Each rate's term (`terms`) is replaced by a site exp(-lam x^2 / 2 + eta x). Under the sites all is
 Gaussian: a scalar filter of each chain carries the mean of x as a linear function of gamma, one
 column for each of its coefficients, so that a chain's sites give its evidence as a quadratic form
@@ -49,10 +50,13 @@ class Chains(NamedTuple):
     drift: np.ndarray  # (chain, bound), fixed part of the drift
     counts: np.ndarray  # (case, 2): ticks in contact, ticks
     tables: np.ndarray  # (phi, case, x), see `terms.count_tables`
+    lost: float  # share of the drift before that is not carried on: 0, or 1 where deviations last
 
 
 @njit(**PART_OPTIONS)
-def _filter(b0, q, x0, chain, u, drift, n, lam, eta, predicted, filtered, var, Q, h):
+def _filter(
+    b0, q, x0, chain, u, drift, n, lost, lam, eta, predicted, filtered, var, Q, h
+):  # fmt: skip
     """Filter a chain under its sites: log integral at gamma = 0; adds to a quadratic form in gamma.
 
     Columns of `predicted` and `filtered` (bound, column + 1) are the mean's coefficients, the last
@@ -63,7 +67,7 @@ def _filter(b0, q, x0, chain, u, drift, n, lam, eta, predicted, filtered, var, Q
     v = b0 * b0 * x0[1] * x0[1] + q
     for j in range(last):
         predicted[0, j] = u[chain, 0, j]
-    predicted[0, last] = b0 * x0[0] + drift[chain, 0]
+    predicted[0, last] = b0 * (1.0 - lost) * x0[0] + drift[chain, 0]
     for k in range(n):
         p, e = lam[chain, k], eta[chain, k]
         D = 1.0 + p * v
@@ -87,8 +91,10 @@ def _filter(b0, q, x0, chain, u, drift, n, lam, eta, predicted, filtered, var, Q
         filtered[k, last] = (m + e * v) * i
         if k + 1 < n:
             for j in range(last):
-                predicted[k + 1, j] = b0 * filtered[k, j] + u[chain, k + 1, j]
-            predicted[k + 1, last] = b0 * filtered[k, last] + drift[chain, k + 1]
+                carried = filtered[k, j] - lost * u[chain, k, j]
+                predicted[k + 1, j] = b0 * carried + u[chain, k + 1, j]
+            carried = filtered[k, last] - lost * drift[chain, k]
+            predicted[k + 1, last] = b0 * carried + drift[chain, k + 1]
             v = b0 * b0 * v * i + q
     return total - 0.5 * np.log(det)
 
@@ -251,7 +257,8 @@ def propagate(b0, delta_w, delta_v, x0, P, g, chains, table, lam, eta, n_sweeps,
             own_Q[:], own_h[:] = 0.0, 0.0
             total += _filter(
                 b0[chains.robot[c]], delta_w * delta_w, x0, c, chains.u, chains.drift,
-                chains.length[c], lam, eta, predicted[c], filtered[c], var[c], own_Q, own_h,
+                chains.length[c], chains.lost, lam, eta, predicted[c], filtered[c], var[c], own_Q,
+                own_h,
             )  # fmt: skip
             for a in range(last):
                 i = chains.gamma_index[c, a]
