@@ -21,6 +21,8 @@ from trustbo.errors import (
 Cell = tuple[int, int]
 Status = Literal["ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted"]
 STATUSES: tuple[str, ...] = get_args(Status)
+NOWHERE: Cell = (-1, -1)
+"""Cell of a bound of a log without a map."""
 FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 LINE_OF_SIGHT = "line_of_sight"
@@ -33,8 +35,9 @@ class Bound(Displayed):
     """Measurements of one bound, one row per overwatching robot.
 
     Attributes:
-        cell: Planning cell entered, (row, col).
-        awareness: Situational awareness, shape (robot, feature), in [0, 1]; NaN where not measured.
+        cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
+        awareness: Situational awareness, shape (robot, feature), in [0, 1], or of any finite values
+            in a log without a map; NaN where not measured.
         contact_rate: Share of the running time in contact, shape (robot,); NaN where not measured.
         duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
         status: Outcome of the bound, `"ok"` or the reason that ended the mission.
@@ -86,8 +89,13 @@ class Bound(Displayed):
         require_choice("status", self.status, STATUSES)
         ticks = np.full(lengths[0], np.nan) if self.n_ticks is None else self.n_ticks
         object.__setattr__(self, "n_ticks", as_array("n_ticks", ticks))
-        for name, values in (("awareness", self.awareness), ("contact_rate", self.contact_rate)):
-            require_unit_interval(f"{name} of the bound into cell {self.cell}", values)
+        mapped = self.cell != NOWHERE
+        where = f"the bound into cell {self.cell}" if mapped else "a bound of no map"
+        require_unit_interval(f"contact_rate of {where}", self.contact_rate)
+        if mapped:
+            require_unit_interval(f"awareness of {where}", self.awareness)
+        elif np.isinf(self.awareness).any():
+            raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
         if (self.duration <= 0).any():
             robot = int(np.argmax(self.duration <= 0))
             raise TrustboError(f"duration[{robot}] = {self.duration[robot]:g} s must be positive.")
@@ -105,7 +113,9 @@ class Bound(Displayed):
 
     def _card(self) -> Card:
         return Card(
-            f"Bound into cell {self.cell}: {self.status}",
+            f"Bound into cell {self.cell}: {self.status}"
+            if self.cell != NOWHERE
+            else f"Bound of no map: {self.status}",
             [
                 ("contact rate", np.array2string(self.contact_rate, precision=2)),
                 ("duration", f"{np.array2string(self.duration, precision=1)} s"),
@@ -123,7 +133,7 @@ class Mission(Displayed):
     """One traversal of a path: the bounds that were run, and the outcome.
 
     Attributes:
-        path: Planned cells, start first, each (row, col).
+        path: Planned cells, start first, each (row, col); empty in a log without a map.
         bounds: Bounds that were run; bound k enters `path[k]`. There are fewer than planned if the
             mission ended early; the last one then has the status of the mission.
         status: `"ok"` if the mission reached the goal, else the reason that it did not.
@@ -147,17 +157,19 @@ class Mission(Displayed):
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
-        if not self.bounds or len(self.bounds) > len(self.path) - 1:
+        if not self.path:
+            self._require_no_map()
+        elif not self.bounds or len(self.bounds) > len(self.path) - 1:
             raise ShapeError(
                 f"a path of {len(self.path)} cells has {len(self.path) - 1} bounds, and a mission "
                 f"at least one; got {len(self.bounds)}."
             )
-        if self.status == "ok" and len(self.bounds) < len(self.path) - 1:
+        if self.path and self.status == "ok" and len(self.bounds) < len(self.path) - 1:
             raise ShapeError(
                 f'status "ok" says the goal was reached, but only {len(self.bounds)} of '
                 f"{len(self.path) - 1} bounds were run; give the status it ended with."
             )
-        for k, bound in enumerate(self.bounds, start=1):
+        for k, bound in enumerate(self.bounds if self.path else (), start=1):
             if bound.cell != self.path[k]:
                 raise ShapeError(
                     f"bound {k} enters {bound.cell}, but the path has {self.path[k]} there."
@@ -178,16 +190,34 @@ class Mission(Displayed):
             shape = len(self.path) - 1, n_robots, 2
             object.__setattr__(self, "posts", require_posts(self.posts, shape))
 
+    def _require_no_map(self) -> None:
+        """Refuse bounds that enter cells, or posts, in a mission without a path."""
+        if not self.bounds:
+            raise ShapeError("a mission has at least one bound; got 0.")
+        if entered := [bound.cell for bound in self.bounds if bound.cell != NOWHERE]:
+            raise ShapeError(
+                f"a bound enters {entered[0]}, but the mission has no path; give the path, or "
+                f"bounds of cell {NOWHERE}, trustbo.data.NOWHERE."
+            )
+        if self.posts is not None:
+            raise TrustboError("posts are of missions with a path; this one has none.")
+
+    @property
+    def has_map(self) -> bool:
+        """Whether its bounds enter cells of a map."""
+        return bool(self.path)
+
     def _card(self) -> Card:
         rates = self.contact_rate
         measured = np.isfinite(rates)
         mean = f"{np.nanmean(rates):.3f}" if measured.any() else "not measured"
         took = self.bounds[-1].t1
-        first, last = path_text(self.path[:1]), path_text(self.path[-1:])
+        ends = f"{path_text(self.path[:1])} to {path_text(self.path[-1:])}"
+        path = f"{ends}, {len(self.path) - 1} bounds planned" if self.path else "none: no map"
         with np.errstate(all="ignore"):
             means = np.where(measured, rates, 0.0).sum(0) / measured.sum(0)
         rows = [
-            ("path", f"{first} to {last}, {len(self.path) - 1} bounds planned"),
+            ("path", path),
             ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
             ("contact rate", f"{mean} on average; {(~measured).sum()} of {rates.size} missing"),
             *((f"  {name}", f"{rate:.3f}") for name, rate in zip(self.robots, means, strict=True)),
@@ -202,7 +232,7 @@ class Mission(Displayed):
             )
 
         sections = {
-            "cells": [("path", path_text(self.path))],
+            **({"cells": [("path", path_text(self.path))]} if self.path else {}),
             "features": [("", ", ".join(self.features))],
         }
         return Card(f"Mission: {self.status}, contact {mean}", rows, [picture], sections)
@@ -210,7 +240,7 @@ class Mission(Displayed):
     @classmethod
     def from_arrays(
         cls,
-        path: Sequence[Cell],
+        path: Sequence[Cell] | None,
         awareness: ArrayLike,
         contact_rate: ArrayLike,
         duration: ArrayLike | None = None,
@@ -228,8 +258,9 @@ class Mission(Displayed):
         A mission that ended early is `from_arrays(path, z, y, failed_at=4, reason="stuck")`.
 
         Args:
-            path: Planned cells, start first.
-            awareness: Shape (bound, robot, feature), in [0, 1].
+            path: Planned cells, start first; None for a log without a map, whose missions have
+                neither plans nor effects of places.
+            awareness: Shape (bound, robot, feature), in [0, 1], without a map of any finite values.
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s; None where not recorded.
             status: Outcome of the mission.
@@ -252,7 +283,8 @@ class Mission(Displayed):
         """
         z, y = as_array("awareness", awareness), as_array("contact_rate", contact_rate)
         if failed_at is not None or reason:
-            last, status = _failure(failed_at, reason, status, len(path) - 1)
+            n_planned = len(y) if path is None else len(path) - 1
+            last, status = _failure(failed_at, reason, status, n_planned)
             measured = {"contact_rate": y, "duration": duration, "n_ticks": n_ticks}
             for name, values in measured.items():
                 if values is not None:
@@ -276,13 +308,16 @@ class Mission(Displayed):
             _per_robot(name, values, y.shape)
             for name, values in (("duration", duration), ("n_ticks", n_ticks))
         )
-        cells = require_cells("path", path)
-        if len(y) > len(cells) - 1:
+        cells = () if path is None else require_cells("path", path)
+        if path is not None and not cells:
+            raise ShapeError("path is empty; give its cells, or None for a log without a map.")
+        if cells and len(y) > len(cells) - 1:
             raise ShapeError(f"{len(y)} bounds need {len(y) + 1} cells; the path has {len(cells)}.")
         longest = np.nanmax(np.where(np.isnan(seconds), 0.0, seconds), axis=1)
         last, starts = len(y) - 1, np.concatenate([[0.0], np.cumsum(longest)])
         statuses = ["ok"] * last + [status]
-        measured = zip(cells[1:], z, y, seconds, statuses, map(float, starts), ticks, strict=False)
+        entered = cells[1:] or (NOWHERE,) * len(y)
+        measured = zip(entered, z, y, seconds, statuses, map(float, starts), ticks, strict=False)
         bounds = tuple(Bound(*values, n_ticks=n) for *values, n in measured)
         named = as_names("features", features), as_names("robots", robots)
         places = None if posts is None else as_array("posts", posts)
@@ -358,6 +393,16 @@ class Mission(Displayed):
         array = np.stack([getattr(bound, name) for bound in self.bounds])
         array.flags.writeable = False
         return array
+
+
+def require_map(what: str, missions: Iterable[Mission]) -> None:
+    """Refuse missions of a log without a map: TrustboError."""
+    for j, mission in enumerate(missions):
+        if not mission.has_map:
+            raise TrustboError(
+                f"{what} needs the cells of a map, and mission {j} is of a log without one "
+                "(path=None); such missions have fits without effects of places, and scores."
+            )
 
 
 def path_text(path: Iterable[Cell]) -> str:

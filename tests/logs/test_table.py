@@ -296,10 +296,10 @@ def test_files_that_are_no_table_are_named(tmp_path):
         read_table(3)
     file = tmp_path / "bad.csv"
     for text, message in (
-        ("", "the table lacks mission, bound, robot, row, col, contact_rate"),
+        ("", "the table lacks mission, bound, robot, contact_rate"),
         (
             "mission;bound\n1;2\n",
-            r"lacks robot, row, col, .* has mission, bound\. A log without places: row = 0",
+            r"lacks robot, contact_rate .* has mission, bound\.",
         ),
         ("mission,bound\n1,2,3\n", "row 1 has 3 values, the header 2"),
         ("mission,mission\n1,2\n", "two columns of one name: mission, mission"),

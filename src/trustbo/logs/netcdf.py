@@ -10,7 +10,7 @@ import xarray as xr
 from xarray.backends import NetCDF4DataStore
 from xarray.conventions import encode_dataset_coordinates
 
-from trustbo.data import Bound, Mission
+from trustbo.data import NOWHERE, Bound, Mission
 from trustbo.errors import DamagedFileError, TrustboError
 from trustbo.files import (
     FilePath,
@@ -173,7 +173,7 @@ def missions_of_tree(tree: xr.DataTree, path: FilePath) -> list[Mission]:
 def _table(missions: Sequence[Mission]) -> xr.Dataset:
     """Arrays of missions, padded with NaN; ShapeError if robots or features differ."""
     require_same_team(missions)
-    n_steps = max(len(mission.path) for mission in missions)
+    n_steps = max(max(len(mission.path), len(mission.bounds) + 1) for mission in missions)
     shape = (len(missions), n_steps - 1)
     robots, features = missions[0].robots, missions[0].features
     path = np.full((len(missions), n_steps, 2), -1)
@@ -183,7 +183,7 @@ def _table(missions: Sequence[Mission]) -> xr.Dataset:
     posts = np.full((*shape, len(robots), 2), np.nan)
     for j, mission in enumerate(missions):
         n = len(mission.bounds)
-        path[j, : len(mission.path)] = mission.path
+        path[j, : len(mission.path)] = np.reshape(mission.path, (-1, 2))
         awareness[j, :n], rates[j, :n] = mission.awareness, mission.contact_rate
         duration[j, :n], n_ticks[j, :n] = mission.duration, mission.n_ticks
         if mission.posts is not None:
@@ -220,8 +220,9 @@ def _mission(table: dict[str, np.ndarray], j: int, ticks: xr.Dataset | None) -> 
         )
         status, t0 = str(table["bound_status"][j, k]), float(table["start"][j, k])
         poses, contact, states = _ticks_of(ticks, k)
-        bounds.append(Bound(path[k + 1], z, y, seconds, status, t0, poses, contact, n, states))
-    posts = table["posts"][j, : len(path) - 1] if "posts" in table else np.full(1, np.nan)
+        cell = path[k + 1] if path else NOWHERE
+        bounds.append(Bound(cell, z, y, seconds, status, t0, poses, contact, n, states))
+    posts = table["posts"][j, : len(path) - 1] if "posts" in table and path else np.full(1, np.nan)
     own = None if np.isnan(posts).any() else posts
     return Mission(path, tuple(bounds), str(table["status"][j]), features, robots, own)
 

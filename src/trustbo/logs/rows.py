@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from trustbo.data import FEATURES, Cell
+from trustbo.data import FEATURES, NOWHERE, Cell
 from trustbo.errors import TrustboError
 from trustbo.spreadsheet import meant
 from trustbo.workspace.grid import Grid
@@ -50,30 +50,44 @@ class Row(NamedTuple):
         return not self.status and all(map(math.isnan, (*self.numbers.values(), *self.awareness)))
 
 
-def read_columns(table: Any, ignore: Sequence[str] = ()) -> dict[str, list[str]]:
+def read_columns(
+    table: Any, ignore: Sequence[str] = (), *, mapped: bool = False
+) -> dict[str, list[str]]:
     """Read the columns of a table (see `read_table`) but `ignore` as text, "" if blank.
+
+    Columns of cells or positions are needed where the table is `mapped`, or has any of them.
 
     TrustboError: no such file, or no CSV; a missing or repeated column; no rows.
     """
-    names, values = _from_file(Path(table)) if isinstance(table, str | PathLike) else _of(table)
-    columns = {n: [_stripped(v) for v in column] for n, column in zip(names, values, strict=True)}
-    if len(columns) < len(names):
-        raise TrustboError(f"the table has two columns of one name: {', '.join(names)}.")
+    columns = text_columns(table)
+    names = list(columns)
     for name in (ignore,) if isinstance(ignore, str) else ignore:
         if columns.pop(name, None) is None:
             raise TrustboError(f"ignore has {name!r}; the table has {', '.join(names)}.")
     if _TICKS_BEFORE in columns:
         other = "n_ticks" if "n_ticks" not in columns else f"{_PREFIX}{_TICKS_BEFORE}"
         columns[other] = columns.pop(_TICKS_BEFORE)
-    missing = [n for n in (*KEYS[:3], *position_of(columns)) if n not in columns]
+    place = position_of(columns) if mapped or has_places(columns) else ()
+    missing = [n for n in (*KEYS[:3], *place) if n not in columns]
     if "contact_rate" not in columns and not {"contact_time", "duration"} <= columns.keys():
         missing.append("contact_rate (or contact_time and duration)")
     if missing:
         shown = ", ".join(names) or "no columns"
-        nowhere = " A log without places: row = 0, col = bound." if "row" in missing else ""
-        raise TrustboError(f"the table lacks {', '.join(missing)}; it has {shown}.{nowhere}")
+        raise TrustboError(f"the table lacks {', '.join(missing)}; it has {shown}.")
     if not columns["mission"]:
         raise TrustboError("the table has no rows.")
+    return columns
+
+
+def text_columns(table: Any) -> dict[str, list[str]]:
+    """Columns of a CSV file, a DataFrame or a mapping as text by name, "" if blank.
+
+    TrustboError: no such file, or no CSV; no table; or a repeated column.
+    """
+    names, values = _from_file(Path(table)) if isinstance(table, str | PathLike) else _of(table)
+    columns = {n: [_stripped(v) for v in column] for n, column in zip(names, values, strict=True)}
+    if len(columns) < len(names):
+        raise TrustboError(f"the table has two columns of one name: {', '.join(names)}.")
     return columns
 
 
@@ -88,14 +102,14 @@ def parse_rows(
     """
     wanted = [column_of(name) for name in features]
     missing = [name for name in wanted if name not in columns]
-    place = position_of(columns)
+    place = position_of(columns) if has_places(columns) else ()
     others = [n for n in columns if n not in (*COLUMNS, *place, *wanted)]
     if missing and others:
         raise TrustboError(
             f"the table lacks columns of awareness: {', '.join(missing)}; it has "
             f"{', '.join(others)}. Rename what is awareness; what is not: ignore={(*others,)!r}."
         )
-    if grid is None and place != POSITIONS[0]:
+    if grid is None and place and place != POSITIONS[0]:
         raise TrustboError(f"cells from {' and '.join(place)} need the grid: give workspace.")
     blank = [""] * len(columns["mission"])
     names = (*COLUMNS, *place, *wanted)
@@ -105,6 +119,11 @@ def parse_rows(
     ]
 
 
+def has_places(columns: Mapping[str, object]) -> bool:
+    """Whether a table has any column of cells or positions: one without is of a log of no map."""
+    return any(name in columns for pair in POSITIONS for name in pair)
+
+
 def position_of(columns: Mapping[str, object]) -> tuple[str, str]:
     """Columns with the cell: the first of `POSITIONS` that the table has, else row and col."""
     return next((pair for pair in POSITIONS if columns.keys() >= set(pair)), POSITIONS[0])
@@ -112,7 +131,8 @@ def position_of(columns: Mapping[str, object]) -> tuple[str, str]:
 
 def features_of(columns: Mapping[str, object]) -> tuple[str, ...]:
     """Features by the names of a table's columns; those of `FEATURES` if it has none."""
-    others = [name for name in columns if name not in (*COLUMNS, *position_of(columns))]
+    place = position_of(columns) if has_places(columns) else ()
+    others = [name for name in columns if name not in (*COLUMNS, *place)]
     bare = [name.removeprefix(_PREFIX) for name in others]
     features = tuple(b if b in _RESERVED else name for b, name in zip(bare, others, strict=True))
     return features or FEATURES
@@ -127,17 +147,19 @@ def _parse(
     line: int,
     text: Mapping[str, str],
     wanted: Sequence[str],
-    place: tuple[str, str],
+    place: Sequence[str],
     grid: Grid | None,
 ) -> Row:
     numbers = {name: _number(line, name, text[name]) for name in NUMBERS}
-    awareness = tuple(_awareness(line, name, text[name]) for name in wanted)
+    awareness = tuple(_awareness(line, name, text[name], bounded=bool(place)) for name in wanted)
     bound = _whole(line, "bound", text["bound"])
     if not text["mission"]:
         raise TrustboError(f"row {line}: mission is blank.")
     if bound < 0:
         raise TrustboError(f"row {line}: bound = {bound} must be 0, the start cell, or more.")
-    if grid is None or place == POSITIONS[0]:
+    if not place:
+        row, col = NOWHERE
+    elif grid is None or place == POSITIONS[0]:
         row, col = (_whole(line, name, text[name]) for name in place)
     else:
         row, col = _cell_at(line, place, [text[name] for name in place], grid)
@@ -145,7 +167,7 @@ def _parse(
     return Row(line, text["mission"], bound, text["robot"], (row, col), numbers, awareness, *names)
 
 
-def _cell_at(line: int, place: tuple[str, str], texts: Sequence[str], grid: Grid) -> Cell:
+def _cell_at(line: int, place: Sequence[str], texts: Sequence[str], grid: Grid) -> Cell:
     """Cell at a position, (x, y) or (lon, lat)."""
     a, b = (_number(line, name, text) for name, text in zip(place, texts, strict=True))
     find = grid.cell_at if place[0] == "x" else grid.cell_at_lonlat
@@ -198,10 +220,10 @@ def _of(table: Any) -> tuple[list[str], list[list[object]]]:
     return [str(name).strip() for name in names], columns
 
 
-def _awareness(line: int, name: str, text: str) -> float:
+def _awareness(line: int, name: str, text: str, *, bounded: bool) -> float:
     hint = f"; if it is no awareness feature: ignore=({name!r},)"
     number = _number(line, name, text, hint)
-    if number < 0.0 or number > 1.0:
+    if bounded and (number < 0.0 or number > 1.0):
         raise TrustboError(f"row {line}: {name} = {text} is outside [0, 1]{hint}.")
     return number
 

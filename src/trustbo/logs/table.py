@@ -5,13 +5,14 @@
 | `mission` | yes | label |
 | `bound` | yes | 0 for the start cell, without measurements; then 1, 2, ... |
 | `robot` | yes | name; blank where nothing was measured |
-| `row`, `col` | yes, or `x`, `y`, or `lon`, `lat` | cell of the bound, or a position in it |
+| `row`, `col` | no, or `x`, `y`, or `lon`, `lat` | cell of the bound, or a position in it |
 | `contact_rate` | yes, or `contact_time` and `duration` (s) | in [0, 1] |
 | `duration`, `t0` (s), `n_ticks`, `status`, `mission_status` | no | |
 | any other | no | awareness feature, in [0, 1] |
 
-A blank means "not measured". Bounds after the last one with a measurement were planned, not run. A
-feature with the name of one of these columns takes the prefix `awareness_`, e.g.
+A table without places is of a log without a map: bounds are from 1, features of any values. A blank
+means "not measured". Bounds after the last one with a measurement were planned, not run. A feature
+with the name of one of these columns takes the prefix `awareness_`, e.g.
 `awareness_status`; so does `exposure`, which was the name of `n_ticks` in version 0.1 and is still
 read as such.
 """
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from trustbo.data import Bound, Cell, Mission
+from trustbo.data import NOWHERE, Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_pair
 from trustbo.files import FilePath, write_text
 from trustbo.logs.rows import KEYS, Row, column_of, features_of, parse_rows, read_columns
@@ -45,7 +46,7 @@ def read_table(
     Required columns are `mission`, `bound`, `robot`, the cell (`row` and `col`, or `x` and `y`, or
     `lon` and `lat`) and the contact (`contact_rate`, or `contact_time` and `duration`). Optional
     ones are `duration`, `t0`, `n_ticks`, `status`, `mission_status` and a column for each awareness
-    feature: docs/howto/your-own-robots.md.
+    feature: docs/howto/your-own-robots.md. A table without a cell is of a log without a map.
 
     Args:
         table: Path of a CSV file with a header, separated by commas, semicolons or tabs, or a
@@ -67,7 +68,8 @@ def read_table(
             kind; a position off the grid; time that goes backwards; rows of one bound that
             disagree; or what `Mission` refuses.
     """
-    columns = read_columns(table, ignore)
+    mapped = workspace is not None or start is not None
+    columns = read_columns(table, ignore, mapped=mapped)
     if workspace is not None:
         features = workspace.features if features is None else features
         robots = workspace.team.names if robots is None else robots
@@ -94,14 +96,22 @@ def write_table(missions: Sequence[Mission], path: FilePath) -> None:
     """Write missions, without their ticks, as a CSV file that `read_table` reads back.
 
     The file is written whole or not at all. ShapeError: no missions, or missions that disagree on
-    robots or features.
+    robots or features. TrustboError: some have a path and others none.
     """
     require_same_team(missions)
     features = [column_of(name) for name in missions[0].features]
     measured = ["contact_rate", "duration", "n_ticks", "t0", "status", "mission_status", *features]
-    lines: list[list[object]] = [[*KEYS, *measured]]
+    mapped = [mission.has_map for mission in missions]
+    if any(mapped) and not all(mapped):
+        raise TrustboError(
+            f"mission {mapped.index(False)} has no path, and others have; write these apart."
+        )
+    lines: list[list[object]] = [[*(KEYS if all(mapped) else KEYS[:3]), *measured]]
     for j, mission in enumerate(missions):
-        for k, cell in enumerate(mission.path):
+        steps = mission.path or [()] * (len(mission.bounds) + 1)
+        for k, cell in enumerate(steps):
+            if not k and not mission.has_map:
+                continue
             bound = mission.bounds[k - 1] if 1 <= k <= len(mission.bounds) else None
             for i, robot in enumerate(mission.robots):
                 cells: list[object] = [""] * len(measured)
@@ -122,14 +132,17 @@ def _mission(
     team: tuple[str, ...],
 ) -> Mission:
     """Make one mission from its rows, by bound and robot."""
-    cells = _cells(label, rows, start)
+    mapped = any(row.cell != NOWHERE for robots in rows.values() for row in robots.values())
+    cells = _cells(label, rows, start) if mapped else ()
     run = [k for k in rows if k and not all(row.is_blank for row in rows[k].values())]
     if not run:
         raise TrustboError(f"mission {label} measured nothing: no bound of it has a value.")
     bounds: list[Bound] = []
     for k in range(1, max(run) + 1):
-        t0 = bounds[-1].t1 if bounds else 0.0
-        bound = _bound(f"mission {label}, bound {k}", cells[k], rows[k], team, t0)
+        if k not in rows:
+            raise TrustboError(f"mission {label} has bounds {sorted(rows)}, but no bound {k}.")
+        t0, cell = bounds[-1].t1 if bounds else 0.0, cells[k] if cells else NOWHERE
+        bound = _bound(f"mission {label}, bound {k}", cell, rows[k], team, t0)
         if bounds and bound.t0 < bounds[-1].t0:
             raise TrustboError(
                 f"mission {label}, bound {k}: time goes backwards, t0 = {bound.t0:.9g} s after "

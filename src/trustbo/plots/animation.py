@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from scipy.ndimage import uniform_filter1d
 
-from trustbo.data import Mission
+from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError, pip_install, require_choice, require_kind, require_positive
 from trustbo.files import FilePath, write_file
 from trustbo.plots.layout import as_text, extent_of, plain
@@ -75,6 +75,7 @@ def animate_mission(
     """
     for value, kind in ((mission, Mission), (workspace, Workspace)):
         require_kind("plots.animate_mission", value, kind, "give a Mission and its Workspace")
+    require_map("plots.animate_mission", [mission])
     target = None if path is None else Path(path)
     if target is not None:
         require_choice("suffix", target.suffix.lower(), SUFFIXES)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from trustbo.data import Bound, Cell, Mission, path_text
+from trustbo.data import Bound, Cell, Mission, path_text, require_map
 from trustbo.errors import TrustboError, require_choice, require_pair
 from trustbo.files import FilePath
 from trustbo.logs.netcdf import read_missions
@@ -46,6 +46,7 @@ class ReplaySimulator(DescribedSimulator):
         for j, mission in enumerate(missions):
             if not isinstance(mission, Mission):
                 raise TrustboError(f"mission {j} must be a Mission; got {mission!r}.")
+        require_map("a replay", missions)
         self.missions = tuple(missions)
         self._on_missing = require_choice("on_missing", on_missing, ON_MISSING)
         self._left = list(range(len(self.missions)))

@@ -17,6 +17,7 @@ from trustbo.data import (
     as_names,
     default_features,
     is_line_of_sight,
+    require_map,
     require_posts,
 )
 from trustbo.display.card import Card, Displayed
@@ -485,7 +486,9 @@ class Workspace(Displayed):
 
         Raises:
             ShapeError: It has other robots or features.
+            TrustboError: It is of a log without a map.
         """
+        require_map("a workspace", [mission])
         unnamed = default_features(len(mission.features))
         if mission.features == unnamed and len(unnamed) == len(self.features):
             named = tuple(

@@ -1,0 +1,114 @@
+"""Missions of logs without a map: files, fits, scores, and what refuses them."""
+
+import numpy as np
+import pytest
+
+import trustbo as tb
+from trustbo.data import NOWHERE, Bound, Mission
+from trustbo.errors import ShapeError, TrustboError
+from trustbo.inference.posterior_tree import missions_of
+from trustbo.logs import read_missions, read_table, write_missions, write_table
+from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
+
+
+@pytest.fixture(scope="module")
+def missions():
+    rng = np.random.default_rng(0)
+    made = []
+    for n in (6, 9, 7):
+        y = rng.uniform(size=(n, 2))
+        y[0, 1] = np.nan
+        z = 3.0 * rng.normal(size=(n, 2, 2))  # of any values
+        made.append(Mission.from_arrays(None, z, y, features=("expected", "range")))
+    return made
+
+
+@pytest.fixture(scope="module")
+def posterior(missions):
+    return tb.fit(missions, PooledTrust(effects=RobotEffect()), draws=50, progress=False)
+
+
+def equal(found, expected):
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert not one.has_map
+        assert one.path == other.path == ()
+        assert {bound.cell for bound in one.bounds} == {NOWHERE}
+        assert (one.features, one.robots) == (other.features, other.robots)
+        np.testing.assert_array_equal(one.awareness, other.awareness)
+        np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+
+
+def test_files_and_posteriors_give_them_back(missions, posterior, tmp_path):
+    write_missions(tmp_path / "missions.nc", missions)
+    equal(read_missions(tmp_path / "missions.nc"), missions)
+    write_table(missions, tmp_path / "missions.csv")
+    equal(read_table(tmp_path / "missions.csv"), missions)
+    equal(missions_of(posterior), missions)
+    assert "no map" in repr(missions[0])
+
+
+def test_they_have_fits_and_scores(missions, posterior):
+    table = tb.inference.score(posterior, missions)
+    assert int(table["n"].sel(among="all")) == sum(2 * n - 1 for n in (6, 9, 7))
+    assert int(table["n"].sel(among="seen")) == 0
+    assert np.isfinite(tb.inference.memory(posterior).log_bf)
+
+
+def test_a_robot_that_stands_out_is_found_without_places():
+    rng = np.random.default_rng(1)
+    missions = []
+    for j in range(6):
+        z = rng.uniform(size=(8, 3, 1))
+        y = 0.8 * z[..., 0] + 0.1 + 0.03 * rng.normal(size=(8, 3))
+        y[:, 1] -= 0.5 * z[:, 1, 0] * (j >= 3)  # robot 2, index 1, from mission 3 on
+        given = z, np.clip(y, 0.0, 1.0)
+        missions.append(Mission.from_arrays(None, *given, features=["line_of_sight"]))
+    found = tb.criticise(tb.fit(missions, PooledTrust(effects=RobotEffect())))
+    assert found.fault == "robot in a mission"
+    assert "r2 has" in found.verdict
+    assert "from mission 3 on" in found.verdict
+    assert "needs the cells of a map" in found.table["finding"]["change"]
+
+
+def test_what_needs_a_map_refuses_them_in_a_sentence(missions, posterior):
+    z = np.full((2, 3, 3, 2), 0.5)
+    workspace = tb.Workspace.from_awareness(z, features=missions[0].features)
+    for call in (
+        lambda: tb.fit(missions, PooledTrust(place=PlaceEffect())),
+        lambda: tb.fit(missions, PooledTrust(), workspace=workspace),
+        lambda: tb.inference.changes(posterior),
+        lambda: tb.simulation.ReplaySimulator(missions),
+        lambda: tb.plots.animate_mission(missions[0], workspace),
+        lambda: tb.Campaign(workspace, (0, 0), (2, 2)).tell(missions[0]),
+    ):
+        with pytest.raises(TrustboError, match=r"needs the cells of a map, and mission 0 is of"):
+            call()
+
+
+def test_a_path_is_given_or_not():
+    z, y = np.zeros((2, 1, 1)), np.zeros((2, 1))
+    with pytest.raises(ShapeError, match="path is empty; give its cells, or None for a log"):
+        Mission.from_arrays([], z, y)
+    with pytest.raises(TrustboError, match="awareness of a bound of no map must be finite"):
+        Mission.from_arrays(None, z + np.inf, y)
+    bound = Bound((0, 1), z[0], y[0], np.ones(1))
+    with pytest.raises(ShapeError, match=r"enters \(0, 1\), but the mission has no path"):
+        Mission((), (bound,))
+    with pytest.raises(ShapeError, match="at least one bound; got 0"):
+        Mission((), ())
+    with pytest.raises(TrustboError, match="posts are of missions with a path"):
+        Mission.from_arrays(None, z, y, posts=np.zeros((2, 1, 2)))
+    failed = Mission.from_arrays(None, z, y, failed_at=2, reason="stuck")
+    assert failed.status == failed.bounds[-1].status == "stuck"
+
+
+def test_tables_are_of_one_kind(tmp_path):
+    z, y = np.full((2, 1, 2), 0.5), np.zeros((2, 1))
+    mapped = Mission.from_arrays([(0, 0), (0, 1), (0, 2)], z, y)
+    with pytest.raises(TrustboError, match="mission 1 has no path, and others have"):
+        write_table([mapped, Mission.from_arrays(None, z, y)], tmp_path / "both.csv")
+    columns = {"mission": [1], "bound": [1], "robot": ["r1"], "contact_rate": [0.5], "z": [7.0]}
+    assert read_table(columns)[0].awareness == 7.0
+    with pytest.raises(TrustboError, match="lacks row, col"):
+        read_table(columns, start=(0, 0))
