@@ -23,6 +23,7 @@ from trustbo.models import (
 )
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
+LOG = (2, 40, 3, 1)  # missions of a log, trust carried over all of it
 OWN = {
     "top": HalfNormal(1.0),
     "slope": LogNormal(1.0, 0.7),
@@ -48,6 +49,9 @@ def cases():
         for places in ([], [PlaceEffect()]):
             effects = [*places, RobotEffect()]
             yield PooledTrust(effects=effects, observation=observation), "exact", 200, SMALL
+        robots = {"effects": [RobotEffect()], "observation": observation}
+        yield PooledTrust(memory="deviation", **robots), "exact", 200, LOG
+    yield HierarchicalTrust(observation="beta_binomial"), "exact", 200, LOG
     yield HierarchicalTrust(), "exact", 300, SMALL
     yield DriftTrust(saturating, OWN), "exact", 300, SMALL
     yield CoupledTrust(), "exact", 200, SMALL
@@ -68,6 +72,7 @@ def main():
     parser = arguments(
         __doc__, names=("exact", "nuts", "joint"), out="out/calibration", quick="2 data sets each"
     )
+    parser.add_argument("--only", default="", help="rows whose label has this text")
     parser.add_argument("--share", type=float, default=1.0, help="share of the data sets")
     given = parsed(parser)
     table = Table(
@@ -84,6 +89,12 @@ def main():
         effects = ["places"] * (model.place is not None) + ["robots"] * bool(model.effects)
         detail = " and ".join(effects) or detail
         label = name if detail in ("full", "level") else f"{name}, {detail}"
+        if shape is LOG:
+            detail, label = f"{detail}-log", f"{label}, of a log"
+        if model.memory != "level":
+            detail, label = f"{detail}-{model.memory}", f"{label}, memory of the {model.memory}"
+        if given.only not in label:
+            continue
         file = given.out / f"{name}-{detail}-{model.observation}-{sampler}.json"
         design = None if model.place is None else Walks.random(shape[:2], seed=0)
         options = {

@@ -38,6 +38,7 @@ class Topics:
         pose: Pose of each robot and the lead.
         state: State of each robot.
         lead: Name of the lead.
+        seen: Names of the robots that each robot sees, in logs of detections.
 
     Raises:
         TrustboError: A topic of each robot without `{robot}`.
@@ -50,9 +51,10 @@ class Topics:
     pose: str = "/{robot}/odom"
     lead: str = "lead"
     state: str = "/{robot}/state"
+    seen: str = "/{robot}/seen"
 
     def __post_init__(self) -> None:
-        for name in ("contact", "awareness", "pose", "state"):
+        for name in ("contact", "awareness", "pose", "state", "seen"):
             if getattr(self, name).count("{robot}") != 1:
                 raise TrustboError(
                     f"Topics.{name} must name the robot's place, e.g. '/{{robot}}/{name}'; got "

@@ -1,6 +1,7 @@
 """Rows of a table of missions: checked numbers from text or from a frame's values."""
 
 import csv
+import gzip
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -190,14 +191,15 @@ def _from_file(file: Path) -> tuple[list[str], list[list[str]]]:
     if not file.is_file():
         raise TrustboError(f"there is no file {str(file)!r}; give a CSV file.")
     try:
-        with file.open(newline="", encoding="utf-8-sig") as stream:
+        opener = gzip.open if file.suffix == ".gz" else open
+        with opener(file, "rt", newline="", encoding="utf-8-sig") as stream:
             first = stream.readline()
             stream.seek(0)
             separator = max(_SEPARATORS, key=first.count)
             header, *rows = [line for line in csv.reader(stream, delimiter=separator) if line] or [
                 []
             ]
-    except (csv.Error, UnicodeDecodeError) as error:
+    except (csv.Error, UnicodeDecodeError, EOFError, gzip.BadGzipFile) as error:
         raise TrustboError(f"{str(file)!r} cannot be read as CSV in UTF-8: {error}.") from None
     for i, row in enumerate(rows, start=1):
         if len(row) != len(header):
