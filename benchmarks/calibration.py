@@ -76,8 +76,8 @@ def main():
     parser.add_argument("--share", type=float, default=1.0, help="share of the data sets")
     given = parsed(parser)
     table = Table(
-        "model", "observation", "sampler", "data sets", "parameters", "smallest p", "limit",
-        "50 % interval", "90 % interval", "uniform",
+        "model", "observation", "sampler", "data sets", "refused", "parameters", "smallest p",
+        "limit", "50 % interval", "90 % interval", "uniform",
     )  # fmt: skip
     for model, sampler, n, shape in cases():
         if sampler not in given.names:
@@ -102,6 +102,7 @@ def main():
             "n_datasets": n,
             "shape": shape,
             "checkpoint": file,
+            "max_refused": 0.05,
             "progress": False,
         }
         seconds, result = timed(
@@ -110,8 +111,8 @@ def main():
         p, limit = float(result["p_value"].min()), 0.01 / result.sizes["parameter"]
         half, most = result["coverage"].mean("parameter").values
         table.row(
-            label, model.observation, f"`{sampler}`", n, result.sizes["parameter"], f"{p:.4f}",
-            f"{limit:.5f}", f"{half:.1%}", f"{most:.1%}",
+            label, model.observation, f"`{sampler}`", n, result.attrs["n_refused"],
+            result.sizes["parameter"], f"{p:.4f}", f"{limit:.5f}", f"{half:.1%}", f"{most:.1%}",
             "not rejected" if p > limit else "REJECTED",
         )  # fmt: skip
         print(f"{label}: {seconds:.0f} s", file=sys.stderr, flush=True)

@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 import pytest
 import xarray as xr
 
-from trustbo.errors import TrustboError
+from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import sbc
 from trustbo.inference.sbc import _uniformity
 from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors
@@ -64,6 +64,26 @@ def test_effects_of_places_are_ranked_as_parameters_are(monkeypatch):
     one_kind = PooledTrust(place=PlaceEffect(cells=False))
     options["n_datasets"] = 1
     assert not {"tau_s", "place[last]"} & set(sbc(one_kind, "exact", **options)["parameter"].values)
+
+
+def test_data_sets_that_the_sampler_refuses_are_counted(monkeypatch):
+    calibration = import_module("trustbo.inference.sbc")
+    tried, draw = [], calibration.draw_posterior
+
+    def refuses(model, sampler, settings, seed, *args, **kwargs):
+        tried.append(seed)
+        if seed % 5 == 0:
+            raise PosteriorError("weights are too uneven.")
+        return draw(model, sampler, settings, seed, *args, **kwargs)
+
+    monkeypatch.setattr(calibration, "draw_posterior", refuses)
+    few = {"n_datasets": 10, "progress": False}
+    ranks = sbc(PooledTrust(), seed=1, max_refused=0.2, **few)
+    assert ranks.attrs["n_refused"] == 2
+    assert ranks.sizes["dataset"] == 8
+    with pytest.raises(PosteriorError, match="too uneven"):
+        sbc(PooledTrust(), seed=1, max_refused=0.1, **few)
+    assert len(tried) == 10 + 10  # the second run ends at its second refusal
 
 
 def test_uniform_ranks_pass_and_others_do_not():

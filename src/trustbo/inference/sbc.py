@@ -10,7 +10,7 @@ from jax import random
 from scipy import stats
 from tqdm import tqdm
 
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import PosteriorError, TrustboError, require_whole
 from trustbo.files import FilePath, read_record, write_text
 from trustbo.inference.draws import theta_of
 from trustbo.inference.prior_predictive import draw_sites
@@ -58,6 +58,7 @@ def sbc(
     n_ranked: int = 396,
     seed: int = 0,
     design: Design | None = None,
+    max_refused: float = 0.0,
     checkpoint: FilePath | None = None,
     progress: bool = True,
 ) -> xr.Dataset:
@@ -78,6 +79,8 @@ def sbc(
         seed: Seed; the same seed gives the same ranks.
         design: Missions that visit places, for a model with effects of places, which are ranked
             too; `benchmarks/sbc_places.py` has random walks.
+        max_refused: Largest share of data sets that the sampler may refuse, as its weights are too
+            uneven. They are left out, and hide a departure of that share at most.
         checkpoint: A file that keeps the ranks after each data set; with it, a call goes on where
             one with the same arguments stopped.
         progress: Whether to show a progress bar.
@@ -86,8 +89,10 @@ def sbc(
         Dataset with `rank` (dataset, parameter), in 0..n_ranked; `pit`, the ranks in (0, 1), which
         `az.plot_ecdf_pit` draws; `p_value` (parameter) of a chi-squared test of uniformity in 20
         bins; and `coverage` (interval, parameter), the share of truths in the central interval.
+        Its attribute `n_refused` is the number of data sets left out.
 
     Raises:
+        PosteriorError: The sampler refuses more data sets than that.
         TrustboError: The sampler is unknown or does not suit the model, there are no data sets, a
             model with effects of places has no design, or the checkpoint is of other arguments.
     """
@@ -122,23 +127,36 @@ def sbc(
         places = None if design is None else design.places(model)
         evidence = needs_evidence(model, sampler)
         slots = Slots.of(batch, shape[0], places=places) if evidence else None
-        draws, _ = draw_posterior(
-            model, sampler, settings, seed + j, batch, places=places, slots=slots, check=False
-        )
+        try:
+            draws, _ = draw_posterior(
+                model, sampler, settings, seed + j, batch, places=places, slots=slots, check=False
+            )
+        except PosteriorError:
+            if sum(not rank for rank in ranks) + 1 > max_refused * n_datasets:
+                raise
+            ranks.append({})
+            _write(checkpoint, asked, ranks)
+            continue
         found = dict(draws.params)
         for variables in draws.effects.values():
             found |= {name: _ends(d, 2) for name, d in variables.items()}
         if design is not None:
             found = found | design.effects(model, draws, seed + j)
-        rank = {}
-        for name in found:
-            below = (found[name][:, thinned] < simulated[name]).sum((0, 1))
-            free = np.ptp(found[name], axis=(0, 1)) > 0.0
-            for index in map(tuple, np.argwhere(free)):
-                rank[_label(name, index)] = int(below[index])
-        ranks.append(rank)
+        ranks.append(_ranked(found, simulated, thinned))
         _write(checkpoint, asked, ranks)
     return _summary(ranks[:n_datasets], kept * _CHAINS, sampler)
+
+
+def _ranked(
+    found: dict[str, np.ndarray], truth: dict[str, np.ndarray], thinned: np.ndarray
+) -> dict[str, int]:
+    """Rank of each true number among the thinned draws (chain, draw, ...), by label."""
+    rank = {}
+    for name, drawn in found.items():
+        below = (drawn[:, thinned] < truth[name]).sum((0, 1))
+        free = np.ptp(drawn, axis=(0, 1)) > 0.0
+        rank |= {_label(name, i): int(below[i]) for i in map(tuple, np.argwhere(free))}
+    return rank
 
 
 def _simulate(
@@ -191,6 +209,8 @@ def _label(name: str, index: tuple[int, ...]) -> str:
 
 
 def _summary(ranks: list[dict[str, int]], n_ranked: int, sampler: str) -> xr.Dataset:
+    n_refused = sum(not rank for rank in ranks)
+    ranks = [rank for rank in ranks if rank]
     names = list(ranks[0])
     table = np.array([[rank[name] for name in names] for rank in ranks])
     pit = (table + 0.5) / (n_ranked + 1)
@@ -203,7 +223,7 @@ def _summary(ranks: list[dict[str, int]], n_ranked: int, sampler: str) -> xr.Dat
             "coverage": (("interval", "parameter"), coverage),
         },
         {"parameter": names, "interval": list(_INTERVALS)},
-        {"sampler": sampler, "n_ranked": n_ranked},
+        {"sampler": sampler, "n_ranked": n_ranked, "n_refused": n_refused},
     )
 
 
