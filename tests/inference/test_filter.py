@@ -232,6 +232,32 @@ def test_ticks_add_up_to_the_bound(family):
     assert by_tick.n_bounds == 4
 
 
+@pytest.mark.parametrize("family", ["gaussian", "beta_binomial"])
+def test_ticks_together_are_ticks_one_by_one(family):
+    rng = np.random.default_rng(5)
+    seen = np.where(rng.uniform(size=(40, 2)) < 0.2, np.nan, rng.uniform(size=(40, 2)) < 0.7)
+    params = constant(OF_FAMILY[family], 30)
+    one, many = (TrustFilter(params, 2, observation=family) for _ in range(2))
+    for live in (one, many):
+        live.begin_bound(np.full((2, 2), 0.5))
+    for tick in seen:
+        last = one.update_tick(tick)
+    for part in np.split(seen, [7, 30]):
+        state = many.update_ticks(np.nansum(part, 0), (~np.isnan(part)).sum(0))
+    np.testing.assert_array_equal(state.mean, last.mean)
+    np.testing.assert_array_equal(many.end_bound().sd, one.end_bound().sd)
+
+
+def test_counts_of_ticks_that_cannot_be_are_refused():
+    live = TrustFilter(constant(OF_FAMILY["gaussian"]), 2)
+    live.begin_bound(np.full((2, 2), 0.5))
+    for contacts, ticks in (([3, 1], [2, 1]), ([-1, 0], [2, 1]), ([np.nan, 0], [2, 1])):
+        with pytest.raises(TrustboError, match="n_contact must be from 0 to n_ticks"):
+            live.update_ticks(contacts, ticks)
+    with pytest.raises(ShapeError, match=r"n_ticks must be \(2,\); got shape \(\)"):
+        live.update_ticks([1, 1], 2)
+
+
 def test_a_robot_that_did_not_look_is_not_measured():
     params = constant(OF_FAMILY["censored"])
     live, other = (TrustFilter(params, 2, observation="censored") for _ in range(2))

@@ -65,7 +65,8 @@ class TrustFilter:
     but for the number of draws and the moments.
 
     A bound is taken in when it is over, by `update`; or while it runs, tick by tick, by
-    `begin_bound`, `update_tick` and `end_bound`: then `state` is that of the bound if it ended now.
+    `begin_bound`, `update_tick` or `update_ticks`, and `end_bound`: each tick gives the trust if
+    the bound ended now.
 
     Attributes:
         params: Parameter draws, leading axis (draw,).
@@ -220,10 +221,36 @@ class TrustFilter:
             ShapeError: Another number of robots.
             TrustboError: No bound was begun, or a value outside [0, 1].
         """
-        running = self._require_running(running=True)
+        self._require_running(running=True)
         seen = self._by_robot("in_contact", in_contact)
-        running.contacts[:] += np.nan_to_num(seen)
-        running.ticks[:] += ~np.isnan(seen)
+        return self.update_ticks(np.nan_to_num(seen), ~np.isnan(seen))
+
+    def update_ticks(self, n_contact: ArrayLike, n_ticks: ArrayLike) -> TrustState:
+        """Take in several ticks of the bound that runs, as `update_tick` would one by one.
+
+        Args:
+            n_contact: Number of these ticks with contact, (robot,).
+            n_ticks: Number of ticks measured, (robot,).
+
+        Returns:
+            Trust after the bound if it ended now, with the rate so far; shapes (robot,).
+
+        Raises:
+            ShapeError: Another number of robots.
+            TrustboError: No bound was begun, a number that is negative or NaN, or more ticks with
+                contact than ticks.
+        """
+        running = self._require_running(running=True)
+        contacts, ticks = as_array("n_contact", n_contact), as_array("n_ticks", n_ticks)
+        for name, numbers in (("n_contact", contacts), ("n_ticks", ticks)):
+            if numbers.shape != (self._n_robots,):
+                raise ShapeError(f"{name} must be ({self._n_robots},); got shape {numbers.shape}.")
+        if not ((contacts >= 0.0) & (contacts <= ticks)).all():
+            raise TrustboError(
+                f"n_contact must be from 0 to n_ticks; got {contacts} of {ticks} ticks."
+            )
+        running.contacts[:] += contacts
+        running.ticks[:] += ticks
         mean, var, increment = self._core.update(
             self._mean, self._var, running.z, running.rates(self._family), running.effect
         )

@@ -66,25 +66,31 @@ class Bag:
         """
         times: dict[str, list[int]] = {topic: [] for topic in topics}
         values: dict[str, list[Any]] = {topic: [] for topic in topics}
-        stamps = dict.fromkeys(topics, 0)
+        for topic, time, value in self.values(topics):
+            times[topic].append(time)
+            values[topic].append(value)
+        return {
+            topic: Series(np.array(times[topic], np.int64), _as_array(values[topic], topics[topic]))
+            for topic in topics
+        }
+
+    def values(self, topics: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time in ns and value of each record, in order of time; see `collect`."""
+        stamps, numbers = dict.fromkeys(topics, 0), dict.fromkeys(topics, 0)
         for topic, time, message in self._messages(topics):
             types = topics[topic]
             stamp = stamp_of(message) if types is POSE_TYPES else time
             if stamp < stamps[topic]:
                 raise TrustboError(
-                    f"the clock of {topic} goes backwards: its message {len(times[topic])} is of "
+                    f"the clock of {topic} goes backwards: its message {numbers[topic]} is of "
                     f"{stamp / 1e9:.9f} s, the one before of {stamps[topic] / 1e9:.9f} s."
                 )
             stamps[topic] = stamp
-            times[topic].append(time)
+            numbers[topic] += 1
             try:
-                values[topic].append(READERS[types](message))
+                yield topic, time, READERS[types](message)
             except TrustboError as error:
                 raise TrustboError(f"{topic}: {error}") from None
-        return {
-            topic: Series(np.array(times[topic], np.int64), _as_array(values[topic], topics[topic]))
-            for topic in topics
-        }
 
     def _messages(self, topics: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time in ns and content of all messages on some topics."""

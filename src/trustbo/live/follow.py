@@ -1,0 +1,192 @@
+"""Trust of each robot during a mission, with what is expected of the bounds ahead."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import NormalDist
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from trustbo.data import Cell, Mission
+from trustbo.errors import TrustboError
+from trustbo.inference import TrustFilter, params_of, sample_prior
+from trustbo.inference.filter import TrustForecast, TrustState
+from trustbo.live.underway import Run, Underway
+
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+
+_N_DRAWS = 1000
+_P_FALSE = 0.01
+"""Chance of a false alarm in a bound, of the whole team."""
+_FIVE_PERCENT = -NormalDist().inv_cdf(0.05)
+_LEAST_LOSS = 0.1
+"""Share of contact below which a loss is no alarm, as for changes of the world."""
+_LEAST_DRAWS = 20.0
+"""Effective number of draws below which a forecast is too narrow for an alarm."""
+_LEAST_TICKS = 30
+"""Ticks before which the rate of a bound that runs is no evidence."""
+
+
+class Low(NamedTuple):
+    """Contact far below what was expected."""
+
+    bound: int
+    robot: int
+    rate: float
+    expected: float
+
+
+class Follower:
+    """Filter of a mission that runs, and what it said before each bound.
+
+    Attributes:
+        now: Trust now; of a bound that runs, as if it ended now. None where nothing is filtered.
+        after: Trust after each bound that ended.
+        ahead: Forecast of the bounds of the rest, the one that runs included.
+        n_draws: Effective number of draws of the forecast; below 20 its bands are too narrow.
+        low: Alarms of the bounds that ended.
+        reason: Reason why there is no filter; empty where there is one.
+    """
+
+    def __init__(self, campaign: "Campaign") -> None:
+        """Start before the first bound of a mission of a campaign."""
+        self._campaign = campaign
+        self.reason = ""
+        self._filter: TrustFilter | None = None
+        self.now: TrustState | None = None
+        self.after: list[TrustState] = []
+        self.ahead: TrustForecast | None = None
+        self.low: list[Low] = []
+        self.n_draws = 0.0
+        try:
+            self._filter = _filter_of(campaign)
+            self.now = self.start = self._filter.state
+        except TrustboError as error:  # parameters that no filter takes
+            self.reason = str(error)
+
+    @property
+    def filter(self) -> TrustFilter | None:
+        """Filter after the bounds that ended; None where there is none."""
+        return self._filter
+
+    def catch_up(self, mission: Underway) -> None:
+        """Take in a mission as it is, from its beginning."""
+        if self._filter is None:
+            return
+        self._filter.reset()
+        self.now, self.after, self.low = self._filter.state, [], []
+        cells, runs = mission.path, mission.bounds
+        for k, run in enumerate(runs):
+            self.look_ahead(cells[k : k + 2])
+            self._over(cells[k], run)
+        self.look_ahead(mission.rest)
+        if mission.running is not None:
+            self.begin(mission)
+            self.ticks(mission.running.n_contact, mission.running.n_ticks)
+
+    def look_ahead(self, rest: Sequence[Cell]) -> None:
+        """Forecast the bounds of the rest of a path, the current cell first."""
+        self.ahead = None
+        if self._filter is None or len(rest) < 2:
+            return
+        try:
+            known = self._campaign.known_along(rest)
+            self.ahead = self._filter.predict(known, rest)
+            self.n_draws = float(1.0 / np.sum(self._filter.weights**2))
+        except TrustboError as error:
+            self._give_up(error)
+
+    def begin(self, mission: Underway) -> None:
+        """Begin the bound that runs."""
+        if self._filter is None or mission.running is None:
+            return
+        bound = mission.here, mission.running.cell
+        try:
+            if self.ahead is None or not mission.planned:
+                self.look_ahead(bound)
+            self._filter.begin_bound(self._campaign.known_along(bound)[0], bound)
+        except TrustboError as error:
+            self._give_up(error)
+
+    def ticks(self, n_contact: np.ndarray, n_ticks: np.ndarray) -> None:
+        """Take in ticks of the bound that runs."""
+        if self._filter is not None:
+            self.now = self._filter.update_ticks(n_contact, n_ticks)
+
+    def end(self, mission: Underway) -> None:
+        """End the last bound of a mission."""
+        if self._filter is None:
+            return
+        run = mission.bounds[-1]
+        if run.awareness is not None and self._campaign.learner.awareness is not None:
+            self.catch_up(mission)  # the bound was begun with what was expected
+            return
+        try:
+            self._filter.end_bound()
+        except TrustboError:  # it failed before it began
+            self._over(mission.path[len(mission.bounds) - 1], run)
+            return
+        self._kept(run)
+
+    def _over(self, left: Cell, run: Run) -> None:
+        """Take in a bound that ended."""
+        if self._filter is None:
+            return
+        crossed, names = (left, run.cell), self._campaign.workspace.features
+        try:
+            bound = replace(run.to_bound(len(names), run.begun), status="ok")
+            driven = Mission(crossed, (bound,))
+            awareness = self._campaign.as_learned(self._campaign.workspace.in_order(driven))
+            self._filter.update(
+                awareness.awareness[0], bound.contact_rate, crossed, n_ticks=bound.n_ticks
+            )
+        except TrustboError as error:
+            self._give_up(error)
+            return
+        self._kept(run)
+
+    def _kept(self, run: Run) -> None:
+        assert self._filter is not None  # noqa: S101
+        self.low += self.low_of(run, len(self.after) + 1)
+        self.now = self._filter.state
+        self.after.append(self.now)
+
+    def low_of(self, run: Run, bound: int) -> list[Low]:
+        """Robots with contact far below what was expected of a bound, the first one ahead.
+
+        Far is below a quantile of the forecast that all robots together pass once in a hundred
+        bounds, and by a tenth of contact; of the bound that runs, after 30 ticks. The quantile is
+        that of a normal distribution with the forecast's mean and 5 % quantile. There are no alarms
+        where fewer than 20 draws carry the weight, as may be in the first missions.
+        """
+        if self.ahead is None or self.n_draws < _LEAST_DRAWS:
+            return []
+        mean, low, rate = self.ahead.rate[0], self.ahead.rate_low[0], run.rate
+        limit = -NormalDist().inv_cdf(_P_FALSE / len(mean))
+        least = np.minimum(mean - limit / _FIVE_PERCENT * (mean - low), mean - _LEAST_LOSS)
+        with np.errstate(invalid="ignore"):
+            far = rate < least
+        if not run.status:
+            far &= run.n_ticks >= _LEAST_TICKS
+        return [Low(bound, int(i), float(rate[i]), float(mean[i])) for i in np.flatnonzero(far)]
+
+    def _give_up(self, error: TrustboError) -> None:
+        self._filter, self.now, self.ahead, self.reason = None, None, None, str(error)
+
+
+def _filter_of(campaign: "Campaign") -> TrustFilter:
+    """Filter of the posterior of a campaign, or of the prior before its first mission."""
+    n_robots, features = len(campaign.workspace.team.robots), campaign.workspace.features
+    if (posterior := campaign.state.last_tree) is not None:
+        params, observation = params_of(posterior, day=True), campaign.learner.observation
+    else:
+        model, observation = campaign.model.observing("gaussian"), "gaussian"
+        params = sample_prior(
+            model.for_features(features), len(features), _N_DRAWS, campaign.seed_of("prior"),
+            n_robots=n_robots,
+        )  # fmt: skip
+    return TrustFilter(
+        params, n_robots, response=campaign.model.response, observation=observation,
+        max_draws=_N_DRAWS,
+    )  # fmt: skip
