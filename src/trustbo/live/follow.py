@@ -106,6 +106,7 @@ class Follower:
             if self.ahead is None or not mission.planned:
                 self.look_ahead(bound)
             self._filter.begin_bound(self._campaign.known_along(bound)[0], bound)
+            self.ticks(*np.zeros((2, mission.n_robots)))  # trust is predicted
         except TrustboError as error:
             self._give_up(error)
 

@@ -3,11 +3,12 @@
 import json
 import os
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from trustbo.errors import DamagedFileError
-from trustbo.files import folder_to_disk, naming_refusal, read_file, to_json
+from trustbo.files import folder_to_disk, naming_refusal, read_file, require_folder, to_json
 
 
 class Journal:
@@ -31,6 +32,7 @@ class Journal:
             TrustboError: The folder may not be written to.
         """
         self.path = path
+        require_folder(path.parent)
         with naming_refusal(path.parent):
             path.parent.mkdir(parents=True, exist_ok=True)
             self.records, whole = _read(path)
@@ -50,7 +52,8 @@ class Journal:
                 while done < len(line):
                     done += os.write(self._file, line[done:])
             except OSError:
-                os.ftruncate(self._file, self._size)  # no half of a line before the next
+                with suppress(OSError):
+                    os.ftruncate(self._file, self._size)  # no half of a line before the next
                 raise
         self._size += len(line)
         self.written += 1

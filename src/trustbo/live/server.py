@@ -18,9 +18,11 @@ from trustbo.live.hub import Hub
 
 _log = logging.getLogger(__name__)
 _MOST_BODY = 1 << 20
-"""Upper limit in bytes of the messages of a request, and of the websocket."""
+"""Upper limit in bytes of the messages of a request, or of one of the websocket."""
 _MOST_READ = 1 << 26
 """Bytes of a larger request that are read and dropped, so that its answer is read too."""
+_MOST_FRAME = 1 << 24
+"""Bytes of a message of the websocket that is read to be refused; a larger one ends it."""
 _MOST_UNSENT = 4
 """States that a page may be behind before others are left out."""
 _PAGE = {"": "text/html", "page.css": "text/css", "page.js": "text/javascript"}
@@ -46,7 +48,7 @@ def application(hub: Hub, token: str) -> Application:
             "%d %s", handler.get_status(), handler.request.path
         ),
         websocket_ping_interval=20,
-        websocket_max_message_size=_MOST_BODY,
+        websocket_max_message_size=_MOST_FRAME,
     )
 
 
@@ -194,6 +196,10 @@ class _Socket(WebSocketHandler):
             sent.exception()  # of a connection that was closed meanwhile
 
     async def on_message(self, message: str | bytes) -> None:
+        if len(message) > _MOST_BODY:
+            reason = f"a request has at most {_MOST_BODY} bytes; got {len(message)}."
+            self.send(json.dumps({"error": reason}))
+            return
         lines = (message.encode() if isinstance(message, str) else message).splitlines()
         try:
             taken = await self.hub.take_lines(lines)

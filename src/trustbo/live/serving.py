@@ -4,6 +4,7 @@ import asyncio
 import os
 import secrets
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -11,8 +12,6 @@ from contextlib import AsyncExitStack, contextmanager, suppress
 from ipaddress import ip_address
 from pathlib import Path
 from typing import IO
-
-from tornado.netutil import bind_sockets
 
 from trustbo.errors import TrustboError, require_not_negative, require_whole
 from trustbo.files import FilePath, as_path, folder_to_disk, naming_refusal
@@ -105,11 +104,13 @@ async def _serve(
     async with AsyncExitStack() as stack:
         stack.push_async_callback(hub.close)
         with _naming_port(listen, port):
-            sockets = bind_sockets(port, listen)
+            family = socket.AF_INET6 if ":" in listen else socket.AF_INET
+            listening = socket.create_server((listen, port), family=family)
+        listening.setblocking(False)
         server = http_server(hub, token)
-        server.add_sockets(sockets)
+        server.add_socket(listening)
         stack.callback(server.stop)
-        port = sockets[0].getsockname()[1]
+        port = listening.getsockname()[1]
         host = f"[{listen}]" if ":" in listen else listen
         said = [f"page      http://{host}:{port}/#token={token}"]
         if udp is not None:

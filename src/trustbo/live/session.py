@@ -110,6 +110,8 @@ class Live:
         self.trouble, self.n_idle, self.version, self.busy_with = "", 0, 0, ""
         try:
             self._hold(self._open())
+            if (k := self.mission.k) > 1 or self.mission.running is not None:
+                self._say(f"went on with mission {self.number} at bound {k}")
         except BaseException:
             campaign.__exit__()
             raise
@@ -272,7 +274,7 @@ class Live:
         mission = self.mission
         if mission.status:
             self.job, self.busy_with = self._learn, "learning"
-        elif mission.bounds and mission.running is None and self._may_replan():
+        elif mission.bounds and mission.running is None:
             self.job, self.busy_with = self._route, "planning"
         self.version += 1
 
@@ -285,18 +287,10 @@ class Live:
     def _route(self) -> Apply:
         """Plan the rest of the mission from the trust of now."""
         mission, follower = self.mission, self.follower
-        rest = None
-        with suppress(TrustboError):  # no way on: too few bounds are left
-            planner = self.campaign.planner_now().onward(mission.path[: mission.k])
-            learned, live = self.campaign.state.last is not None, follower.filter
-            if mission.planned and learned and live is not None:
-                rest = better_rest(planner, live, mission.rest)
-            elif not mission.planned and live is not None:
-                params = weighted_mean(live.params, live.weights)
-                rest = planner.plan(params, x0=live.state.mean).path
-            elif not mission.planned:
-                rest = planner.plan(self.campaign.belief.mean()).path
-        rest = mission.rest if rest is None else rest
+        rest = mission.rest
+        if self._may_replan():
+            with suppress(TrustboError):  # no way on: too few bounds are left
+                rest = self._better_rest()
         follower.look_ahead(rest)
 
         def apply() -> None:
@@ -312,6 +306,19 @@ class Live:
             self.version += 1
 
         return apply
+
+    def _better_rest(self) -> tuple[Cell, ...]:
+        """Best rest of the mission from here; TrustboError: too few bounds are left."""
+        mission, campaign, live = self.mission, self.campaign, self.follower.filter
+        planner = campaign.planner_now().onward(mission.path[: mission.k])
+        if mission.planned:
+            if live is None or campaign.state.last is None:  # the prior is no reason to change
+                return mission.rest
+            return better_rest(planner, live, mission.rest)
+        if live is None:
+            return planner.plan(campaign.belief.mean()).path
+        params = weighted_mean(live.params, live.weights)
+        return planner.plan(params, x0=live.state.mean).path
 
     def _learn(self) -> Apply:
         """Pass the mission to the campaign, and plan the next one."""

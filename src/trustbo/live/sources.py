@@ -198,7 +198,7 @@ def _contact(robot: int, n_robots: int, value: float, t: float) -> Contact:
     counts = np.zeros((2, n_robots), dtype=np.int64)
     if not np.isnan(value):
         counts[:, robot] = value > 0.5, 1
-    return Contact(*counts, t)
+    return Contact(counts[0], counts[1], t)
 
 
 def _marker(value: Any, t: float) -> Marker:

@@ -134,7 +134,10 @@ class Underway:
             path, planned = (*entered, cell), False
         contacts, ticks = np.zeros((2, self.n_robots), dtype=np.int64)
         return replace(
-            self, path=path, planned=planned, running=Run(cell, float(event["t"]), contacts, ticks)
+            self,
+            path=path,
+            planned=planned,
+            running=Run(cell, float(event["t"] or 0.0), contacts, ticks),
         )
 
     def _ticked(self, event: Event) -> Self:

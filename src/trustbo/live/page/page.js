@@ -212,7 +212,7 @@ function drawMap() {
   at("high").textContent = number(map.high)
   const bar = canvasOf(at("scale"), 96, 10)
   for (let i = 0; i < 96; i++) { bar.fillStyle = colour(i / 95); bar.fillRect(i, 0, 1.5, 10) }
-  at("map-title").textContent = `${map.layer === "cost" ? "Cost" : "Largest trust"} of ${map.robot ?? "the team"}, cell by cell`
+  at("map-title").textContent = `${map.layer === "cost" ? "Cost" : "Trust"} of ${map.robot ?? "the team"}, cell by cell`
   at("place").textContent = place === null ? "" : `cell ${place}: ${number(map.values[place[0]]?.[place[1]])}`
   at("map").dataset.frame = JSON.stringify([left, scale])
 }
