@@ -38,10 +38,12 @@ class Low(NamedTuple):
 
 
 class Follower:
-    """Filter of a mission that runs, and what it said before each bound.
+    """Filter of a mission that runs, and what it expected before each bound.
+
+    Ticks are summed up, as their numbers are all that the filter takes of them, and filtered when
+    the trust of now is asked for: a tick costs microseconds, and its trust is that of every tick.
 
     Attributes:
-        now: Trust now; of a bound that runs, as if it ended now. None where nothing is filtered.
         after: Trust after each bound that ended.
         ahead: Forecast of the bounds of the rest, the one that runs included.
         n_draws: Effective number of draws of the forecast; below 20 its bands are too narrow.
@@ -54,16 +56,25 @@ class Follower:
         self._campaign = campaign
         self.reason = ""
         self._filter: TrustFilter | None = None
-        self.now: TrustState | None = None
+        self._now: TrustState | None = None
+        self._waiting: np.ndarray | None = None  # ticks with contact, and ticks, (2, robot)
         self.after: list[TrustState] = []
         self.ahead: TrustForecast | None = None
         self.low: list[Low] = []
         self.n_draws = 0.0
         try:
             self._filter = _filter_of(campaign)
-            self.now = self.start = self._filter.state
+            self._now = self.start = self._filter.state
         except TrustboError as error:  # parameters that no filter takes
             self.reason = str(error)
+
+    @property
+    def now(self) -> TrustState | None:
+        """Trust now; of a bound that runs, as if it ended now. None where nothing is filtered."""
+        if self._waiting is not None and self._filter is not None:
+            waiting, self._waiting = self._waiting, None
+            self._now = self._filter.update_ticks(*waiting)
+        return self._now
 
     @property
     def filter(self) -> TrustFilter | None:
@@ -75,7 +86,7 @@ class Follower:
         if self._filter is None:
             return
         self._filter.reset()
-        self.now, self.after, self.low = self._filter.state, [], []
+        self._now, self._waiting, self.after, self.low = self._filter.state, None, [], []
         cells, runs = mission.path, mission.bounds
         for k, run in enumerate(runs):
             self.look_ahead(cells[k : k + 2])
@@ -112,14 +123,18 @@ class Follower:
 
     def ticks(self, n_contact: np.ndarray, n_ticks: np.ndarray) -> None:
         """Take in ticks of the bound that runs."""
-        if self._filter is not None:
-            self.now = self._filter.update_ticks(n_contact, n_ticks)
+        if self._filter is None:
+            return
+        if self._waiting is None:
+            self._waiting = np.zeros((2, len(n_ticks)))
+        self._waiting[0] += n_contact
+        self._waiting[1] += n_ticks
 
     def end(self, mission: Underway) -> None:
         """End the last bound of a mission."""
         if self._filter is None:
             return
-        run = mission.bounds[-1]
+        run, _ = mission.bounds[-1], self.now  # with all ticks
         if run.awareness is not None and self._campaign.learner.awareness is not None:
             self.catch_up(mission)  # the bound was begun with what was expected
             return
@@ -150,8 +165,8 @@ class Follower:
     def _kept(self, run: Run) -> None:
         assert self._filter is not None  # noqa: S101
         self.low += self.low_of(run, len(self.after) + 1)
-        self.now = self._filter.state
-        self.after.append(self.now)
+        self._now = self._filter.state
+        self.after.append(self._now)
 
     def low_of(self, run: Run, bound: int) -> list[Low]:
         """Robots with contact far below what was expected of a bound, the first one ahead.
@@ -173,7 +188,7 @@ class Follower:
         return [Low(bound, int(i), float(rate[i]), float(mean[i])) for i in np.flatnonzero(far)]
 
     def _give_up(self, error: TrustboError) -> None:
-        self._filter, self.now, self.ahead, self.reason = None, None, None, str(error)
+        self._filter, self._now, self.ahead, self.reason = None, None, None, str(error)
 
 
 def _filter_of(campaign: "Campaign") -> TrustFilter:

@@ -13,6 +13,7 @@ from trustbo.errors import TrustboError, one_line, require_pair, require_whole, 
 MOST_BYTES = 1 << 16
 """Upper limit in bytes of a line."""
 _MOST_NOTE = 500  # characters
+_ANY = ("t", "token")  # keys of every message; the token is checked where it is needed
 
 
 class Contact(NamedTuple):
@@ -98,7 +99,7 @@ class Reader:
                 f"a message has one of the keys {', '.join(KINDS)}; got {one_line(record)}."
             )
         read, others = KINDS[kinds[0]]
-        if strange := [key for key in record if key not in (kinds[0], "t", *others)]:
+        if strange := [key for key in record if key not in (kinds[0], *_ANY, *others)]:
             raise TrustboError(
                 f"a message of {kinds[0]} has no {one_line(strange[0])}; its keys are "
                 f"{', '.join((kinds[0], *others, 't'))}."

@@ -132,7 +132,7 @@ class Datagrams(asyncio.DatagramProtocol):
     def _checked(self, line: bytes) -> Message:
         try:
             record = json.loads(line)
-            given = record.pop("token", "") if isinstance(record, dict) else ""
+            given = record.get("token", "") if isinstance(record, dict) else ""
             if not hmac.compare_digest(str(given).encode(), self._token.encode()):
                 raise TrustboError("wrong token: a datagram has the key token.")
             return self._hub.live.reader.of_record(record)
