@@ -1,13 +1,24 @@
 """`trustbo live`: a campaign in the field, with a page."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
+from trustbo.cli.terrains import pair, reader_of, team_of, terrain_with
 from trustbo.errors import TrustboError
 
 
 def live(
     folder: Path,
+    dem: Path | None = None,
+    dsm: Path | None = None,
+    start: str | None = None,
+    goal: str | None = None,
+    shape: str = "10,10",
+    crs: str | None = None,
+    robots: int = 3,
+    max_slope: float = 45.0,
+    lidar_range: float = 100.0,
     port: int = 8737,
     listen: str = "127.0.0.1",
     udp: int | None = None,
@@ -20,27 +31,54 @@ def live(
     """Follow a campaign in the field: contact tick by tick, a page, a plan for each next bound.
 
     Example: trustbo live out/field --udp 8738
+    A new one: trustbo live out/field --dem dem.tif --start 9,0 --goal 0,9 --udp 8738
     A bag, ten times as fast: trustbo live out/field --bag log.bag --rate 10
 
     The page shows the map, the trust of each robot and what to do next, and has
     buttons for the outcome of each bound. Messages are lines of JSON, such as
-    {"contact": {"r1": true, "r2": false}}; see docs/live.md. Nobody else reaches it
-    without --listen and the token that is printed. After Ctrl-C, a crash or a power
-    cut, the same command goes on where it was. TRUSTBO_TOKEN sets a token of yours.
+    {"contact": {"r1": true, "r2": false}}; see docs/live.md. Nobody else reaches
+    it without --listen and the token that is printed; TRUSTBO_TOKEN sets a token of
+    yours. After Ctrl-C, a crash or a power cut, the same command goes on where it was.
     """
     from trustbo.campaign.replacing import STATE, current
 
-    if not (current(folder) / STATE).exists():
+    begun = (current(folder) / STATE).exists()
+    if not begun and (dem is None or start is None or goal is None):
         raise TrustboError(
-            f"{str(folder)!r} holds no campaign; make one in Python by "
-            "trustbo.Campaign(workspace, start, goal, directory=folder), or give the --out of "
-            "trustbo run."
+            f"{str(folder)!r} holds no campaign; to begin one, give --dem, --start and --goal, or "
+            "make it in Python: trustbo.Campaign(workspace, start, goal, directory=folder)."
         )
+    if not begun:
+        assert dem is not None  # noqa: S101
+        _begin(folder, dem, dsm, str(start), str(goal), shape, crs,
+               team=(max_slope, robots, lidar_range))  # fmt: skip
     from trustbo.live import serve
 
     serve(
         folder, port=port, listen=listen, udp=udp, lines=sys.stdin.buffer if stdin else None,
         bag=bag, rate=rate, foxglove=foxglove, replan=not keep_path,
-        ready=lambda text: print(text, flush=True),
+        ready=partial(print, flush=True),
     )  # fmt: skip
     print(f"stopped; trustbo live {folder} goes on.")
+
+
+def _begin(
+    folder: Path,
+    dem: Path,
+    dsm: Path | None,
+    start: str,
+    goal: str,
+    shape: str,
+    crs: str | None,
+    *,
+    team: tuple[float, int, float],
+) -> None:
+    """Begin a campaign on a terrain, without a mission."""
+    from trustbo.campaign import Campaign
+    from trustbo.workspace import Workspace
+
+    cells, of_team = pair("shape", shape), team_of(*team)
+    read = reader_of(dem, dsm, crs, None, None)
+    terrain, ends = terrain_with(start, goal, read, cells, of_team, progress=True)
+    with Campaign(Workspace.from_terrain(terrain, cells, of_team), *ends, directory=folder):
+        print(f"a campaign was begun in {folder}.")

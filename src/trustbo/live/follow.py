@@ -82,7 +82,7 @@ class Follower:
         return self._filter
 
     def catch_up(self, mission: Underway) -> None:
-        """Take in a mission as it is, from its beginning."""
+        """Take in a mission from its beginning."""
         if self._filter is None:
             return
         self._filter.reset()

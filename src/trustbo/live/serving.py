@@ -51,7 +51,7 @@ def serve(
         udp: Port of datagrams; None takes none, 0 any that is free.
         lines: Stream of messages, such as `sys.stdin.buffer`.
         bag: ROS bag to replay.
-        rate: Speed of the replay, 1 that of the bag; 0 for as fast as it is taken.
+        rate: Speed of the replay, 1 that of the bag; 0 for no waiting.
         topics: Names of topics of the bag.
         foxglove: Port of a server for Foxglove, on this machine alone; None for none.
         replan: Whether the rest of a path is planned again after each bound.

@@ -149,7 +149,7 @@ def bag_messages(path: Path, rate: float, hub: Hub, topics: Topics | None = None
 
     Args:
         path: Bag, as of `logs.read_bag`.
-        rate: Speed, 1 that of the bag; 0 for as fast as they are taken.
+        rate: Speed, 1 that of the bag; 0 for no waiting.
         hub: Hub that takes them.
         topics: Names of topics.
 
