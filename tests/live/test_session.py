@@ -219,6 +219,7 @@ def test_a_marker_ends_the_bound_before_and_a_new_mission_the_one_before(folder)
         ([{"bound": 3}], "bound 3 cannot begin: bound 1 is next"),
         ([{"bound": 1}, {"bound": 3}], "bound 3 cannot begin: bound 1 runs"),
         ([{"bound": 1}, {"bound": 1}], "bound 1 cannot begin: bound 1 runs"),
+        ([{"bound": 1}, {"bound": 2, "cell": [0, 3]}], "no bound leads from"),
         ([{"status": "stuck"}], 'no bound of mission 2 has begun.*"mission": 2'),
         ([{"status": "stuck", "mission": 1}], "mission 2 runs, not 1"),
         ([{"bound": 0, "cell": [0, 0]}], r"the mission starts at \(3, 0\), not at \(0, 0\)"),

@@ -6,6 +6,8 @@ flushes to the disk in a third, so that ticks do not wait for them.
 
 import asyncio
 import json
+import logging
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,6 +16,7 @@ from trustbo.errors import TrustboError
 from trustbo.live.messages import Contact, Message, Pose
 from trustbo.live.session import Live
 
+_log = logging.getLogger(__name__)
 _PUSH, _FLUSH = 0.25, 1.0
 """Seconds between two states for the page, and between two flushes of ticks."""
 
@@ -43,7 +46,7 @@ class Hub:
         self._worker = ThreadPoolExecutor(1, "trustbo-live-work")
         self._flusher = ThreadPoolExecutor(1, "trustbo-live-disk")
         self._task: asyncio.Task[None] | None = None
-        self._pushed = -1
+        self._pushed, self._quiet_until = -1, 0.0
 
     async def take(self, message: Message) -> None:
         """Take a message, after the work that it waits for; TrustboError: it is refused."""
@@ -59,6 +62,10 @@ class Hub:
         except TrustboError as error:
             self.refuse(error)
             raise
+        except Exception as error:  # such as a disk that fails
+            live.stopped(f"{type(error).__name__}: {error}")
+            self.refuse(TrustboError(live.trouble))
+            raise TrustboError(live.trouble) from error
         self.n_taken += 1
 
     async def take_line(self, line: bytes | str) -> None:
@@ -83,9 +90,12 @@ class Hub:
         return number
 
     def refuse(self, error: TrustboError) -> None:
-        """Count a message that is refused."""
+        """Count a message that is refused, and log it, once a second at most."""
         self.n_refused += 1
         self.last_refusal = str(error)
+        if (now := time.monotonic()) >= self._quiet_until:
+            self._quiet_until = now + 1.0
+            _log.warning("refused: %s", error)
 
     async def flush(self) -> None:
         """Wait until everything taken so far is on the disk."""

@@ -137,10 +137,10 @@ async def _serve(
             ready("\n".join(said))
             feeds = []
             if lines is not None:
-                feeds.append(Feed(hub, lines_of(lines)))
+                feeds.append(Feed(hub, "the standard input", lines_of(lines)))
             if bag is not None:
                 path, rate, topics = bag
-                feeds.append(Feed(hub, bag_messages(path, rate, hub, topics)))
+                feeds.append(Feed(hub, str(path), bag_messages(path, rate, hub, topics)))
             for feed in feeds:
                 feed.start()
             while not over.is_set() and not (stop is not None and stop.is_set()):

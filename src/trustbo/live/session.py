@@ -111,7 +111,7 @@ class Live:
         try:
             self._hold(self._open())
             if (k := self.mission.k) > 1 or self.mission.running is not None:
-                self._say(f"went on with mission {self.number} at bound {k}")
+                self.say(f"went on with mission {self.number} at bound {k}")
         except BaseException:
             campaign.__exit__()
             raise
@@ -218,18 +218,25 @@ class Live:
         if mission.running is not None:
             if marker.bound != mission.k + 1:
                 raise TrustboError(f"bound {marker.bound} cannot begin: bound {mission.k} runs.")
+            # Both or none: a marker that is refused does not end the bound before it.
+            over = mission.after({"event": "end", "status": "ok", "t": None})
+            over.after(self._beginning(marker, over))
             self._end("ok", "", None)
             return False
+        self._happen(self._beginning(marker, mission))
+        self.follower.begin(self.mission)
+        self.n_idle = 0
+        return True
+
+    def _beginning(self, marker: Marker, mission: Underway) -> Event:
+        """Event of the start of a bound, by default to the planned cell."""
         cell = marker.cell
-        if cell is None:
+        if cell is None and not mission.status:
             if not mission.planned:
                 raise TrustboError(f"no path leads on from {mission.here}: give the cell entered.")
             cell = mission.path[mission.k]
         t = self._clock() if marker.t is None else marker.t
-        self._happen({"event": "begin", "bound": marker.bound, "cell": cell, "t": t})
-        self.follower.begin(self.mission)
-        self.n_idle = 0
-        return True
+        return {"event": "begin", "bound": marker.bound, "cell": cell, "t": t}
 
     def _end(self, status: str, note: str, t: float | None) -> None:
         """End the bound that runs, by its last tick unless a time is given."""
@@ -241,8 +248,8 @@ class Live:
             self.follower.end(self.mission)
             for low in self.follower.low:
                 if low.bound == before.k:
-                    self._say(view.sentence_of(low, self.reader.robots))
-        self._say(f"bound {before.k}: {status}" + (f" ({note})" if note else ""))
+                    self.say(view.sentence_of(low, self.reader.robots))
+        self.say(f"bound {before.k}: {status}" + (f" ({note})" if note else ""))
         self._plan_work()
 
     def _require_mission(self, ending: Ending) -> None:
@@ -298,9 +305,9 @@ class Live:
             if tuple(rest) != mission.rest or not mission.planned:
                 if len(rest) > 1:
                     self._happen({"event": "route", "path": rest})
-                    self._say(f"planned anew from {mission.here}")
+                    self.say(f"planned anew from {mission.here}")
                 else:
-                    self._say(
+                    self.say(
                         f"no path leads on from {mission.here} within the bounds that are left"
                     )
             self.version += 1
@@ -338,7 +345,7 @@ class Live:
         def apply() -> None:
             self.journal.close()
             self._hold(opened)
-            self._say(said)
+            self.say(said)
 
         return apply
 
@@ -387,16 +394,17 @@ class Live:
         self.posts: dict[tuple[Cell, Cell], list[list[float]]] = {}
         self.job, self.busy_with = None, ""
         for alarm in self.alarms:
-            self._say(alarm)
+            self.say(alarm)
         self._plan_work()
 
     def stopped(self, reason: str) -> None:
         """Take nothing more, for a reason."""
         self.job, self.busy_with = None, ""
         self.trouble = f"{reason} Nothing that was told is lost; start again to go on."
-        self._say(self.trouble)
+        self.say(self.trouble)
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Add a line to the log."""
         self.log.append((self._clock(), text))
         self.version += 1
 

@@ -3,10 +3,11 @@
 import asyncio
 import hmac
 import json
-import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import suppress
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -27,7 +28,6 @@ from trustbo.logs.messages import (
     Topics,
 )
 
-_log = logging.getLogger(__name__)
 _MOST_WAITING = 10_000
 """Datagrams that may wait while work is done."""
 _NS = 1e9
@@ -36,51 +36,33 @@ _NS = 1e9
 class Feed(threading.Thread):
     """Thread that passes messages to a hub, each when those before it are taken."""
 
-    def __init__(
-        self, hub: Hub, messages: Iterable[Message | bytes], *, strict: bool = False
-    ) -> None:
-        """Hold messages, which may block; `strict` ends at the first one that is refused."""
+    def __init__(self, hub: Hub, name: str, batches: Iterable[Sequence[Message | bytes]]) -> None:
+        """Hold lists of messages that come together, which may block, and their name."""
         super().__init__(name="trustbo-live-feed", daemon=True)
-        self._hub, self._messages, self._strict = hub, messages, strict
+        self._hub, self._name, self._batches = hub, name, batches
         self._loop = asyncio.get_running_loop()
-        self.ended = asyncio.Event()
-        self.error = ""
 
     def run(self) -> None:
         """Pass the messages."""
         try:
-            for batch in _batches(self._messages):
+            for batch in self._batches:
                 asyncio.run_coroutine_threadsafe(self._take(batch), self._loop).result()
-                if self.error and self._strict:
-                    break
+            self._loop.call_soon_threadsafe(self._hub.live.say, f"{self._name} is over")
         except TrustboError as error:  # of the bag
-            self.error = str(error)
-            _log.error("%s", error)
-        except (RuntimeError, asyncio.CancelledError):  # the loop was closed
+            self._loop.call_soon_threadsafe(self._hub.refuse, error)
+        except (RuntimeError, CancelledError):  # the loop was closed
             return
-        finally:
-            if not self._loop.is_closed():
-                self._loop.call_soon_threadsafe(self.ended.set)
 
-    async def _take(self, batch: list[Message | bytes]) -> None:
+    async def _take(self, batch: Sequence[Message | bytes]) -> None:
         for one in batch:
-            try:
+            with suppress(TrustboError):  # the hub counts it
                 if not isinstance(one, bytes):
                     await self._hub.take(one)
                 elif one.strip():
                     await self._hub.take_line(one)
-            except TrustboError as error:
-                self.error = str(error)
-                _log.warning("refused: %s", error)
 
 
-def _batches(messages: Iterable[Message | bytes]) -> Iterator[list[Message | bytes]]:
-    """Lists of messages that come together."""
-    for one in messages:
-        yield one if isinstance(one, list) else [one]
-
-
-def lines_of(stream: IO[bytes]) -> Iterator[Any]:
+def lines_of(stream: IO[bytes]) -> Iterator[list[bytes]]:
     """Lists of the lines of a stream, as they come; of a line that is too long, its beginning."""
     read = getattr(stream, "read1", stream.read)
     left, skipping = b"", False
@@ -121,13 +103,11 @@ class Datagrams(asyncio.DatagramProtocol):
     async def _take(self) -> None:
         while True:
             for line in (await self._waiting.get()).splitlines():
-                try:
+                with suppress(TrustboError):  # the hub counts it
                     if self._token:
                         await self._hub.take(self._checked(line))
                     else:
                         await self._hub.take_line(line)
-                except TrustboError as error:
-                    _log.warning("refused: %s", error)
 
     def _checked(self, line: bytes) -> Message:
         try:
@@ -168,7 +148,7 @@ def bag_messages(path: Path, rate: float, hub: Hub, topics: Topics | None = None
                 due = began + (stamp - first) / _NS / rate
                 time.sleep(max(0.0, due - time.monotonic()))
             last = stamp / _NS
-            yield _merged([(kinds[topic], value) for topic, _, value in together], last, hub)
+            yield _merged([(kinds[topic], value) for topic, _, value in together], last)
     yield from _over(hub, last)
 
 
@@ -215,7 +195,7 @@ def _pose(name: str, value: Any, t: float) -> Pose:
     return Pose({name: (float(value[0]), float(value[1]))}, t)
 
 
-def _merged(together: list[tuple[_Kind, Any]], t: float, hub: Hub) -> list[Message]:
+def _merged(together: list[tuple[_Kind, Any]], t: float) -> list[Message]:
     """Messages of one time in their order, contacts as one tick."""
     together.sort(key=lambda one: one[0][1])
     messages = [kind[2](value, t) for kind, value in together]
