@@ -58,6 +58,7 @@ def test_a_bag_is_told_as_it_is_read(recorded, tmp_path, serving):
         )
 
 
+@pytest.mark.slow  # a terrain and a fit more
 def test_a_bag_that_ends_in_a_bound_ends_the_mission(recorded, tmp_path, serving):
     folder = tmp_path / "campaign"
     shutil.copytree(recorded / "campaign", folder)

@@ -33,6 +33,7 @@ async def read_state(port):
     return topics, state
 
 
+@pytest.mark.slow  # waits for seconds
 def test_foxglove_gets_the_map_the_path_and_the_state(folder, serving):
     pytest.importorskip("foxglove")
     with serving(folder, foxglove=0) as served:
