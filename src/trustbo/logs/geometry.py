@@ -33,7 +33,7 @@ def geometry(
         terrain: DEM and DSM in the coordinates of the poses, which may hide robots.
         sight: Model of sight through the terrain.
         sensor_height: Height of the sensors above ground, m.
-        target_height: Height at which they look for robots, m.
+        target_height: Height of the point of a robot that they aim at, m.
 
     Returns:
         Dataset over (watcher, seen, time), NaN where a pose is not known, or of a robot with

@@ -48,7 +48,7 @@ class Log(Displayed):
         """Read two tables: paths of CSV files, DataFrames, or mappings of columns.
 
         Args:
-            poses: Columns t, robot, x, y and, if known, heading; by default robots look ahead, in
+            poses: Columns t, robot, x, y and, if known, heading; by default robots face ahead, in
                 the direction of their motion. Times are numbers of seconds, or dates with times.
             detections: Columns t, watcher, seen; others are left out, and so are detections of
                 anything without poses.
@@ -142,7 +142,7 @@ def read_log(path: FilePath, *, topics: Topics | None = None, **options: Any) ->
             robot, and the names of robots as it sees them (`std_msgs/msg/String`), on
             `Topics.pose` and `Topics.seen`.
         topics: Names of topics of a bag.
-        options: As for `Log`.
+        options: Further arguments of `Log`.
 
     Raises:
         TrustboError: There is no such file, or what `Log` and bags refuse.

@@ -21,7 +21,7 @@ def read_mrclam(folder: FilePath) -> Log:
     """Read a run of the five robots.
 
     Args:
-        folder: Folder of a run as it is published: `Robot1_Groundtruth.dat`,
+        folder: Folder of a run as published: `Robot1_Groundtruth.dat`,
             `Robot1_Measurement.dat`, ..., `Landmark_Groundtruth.dat`, `Barcodes.dat`; or of tables
             as of `read_log`.
 

@@ -41,7 +41,7 @@ class Sensor(Displayed):
         """Chance of detection, (watcher, seen, time), in [0, 1]; NaN where it is NaN in the data.
 
         Ticks that the sensor was fitted to have the chance by fits to the others, a fifth of the
-        time left out at once: its own fit would promise more than holds of other logs.
+        time left out at once: the whole fit would promise more than holds of other logs.
 
         Args:
             geometry: Dataset of `geometry`.
@@ -120,7 +120,7 @@ def fit_sensor(
 
 
 def _pipeline(variables: Sequence[str]) -> Pipeline:
-    """Splines of range and |bearing|, other columns as they are, and a logistic regression."""
+    """Splines of range and |bearing|, other columns unchanged, and a logistic regression."""
     bent = [i for i, name in enumerate(variables) if name in _BENT]
     splines = SplineTransformer(_KNOTS, extrapolation="constant", include_bias=False)
     others: Any = StandardScaler()

@@ -18,7 +18,7 @@ _STEP = 0.5  # s between poses
 def synthetic_log(
     n_robots: int = 5, minutes: float = 10.0, *, seed: int = 0, lasting: float = 0.95
 ) -> Log:
-    """Make up a log of robots that wander in a hall and look for each other with a camera.
+    """Make up a log of robots that wander in a hall and detect each other with a camera.
 
     A camera sees 31 degrees to each side, some 5 m far, and not through robots. A robot has a
     quality of its camera, N(0, .7^2) of log odds, which stays; and each pair a deviation from

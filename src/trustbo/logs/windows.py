@@ -61,7 +61,7 @@ def missions_of(
             in [0, 1]: `near`, r / (r + range) with the median range r of the log; `ahead`, within
             30 degrees of the heading; `clear`, not hidden.
         could_see: Function of the geometry to booleans (watcher, seen, time): the ticks in which a
-            robot could have seen. Others are no ticks, as a sensor that looks away says nothing.
+            robot could have seen. Others are no ticks: a sensor that faces away measures nothing.
         workspace: Map; bounds then are the lead's crossings from cell to cell, and missions end
             where it leaves the grid or comes to a cell that is no neighbour.
         length: Most bounds of a mission; by default trust carries over the whole log.

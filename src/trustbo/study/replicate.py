@@ -1,4 +1,4 @@
-"""Does a model hold on another log? Fits to one, scores on the others, beside simple baselines."""
+"""Does a model hold on another log? Fits to one, scores on the others, and simple baselines."""
 
 import importlib.util
 import itertools
@@ -47,7 +47,7 @@ def replicate(
     """Fit to the missions of each log, and score one bound ahead on those of every other.
 
     Rates of all bounds but the first of each mission are scored, as some baselines need one before;
-    forecasts of a bound know all rates before it.
+    forecasts of a bound are given all rates before it.
 
     Args:
         missions: Missions by the name of their log, of the same robots and features; or functions
