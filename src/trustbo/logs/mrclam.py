@@ -29,7 +29,7 @@ def read_mrclam(folder: FilePath) -> Log:
         TrustboError: A file is missing, or is no such table.
     """
     run = Path(folder)
-    if not (run / "Barcodes.dat").exists() and (run / "poses.csv.gz").exists():
+    if not (run / "Barcodes.dat").exists() and any(run.glob("poses.csv*")):
         log = read_log(run)
         landmarks = np.column_stack([log.landmarks[:, :2], np.full(len(log.landmarks), _TUBE)])
         log.landmarks, log.robot_radius = landmarks, _ROBOT
