@@ -61,8 +61,8 @@ def test_export_puts_maps_for_ros_into_a_frame(invoke, finished, tmp_path):
     ask = ("export", folder, "--format", "ros_map", "--out", tmp_path)
     done = invoke(*ask, "--origin", "auto", "--rotation", 90, "--frame", "odom")
     assert done.exit_code == 0, done.output
-    assert "cost_map_frame.yaml" in done.output
-    frame = yaml.safe_load((tmp_path / "cost_map_frame.yaml").read_text())
+    assert "frame.yaml" in done.output
+    frame = yaml.safe_load((tmp_path / "frame.yaml").read_text())
     assert frame["rotation"] == pytest.approx(np.pi / 2)
     x, y = frame["origin"]
     written = {file: file.read_bytes() for file in tmp_path.iterdir()}

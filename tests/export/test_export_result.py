@@ -33,7 +33,8 @@ def test_every_format_is_written_under_its_name(result, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
     assert list(FORMATS) == list(FILES)
     written = export_result(result, tmp_path / "out", FORMATS)
-    assert written == [tmp_path / "out" / name for names in FILES.values() for name in names]
+    names = [name for names in FILES.values() for name in names]
+    assert written == [tmp_path / "out" / name for name in (*names, "frame.yaml")]
     assert set((tmp_path / "out").iterdir()) == set(written)
     assert all(file.is_dir() or file.stat().st_size for file in written)
 
@@ -49,19 +50,35 @@ def test_by_default_it_is_what_a_gis_takes_and_a_second_time_replaces_it(result,
 def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
     lon, lat = result.workspace.grid.lonlat(result.path[0])
     options = {"rotation": 0.1, "frame": "odom"}
+    (tmp_path / "cost_map_frame.yaml").touch()  # as version 0.2 wrote it
     written = export_result(result, tmp_path, ["csv", "ros_map"], origin="auto", **options)
-    assert written[-1] == tmp_path / "cost_map_frame.yaml"
+    assert written[-1] == tmp_path / "frame.yaml"
     assert all(file.exists() for file in written)
+    assert not (tmp_path / "cost_map_frame.yaml").exists()
     frame = yaml.safe_load(written[-1].read_text())
     assert frame["origin"] == list(result.workspace.grid.center(result.path[0]))
     export_result(result, tmp_path / "b", "ros_map", origin=f"lon={lon},lat={lat}", **options)
-    again = yaml.safe_load((tmp_path / "b" / "cost_map_frame.yaml").read_text())
+    again = yaml.safe_load((tmp_path / "b" / "frame.yaml").read_text())
     np.testing.assert_allclose(again["origin"], frame["origin"], rtol=0.0, atol=1e-3)
     for name, value in {"origin": "auto", "rotation": 0.1, "frame": "odom"}.items():
         with pytest.raises(TrustboError, match=f"{name}={value!r} is of maps for ROS; leave it"):
             export_result(result, tmp_path, "geotiff", **{name: value})
     with pytest.raises(TrustboError, match=r"origin 'x=0,y=0' .* is 5239 km from the grid, x 380"):
         export_result(result, tmp_path, "ros_map", origin=(0.0, 0.0))
+
+
+def test_files_for_robots_in_one_folder_have_one_frame(result, tmp_path):
+    pytest.importorskip("rosbags", reason="needs the extra ros")
+    export_result(result, tmp_path, "ros_map", origin="auto")
+    with pytest.raises(TrustboError, match=r"holds cost_map.yaml, cost_map.pgm in another frame"):
+        export_result(result, tmp_path, "ros2_bag")
+    assert not (tmp_path / "path_ros2").exists()
+    export_result(result, tmp_path, "ros2_bag", origin="auto")
+    export_result(result, tmp_path / "b", "ros_map")  # in the frame of the CRS
+    export_result(result, tmp_path / "b", "ros_map", origin="auto")  # alone, it is replaced
+    (tmp_path / "b" / "frame.yaml").unlink()  # as an export of version 0.2 to that of the CRS
+    with pytest.raises(TrustboError, match=r"asked for, 'map' at x 380015, y 5224925 of the"):
+        export_result(result, tmp_path / "b", "ros2_bag", origin="auto")
 
 
 def test_the_assumed_trust_of_the_start_does_not_stretch_the_colours(result, tmp_path):

@@ -259,6 +259,8 @@ def test_a_bag_in_a_frame_of_its_own_keeps_millimetres_in_float32(
     with (tmp_path / "path" / "path.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = {c.topic: m for _, c, _, m in reader.iter_decoded_messages()}
+    (static,) = found.pop("/tf_static").transforms
+    assert (static.header.frame_id, static.child_frame_id) == ("epsg_32616", "odom")
     assert {message.header.frame_id for message in found.values()} == {"odom"}
     poses = [pose.pose for pose in found["/trustbo/path"].poses]
     drawn = np.array([(p.position.x, p.position.y) for p in poses], np.float32)

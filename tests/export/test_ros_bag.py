@@ -101,6 +101,7 @@ def test_a_bag_of_ros_1_is_latched(result, maps, tmp_path):
         "/trustbo/cost": ("nav_msgs/msg/OccupancyGrid", "3381f2d731d4076ec5c71b0759edbe4e", 1),
         "/trustbo/path": path,
         "/trustbo/lead/waypoints": poses,
+        "/tf_static": ("tf2_msgs/msg/TFMessage", "94810edda583a504dfda3829e70d7eec", 1),
         **{f"/trustbo/{robot}/posts": poses for robot in ("r1", "r2", "r3")},
         **{f"/trustbo/{robot}/way": path for robot in ("lead", "r1", "r2", "r3")},
     }
@@ -120,7 +121,7 @@ def test_a_database_of_ros_2_is_transient_local(result, maps, tmp_path):
     ).fetchall()
     raw = dict(base.execute("SELECT topic_id, data FROM messages").fetchall())
     base.close()
-    assert len(topics) == 10
+    assert len(topics) == 11
     assert {topic[:3] for topic in topics} >= {
         ("/trustbo/cost", "nav_msgs/msg/OccupancyGrid", "cdr"),
         ("/trustbo/path", "nav_msgs/msg/Path", "cdr"),

@@ -100,8 +100,7 @@ Options
   export.resolution M: Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side
     where cells are not square.
   origin PLACE: Position in the terrain's CRS that is 0,0 of maps and bags for ROS, as x,y in metres
-    or lon=174.7,lat=-41.3; or auto, the start of the path. It is kept in a file that ends in
-    _frame.yaml.
+    or lon=174.7,lat=-41.3; or auto, the start of the path. It is kept in frame.yaml.
   rotation DEG: Angle from east to the x axis of their frame, anticlockwise.
   frame NAME: Name of their frame.
   executor NAME: Executor of the runs: serial, loky, dask, or a scheduler's address,

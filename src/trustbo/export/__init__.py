@@ -1,6 +1,7 @@
 """Results as files for other programs: GIS, GPS, robots, tables."""
 
 from trustbo.export.everything import FORMATS, export_result
+from trustbo.export.frame import write_frame
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
 from trustbo.export.rasters import write_geotiff, write_netcdf
@@ -8,7 +9,7 @@ from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.tables import write_csv
 
 __all__ = [
-    "FORMATS", "export_result", "path_frame", "write_csv", "write_geotiff", "write_netcdf",
-    "write_overwatch", "write_path", "write_ros_bag", "write_ros_map",
+    "FORMATS", "export_result", "path_frame", "write_csv", "write_frame", "write_geotiff",
+    "write_netcdf", "write_overwatch", "write_path", "write_ros_bag", "write_ros_map",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -1,9 +1,9 @@
 """Export of a result in several formats to one folder."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import xarray as xr
 
@@ -15,11 +15,11 @@ from trustbo.export.checks import (
     require_names_for_netcdf,
     require_names_for_sql,
 )
-from trustbo.export.frame import Frame, Origin, frame_file, frame_of
+from trustbo.export.frame import Frame, Origin, frame_file, frame_of, is_frame, save_frame
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import tables_beside, write_path
 from trustbo.export.rasters import write_geotiff, write_netcdf
-from trustbo.export.ros import occupancy, require_robots, write_ros_bag, write_ros_map
+from trustbo.export.ros import occupancy, require_robots, save_ros_bag, save_ros_map
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
@@ -32,8 +32,10 @@ class _Content(NamedTuple):
     result: Result
     maps: Callable[[], xr.Dataset]
     """Its maps, computed once and only if a format needs them: they are slow."""
-    for_ros: dict[str, Any]
-    """Arguments of the maps and bags for ROS."""
+    frame: Frame
+    """Frame of all formats for robots."""
+    resolution: float | None
+    """Side of a pixel of their maps, m."""
 
 
 class _Format(NamedTuple):
@@ -77,7 +79,8 @@ def export_result(
         frame: Name of their frame; see `write_ros_map`.
 
     Returns:
-        Files written; the folder of a ROS 2 bag.
+        Files written; the folder of a ROS 2 bag. With maps and bags for ROS, the last is
+        `frame.yaml`, the one frame of them all, see `write_frame`.
 
     Raises:
         TrustboError: A format is unknown, or needs a CRS that the result lacks; a bag exists, or
@@ -101,16 +104,32 @@ def export_result(
             )
     for name in chosen:
         _require_possible(name, result, target)
-    origin_xy = None if origin is None else place.origin  # "auto" is not known to a map alone
-    content = _Content(result, cache(result.maps), given | {"origin": origin_xy})
+    if for_ros:
+        _require_frame(place, target, chosen)
+    content = _Content(result, cache(result.maps), place, resolution)
     if for_ros:
         occupancy(content.maps()["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
     written = [file for kind in chosen.values() for file in kind.files_in(target, result)]
-    if place != Frame():
-        written += [frame_file(target / kind.files[0]) for n, kind in chosen.items() if n in _ROS]
+    if for_ros:
+        written.append(target / _FRAME)
+        save_frame(target / _FRAME, place, result.workspace)
+        for name in chosen.keys() & _ROS:  # one of an earlier version would contradict it
+            frame_file(target / _FORMATS[name].files[0]).unlink(missing_ok=True)
     return written
+
+
+def _require_frame(place: Frame, target: Path, chosen: Collection[str]) -> None:
+    """Refuse another frame than that of files for robots that stay in a folder: TrustboError."""
+    others = (file for name in _ROS if name not in chosen for file in _FORMATS[name].files)
+    staying = [file for file in others if (target / file).exists()]
+    if staying and not is_frame(require_file(target / _FRAME), place):
+        raise TrustboError(
+            f"{str(target)!r} holds {', '.join(staying)} in another frame than that asked for, "
+            f"{place.name!r} at x {place.origin[0]:.10g}, y {place.origin[1]:.10g} of the CRS; "
+            "write all files for robots at once, or to another folder."
+        )
 
 
 def left_out(result: Result, folder: FilePath) -> dict[str, str]:
@@ -160,7 +179,12 @@ def _write_tables(content: _Content, file: Path) -> None:
 
 def _write_bag(content: _Content, file: Path) -> None:
     result, cost = content.result, content.maps()["cost"]
-    write_ros_bag(file, result, cost, result.workspace, **content.for_ros)
+    save_ros_bag(file, result.plan, cost, result.workspace, content.resolution, content.frame)
+
+
+def _write_map(content: _Content, file: Path) -> None:
+    result, cost = content.result, content.maps()["cost"]
+    save_ros_map(file, cost, result.workspace, content.resolution, content.frame)
 
 
 def _write_path(content: _Content, file: Path) -> None:
@@ -173,6 +197,8 @@ def _require_topics(result: Result) -> None:
 
 _BAGS = ("ros1_bag", "ros2_bag")
 _ROS = ("ros_map", *_BAGS)
+_FRAME = "frame.yaml"
+"""File with the frame of all formats for ROS."""
 _FOR_ROS = {"resolution": None, "origin": None, "rotation": 0.0, "frame": "map"}
 """Options of the formats for ROS, with their defaults."""
 _FORMATS = {
@@ -234,9 +260,7 @@ _FORMATS = {
     "ros_map": _Format(
         "the cost map for map_server and Nav2",
         ("cost_map.yaml", "cost_map.pgm"),
-        lambda content, file: write_ros_map(
-            file, content.maps()["cost"], content.result.workspace, **content.for_ros
-        ),
+        _write_map,
     ),
     "ros1_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 1",

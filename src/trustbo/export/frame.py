@@ -1,4 +1,8 @@
-"""Frame of a robot's map: an origin and a direction in the CRS, subtracted in float64."""
+"""Frame of robots: an origin and a direction in the CRS, subtracted in float64.
+
+One frame serves all exports for robots. Its pose in the CRS is a static transform, in a YAML file,
+and in bags on `/tf_static`.
+"""
 
 import math
 import re
@@ -8,10 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
+from pyproj import Geod
 
-from trustbo.errors import TrustboError
+from trustbo.campaign.result import Result
+from trustbo.errors import TrustboError, require_kind
 from trustbo.export.checks import find_crs
-from trustbo.files import require_file, write_text
+from trustbo.files import FilePath, read_yaml, require_file, write_text
+from trustbo.planning import Plan
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, crs_name, lonlat_of, position_near
@@ -20,21 +27,36 @@ AUTO = "auto"
 """Origin at the centre of the first cell of the path."""
 _FAR = 1e5
 """Distance of an origin from the grid, m, beyond which float32 is coarser than 8 mm again."""
+_AHEAD = 100.0
+"""Distance over which the direction of the x axis on Earth is measured, m."""
+_COARSE = 0.01
 Origin = Location | tuple[float, float] | None
 
 
 class Frame(NamedTuple):
-    """Frame of a map.
+    """Frame of robots, and its pose in the frame of the CRS, its parent.
 
     Attributes:
         name: Name, the `frame_id` of messages.
         origin: Position of (0, 0) of the frame, x and y in CRS metres.
         rotation: Angle from east, the CRS's x axis, to that of the frame, rad, anticlockwise.
+        parent: Name of the frame of the CRS, such as `epsg_2193`; `grid` without a CRS.
     """
 
     name: str = "map"
     origin: tuple[float, float] = (0.0, 0.0)
     rotation: float = 0.0
+    parent: str = "grid"
+
+    @property
+    def is_default(self) -> bool:
+        """Whether positions in the frame are those in the CRS, under the default name."""
+        return self == Frame(parent=self.parent)
+
+    @property
+    def turn(self) -> tuple[float, float, float, float]:
+        """Rotation as a quaternion x, y, z, w."""
+        return 0.0, 0.0, math.sin(self.rotation / 2.0), math.cos(self.rotation / 2.0)
 
     @property
     def axes(self) -> np.ndarray:
@@ -73,7 +95,46 @@ def frame_of(
         angle = math.nan
     if not math.isfinite(angle):
         raise TrustboError(f"rotation must be a finite angle; got {rotation!r}.")
-    return Frame(name, _origin(workspace.grid, origin, start), angle)
+    parent = _parent(workspace.grid)
+    if name == parent:
+        raise TrustboError(f"frame {name!r} is that of the CRS itself; choose another name.")
+    return Frame(name, _origin(workspace.grid, origin, start), angle, parent)
+
+
+def write_frame(
+    path: FilePath,
+    plan: Plan | Result | Workspace,
+    *,
+    origin: Origin = AUTO,
+    rotation: float = 0.0,
+    frame: str = "map",
+) -> None:
+    """Write the pose of a frame in the CRS to a YAML file, as other exports with a frame do.
+
+    The file has the `frame`, its `parent` (the CRS as a frame, such as `epsg_2193`), the `origin`
+    and `rotation` of the frame in it, the same as the `transform` of a TransformStamped of ROS,
+    the `crs`, and the `longitude` and `latitude` of (0, 0) with `datum`: latitude, longitude
+    (degrees) and the angle of the x axis from true east (rad, anticlockwise), as
+    navsat_transform_node of robot_localization takes it. Without a CRS, the last four are missing.
+
+    Args:
+        path: .yaml or .yml file to write, or to replace.
+        plan: Plan or result, at whose start is the origin `"auto"`; or a workspace.
+        origin: Position in the CRS that is (0, 0) of the frame, see `write_ros_map`; `"auto"` is
+            the centre of the path's first cell, None that of the CRS.
+        rotation: Angle from east to the x axis of the frame, rad, anticlockwise.
+        frame: Name of the frame.
+
+    Raises:
+        TrustboError: An argument is refused by `write_ros_map`, or the file cannot be written.
+    """
+    target = require_file(path, ".yaml", ".yml")
+    require_kind("plan", plan, Plan | Result | Workspace, "give a Plan, a Result or a Workspace")
+    workspace, start = plan, None
+    if not isinstance(plan, Workspace):
+        workspace, start = plan.workspace, plan.path[0]
+    assert isinstance(workspace, Workspace)  # noqa: S101
+    save_frame(target, frame_of(workspace, origin, rotation, frame, start), workspace)
 
 
 def frame_file(path: Path) -> Path:
@@ -81,24 +142,84 @@ def frame_file(path: Path) -> Path:
     return require_file(path.with_name(f"{path.stem}_frame.yaml"))
 
 
-def write_frame(path: Path, frame: Frame, workspace: Workspace) -> None:
+def save_beside(path: Path, frame: Frame, workspace: Workspace) -> None:
     """Write the frame of the map or bag at `path` to a file; nothing for that of the CRS."""
-    if frame == Frame():
-        return
+    if not frame.is_default:
+        save_frame(frame_file(path), frame, workspace)
+
+
+def save_frame(file: Path, frame: Frame, workspace: Workspace) -> None:
+    """Write a frame to a file; see `write_frame`."""
+    (x, y), turn = frame.origin, frame.turn
     record: dict[str, object] = {
         "frame": frame.name,
-        "origin": list(frame.origin),
+        "parent": frame.parent,
+        "origin": [x, y],
         "rotation": frame.rotation,
+        "transform": {
+            "translation": {"x": x, "y": y, "z": 0.0},
+            "rotation": dict(zip("xyzw", turn, strict=True)),
+        },
     }
-    about = "# x, y of the CRS = origin + [[c, -s], [s, c]] (x, y of the frame), c, s of rotation\n"
+    about = (
+        "# Pose of the frame in its parent, the CRS: x, y of the CRS = origin + [[c, -s], [s, c]]\n"
+        "# (x, y of the frame), c and s of rotation (rad). To publish it in ROS 2:\n"
+        f"#   ros2 run tf2_ros static_transform_publisher --x {x!r} --y {y!r} "
+        f"--yaw {frame.rotation!r} --frame-id {frame.parent} --child-frame-id {frame.name}\n"
+    )
     if find_crs(workspace) is not None:
+        about += "# datum: latitude, longitude, angle of x from true east (rad), for GPS\n"
         lon, lat = lonlat_of(workspace.grid, frame.origin)
         record |= {
             "crs": crs_name(workspace.grid),
             "longitude": round(lon, 9),
             "latitude": round(lat, 9),
+            "datum": [round(lat, 9), round(lon, 9), round(_from_east(workspace.grid, frame), 9)],
         }
-    write_text(frame_file(path), about + yaml.safe_dump(record, sort_keys=False))
+    write_text(file, about + yaml.safe_dump(record, sort_keys=False))
+
+
+def is_frame(file: Path, frame: Frame) -> bool:
+    """Whether a file of `save_frame` has a frame; without a file, whether it is that of the CRS."""
+    if not file.exists():
+        return frame.is_default
+    record = read_yaml(file)
+    if not isinstance(record, dict):
+        return False
+    return (record.get("frame"), record.get("origin"), record.get("rotation")) == (
+        frame.name, [*frame.origin], frame.rotation
+    )  # fmt: skip
+
+
+def require_fine(frame: Frame, workspace: Workspace, what: str) -> None:
+    """Refuse a frame so far from the grid that float32, which a reader uses, is coarse there.
+
+    TrustboError: its step is more than a centimetre.
+    """
+    left, bottom, right, top = workspace.grid.bounds
+    corners = np.array([[x, y] for x in (left, right) for y in (bottom, top)])
+    far = float(np.abs(frame.of_crs(corners)).max())
+    step = float(np.spacing(np.float32(far)))
+    if step > _COARSE:
+        raise TrustboError(
+            f"{what} holds positions in float32, in steps of {step:g} m where coordinates are "
+            f"{far:.0f} m; put the origin near the robots: origin='auto' is the start of the path."
+        )
+
+
+def _from_east(grid: Grid, frame: Frame) -> float:
+    """Angle from true east to the x axis of a frame at its origin, rad, anticlockwise."""
+    ahead = frame.to_crs(np.array([_AHEAD, 0.0]))
+    places = lonlat_of(grid, frame.origin), lonlat_of(grid, (float(ahead[0]), float(ahead[1])))
+    azimuth, *_ = Geod(ellps="WGS84").inv(*places[0], *places[1])
+    return math.remainder(math.radians(90.0 - azimuth), math.tau)
+
+
+def _parent(grid: Grid) -> str:
+    """Name of the frame of a CRS, of letters, digits and _."""
+    if grid.crs is None:
+        return "grid"
+    return re.sub(r"\W+", "_", crs_name(grid)).strip("_").lower() or "crs"
 
 
 def _origin(grid: Grid, origin: Origin, start: tuple[int, int] | None) -> tuple[float, float]:

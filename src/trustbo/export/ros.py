@@ -16,11 +16,18 @@ import yaml
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import LEAD, require_maps
-from trustbo.export.frame import Frame, Origin, frame_file, frame_of, write_frame
+from trustbo.export.frame import Frame, Origin, frame_file, frame_of, save_beside
 from trustbo.export.layers import plan_of, routes_of
 from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.logs.bagfile import STORAGES, Record, require_new_bag, write_messages
-from trustbo.logs.messages import GRID, PATH, POSES, Messages, require_topic_names
+from trustbo.logs.messages import (
+    GRID,
+    PATH,
+    POSES,
+    TRANSFORMS,
+    Messages,
+    require_topic_names,
+)
 from trustbo.planning import Plan
 from trustbo.workspace import Workspace
 
@@ -134,10 +141,22 @@ def write_ros_map(
             that cannot be; or the file cannot be written.
     """
     target = require_file(path, ".yaml", ".yml")
-    picture = require_file(target.with_suffix(".pgm"))
+    require_file(target.with_suffix(".pgm"))
     place = frame_of(workspace, origin, rotation, frame)
     frame_file(target)
-    raster = _raster(cost, workspace, resolution, place)
+    save_ros_map(target, cost, workspace, resolution, place)
+    save_beside(target, place, workspace)
+
+
+def save_ros_map(
+    target: Path,
+    cost: xr.DataArray,
+    workspace: Workspace,
+    resolution: float | None,
+    place: Frame,
+) -> None:
+    """Write a map in a frame, without the file of the frame; see `write_ros_map`."""
+    raster, picture = _raster(cost, workspace, resolution, place), target.with_suffix(".pgm")
     height, width = raster.values.shape
     # Pictures begin in the north. In raw mode, map_server takes the byte of a pixel as its value,
     # 255 as -1; Nav2 does so up to 100, and takes larger bytes as unknown.
@@ -154,7 +173,6 @@ def write_ros_map(
         "free_thresh": 0.196,
     }
     write_file(picture, lambda file: file.write_bytes(head + pixels))
-    write_frame(target, place, workspace)
     # Last, as it names the picture.
     write_text(target, yaml.safe_dump(record, sort_keys=False, default_flow_style=None))
 
@@ -177,6 +195,7 @@ def write_ros_bag(
     All messages are latched (transient local), for RViz, Foxglove and drivers:
 
     ======================= ======================= ==========================================
+    /tf_static              tf2_msgs/TFMessage      pose of the frame in that of the CRS
     /trustbo/cost           nav_msgs/OccupancyGrid  cost map
     /trustbo/path           nav_msgs/Path           centres of the cells, each towards the next
     /trustbo/<robot>/way    nav_msgs/Path           ways of all bounds, also of the `lead`
@@ -205,30 +224,50 @@ def write_ros_bag(
     """
     target = Path(path)
     require_choice("storage", storage, STORAGES)
-    of_path = require_new_bag(target, version)
+    require_new_bag(target, version)
     plan = plan_of(plan, workspace)
     require_robots(workspace)
     place = frame_of(workspace, origin, rotation, frame, plan.path[0])
     frame_file(target)
-    raster = _raster(cost, workspace, resolution, place)
-    topics = _topics(plan, place)
+    save_ros_bag(target, plan, cost, workspace, resolution, place, storage)
+    save_beside(target, place, workspace)
 
+
+def save_ros_bag(
+    target: Path,
+    plan: Plan,
+    cost: xr.DataArray,
+    workspace: Workspace,
+    resolution: float | None,
+    place: Frame,
+    storage: str = "mcap",
+) -> None:
+    """Write a bag in a frame, without the file of the frame; see `write_ros_bag`."""
+    raster, topics = _raster(cost, workspace, resolution, place), _topics(plan, place)
     of_kind = {PATH: Messages.path, POSES: Messages.poses}
 
     def records(make: Messages) -> list[Record]:
         corner = np.array([*raster.corner, 0.0])
         now = time.time_ns()
-        grid = make.grid(now, raster.values, raster.resolution, corner)
         return [
-            Record(now, "/trustbo/cost", GRID, grid),
+            static_transform(make, now, place),
+            Record(
+                now, "/trustbo/cost", GRID, make.grid(now, raster.values, raster.resolution, corner)
+            ),
             *(
                 Record(now, f"/trustbo/{name}", kind, of_kind[kind](make, now, poses))
                 for name, (kind, poses) in topics.items()
             ),
         ]
 
-    write_messages(target, of_path, storage, records, latched=True, frame=frame)
-    write_frame(target, place, workspace)
+    version = require_new_bag(target, None)
+    write_messages(target, version, storage, records, latched=True, frame=place.name)
+
+
+def static_transform(make: Messages, now: int, place: Frame) -> Record:
+    """Pose of a frame in that of the CRS, for `/tf_static`; time in ns."""
+    message = make.transform(now, place.parent, place.origin, place.turn)
+    return Record(now, "/tf_static", TRANSFORMS, message)
 
 
 def _resolution(workspace: Workspace, resolution: float | None, *, turned: bool) -> float:

@@ -13,7 +13,14 @@ import numpy as np
 
 from trustbo.errors import TrustboError, pip_install
 from trustbo.files import naming_refusal, require_regular
-from trustbo.logs.messages import CONTACT_TYPES, POSE_TYPES, READERS, Messages, stamp_of
+from trustbo.logs.messages import (
+    CONTACT_TYPES,
+    DEFINITIONS,
+    POSE_TYPES,
+    READERS,
+    Messages,
+    stamp_of,
+)
 from trustbo.logs.recording import Series
 
 STORAGES = ("sqlite3", "mcap")
@@ -168,9 +175,8 @@ def write_messages(
     given `Messages`, in `frame`. If `latched`, late subscribers get the messages played before.
     """
     from rosbags import rosbag1, rosbag2
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    store = _types(version)
     serialize = store.serialize_ros1 if version == 1 else store.serialize_cdr
     with naming_refusal(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -191,6 +197,16 @@ def write_messages(
                     )
                 writer.write(connections[topic], time, serialize(message, kind))
         os.replace(file, path)
+
+
+def _types(version: int) -> Any:
+    """Types of a version of ROS, those of `DEFINITIONS` included."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    for kind, text in DEFINITIONS[version].items():
+        store.register(get_types_from_msg(text, kind))
+    return store
 
 
 def _latch(version: int) -> dict[str, Any]:

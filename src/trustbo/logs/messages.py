@@ -18,6 +18,12 @@ POSE = "geometry_msgs/msg/PoseStamped"
 GRID = "nav_msgs/msg/OccupancyGrid"
 PATH = "nav_msgs/msg/Path"
 POSES = "geometry_msgs/msg/PoseArray"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+DEFINITIONS: Mapping[int, Mapping[str, str]] = {
+    1: {TRANSFORMS: "geometry_msgs/TransformStamped[] transforms\n"},
+    2: {},
+}
+"""Definitions of types that rosbags has not, by the version of ROS."""
 
 MARKER_TYPES = (TEXT, "std_msgs/msg/Int32MultiArray")
 STATUS_TYPES = (TEXT,)
@@ -113,6 +119,29 @@ class Messages:
         """Make an array of poses, shape (pose, 3), in the frame."""
         return self._types[POSES](header=self._header(time), poses=[self._pose(p) for p in poses])
 
+    def transform(
+        self,
+        time: int,
+        parent: str,
+        origin: tuple[float, float],
+        turn: tuple[float, float, float, float],
+    ) -> Any:
+        """Make the transform with the pose of the frame in its parent.
+
+        `origin` is x and y in the parent, m, `turn` a quaternion x, y, z, w.
+        """
+        x, y = origin
+        shift = self._types["geometry_msgs/msg/Vector3"](x=x, y=y, z=0.0)
+        rotation = self._types["geometry_msgs/msg/Quaternion"](*turn)
+        one = self._types["geometry_msgs/msg/TransformStamped"](
+            header=self._header(time, parent),
+            child_frame_id=self._frame,
+            transform=self._types["geometry_msgs/msg/Transform"](
+                translation=shift, rotation=rotation
+            ),
+        )
+        return self._types[TRANSFORMS](transforms=[one])
+
     def grid(self, time: int, values: np.ndarray, resolution: float, corner: np.ndarray) -> Any:
         """Make a map in the frame from int8 values (row, col), the southern row first.
 
@@ -134,10 +163,10 @@ class Messages:
             sec=time // 1_000_000_000, nanosec=time % 1_000_000_000
         )
 
-    def _header(self, time: int) -> Any:
+    def _header(self, time: int, frame: str = "") -> Any:
         head = self._types["std_msgs/msg/Header"]
         number = {"seq": 0} if "seq" in head.__dataclass_fields__ else {}  # of ROS 1 alone
-        return head(stamp=self._stamp(time), frame_id=self._frame, **number)
+        return head(stamp=self._stamp(time), frame_id=frame or self._frame, **number)
 
     def _pose(self, pose: np.ndarray) -> Any:
         x, y, heading = (float(value) for value in pose)
