@@ -98,7 +98,10 @@ def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished,
 @pytest.mark.parametrize(
     ("ask", "message"),
     [
-        (("gpx", "--resolution", 5), "--resolution 5 is of maps for ROS; leave it out, or ask for"),
+        (
+            ("gpx", "--resolution", 5),
+            "--resolution 5 is of files for robots; leave it out, or ask for",
+        ),
         (("ros_map", "--resolution", 0), "resolution must be positive and finite; got 0.0"),
     ],
 )

@@ -22,7 +22,12 @@ FILES = {
     "geopackage": ["path.gpkg"],
     "overwatch": ["overwatch.tif"],
     "csv": ["missions.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
-    "ros_map": ["cost_map.yaml", "cost_map.pgm"],
+    "ros_map": ["cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"],
+    "nav2": [
+        "route_graph.geojson",
+        "route_graph_params.yaml",
+        *(f"waypoints_{robot}.yaml" for robot in ("lead", "r1", "r2", "r3")),
+    ],
     "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],
 }
@@ -51,7 +56,7 @@ def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
     lon, lat = result.workspace.grid.lonlat(result.path[0])
     options = {"rotation": 0.1, "frame": "odom"}
     (tmp_path / "cost_map_frame.yaml").touch()  # as version 0.2 wrote it
-    written = export_result(result, tmp_path, ["csv", "ros_map"], origin="auto", **options)
+    written = export_result(result, tmp_path, ["csv", "ros_map"], **options)
     assert written[-1] == tmp_path / "frame.yaml"
     assert all(file.exists() for file in written)
     assert not (tmp_path / "cost_map_frame.yaml").exists()
@@ -60,8 +65,10 @@ def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
     export_result(result, tmp_path / "b", "ros_map", origin=f"lon={lon},lat={lat}", **options)
     again = yaml.safe_load((tmp_path / "b" / "frame.yaml").read_text())
     np.testing.assert_allclose(again["origin"], frame["origin"], rtol=0.0, atol=1e-3)
-    for name, value in {"origin": "auto", "rotation": 0.1, "frame": "odom"}.items():
-        with pytest.raises(TrustboError, match=f"{name}={value!r} is of maps for ROS; leave it"):
+    for name, value in {"origin": "crs", "rotation": 0.1, "frame": "odom"}.items():
+        with pytest.raises(
+            TrustboError, match=f"{name}={value!r} is of files for robots; leave it"
+        ):
             export_result(result, tmp_path, "geotiff", **{name: value})
     with pytest.raises(TrustboError, match=r"origin 'x=0,y=0' .* is 5239 km from the grid, x 380"):
         export_result(result, tmp_path, "ros_map", origin=(0.0, 0.0))
@@ -69,16 +76,20 @@ def test_maps_for_ros_have_the_frame_that_is_asked_for(result, tmp_path):
 
 def test_files_for_robots_in_one_folder_have_one_frame(result, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
-    export_result(result, tmp_path, "ros_map", origin="auto")
-    with pytest.raises(TrustboError, match=r"holds cost_map.yaml, cost_map.pgm in another frame"):
-        export_result(result, tmp_path, "ros2_bag")
+    export_result(result, tmp_path, ["ros_map", "nav2"])
+    with pytest.raises(TrustboError, match=r"holds cost_map.yaml, .*geojson, .* in another frame"):
+        export_result(result, tmp_path, "ros2_bag", origin="crs")
     assert not (tmp_path / "path_ros2").exists()
-    export_result(result, tmp_path, "ros2_bag", origin="auto")
-    export_result(result, tmp_path / "b", "ros_map")  # in the frame of the CRS
-    export_result(result, tmp_path / "b", "ros_map", origin="auto")  # alone, it is replaced
-    (tmp_path / "b" / "frame.yaml").unlink()  # as an export of version 0.2 to that of the CRS
+    export_result(result, tmp_path, "ros2_bag")
+    export_result(result, tmp_path / "b", "ros_map", origin="crs")
+    export_result(result, tmp_path / "b", "ros_map")  # alone, it is replaced
+    export_result(result, tmp_path / "b", "ros_map", origin="crs")
+    (tmp_path / "b" / "frame.yaml").unlink()  # as an export of version 0.2
     with pytest.raises(TrustboError, match=r"asked for, 'map' at x 380015, y 5224925 of the"):
-        export_result(result, tmp_path / "b", "ros2_bag", origin="auto")
+        export_result(result, tmp_path / "b", "ros2_bag")
+    export_result(result, tmp_path / "b", "ros2_bag", origin="crs")
+    with pytest.raises(TrustboError, match=r"float32, in steps of 0.5 m .* origin='auto' is the"):
+        export_result(result, tmp_path / "c", "nav2", origin="crs")
 
 
 def test_the_assumed_trust_of_the_start_does_not_stretch_the_colours(result, tmp_path):
@@ -145,7 +156,9 @@ def test_what_one_format_refuses_keeps_all_from_being_written(result, tmp_path, 
         export_result(result, tmp_path, ["csv", "kml"])
     with pytest.raises(TrustboError, match=r"resolution must be positive and finite; got 0"):
         export_result(result, tmp_path, ["csv", "ros_map"], resolution=0)
-    with pytest.raises(TrustboError, match=r"resolution=5 is of maps for ROS; leave it out, or"):
+    with pytest.raises(
+        TrustboError, match=r"resolution=5 is of files for robots; leave it out, or"
+    ):
         export_result(result, tmp_path, ["csv", "gpx"], resolution=5)
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(TrustboError, match="pip install rosbags"):

@@ -52,6 +52,13 @@ def test_the_graph_of_costs_has_the_stationary_plan_as_its_shortest_path(workspa
     risk = nx.path_weight(graph, plan.path, "risk")
     np.testing.assert_allclose(np.exp(-risk), planner.problem.risk.survival(plan.path), rtol=1e-12)
     assert "cost" not in planner.graph.edges[plan.path[:2]]
+    assert planner.with_objective("stationary").plan(PARAMS).path == plan.path
+    free = PARAMS._replace(beta0=0.0)  # without memory, losses of bounds are those of the plan
+    lost = Planner(workspace, (4, 0), (0, 5), length_weight=1e-3)
+    best = lost.plan(free)
+    total = nx.path_weight(lost.graph_of(free), best.path, "lost")
+    np.testing.assert_allclose(-total, best.value, rtol=1e-12)
+    assert not nx.get_edge_attributes(lost.with_objective("mean").graph_of(free), "lost")
     with pytest.raises(TrustboError, match=r"abs\(beta0\) < 1; got 1"):
         planner.graph_of(PARAMS._replace(beta0=1.0))
 

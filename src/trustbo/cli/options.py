@@ -95,12 +95,14 @@ Program
   title TEXT: Title of the page.
 Options
   formats NAME: Format, may be repeated: geotiff, cog, netcdf (maps); geojson, gpx, geopackage
-    (the path); overwatch (what one would see of its bounds); csv (path and missions); ros_map,
-    ros1_bag, ros2_bag (cost and path); or all that can be written.
+    (the path); overwatch (what one would see of its bounds); csv (path and missions); for robots
+    ros_map, nav2 (route graph and waypoints), ros1_bag, ros2_bag (cost and path); or all that can
+    be written.
   export.resolution M: Pixel size of maps for ROS; by default a cell, or a tenth of its shorter side
     where cells are not square.
-  origin PLACE: Position in the terrain's CRS that is 0,0 of maps and bags for ROS, as x,y in metres
-    or lon=174.7,lat=-41.3; or auto, the start of the path. It is kept in frame.yaml.
+  origin PLACE: Position in the terrain's CRS that is 0,0 of files for robots, as x,y in metres
+    or lon=174.7,lat=-41.3; or auto, the start of the path; or crs, that of the CRS. It is kept in
+    frame.yaml.
   rotation DEG: Angle from east to the x axis of their frame, anticlockwise.
   frame NAME: Name of their frame.
   executor NAME: Executor of the runs: serial, loky, dask, or a scheduler's address,

@@ -4,6 +4,7 @@ import sys
 from math import radians
 from pathlib import Path
 
+from trustbo.cli.errors import in_flags
 from trustbo.cli.outputs import use_no_screen
 from trustbo.errors import TrustboError, require_choice
 
@@ -35,7 +36,7 @@ def export(
     formats: list[str],
     out: Path | None = None,
     resolution: float | None = None,
-    origin: str | None = None,
+    origin: str = "auto",
     rotation: float = 0.0,
     frame: str = "map",
 ) -> None:
@@ -43,7 +44,7 @@ def export(
 
     Example: trustbo export out/demo --format geotiff --format gpx
     All formats: trustbo export out/demo --format all --out for-the-field
-    For a robot, from its start: trustbo export out/demo --format ros2_bag --origin auto
+    For robots: trustbo export out/demo --format nav2 --format ros_map --out robots
 
     With all, formats that cannot be written (a place on Earth without a terrain, a
     bag that exists already) are left out, each with a line that gives the reason; a
@@ -59,7 +60,7 @@ def export(
     result, target = load_result(folder), out or folder
     chosen, absent = formats, {}
     if "all" in formats:
-        reasons = left_out(result, target)
+        reasons = left_out(result, target, origin=origin, rotation=radians(rotation), frame=frame)
         absent = {name: why for name, why in reasons.items() if name not in formats}
         chosen = [name for name in FORMATS if name not in absent]
     files = export_result(
@@ -67,7 +68,7 @@ def export(
         rotation=radians(rotation), frame=frame,
     )  # fmt: skip
     for name, why in absent.items():
-        print(f"left out {name}: {why}", file=sys.stderr)
+        print(f"left out {name}: {in_flags(why)}", file=sys.stderr)
     for file in files:
         print(file)
 

@@ -10,19 +10,33 @@ import xarray as xr
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import (
+    LEAD,
     require_crs,
     require_lead_apart,
     require_names_for_netcdf,
     require_names_for_sql,
 )
-from trustbo.export.frame import Frame, Origin, frame_file, frame_of, is_frame, save_frame
+from trustbo.export.frame import (
+    AUTO,
+    Frame,
+    Origin,
+    frame_file,
+    frame_of,
+    is_frame,
+    require_fine,
+    save_frame,
+)
+from trustbo.export.nav2 import save_waypoints, stops_of, write_costmap_filters
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import tables_beside, write_path
 from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import occupancy, require_robots, save_ros_bag, save_ros_map
+from trustbo.export.route_graph import OBJECTIVES, RouteGraph, graph_of, summed
+from trustbo.export.route_graph_file import save_route_graph
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
+from trustbo.inference import params_of
 from trustbo.logs.bagfile import require_new_bag
 
 
@@ -45,14 +59,21 @@ class _Format(NamedTuple):
     """Function of the content and the first of the files."""
     on_earth: bool = False
     """Whether the format needs a CRS."""
-    require: Callable[[Result], None] | None = None
-    """Check that refuses a result the format cannot hold."""
+    in_frame: bool = False
+    """Whether its positions are in the frame of robots."""
+    require: Callable[[Result, Frame], object] | None = None
+    """Check that refuses a result, or a frame, that the format cannot hold."""
     on_terrain: tuple[str, ...] = ()
-    """Further files, of posts and ways, which need a terrain in memory."""
+    """Further files, of posts and ways, which need a terrain in memory; `{robot}`: one for each."""
 
     def files_in(self, folder: Path, result: Result) -> list[Path]:
-        more = () if result.workspace.ground is None else self.on_terrain
-        return [folder / name for name in (*self.files, *more)]
+        more, names = self.on_terrain, (LEAD, *result.workspace.team.names)
+        if result.workspace.ground is None:
+            more = ()
+        by_robot = {
+            name.format(robot=robot): None for name in more for robot in names
+        }  # each once, in order
+        return [folder / name for name in (*self.files, *by_robot)]
 
 
 def export_result(
@@ -61,7 +82,7 @@ def export_result(
     formats: Sequence[str] = ("geotiff", "geojson"),
     *,
     resolution: float | None = None,
-    origin: Origin = None,
+    origin: Origin = AUTO,
     rotation: float = 0.0,
     frame: str = "map",
 ) -> list[Path]:
@@ -73,56 +94,58 @@ def export_result(
         formats: Names of formats, keys of `FORMATS`.
         resolution: Side of a pixel of the maps for ROS, m; by default that of a cell, or a tenth of
             its shorter side if cells are not square.
-        origin: Position in the CRS that is (0, 0) of the maps and bags for ROS, x and y, m, or with
-            names; `"auto"`: the centre of the path's first cell. By default that of the CRS.
+        origin: Position in the CRS that is (0, 0) of the files for robots, x and y, m, or with
+            names; `"auto"`: the centre of the path's first cell; `"crs"`: that of the CRS.
         rotation: Angle from east to the x axis of their frame, rad, anticlockwise.
         frame: Name of their frame; see `write_ros_map`.
 
     Returns:
-        Files written; the folder of a ROS 2 bag. With maps and bags for ROS, the last is
+        Files written; the folder of a ROS 2 bag. With files for robots, the last is
         `frame.yaml`, the one frame of them all, see `write_frame`.
 
     Raises:
         TrustboError: A format is unknown, or needs a CRS that the result lacks; a bag exists, or
             rosbags is not installed; the resolution is not positive, far too fine, or given
-            without a format for ROS; a cost is outside [0, 1]; or a file cannot be written. Then
+            without a format for robots; a cost is outside [0, 1]; or a file cannot be written. Then
             nothing is written.
     """
     names = [formats] if isinstance(formats, str) else dict.fromkeys(formats)
     chosen = {name: _FORMATS[require_choice("format", name, _FORMATS)] for name in names}
-    target, for_ros = require_folder(folder), not chosen.keys().isdisjoint(_ROS)
+    target, for_robots = require_folder(folder), any(kind.in_frame for kind in chosen.values())
     if resolution is not None:
         require_positive("resolution", resolution)
     place = frame_of(result.workspace, origin, rotation, frame, result.path[0])
     given = {"resolution": resolution, "origin": origin, "rotation": rotation, "frame": frame}
-    for option, default in _FOR_ROS.items():
-        if not for_ros and (value := given[option]) != default:
+    for option, default in _FOR_ROBOTS.items():
+        if not for_robots and (value := given[option]) != default:
             shown = f"{value:g}" if isinstance(value, float | int) else repr(value)
             raise TrustboError(
-                f"{option}={shown} is of maps for ROS; leave it out, or ask for one of "
-                f"{', '.join(_ROS)}."
+                f"{option}={shown} is of files for robots; leave it out, or ask for one of "
+                f"{', '.join(_in_frame())}."
             )
     for name in chosen:
-        _require_possible(name, result, target)
-    if for_ros:
+        _require_possible(name, result, target, place)
+    if for_robots:
         _require_frame(place, target, chosen)
     content = _Content(result, cache(result.maps), place, resolution)
-    if for_ros:
+    if not chosen.keys().isdisjoint(_WITH_COST):
         occupancy(content.maps()["cost"], result.workspace, resolution=resolution)
     for kind in chosen.values():
         kind.write(content, target / kind.files[0])
     written = [file for kind in chosen.values() for file in kind.files_in(target, result)]
-    if for_ros:
+    if for_robots:
         written.append(target / _FRAME)
         save_frame(target / _FRAME, place, result.workspace)
-        for name in chosen.keys() & _ROS:  # one of an earlier version would contradict it
+        for name in chosen.keys() & set(
+            _in_frame()
+        ):  # one of an earlier version would contradict it
             frame_file(target / _FORMATS[name].files[0]).unlink(missing_ok=True)
     return written
 
 
 def _require_frame(place: Frame, target: Path, chosen: Collection[str]) -> None:
     """Refuse another frame than that of files for robots that stay in a folder: TrustboError."""
-    others = (file for name in _ROS if name not in chosen for file in _FORMATS[name].files)
+    others = (file for name in _in_frame() if name not in chosen for file in _FORMATS[name].files)
     staying = [file for file in others if (target / file).exists()]
     if staying and not is_frame(require_file(target / _FRAME), place):
         raise TrustboError(
@@ -132,22 +155,38 @@ def _require_frame(place: Frame, target: Path, chosen: Collection[str]) -> None:
         )
 
 
-def left_out(result: Result, folder: FilePath) -> dict[str, str]:
-    """Return the formats that cannot be written, and why; TrustboError: the folder is a file."""
+def _in_frame() -> list[str]:
+    """Names of the formats for robots."""
+    return [name for name, kind in _FORMATS.items() if kind.in_frame]
+
+
+def left_out(
+    result: Result,
+    folder: FilePath,
+    *,
+    origin: Origin = AUTO,
+    rotation: float = 0.0,
+    frame: str = "map",
+) -> dict[str, str]:
+    """Return the formats that cannot be written, and why, in a frame as of `export_result`.
+
+    TrustboError: the folder is a file, or the frame cannot be.
+    """
     target, reasons = require_folder(folder), {}
+    place = frame_of(result.workspace, origin, rotation, frame, result.path[0])
     for name in _FORMATS:
         try:
-            _require_possible(name, result, target)
+            _require_possible(name, result, target, place)
         except TrustboError as error:
             reasons[name] = str(error)
     return reasons
 
 
-def _require_possible(name: str, result: Result, target: Path) -> None:
+def _require_possible(name: str, result: Result, target: Path, place: Frame) -> None:
     """Refuse a format that cannot be written: TrustboError.
 
-    It needs a CRS that the result lacks, or cannot hold one of its names; a bag exists, or rosbags
-    is not installed; or a folder has the name of a file.
+    It needs a CRS that the result lacks, or cannot hold one of its names, or its frame; a bag
+    exists, or rosbags is not installed; or a folder has the name of a file.
     """
     kind = _FORMATS[name]
     if kind.on_earth:
@@ -155,7 +194,7 @@ def _require_possible(name: str, result: Result, target: Path) -> None:
     if any(file.startswith("path") for file in kind.files):
         require_lead_apart(result.workspace.team.names)
     if kind.require is not None:
-        kind.require(result)
+        kind.require(result, place)
     for file in kind.files_in(target, result):
         if name in _BAGS:
             require_new_bag(file, None)
@@ -182,25 +221,53 @@ def _write_bag(content: _Content, file: Path) -> None:
     save_ros_bag(file, result.plan, cost, result.workspace, content.resolution, content.frame)
 
 
-def _write_map(content: _Content, file: Path) -> None:
-    result, cost = content.result, content.maps()["cost"]
-    save_ros_map(file, cost, result.workspace, content.resolution, content.frame)
-
-
 def _write_path(content: _Content, file: Path) -> None:
     write_path(file, content.result)
 
 
-def _require_topics(result: Result) -> None:
+def _write_map(content: _Content, file: Path) -> None:
+    result, cost, place = content.result, content.maps()["cost"], content.frame
+    save_ros_map(file, cost, result.workspace, content.resolution, place)
+    write_costmap_filters(file, frame=place.name)
+
+
+def _write_nav2(content: _Content, file: Path) -> None:
+    result, place = content.result, content.frame
+    save_route_graph(file, _route_graph(result, place))
+    if result.workspace.ground is not None:
+        for robot in (LEAD, *result.workspace.team.names):
+            target = file.with_name(_WAYPOINTS.format(robot=robot))
+            save_waypoints(target, result.plan, robot, place)
+
+
+def _route_graph(result: Result, place: Frame) -> RouteGraph:
+    """Graph of the campaign's objective, or of lost_contact where its value is no sum."""
+    planner = result.planner
+    require_fine(place, result.workspace, "a route graph")
+    summable = planner if planner.objective in OBJECTIVES else summed(planner, "lost_contact")
+    return graph_of(summable, params_of(result.posterior).mean(), place)
+
+
+def _require_nav2(result: Result, place: Frame) -> None:
+    _require_topics(result, place)
+    _route_graph(result, place)
+    if result.workspace.ground is not None:
+        for robot in (LEAD, *result.workspace.team.names):
+            stops_of(result.plan, robot, place)
+
+
+def _require_topics(result: Result, place: Frame) -> None:
     require_robots(result.workspace)
 
 
 _BAGS = ("ros1_bag", "ros2_bag")
-_ROS = ("ros_map", *_BAGS)
+_WITH_COST = ("ros_map", *_BAGS)
+"""Formats with the cost map as occupancy."""
+_WAYPOINTS = "waypoints_{robot}.yaml"
 _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
-_FOR_ROS = {"resolution": None, "origin": None, "rotation": 0.0, "frame": "map"}
-"""Options of the formats for ROS, with their defaults."""
+_FOR_ROBOTS = {"resolution": None, "origin": AUTO, "rotation": 0.0, "frame": "map"}
+"""Options of the formats for robots, with their defaults."""
 _FORMATS = {
     "geotiff": _Format(
         "all maps as bands of a GeoTIFF, with a style for QGIS",
@@ -221,7 +288,7 @@ _FORMATS = {
         ("maps.nc",),
         lambda content, file: write_netcdf(file, content.maps(), content.result.workspace),
         # Result.maps renames features that have the name of a coordinate.
-        require=lambda result: require_names_for_netcdf(
+        require=lambda result, _: require_names_for_netcdf(
             name for name in result.workspace.features if "/" in name
         ),
     ),
@@ -242,14 +309,14 @@ _FORMATS = {
         ("path.gpkg",),
         _write_path,
         on_earth=True,
-        require=lambda result: require_names_for_sql(result.workspace.team.names),
+        require=lambda result, _: require_names_for_sql(result.workspace.team.names),
     ),
     "overwatch": _Format(
         "how much of each bound of the path one would see from each point, as GeoTIFF",
         ("overwatch.tif",),
         lambda content, file: write_overwatch(file, content.result.plan),
         on_earth=True,
-        require=lambda result: require_overwatch(result.workspace),
+        require=lambda result, _: require_overwatch(result.workspace),
     ),
     "csv": _Format(
         "tables of all bounds, of the path, its posts and its ways",
@@ -258,20 +325,31 @@ _FORMATS = {
         on_terrain=tuple(file.name for file in tables_beside(Path("path.csv"))),
     ),
     "ros_map": _Format(
-        "the cost map for map_server and Nav2",
-        ("cost_map.yaml", "cost_map.pgm"),
+        "the cost map for map_server and Nav2, and filters of costmaps",
+        ("cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"),
         _write_map,
+        in_frame=True,
+    ),
+    "nav2": _Format(
+        "the graph of all bounds for the route server of Nav2, and each robot's waypoints",
+        ("route_graph.geojson", "route_graph_params.yaml"),
+        _write_nav2,
+        in_frame=True,
+        require=_require_nav2,
+        on_terrain=(_WAYPOINTS,),
     ),
     "ros1_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 1",
         ("path.bag",),
         _write_bag,
+        in_frame=True,
         require=_require_topics,
     ),
     "ros2_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 2 (mcap)",
         ("path_ros2",),
         _write_bag,
+        in_frame=True,
         require=_require_topics,
     ),
 }

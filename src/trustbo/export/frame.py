@@ -23,8 +23,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.location import Location, crs_name, lonlat_of, position_near
 
-AUTO = "auto"
-"""Origin at the centre of the first cell of the path."""
+AUTO, OF_CRS = "auto", "crs"
+"""Origins at the centre of the first cell of the path, and at that of the CRS."""
 _FAR = 1e5
 """Distance of an origin from the grid, m, beyond which float32 is coarser than 8 mm again."""
 _AHEAD = 100.0
@@ -121,7 +121,7 @@ def write_frame(
         path: .yaml or .yml file to write, or to replace.
         plan: Plan or result, at whose start is the origin `"auto"`; or a workspace.
         origin: Position in the CRS that is (0, 0) of the frame, see `write_ros_map`; `"auto"` is
-            the centre of the path's first cell, None that of the CRS.
+            the centre of the path's first cell, `"crs"` that of the CRS.
         rotation: Angle from east to the x axis of the frame, rad, anticlockwise.
         frame: Name of the frame.
 
@@ -224,7 +224,7 @@ def _parent(grid: Grid) -> str:
 
 def _origin(grid: Grid, origin: Origin, start: tuple[int, int] | None) -> tuple[float, float]:
     """Position of an origin in the CRS."""
-    if origin is None:
+    if origin is None or (isinstance(origin, str) and origin == OF_CRS):
         return 0.0, 0.0
     if isinstance(origin, str) and origin == AUTO:
         if start is None:

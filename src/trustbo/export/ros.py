@@ -18,6 +18,7 @@ from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.export.checks import LEAD, require_maps
 from trustbo.export.frame import Frame, Origin, frame_file, frame_of, save_beside
 from trustbo.export.layers import plan_of, routes_of
+from trustbo.export.poses import onward, towards
 from trustbo.files import FilePath, require_file, write_file, write_text
 from trustbo.logs.bagfile import STORAGES, Record, require_new_bag, write_messages
 from trustbo.logs.messages import (
@@ -291,27 +292,17 @@ def require_robots(workspace: Workspace) -> None:
 def _topics(plan: Plan, frame: Frame) -> dict[str, tuple[str, np.ndarray]]:
     """Return the type and the poses (pose, 3) of each topic, in the frame."""
     centers = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
-    topics = {"path": (PATH, _onward(frame.of_crs(centers)))}
+    topics = {"path": (PATH, onward(frame.of_crs(centers)))}
     if plan.waypoints is None or plan.posts is None:
         return topics
     waypoints = frame.of_crs(plan.waypoints)
-    topics[f"{LEAD}/waypoints"] = POSES, _onward(waypoints)
+    topics[f"{LEAD}/waypoints"] = POSES, onward(waypoints)
     for i, robot in enumerate(plan.workspace.team.names):
         posts = frame.of_crs(plan.posts[:, i])
-        topics[f"{robot}/posts"] = POSES, _towards(posts, waypoints[1:] - posts)
+        topics[f"{robot}/posts"] = POSES, towards(posts, waypoints[1:] - posts)
     for robot, ways in routes_of(plan).items():
         if ways:
             # The end of a way is the start of the next.
             points = np.concatenate([ways[0][:1], *(way[1:] for way in ways)])
-            topics[f"{robot}/way"] = PATH, _onward(frame.of_crs(points))
+            topics[f"{robot}/way"] = PATH, onward(frame.of_crs(points))
     return topics
-
-
-def _onward(positions: np.ndarray) -> np.ndarray:
-    """Poses at positions (point, 2), each towards the next, shape (point, 3)."""
-    steps = np.diff(positions, axis=0)
-    return _towards(positions, np.concatenate([steps, steps[-1:]]))
-
-
-def _towards(positions: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    return np.column_stack([positions, np.arctan2(steps[:, 1], steps[:, 0])])

@@ -165,7 +165,9 @@ class Planner(Displayed):
 
         Attributes of the edges: `length` (m); `drift` of the team's mean trust; `cost`, that of
         `stationary`: -log sigma of the trust that the bound would lead to if all were like it, and
-        the length cost; and with a risk `risk`, -log(1 - p_fail).
+        the length cost; for lost_contact of rates that measure trust `lost`, the contact that the
+        bound would lose then, in bounds, and the length cost; and with a risk `risk`,
+        -log(1 - p_fail).
 
         Args:
             params: Parameters of any model, without leading axes.
@@ -204,6 +206,20 @@ class Planner(Displayed):
             return self
         objective = self.problem.objective._replace(family=family)
         return self._with(replace(self.problem, objective=objective))
+
+    def with_objective(self, objective: str) -> Self:
+        """Return the planner of another objective, with the same admissible paths.
+
+        A cost of failure is dropped unless the objective is lost_contact.
+
+        Raises:
+            TrustboError: An unknown objective, or one that admits no length weight where there is
+                one.
+        """
+        chosen, rule = self.problem.objective._replace(name=objective), self.problem.rule
+        if objective != "lost_contact":
+            rule = rule._replace(failure_cost=None)
+        return self._with(replace(self.problem, objective=chosen, rule=rule))
 
     def with_risk(
         self,

@@ -112,8 +112,27 @@ def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
         with np.errstate(divide="ignore"):
             values["risk"] = -np.log1p(-p_fail)
     values["drift"] = np.tensordot(dynamics.views.mean(0), dynamics.drift, 1)
-    cost = entry_cost(paths.passable, dynamics)
-    return with_costs(paths, cost, problem.objective.length_weight, **values)
+    objective = problem.objective
+    if objective.name == "lost_contact" and not objective.lag:
+        values["lost"] = _settled_loss(objective, dynamics)
+    graph = with_costs(
+        paths, entry_cost(paths.passable, dynamics), objective.length_weight, **values
+    )
+    for *_, edge in graph.edges(data=True):
+        if "lost" in edge:
+            edge["lost"] += objective.length_weight * edge["length"]
+    return graph
+
+
+def _settled_loss(objective: Objective, dynamics: Dynamics) -> np.ndarray:
+    """Contact lost in each bound once trust has settled on it, (move, row, col), in bounds.
+
+    The sum along a path is the loss of lost_contact but for the memory of trust: with drifts u and
+    beta0 = b, sum_k x_k = sum_k u_k (1 - b^(K - k + 1)) / (1 - b) + terms of x0 and K alone, of
+    which this keeps u_k / (1 - b).
+    """
+    settled = objective.capped(dynamics).steady_state()
+    return 1.0 - objective.family.rate_moments(settled, dynamics.noise_sd)[0]
 
 
 def require_valid(dynamics: Dynamics, objective: Objective) -> None:

@@ -1,0 +1,87 @@
+"""Waypoints and filters of costmaps for Nav2."""
+
+import math
+
+import numpy as np
+import pytest
+import yaml
+
+from trustbo.errors import TrustboError
+from trustbo.export import write_costmap_filters, write_ros_map, write_waypoints
+
+
+def poses_of(file):
+    """Poses (x, y, heading) of a goal of FollowWaypoints: `poses`, geometry_msgs/PoseStamped[]."""
+    (name, stamped), *others = yaml.safe_load(file.read_text()).items()
+    assert (name, others) == ("poses", [])
+    poses = []
+    for one in stamped:
+        assert one.keys() == {"header", "pose"}
+        assert one["header"] == {"frame_id": "odom"}
+        place, turn = one["pose"]["position"], one["pose"]["orientation"]
+        assert place["z"] == turn["x"] == turn["y"] == 0.0
+        assert math.hypot(turn["z"], turn["w"]) == pytest.approx(1.0)
+        poses.append((place["x"], place["y"], 2.0 * math.atan2(turn["z"], turn["w"])))
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("robot", ["lead", "r2"])
+def test_waypoints_are_the_stops_of_a_robot_in_the_frame(result, tmp_path, robot):
+    plan, angle = result.plan, 0.3
+    origin = np.array([380010.0, 5224920.0])
+    write_waypoints(
+        tmp_path / "w.yaml", result, robot=robot, origin=tuple(origin), rotation=angle,
+        frame="odom",
+    )  # fmt: skip
+    assert yaml.safe_load((tmp_path / "w_frame.yaml").read_text())["rotation"] == angle
+    poses = poses_of(tmp_path / "w.yaml")
+    c, s = math.cos(angle), math.sin(angle)
+    places = poses[:, :2] @ [[c, s], [-s, c]] + origin
+    headings = np.column_stack([np.cos(poses[:, 2] + angle), np.sin(poses[:, 2] + angle)])
+    if robot == "lead":
+        np.testing.assert_allclose(places, plan.waypoints, rtol=0.0, atol=1e-6)
+        ahead = np.diff(plan.waypoints, axis=0)
+        ahead = np.vstack([ahead, ahead[-1:]])
+    else:
+        at_goal = plan.ways[-1][2][-1]  # ways begin with the lead's
+        expected = np.vstack([plan.posts[:, 1], at_goal])
+        np.testing.assert_allclose(places, expected, rtol=0.0, atol=1e-6)
+        ahead = np.vstack([plan.waypoints[1:], plan.waypoints[-1:]]) - expected
+    np.testing.assert_allclose(headings, ahead / np.linalg.norm(ahead, axis=1)[:, None], atol=1e-9)
+
+
+def test_filters_heed_the_map_by_the_rules_of_the_costmap(result, maps, tmp_path):
+    """SpeedFilter: base + multiplier x mask, in percent; 0 is no limit. KeepoutFilter: the mask."""
+    cost, workspace = maps["cost"], result.workspace
+    write_ros_map(tmp_path / "map.yaml", cost, workspace, origin=(380000, 5224910), frame="odom")
+    write_costmap_filters(tmp_path / "map.yaml", slowest=0.4, frame="odom")
+    nodes = {
+        name: values["ros__parameters"]
+        for name, values in yaml.safe_load((tmp_path / "map_filters.yaml").read_text()).items()
+    }
+    for name, kind in (("keepout", 0), ("speed", 1)):  # filter_values.hpp
+        mask = nodes[f"{name}_filter_mask_server"]
+        info = nodes[f"{name}_costmap_filter_info_server"]
+        assert (tmp_path / mask["yaml_filename"]).exists()
+        assert mask["frame_id"] == "odom"
+        assert mask["topic_name"] == info["mask_topic"]
+        assert info["type"] == kind
+        assert all(isinstance(info[key], float) for key in ("base", "multiplier"))
+    info = nodes["keepout_costmap_filter_info_server"]
+    assert (info["base"], info["multiplier"]) == (0.0, 1.0)
+    info = nodes["speed_costmap_filter_info_server"]
+    limits = info["base"] + info["multiplier"] * np.arange(1, 101)
+    assert limits.max() < 100.0
+    assert limits.min() == pytest.approx(40.0)
+    assert limits[49] == pytest.approx(70.0)
+
+
+def test_what_cannot_be_followed_is_refused(result, nowhere, tmp_path):
+    with pytest.raises(TrustboError, match="unknown robot 'r9'; choose one of lead, r1, r2, r3"):
+        write_waypoints(tmp_path / "w.yaml", result, robot="r9")
+    with pytest.raises(TrustboError, match="a plan has posts and ways where its workspace was"):
+        write_waypoints(tmp_path / "w.yaml", nowhere, origin=None)
+    for slowest in (0.0, 1.1):
+        with pytest.raises(TrustboError, match=r"slowest must be a share in \(0, 1\]; got"):
+            write_costmap_filters(tmp_path / "map.yaml", slowest=slowest)
+    assert list(tmp_path.iterdir()) == []
