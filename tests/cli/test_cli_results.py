@@ -84,7 +84,7 @@ def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished,
     there_are_bags = importlib.util.find_spec("rosbags") is not None
     for done in (once, again):
         absent = [line.split(":")[0].removeprefix("left out ") for line in done.stderr.splitlines()]
-        bags = ["ros1_bag", "ros2_bag"]
+        bags = ["grid_map", "ros1_bag", "ros2_bag"]
         assert absent == ([] if done is once and there_are_bags else bags)
         assert len(done.stdout.splitlines()) >= len(FORMATS) - len(absent)
     if there_are_bags:

@@ -28,6 +28,7 @@ FILES = {
         "route_graph_params.yaml",
         *(f"waypoints_{robot}.yaml" for robot in ("lead", "r1", "r2", "r3")),
     ],
+    "grid_map": ["grid_map"],
     "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],
 }
@@ -130,11 +131,11 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
 def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     absent = left_out(nowhere, tmp_path)
-    assert list(absent) == [*NEEDS_A_PLACE, "ros1_bag", "ros2_bag"]
+    assert list(absent) == [*NEEDS_A_PLACE, "grid_map", "ros1_bag", "ros2_bag"]
     assert "only a workspace made from a terrain has a CRS" in absent["gpx"]
     assert "pip install rosbags" in absent["ros2_bag"]
     (tmp_path / "path.csv").mkdir()
-    assert list(left_out(result, tmp_path)) == ["csv", "ros1_bag", "ros2_bag"]
+    assert list(left_out(result, tmp_path)) == ["csv", "grid_map", "ros1_bag", "ros2_bag"]
     (tmp_path / "file").touch()
     with pytest.raises(TrustboError, match=r"cannot write to '.*file': .* is a file"):
         left_out(result, tmp_path / "file")

@@ -2,6 +2,7 @@
 
 from trustbo.export.everything import FORMATS, export_result
 from trustbo.export.frame import write_frame
+from trustbo.export.grid_map import read_grid_map, write_grid_map
 from trustbo.export.nav2 import write_costmap_filters, write_waypoints
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
@@ -12,9 +13,9 @@ from trustbo.export.route_graph_file import edge_updates, read_route_graph, writ
 from trustbo.export.tables import write_csv
 
 __all__ = [
-    "FORMATS", "RouteGraph", "edge_updates", "export_result", "path_frame", "read_route_graph",
-    "write_costmap_filters", "write_csv", "write_frame", "write_geotiff", "write_netcdf",
-    "write_overwatch", "write_path", "write_ros_bag", "write_ros_map", "write_route_graph",
-    "write_waypoints",
+    "FORMATS", "RouteGraph", "edge_updates", "export_result", "path_frame", "read_grid_map",
+    "read_route_graph", "write_costmap_filters", "write_csv", "write_frame", "write_geotiff",
+    "write_grid_map", "write_netcdf", "write_overwatch", "write_path", "write_ros_bag",
+    "write_ros_map", "write_route_graph", "write_waypoints",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

@@ -26,6 +26,7 @@ from trustbo.export.frame import (
     require_fine,
     save_frame,
 )
+from trustbo.export.grid_map import save_grid_map
 from trustbo.export.nav2 import save_waypoints, stops_of, write_costmap_filters
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import tables_beside, write_path
@@ -231,6 +232,11 @@ def _write_map(content: _Content, file: Path) -> None:
     write_costmap_filters(file, frame=place.name)
 
 
+def _write_grid_map(content: _Content, file: Path) -> None:
+    result = content.result
+    save_grid_map(file, content.maps(), result.workspace, content.resolution, content.frame)
+
+
 def _write_nav2(content: _Content, file: Path) -> None:
     result, place = content.result, content.frame
     save_route_graph(file, _route_graph(result, place))
@@ -260,9 +266,9 @@ def _require_topics(result: Result, place: Frame) -> None:
     require_robots(result.workspace)
 
 
-_BAGS = ("ros1_bag", "ros2_bag")
+_BAGS = ("grid_map", "ros1_bag", "ros2_bag")
 _WITH_COST = ("ros_map", *_BAGS)
-"""Formats with the cost map as occupancy."""
+"""Formats with the cost map, as occupancy or at the same resolution."""
 _WAYPOINTS = "waypoints_{robot}.yaml"
 _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
@@ -337,6 +343,12 @@ _FORMATS = {
         in_frame=True,
         require=_require_nav2,
         on_terrain=(_WAYPOINTS,),
+    ),
+    "grid_map": _Format(
+        "all maps as layers of a GridMap in a bag of ROS 2 (mcap)",
+        ("grid_map",),
+        _write_grid_map,
+        in_frame=True,
     ),
     "ros1_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 1",

@@ -4,19 +4,18 @@ Coordinates are in a frame, by default `map` with x east and y north in metres o
 RViz draws in float32, which is coarse so far from 0: `origin` puts (0, 0) near the robots.
 """
 
-import math
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 import yaml
 
 from trustbo.campaign.result import Result
-from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.errors import TrustboError, require_choice
 from trustbo.export.checks import LEAD, require_maps
 from trustbo.export.frame import Frame, Origin, frame_file, frame_of, save_beside
+from trustbo.export.lattice import Raster, sampled
 from trustbo.export.layers import plan_of, routes_of
 from trustbo.export.poses import onward, towards
 from trustbo.files import FilePath, require_file, write_file, write_text
@@ -35,15 +34,6 @@ from trustbo.workspace import Workspace
 IMPASSABLE, UNKNOWN = 100, -1
 # Costmaps publish 99 and 100 for "inscribed" and "lethal", where no robot may go.
 WORST_PASSABLE = 98
-_MOST_PIXELS = 100_000_000
-
-
-class _Raster(NamedTuple):
-    """Map in the layout of ROS."""
-
-    values: np.ndarray  # (row, col), int8, the southern row first
-    resolution: float  # m
-    corner: tuple[float, float]  # lower left, x and y in the frame, m
 
 
 def occupancy(
@@ -65,37 +55,9 @@ def occupancy(
 
 def _raster(
     cost: xr.DataArray, workspace: Workspace, resolution: float | None, frame: Frame
-) -> _Raster:
+) -> Raster:
     """Map of a cost whose pixels lie along the axes of a frame."""
-    cells, grid = _cells(cost, workspace), workspace.grid
-    rows, cols = grid.shape
-    side = _resolution(workspace, resolution, turned=frame.rotation != 0.0)
-    left, bottom, right, top = grid.bounds
-    if frame.rotation:
-        corners = frame.of_crs(np.array([[a, b] for a in (left, right) for b in (bottom, top)]))
-        corner, extent = corners.min(0), np.ptp(corners, axis=0)
-    else:
-        corner = frame.of_crs(np.array(grid.corner))
-        extent = np.array([cols * grid.cell_width, rows * grid.cell_height])
-    width, height = extent / side
-    if height * width > _MOST_PIXELS:
-        raise TrustboError(
-            f"resolution={side:g} m gives {height * width:.1e} pixels; take a coarser one."
-        )
-    # The quotient may be whole up to rounding.
-    n_x, n_y = (math.ceil(n - 1e-6) for n in (width, height))
-    values = np.full((n_y, n_x), UNKNOWN, np.int8)
-    # From the lower left corner on: along a row of pixels, and from row to row.
-    axes = frame.axes
-    offset = frame.to_crs(corner) - grid.corner if frame.rotation else np.zeros(2)
-    along = (np.arange(n_x)[:, None] + 0.5) * side * axes[0]
-    for i in range(n_y):
-        x, y = (offset + along + (i + 0.5) * side * axes[1]).T
-        row, col = rows - 1 - np.floor(y / grid.cell_height), np.floor(x / grid.cell_width)
-        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-        values[i, inside] = cells[row[inside].astype(int), col[inside].astype(int)]
-    x, y = corner.tolist()
-    return _Raster(values, side, (x, y))
+    return sampled(_cells(cost, workspace), UNKNOWN, workspace, resolution, frame)
 
 
 def _cells(cost: xr.DataArray, workspace: Workspace) -> np.ndarray:
@@ -269,18 +231,6 @@ def static_transform(make: Messages, now: int, place: Frame) -> Record:
     """Pose of a frame in that of the CRS, for `/tf_static`; time in ns."""
     message = make.transform(now, place.parent, place.origin, place.turn)
     return Record(now, "/tf_static", TRANSFORMS, message)
-
-
-def _resolution(workspace: Workspace, resolution: float | None, *, turned: bool) -> float:
-    """Side of a pixel, m; by default a number that one can read."""
-    if resolution is not None:
-        return require_positive("resolution", resolution)
-    height, width = workspace.grid.cell_height, workspace.grid.cell_width
-    is_round = math.isclose(width, round(width, 2), rel_tol=1e-9)
-    if math.isclose(height, width, rel_tol=1e-6) and is_round and not turned:
-        return round(width, 2)
-    # Pixels of ROS are square; with ten per cell, its edges are off by a twentieth at most.
-    return float(f"{min(height, width) / 10.0:.2g}")
 
 
 def require_robots(workspace: Workspace) -> None:

@@ -84,7 +84,7 @@ class Bag:
     def values(self, topics: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time in ns and value of each record, in order of time; see `collect`."""
         stamps, numbers = dict.fromkeys(topics, 0), dict.fromkeys(topics, 0)
-        for topic, time, message in self._messages(topics):
+        for topic, time, message in self.messages(topics):
             types = topics[topic]
             stamp = stamp_of(message) if types is POSE_TYPES else time
             if stamp < stamps[topic]:
@@ -99,7 +99,7 @@ class Bag:
             except TrustboError as error:
                 raise TrustboError(f"{topic}: {error}") from None
 
-    def _messages(self, topics: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, int, Any]]:
+    def messages(self, topics: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time in ns and content of all messages on some topics."""
         chosen = [c for c in self._reader.connections if c.topic in topics]
         for c in chosen:
@@ -122,7 +122,6 @@ def opened(path: Path) -> Iterator[Bag]:
     """Open a bag for reading; TrustboError: no rosbags, no such file or folder, or not a bag."""
     _require_rosbags()
     from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
 
     if not path.exists():
         raise TrustboError(f"there is no bag {str(path)!r}; check its path.")
@@ -130,7 +129,7 @@ def opened(path: Path) -> Iterator[Bag]:
         require_regular(path)
     try:
         # Bags of ROS 2 before Iron do not define their types.
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([path], default_typestore=_types(2))
         reader.open()
     except Exception as error:  # as above
         raise _unreadable(path, error) from None
