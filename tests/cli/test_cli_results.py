@@ -83,7 +83,9 @@ def test_export_writes_all_there_is_and_says_what_there_is_not(invoke, finished,
     assert (once.exit_code, again.exit_code) == (0, 0), once.output + again.output
     there_are_bags = importlib.util.find_spec("rosbags") is not None
     for done in (once, again):
-        absent = [line.split(":")[0].removeprefix("left out ") for line in done.stderr.splitlines()]
+        lines = [line for line in done.stderr.splitlines() if line.startswith("left out ")]
+        absent = [line.split(":")[0].removeprefix("left out ") for line in lines]
+        assert done.stderr.count("\nwarning: ") + done.stderr.startswith("warning: ") == 1
         bags = ["grid_map", "ros1_bag", "ros2_bag"]
         assert absent == ([] if done is once and there_are_bags else bags)
         assert len(done.stdout.splitlines()) >= len(FORMATS) - len(absent)

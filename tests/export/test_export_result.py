@@ -21,6 +21,9 @@ FILES = {
     "gpx": ["path.gpx"],
     "geopackage": ["path.gpkg"],
     "overwatch": ["overwatch.tif"],
+    "kmz": ["mission.kmz"],
+    "qgc": [f"mission_{robot}.plan" for robot in ("lead", "r1", "r2", "r3")],
+    "cot": ["mission_tak.zip"],
     "csv": ["missions.csv", "path.csv", "path_posts.csv", "path_ways.csv"],
     "ros_map": ["cost_map.yaml", "cost_map.pgm", "cost_map_filters.yaml"],
     "nav2": [
@@ -29,16 +32,20 @@ FILES = {
         *(f"waypoints_{robot}.yaml" for robot in ("lead", "r1", "r2", "r3")),
     ],
     "grid_map": ["grid_map"],
+    "foxglove": ["scene.mcap"],
     "ros1_bag": ["path.bag"],
     "ros2_bag": ["path_ros2"],
 }
-NEEDS_A_PLACE = ("geotiff", "cog", "geojson", "gpx", "geopackage", "overwatch")
+NEEDS_A_PLACE = (
+    "geotiff", "cog", "geojson", "gpx", "geopackage", "overwatch", "kmz", "qgc", "cot"
+)  # fmt: skip
 
 
 def test_every_format_is_written_under_its_name(result, tmp_path):
     pytest.importorskip("rosbags", reason="needs the extra ros")
     assert list(FORMATS) == list(FILES)
-    written = export_result(result, tmp_path / "out", FORMATS)
+    with pytest.warns(UserWarning, match=r"stops of mission_\*\.plan .* do not wait for each"):
+        written = export_result(result, tmp_path / "out", FORMATS)
     names = [name for names in FILES.values() for name in names]
     assert written == [tmp_path / "out" / name for name in (*names, "frame.yaml")]
     assert set((tmp_path / "out").iterdir()) == set(written)
@@ -131,7 +138,7 @@ def test_maps_are_made_for_formats_that_have_maps_and_once(result, tmp_path):
 def test_what_cannot_be_written_is_said_beforehand(result, nowhere, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags", None)
     absent = left_out(nowhere, tmp_path)
-    assert list(absent) == [*NEEDS_A_PLACE, "grid_map", "ros1_bag", "ros2_bag"]
+    assert list(absent) == [*NEEDS_A_PLACE, "grid_map", "foxglove", "ros1_bag", "ros2_bag"]
     assert "only a workspace made from a terrain has a CRS" in absent["gpx"]
     assert "pip install rosbags" in absent["ros2_bag"]
     (tmp_path / "path.csv").mkdir()
@@ -147,7 +154,9 @@ def test_without_a_terrain_there_are_tables_netcdf_and_ros(nowhere, tmp_path):
         with pytest.raises(TrustboError, match="only a workspace made from a terrain has a CRS"):
             export_result(nowhere, tmp_path / "out", ["csv", name])
     assert list(tmp_path.iterdir()) == []
-    rest = [name for name in FORMATS if name not in NEEDS_A_PLACE]
+    with pytest.raises(TrustboError, match="a plan has posts and ways where its workspace was"):
+        export_result(nowhere, tmp_path, ["csv", "foxglove"])
+    rest = [name for name in FORMATS if name not in (*NEEDS_A_PLACE, "foxglove")]
     written = export_result(nowhere, tmp_path, rest)
     assert set(tmp_path.iterdir()) == set(written)
 

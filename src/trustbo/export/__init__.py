@@ -1,11 +1,15 @@
 """Results as files for other programs: GIS, GPS, robots, tables."""
 
+from trustbo.export.cot import write_cot
 from trustbo.export.everything import FORMATS, export_result
+from trustbo.export.foxglove_scene import write_foxglove
 from trustbo.export.frame import write_frame
 from trustbo.export.grid_map import read_grid_map, write_grid_map
+from trustbo.export.kmz import write_kmz
 from trustbo.export.nav2 import write_costmap_filters, write_waypoints
 from trustbo.export.overwatch import write_overwatch
 from trustbo.export.paths import path_frame, write_path
+from trustbo.export.qgroundcontrol import write_qgc
 from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import write_ros_bag, write_ros_map
 from trustbo.export.route_graph import RouteGraph
@@ -13,9 +17,28 @@ from trustbo.export.route_graph_file import edge_updates, read_route_graph, writ
 from trustbo.export.tables import write_csv
 
 __all__ = [
-    "FORMATS", "RouteGraph", "edge_updates", "export_result", "path_frame", "read_grid_map",
-    "read_route_graph", "write_costmap_filters", "write_csv", "write_frame", "write_geotiff",
-    "write_grid_map", "write_netcdf", "write_overwatch", "write_path", "write_ros_bag",
-    "write_ros_map", "write_route_graph", "write_waypoints",
+    "FORMATS",
+    "RouteGraph",
+    "edge_updates",
+    "export_result",
+    "path_frame",
+    "read_grid_map",
+    "read_route_graph",
+    "write_costmap_filters",
+    "write_cot",
+    "write_csv",
+    "write_foxglove",
+    "write_frame",
+    "write_geotiff",
+    "write_grid_map",
+    "write_kmz",
+    "write_netcdf",
+    "write_overwatch",
+    "write_path",
+    "write_qgc",
+    "write_ros_bag",
+    "write_ros_map",
+    "write_route_graph",
+    "write_waypoints",
 ]  # fmt: skip
 __dir__ = __all__.copy  # completion lists public names alone

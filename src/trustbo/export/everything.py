@@ -16,6 +16,8 @@ from trustbo.export.checks import (
     require_names_for_netcdf,
     require_names_for_sql,
 )
+from trustbo.export.cot import write_cot
+from trustbo.export.foxglove_scene import require_foxglove, save_foxglove
 from trustbo.export.frame import (
     AUTO,
     Frame,
@@ -27,13 +29,16 @@ from trustbo.export.frame import (
     save_frame,
 )
 from trustbo.export.grid_map import save_grid_map
+from trustbo.export.kmz import require_simplekml, write_kmz
 from trustbo.export.nav2 import save_waypoints, stops_of, write_costmap_filters
 from trustbo.export.overwatch import require_overwatch, write_overwatch
 from trustbo.export.paths import tables_beside, write_path
+from trustbo.export.qgroundcontrol import save_qgc, warn_of_holds
 from trustbo.export.rasters import write_geotiff, write_netcdf
 from trustbo.export.ros import occupancy, require_robots, save_ros_bag, save_ros_map
 from trustbo.export.route_graph import OBJECTIVES, RouteGraph, graph_of, summed
 from trustbo.export.route_graph_file import save_route_graph
+from trustbo.export.schedule import schedule_of
 from trustbo.export.style import write_style
 from trustbo.export.tables import write_csv
 from trustbo.files import FilePath, require_file, require_folder
@@ -71,10 +76,8 @@ class _Format(NamedTuple):
         more, names = self.on_terrain, (LEAD, *result.workspace.team.names)
         if result.workspace.ground is None:
             more = ()
-        by_robot = {
-            name.format(robot=robot): None for name in more for robot in names
-        }  # each once, in order
-        return [folder / name for name in (*self.files, *by_robot)]
+        by_robot = [name.format(robot=robot) for name in more for robot in names]
+        return [folder / name for name in dict.fromkeys((*self.files, *by_robot))]
 
 
 def export_result(
@@ -246,6 +249,32 @@ def _write_nav2(content: _Content, file: Path) -> None:
             save_waypoints(target, result.plan, robot, place)
 
 
+def _write_kmz(content: _Content, file: Path) -> None:
+    write_kmz(file, content.result, content.maps()["cost"])
+
+
+def _require_kmz(result: Result, place: Frame) -> None:
+    require_simplekml()
+    schedule_of(result.plan)
+
+
+def _write_missions(content: _Content, file: Path) -> None:
+    plan = content.result.plan
+    for robot in (LEAD, *plan.workspace.team.names):
+        save_qgc(file.with_name(_MISSION.format(robot=robot)), plan, robot)
+    warn_of_holds(_MISSION.format(robot="*"))
+
+
+def _write_scene(content: _Content, file: Path) -> None:
+    plan, maps = content.result.plan, content.maps()
+    save_foxglove(file, plan, maps, content.resolution, content.frame)
+
+
+def _require_scene(result: Result, place: Frame) -> None:
+    require_foxglove()
+    schedule_of(result.plan)
+
+
 def _route_graph(result: Result, place: Frame) -> RouteGraph:
     """Graph of the campaign's objective, or of lost_contact where its value is no sum."""
     planner = result.planner
@@ -269,7 +298,7 @@ def _require_topics(result: Result, place: Frame) -> None:
 _BAGS = ("grid_map", "ros1_bag", "ros2_bag")
 _WITH_COST = ("ros_map", *_BAGS)
 """Formats with the cost map, as occupancy or at the same resolution."""
-_WAYPOINTS = "waypoints_{robot}.yaml"
+_WAYPOINTS, _MISSION = "waypoints_{robot}.yaml", "mission_{robot}.plan"
 _FRAME = "frame.yaml"
 """File with the frame of all formats for ROS."""
 _FOR_ROBOTS = {"resolution": None, "origin": AUTO, "rotation": 0.0, "frame": "map"}
@@ -324,6 +353,28 @@ _FORMATS = {
         on_earth=True,
         require=lambda result, _: require_overwatch(result.workspace),
     ),
+    "kmz": _Format(
+        "ways and posts with their times, and the cost map, for Google Earth and phones",
+        ("mission.kmz",),
+        _write_kmz,
+        on_earth=True,
+        require=_require_kmz,
+    ),
+    "qgc": _Format(
+        "a mission of QGroundControl for each robot",
+        (_MISSION.format(robot=LEAD),),
+        _write_missions,
+        on_earth=True,
+        require=lambda result, _: schedule_of(result.plan),
+        on_terrain=(_MISSION,),
+    ),
+    "cot": _Format(
+        "routes and posts as Cursor on Target, a data package of TAK",
+        ("mission_tak.zip",),
+        lambda content, file: write_cot(file, content.result),
+        on_earth=True,
+        require=lambda result, _: schedule_of(result.plan),
+    ),
     "csv": _Format(
         "tables of all bounds, of the path, its posts and its ways",
         ("missions.csv", "path.csv"),
@@ -349,6 +400,13 @@ _FORMATS = {
         ("grid_map",),
         _write_grid_map,
         in_frame=True,
+    ),
+    "foxglove": _Format(
+        "maps, ways, posts and sight bound by bound as a scene for Foxglove (mcap)",
+        ("scene.mcap",),
+        _write_scene,
+        in_frame=True,
+        require=_require_scene,
     ),
     "ros1_bag": _Format(
         "cost map, path, posts and ways as a bag of ROS 1",

@@ -10,8 +10,9 @@ from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_choice, require_not_negative
 from trustbo.export.checks import LEAD
 from trustbo.export.frame import AUTO, Frame, Origin, frame_file, frame_of, save_beside
-from trustbo.export.layers import plan_of, routes_of
+from trustbo.export.layers import plan_of
 from trustbo.export.poses import onward, towards
+from trustbo.export.schedule import complete_routes
 from trustbo.files import FilePath, require_file, write_text
 from trustbo.planning import Plan
 
@@ -78,12 +79,7 @@ def save_waypoints(target: Path, plan: Plan, robot: str, place: Frame) -> None:
 
 def stops_of(plan: Plan, robot: str, place: Frame) -> np.ndarray:
     """Poses of a robot's stops in a frame, (stop, 3); TrustboError: it has no way in a bound."""
-    ways = routes_of(plan)[robot]
-    if len(ways) < len(plan.path) - 1:
-        raise TrustboError(
-            f"{robot} has no way in bound {len(ways) + 1}, so that it cannot follow waypoints; "
-            "plan another path, or give it a larger max_slope."
-        )
+    ways = complete_routes(plan)[robot]
     assert plan.waypoints is not None and plan.posts is not None  # noqa: S101, PT018  # it has ways
     waypoints = place.of_crs(plan.waypoints)
     if robot == LEAD:

@@ -6,13 +6,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from trustbo.export.checks import Maps, as_dataset
+from trustbo.export.colours import VIRIDIS
 from trustbo.files import FilePath, require_file, write_text
 
-_VIRIDIS = (
-    (68, 1, 84), (72, 36, 117), (65, 68, 135), (53, 95, 141), (42, 120, 142), (33, 145, 140),
-    (34, 168, 132), (68, 191, 112), (122, 209, 81), (189, 223, 38), (253, 231, 37),
-)  # fmt: skip
-"""Stops at tenths; linear interpolation is within 14 of 255 of matplotlib's colours."""
 _HEAD = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
 
 
@@ -63,17 +59,17 @@ def _shader(low: float, high: float) -> ET.Element:
     )
     source = ET.SubElement(ramp, "colorramp", type="gradient", name="[source]")
     options = ET.SubElement(source, "Option", type="Map")
-    steps, values = (np.linspace(*ends, len(_VIRIDIS)).tolist() for ends in ((0, 1), (low, high)))
-    stops = [f"{step:g};{_rgba(c)}" for step, c in zip(steps, _VIRIDIS, strict=True)]
+    steps, values = (np.linspace(*ends, len(VIRIDIS)).tolist() for ends in ((0, 1), (low, high)))
+    stops = [f"{step:g};{_rgba(c)}" for step, c in zip(steps, VIRIDIS, strict=True)]
     for name, value in {
-        "color1": _rgba(_VIRIDIS[0]),
-        "color2": _rgba(_VIRIDIS[-1]),
+        "color1": _rgba(VIRIDIS[0]),
+        "color2": _rgba(VIRIDIS[-1]),
         "discrete": "0",
         "rampType": "gradient",
         "stops": ":".join(stops[1:-1]),
     }.items():
         ET.SubElement(options, "Option", name=name, type="QString", value=value)
-    for value, (red, green, blue) in zip(values, _VIRIDIS, strict=True):
+    for value, (red, green, blue) in zip(values, VIRIDIS, strict=True):
         ET.SubElement(
             ramp,
             "item",
