@@ -86,7 +86,12 @@ def test_edges_follow_the_ways_of_the_lead_in_the_frame(planner, written, tmp_pa
     assert bounds == set(chains.edges)  # and there are no others
     assert len(chains.edges) > len(planner.graph.edges)  # some ways are bent
     assert len(server.edges) == len(graph.edges)
-    record = yaml.safe_load((tmp_path / "graph_params.yaml").read_text())
+    text = (tmp_path / "graph_params.yaml").read_text()
+    assert f"The cheapest route from node 8 to 3:\n# {graph.compared()}.\n" in text
+    assert (graph.node_of((2, 0)), graph.node_of((0, 3))) == (8, 3)
+    with pytest.raises(TrustboError, match=r"the graph has no node of cell \(0, 0\)"):
+        graph.node_of((0, 0))
+    record = yaml.safe_load(text)
     server = record["route_server"]["ros__parameters"]
     assert (server["graph_filepath"], server["route_frame"]) == ("graph.geojson", "map")
     assert server["edge_cost_functions"] == ["PenaltyScorer", "DynamicEdgesScorer"]
@@ -233,7 +238,7 @@ def test_updates_of_graphs_that_do_not_fit_are_refused(planner, tmp_path):
     for name in ("nodes", "positions", "cells", "edges", "ends", "costs"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     assert "of a file, unknown" in str(again)
-    assert "bounds, loses" in str(first)
+    assert "bounds; it loses" in str(first)
     (tmp_path / "a.json").write_text('{"features": []}')
     with pytest.raises(DamagedFileError, match=r"a\.json' is damaged"):
         read_route_graph(tmp_path / "a.json")

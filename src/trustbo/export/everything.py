@@ -140,9 +140,8 @@ def export_result(
     if for_robots:
         written.append(target / _FRAME)
         save_frame(target / _FRAME, place, result.workspace)
-        for name in chosen.keys() & set(
-            _in_frame()
-        ):  # one of an earlier version would contradict it
+        for name in filter(chosen.__contains__, _in_frame()):
+            # One of an earlier version would contradict it.
             frame_file(target / _FORMATS[name].files[0]).unlink(missing_ok=True)
     return written
 

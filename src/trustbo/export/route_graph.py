@@ -75,11 +75,21 @@ class RouteGraph(Displayed):
             ("objective", self.objective or "of a file, unknown"),
         ]
         if self.route:
-            compared = "the exact plan"
-            if self.objective == "lost_contact":
-                compared = f"loses {self.gap:.2%} of contact more than the exact plan"
-            rows.append(("cheapest route", f"{len(self.route) - 1} bounds, {compared}"))
+            rows.append(("cheapest route", f"{len(self.route) - 1} bounds; {self.compared()}"))
         return Card("RouteGraph", rows)
+
+    def node_of(self, cell: Cell) -> int:
+        """Id of the node of a cell; TrustboError: the cell has none."""
+        (found,) = np.nonzero((self.cells == np.asarray(cell)).all(1))
+        if not len(found):
+            raise TrustboError(f"the graph has no node of cell {cell!r}; it is impassable.")
+        return int(self.nodes[found[0]])
+
+    def compared(self) -> str:
+        """Comparison of the cheapest route with the exact plan, as text."""
+        if self.objective == "stationary":
+            return "it is the exact plan"
+        return f"it loses {self.gap:.2%} of contact more than the exact plan"
 
 
 def graph_of(

@@ -122,9 +122,19 @@ def save_route_graph(target: Path, graph: RouteGraph, *, overridable: bool = Tru
         lines.append(_feature("MultiLineString", [[where[start], where[end]]], about))
     text = '{"type": "FeatureCollection", "features": [\n' + ",\n".join(lines) + "\n]}\n"
     server = {"graph_filepath": target.name, "route_frame": graph.frame, **_SERVER}
-    head = "# Parameters of the route server of Nav2; give graph_filepath as a path on the robot.\n"
+    settings = params_file(target)
+    head = (
+        "# Parameters of the route server of Nav2; give graph_filepath as a path on the robot:\n"
+        f"#   ros2 run nav2_route route_server --ros-args --params-file {settings.name}\n"
+    )
+    if graph.route:
+        first, last = (graph.node_of(graph.route[end]) for end in (0, -1))
+        head += (
+            f"# Costs are of {graph.objective}. The cheapest route from node {first} to {last}:\n"
+        )
+        head += f"# {graph.compared()}.\n"
     record = {"route_server": {"ros__parameters": server}}
-    write_text(params_file(target), head + yaml.safe_dump(record, sort_keys=False))
+    write_text(settings, head + yaml.safe_dump(record, sort_keys=False))
     write_text(target, text)
 
 
