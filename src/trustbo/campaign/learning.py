@@ -25,7 +25,7 @@ from trustbo.inference.posterior_groups import parameters_alone
 from trustbo.inference.samplers.choice import resolve_sampler
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.updating import moment_matched
-from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
+from trustbo.models import HumanTrust, PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.models.families import AUTO
 from trustbo.models.model import TrustModel, require_model
 from trustbo.models.params import Params
@@ -274,6 +274,11 @@ def default_model(update: str) -> TrustModel:
 
 def _require_learnable(model: TrustModel, sampler: str, options: CampaignOptions) -> None:
     require_model(model)
+    if isinstance(model, HumanTrust):
+        raise TrustboError(
+            "HumanTrust is of reports of people, and plans no paths: give a campaign another "
+            "model, and fit reports by trustbo.fit."
+        )
     resolved, _ = resolve_sampler(model, sampler)
     NutsSettings.of(options.sampling).require_sampler(resolved)
     gaussian = model.family.integrates_out and model.observation != AUTO

@@ -11,6 +11,8 @@ from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import loo
 from trustbo.inference.memory import memory
+from trustbo.inference.people import predict_reports
+from trustbo.inference.people_scores import compare_people
 from trustbo.inference.place_maps import place_maps
 from trustbo.inference.posterior_groups import complete
 from trustbo.inference.prior_from import prior_from
@@ -25,6 +27,7 @@ __all__ = [
     "by_rate",
     "changes",
     "compare",
+    "compare_people",
     "complete",
     "diagnostics",
     "fit",
@@ -32,6 +35,7 @@ __all__ = [
     "memory",
     "params_of",
     "place_maps",
+    "predict_reports",
     "prior_from",
     "prior_predictive",
     "sample_prior",

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
+from trustbo.errors import TrustboError
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.posterior_tree import require_posterior
 from trustbo.models.effects.effect import (
@@ -61,7 +62,12 @@ def params_of(posterior: xr.DataTree, *, day: bool = False) -> Params:
         TrustboError: No posterior of `fit`; or one with the drift of a `DriftTrust` that this
             process has not made.
     """
-    params, sites = _params(require_posterior("params_of", posterior))
+    if is_of_people(require_posterior("params_of", posterior)):
+        raise TrustboError(
+            "a posterior of HumanTrust has no parameters of paths: for reports use "
+            "trustbo.inference.predict_reports."
+        )
+    params, sites = _params(posterior)
     effects = effects_of(posterior)
     if not effects:
         return params
@@ -120,6 +126,11 @@ def with_effects(
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
     """Effects in the model of a posterior, but those of places."""
     return effects_from_record(json.loads(posterior.attrs.get("model_record", "{}")))
+
+
+def is_of_people(posterior: xr.DataTree) -> bool:
+    """Whether a posterior is of `HumanTrust`."""
+    return posterior.attrs.get("model") == "HumanTrust"
 
 
 def memory_of(posterior: xr.DataTree) -> str:

@@ -11,6 +11,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.draws import (
     effects_of,
+    is_of_people,
     memory_of,
     params_of_missions,
     slots_of,
@@ -20,6 +21,7 @@ from trustbo.inference.draws import (
 from trustbo.inference.evidence import kalman_numpy, latent
 from trustbo.inference.evidence.ep import trust
 from trustbo.inference.log_prior import log_prior_group
+from trustbo.inference.people import groups_of_people
 from trustbo.inference.place_maps import prior_maps
 from trustbo.inference.posterior_tree import missions_of, require_posterior, to_datatree
 from trustbo.models.backend import own_settings
@@ -56,6 +58,7 @@ class Conditional(NamedTuple):
     lag: float
     by_numpy: bool
     """Whether scalar recursions suffice, which run faster than JAX compiles them."""
+    of_people: bool = False
 
     @classmethod
     def of(cls, posterior: xr.DataTree) -> Self:
@@ -63,14 +66,13 @@ class Conditional(NamedTuple):
         family = FAMILIES[posterior.attrs["observation"]]
         apart = posterior.attrs["inter_robot"] == "none"
         lag = float(posterior.attrs["response"] == "change")
-        return cls(
-            family, lag, apart and (family.integrates_out or (family.propagates and not lag))
-        )
+        by_numpy = apart and (family.integrates_out or (family.propagates and not lag))
+        return cls(family, lag, by_numpy, is_of_people(posterior))
 
     @property
     def keeps_trust(self) -> bool:
         """Whether latent trust can be redrawn from the parameters alone."""
-        return self.by_numpy or self.family.integrates_out
+        return self.by_numpy or self.family.integrates_out or self.of_people
 
 
 def complete(
@@ -142,10 +144,12 @@ def _groups(
     latents: latent.Latents,
 ) -> tuple[dict[str, dict[str, Any]], str]:
     """Arrays by group and name, (chain, draw) leading, and the data of the log-likelihoods."""
-    # NumPy needs no padding.
-    batch = stack_missions(missions, pad=not conditional.by_numpy)
     n_chains, n_draws = (posterior["posterior"].sizes[d] for d in ("chain", "draw"))
     kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, n_trajectories // n_chains))).astype(int)
+    if conditional.of_people:
+        return groups_of_people(posterior, missions, kept), "contact_rate"
+    # NumPy needs no padding.
+    batch = stack_missions(missions, pad=not conditional.by_numpy)
     every = params_of_missions(posterior, missions, batch)
     index = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     few = every.map(lambda values, _: values[index])

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from trustbo.errors import PosteriorError, TrustboError, require_whole
 from trustbo.files import FilePath, read_record, write_text
 from trustbo.inference.draws import theta_of
+from trustbo.inference.people import draw_people
 from trustbo.inference.prior_predictive import draw_sites
 from trustbo.inference.samplers.choice import needs_evidence, resolve_sampler
 from trustbo.inference.samplers.run import Draws, draw_posterior
@@ -21,6 +22,7 @@ from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Slots, Theta, draw_effects, drift_of
 from trustbo.models.model import TrustModel
 from trustbo.models.params import Params
+from trustbo.models.people import HumanTrust
 from trustbo.models.place import Visited
 from trustbo.models.pooled import PooledTrust
 from trustbo.stacking import MissionBatch
@@ -164,6 +166,12 @@ def _simulate(
 ) -> dict[str, np.ndarray]:
     """Parameters and contact rates drawn from the prior, by name."""
     sites = draw_sites(model, awareness.shape[2:], 1, seed)
+    if isinstance(model, HumanTrust):
+        slots = Slots.every(MissionBatch(awareness, ticks, ticks), len(ticks), (), None)
+        drawn = draw_people(model, slots, sites, np.random.default_rng([seed, 4]))
+        ranked = {"person": _ends(drawn["person"], 1)[0]}
+        values = {name: value[0] for name, value in sites.items()}
+        return values | ranked | {"contact_rate": drawn["contact_rate"][0]}
     params = model.params(sites, awareness.shape[3]).draw(0)
     batch = MissionBatch(awareness, np.zeros(ticks.shape), ticks)
     params, ranked = with_effects_drawn(model, sites, params, batch, seed)

@@ -92,6 +92,18 @@ def text_columns(table: Any) -> dict[str, list[str]]:
     return columns
 
 
+def columns_of(table: Any) -> dict[str, list[str]]:
+    """Columns of a CSV file, a frame or a mapping as text, "" if blank.
+
+    TrustboError: no such file, or no CSV; a repeated column, or columns of several lengths.
+    """
+    names, values = _from_file(Path(table)) if isinstance(table, str | PathLike) else _of(table)
+    columns = {n: [_stripped(v) for v in column] for n, column in zip(names, values, strict=True)}
+    if len(columns) < len(names):
+        raise TrustboError(f"the table has two columns of one name: {', '.join(names)}.")
+    return columns
+
+
 def parse_rows(
     columns: Mapping[str, list[str]], features: Sequence[str], grid: Grid | None = None
 ) -> list[Row]:
@@ -213,6 +225,8 @@ def _from_file(file: Path) -> tuple[list[str], list[list[str]]]:
 
 def _of(table: Any) -> tuple[list[str], list[list[object]]]:
     names = list(table) if isinstance(table, Mapping) else getattr(table, "columns", None)
+    if names is None:  # a structured array of NumPy
+        names = getattr(getattr(table, "dtype", None), "names", None)
     if names is None:
         raise TrustboError(f"give the path of a CSV file or a DataFrame; got {table!r}.")
     columns = [list(table[name]) for name in names]

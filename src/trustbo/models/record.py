@@ -9,11 +9,14 @@ from trustbo.models.coupled import CoupledTrust
 from trustbo.models.effects.effect import EFFECTS, Effect
 from trustbo.models.hierarchical import HierarchicalTrust
 from trustbo.models.model import TrustModel
+from trustbo.models.people import HumanTrust
 from trustbo.models.place import PlaceEffect
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 
-_MODELS = {model.__name__: model for model in (PooledTrust, HierarchicalTrust, CoupledTrust)}
+_MODELS = {
+    model.__name__: model for model in (PooledTrust, HierarchicalTrust, CoupledTrust, HumanTrust)
+}
 _FIRST = "RobotEffect"  # records without a kind are of it
 
 

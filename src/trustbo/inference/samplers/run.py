@@ -25,6 +25,7 @@ from trustbo.inference.samplers.importance import (
 )
 from trustbo.inference.samplers.nuts import run_nuts
 from trustbo.inference.samplers.nuts_scores import run_nuts_of_scores
+from trustbo.inference.samplers.people import PeoplePosterior
 from trustbo.inference.samplers.posterior import Posterior, posterior_of
 from trustbo.inference.samplers.settings import NutsSettings
 from trustbo.inference.samplers.student import Student
@@ -223,6 +224,7 @@ def _by_evidence(model: TrustModel, slots: Slots) -> Posterior:
 _TARGETS: dict[str, Callable[[Any, MissionBatch, np.ndarray, Slots], ScoreTarget]] = {
     "drift": lambda model, batch, _, slots: DriftPosterior.of(model, batch, slots),
     "coupled": lambda model, batch, weight, _: CoupledTarget(model, batch, weight),
+    "people": lambda model, batch, weight, slots: PeoplePosterior(model, slots),
 }
 """Scores and evidence of models by `TrustModel.robot_sets`; `_by_evidence` of all others."""
 

@@ -18,7 +18,7 @@ from scipy.stats import norm
 
 from trustbo.parallel import PART
 
-NONE, GAUSSIAN, AT_ONE, AT_ZERO, COUNT = range(5)
+NONE, GAUSSIAN, AT_ONE, AT_ZERO, COUNT, INTERVAL = range(6)
 _NUMERICS = {
     "fastmath": {"contract", "reassoc", "nsz", "arcp"},  # NaN and inf keep their meaning
     "error_model": "numpy",
@@ -208,6 +208,57 @@ def match(kind, delta_v, row, m, v, lam, eta):
     return off + math.log(f0), new, mean * (new + 1.0 / v) - m / v
 
 
+@njit(**PART_OPTIONS)
+def log_interval(a, b):
+    """Log of Phi(b) - Phi(a), and the mean and variance of a standard normal between a and b."""
+    if a > -b:  # mirrored: tails are accurate below
+        log_p, mean, var = _below(-b, -a)
+        return log_p, -mean, var
+    return _below(a, b)
+
+
+@njit(**PART_OPTIONS)
+def _below(a, b):
+    """`log_interval` of an interval whose middle is not above 0."""
+    log_b, _ = log_phi(b)
+    log_p, at_a, at_b, first = log_b, 0.0, 0.0, 0.0
+    if a > -1e300:
+        log_a, _ = log_phi(a)
+        log_p += math.log(max(-math.expm1(min(log_a - log_b, 0.0)), 1e-300))
+        at_a = math.exp(-0.5 * a * a - 0.5 * LOG_2PI - log_p)
+        first = a * at_a
+    if b < 1e300:
+        at_b = math.exp(-0.5 * b * b - 0.5 * LOG_2PI - log_p)
+        first -= b * at_b
+    mean = min(max(at_a - at_b, a), b)
+    return log_p, mean, min(max(1.0 + first - mean * mean, 1e-6), 1.0)
+
+
+@njit(**PART_OPTIONS)
+def match_interval(low, high, delta_v, noise, m, v, lam, eta):
+    """`match` of a rate by which trust plus noise lies between two limits.
+
+    `noise` (component, 2) has the weights of a mixture of normals, and their sds by `delta_v`.
+    """
+    log_p, mean, square = -np.inf, 0.0, 0.0
+    for j in range(len(noise)):
+        S2 = (noise[j, 1] * delta_v) ** 2 + v
+        S = math.sqrt(S2)
+        log_one, center, var = log_interval((low - m) / S, (high - m) / S)
+        log_one += math.log(noise[j, 0])
+        x = v / S * center  # mean of trust less m, and its variance, in this component
+        rest = v - v * v / S2 * (1.0 - var)
+        top = max(log_p, log_one)
+        before, now = math.exp(log_p - top), math.exp(log_one - top)
+        share = now / (before + now)
+        mean += share * (x - mean)
+        square += share * (rest + x * x - square)
+        log_p = top + math.log(before + now)
+    left = min(max(1.0 - (square - mean * mean) / v, 1e-12), 1.0 - 1e-12)
+    new = left / (v * (1.0 - left))
+    return log_p - log_overlap(m, v, lam, eta), new, new * (m + mean / left)
+
+
 @njit(**OPTIONS)
 def count_moments(mean, var, y, n_ticks, delta_v):
     """Mean and variance of trust N(mean, var) given counts, and their log probability.
@@ -275,6 +326,47 @@ def _beyond(h, log_p, rng):
         f = 0.5 * math.erfc(0.7071067811865476 * e) - p
         e += f / (0.3989422804014327 * math.exp(-0.5 * e * e))
     return max(e, -h)
+
+
+@njit(**PART_OPTIONS)
+def _between(a, b, rng):
+    """Standard normal draw between a and b, by rejection (Robert 1995)."""
+    if a > -b:
+        return -_between_below(-b, -a, rng)
+    return _between_below(a, b, rng)
+
+
+@njit(**PART_OPTIONS)
+def _between_below(a, b, rng):
+    """`_between` of an interval whose middle is not above 0."""
+    top = min(b, 0.0)
+    if b - a > 2.0 and (b > 0.0 or (b - a) * -b > 2.0):  # wide for the density: a tail, or all
+        while True:
+            e = rng.standard_normal() if b > 0.5 else -_beyond(b, log_phi(b)[0], rng)
+            if a < e < b:
+                return e
+    while True:
+        e = a + (b - a) * rng.random()
+        if rng.random() < math.exp(0.5 * (top * top - e * e)):
+            return e
+
+
+@njit(**OPTIONS)
+def draw_interval(low, high, delta_v, noise, mean, sd, rng):
+    """`draw_censored` of a rate by which trust plus noise lies between two limits."""
+    log_p, chosen = -np.inf, 0
+    for j in range(len(noise)):
+        S = math.hypot(sd, noise[j, 1] * delta_v)
+        log_one = math.log(noise[j, 0]) + log_interval((low - mean) / S, (high - mean) / S)[0]
+        top = max(log_p, log_one)
+        log_p = top + math.log(math.exp(log_p - top) + math.exp(log_one - top))
+        if math.log(1.0 - rng.random()) <= log_one - log_p:  # a choice by mass
+            chosen = j
+    own = noise[chosen, 1] * delta_v
+    S = math.hypot(sd, own)
+    e = S * _between((low - mean) / S, (high - mean) / S, rng)
+    x = mean + sd * sd / (S * S) * e + sd * own / S * rng.standard_normal()
+    return x, log_p
 
 
 @njit(**OPTIONS)

@@ -82,7 +82,7 @@ def draw_chain(b0, delta_w, delta_v, x0, chains, c, u, table, constant, lam, eta
 
 
 @njit(**PART_OPTIONS)
-def _log_student(x, mean, L, nu):
+def log_student(x, mean, L, nu):
     """Log density of a Student-t of precision LL', without the factor (2 pi)^(-D / 2)."""
     D, square = len(x), 0.0
     total = math.lgamma(0.5 * (nu + D)) - math.lgamma(0.5 * nu) - 0.5 * D * np.log(0.5 * nu)
@@ -135,7 +135,7 @@ def draw_coefficients(b0, delta_w, delta_v, x0, P, g, chains, kept, n_sweeps, nu
         backward(L[component], z)
         for i in range(D):
             z[i] += mean[component, i]
-        a, b = _log_student(z, mean[0], L[0], nu), _log_student(z, mean[1], L[1], nu)
+        a, b = log_student(z, mean[0], L[0], nu), log_student(z, mean[1], L[1], nu)
         total = np.log(2.0) - max(a, b) - np.log1p(np.exp(-abs(a - b)))
         for i in range(D):
             for j in range(D):

@@ -1,0 +1,46 @@
+"""The posterior of people's trust: scores of cut points join those of memory and spreads."""
+
+from typing import Any
+
+import numpy as np
+
+from trustbo.inference.evidence.blocks import Blocks
+from trustbo.inference.samplers.posterior import Posterior, Shared
+from trustbo.models.effects.effect import Slots
+from trustbo.models.people import HumanTrust
+
+
+class PeopleScores(Shared):
+    """Scores of `Shared`, and those of free cut points, which are standard normal themselves."""
+
+    def __init__(self, model: HumanTrust) -> None:
+        """Take the priors and effects of a model."""
+        super().__init__(model.priors, model.effects, model.memory)
+        self.cuts = model.levels.names
+        self.n_scores += len(self.cuts)
+
+    def with_core(self, core: Any, z: Any) -> dict[str, Any]:
+        """See `Shared.with_core`."""
+        first = self.n_scores - len(self.cuts)
+        cuts = {name: z[:, first + j] for j, name in enumerate(self.cuts)}
+        return super().with_core(core, z) | cuts
+
+
+class PeoplePosterior(Posterior):
+    """Posterior of scores under blocks of persons, whose points are cheap to draw at."""
+
+    def __init__(self, model: HumanTrust, slots: Slots) -> None:
+        """Lay out the reports of missions."""
+        evidence = evidence_of(model, slots)
+        super().__init__(PeopleScores(model), evidence, float(np.nanstd(slots.y)))
+        if not evidence.exact:
+            self.n_corrected = 1000
+
+
+def evidence_of(model: HumanTrust, slots: Slots, *, every: bool = False) -> Blocks:
+    """Evidence of a model, `every` bound being a row where trust is drawn at each."""
+    x0 = float(model.priors.x0_mean), float(model.priors.x0_sd)
+    return Blocks(
+        slots, model.shared(slots), model.effect.group(slots), model.levels, x0, model.lasting,
+        every=every,
+    )  # fmt: skip

@@ -1,0 +1,373 @@
+"""Trust that people report, in tables: a row for each person and step, as answers to a study are.
+
+A person becomes a mission without a map, a step a bound, an asked task a row of it, a report a rate
+in [0, 1]. Inputs of a step become features: what the person saw since the report before.
+"""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trustbo.data import Mission
+from trustbo.errors import TrustboError
+from trustbo.logs.rows import columns_of
+
+_YES = {"1", "1.0", "true", "yes", "success", "succeeded", "ok"}
+_NO = {"0", "0.0", "false", "no", "failure", "failed", "fail"}
+_SCALE = re.compile(r"(likert|ordinal)(\d+)")
+_TASK = "report"
+
+
+class _Row(NamedTuple):
+    """One row of a table."""
+
+    line: int
+    report: float  # in [0, 1]; NaN if blank
+    success: float
+    failure: float
+    demand: float
+    inputs: tuple[float, ...]
+
+
+def read_reports(
+    table: Any,
+    *,
+    person: str = "person",
+    step: str = "step",
+    report: str = "report",
+    outcome: str | None = None,
+    demand: str | None = None,
+    task: str | None = None,
+    inputs: Sequence[str] = (),
+    scale: str = "unit",
+) -> list[Mission]:
+    """Read reports of trust from a table with a row for each person and step.
+
+    A report is given after the outcome of its step. A first row without an outcome is the report
+    before anything was seen. Steps are taken in their order; a blank report was not given, so
+    that reports may be at some steps only, or at the end.
+
+    Args:
+        table: Path of a CSV file with a header, separated by commas, semicolons or tabs; or a
+            DataFrame, a mapping of columns or a structured array.
+        person: Column that identifies the person.
+        step: Column of the step, a number.
+        report: Column of the report.
+        outcome: Column of what the robot did: 1, `true`, `yes` or `success`, or 0, `false`, `no` or
+            `failure`, or blank. It becomes the features `success` and `failure`.
+        demand: Column with the demand of what was seen, from 0, easy, to 1. It becomes the features
+            `success_demand`, success times demand, and `failure_demand`, failure times 1 - demand:
+            success at what is hard, and failure at what is easy.
+        task: Column of the task that the report is about. Each becomes a row of the mission, its
+            features `task_...` being 1; rows of one step are about different tasks.
+        inputs: Columns of further features, numbers.
+        scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
+
+    Returns:
+        Missions without a map, one for each person in the order of the table; `n_ticks` is the
+        number of steps of a scale of levels, such as 6.
+
+    Raises:
+        TrustboError: A missing file or column, a repeated row, a value of the wrong kind or off the
+            scale, a person without reports, or no outcome and no input at all.
+    """
+    columns = columns_of(table)
+    levels = _levels(scale)
+    named = {"person": person, "step": step, "report": report}
+    named |= {"outcome": outcome, "demand": demand, "task": task}
+    wanted = [name for name in (*named.values(), *inputs) if name is not None]
+    if missing := [name for name in wanted if name not in columns]:
+        raise TrustboError(
+            f"the table lacks {', '.join(missing)}; it has {', '.join(columns) or 'no columns'}. "
+            f'Name its columns, such as read_reports(table, {_name_of(named, missing[0])}="...").'
+        )
+    if len(set(wanted)) < len(wanted):
+        raise TrustboError(f"one column has two meanings: {', '.join(wanted)}.")
+    if not columns[person]:
+        raise TrustboError("the table has no rows.")
+    if demand is not None and outcome is None:
+        raise TrustboError(f"demand={demand!r} scales outcomes: name their column, outcome=.")
+    if outcome is None and not inputs and task is None:
+        raise TrustboError("reports need what was seen: give outcome=, a column, or inputs=.")
+    people: dict[str, dict[float, dict[str, _Row]]] = {}
+    tasks: dict[str, None] = {}
+    for i in range(len(columns[person])):
+        text = {name: columns[name][i] for name in wanted}
+        who, about = text[person], "" if task is None else text[task]
+        where = f"row {i + 1}"
+        if not who or (task is not None and not about):
+            raise TrustboError(f"{where}: {person if not who else task} is blank.")
+        k = _number(where, step, text[step])
+        if math.isnan(k):
+            raise TrustboError(f"{where}: {step} is blank.")
+        steps = people.setdefault(who, {}).setdefault(k, {})
+        if about in steps:
+            again = f" and {task} {about}" if task else ""
+            raise TrustboError(
+                f"person {who}, {step} {k:g}{again} is there twice, in rows "
+                f"{steps[about].line} and {i + 1}."
+            )
+        tasks[about] = None
+        steps[about] = _row(i + 1, text, named, inputs, levels)
+    return [
+        _mission(who, steps, tuple(tasks), named, inputs, levels) for who, steps in people.items()
+    ]
+
+
+def read_azevedo_sa(file: str | PathLike[str]) -> list[Mission]:
+    """Read the study of Azevedo-Sa et al. (2021): trust in a driving task after three others.
+
+    A seen task's demand is the share of its needs, sensing and processing, that are no less than
+    those of the asked task; the mean need of the asked task is the input `need`. Levels are 1 to 7.
+
+    Args:
+        file: Table with the columns person, step, success, sensing, processing, asked_sensing,
+            asked_processing and trust, the logistic function of the rating less 4.
+
+    Raises:
+        TrustboError: See `read_reports`.
+    """
+    columns = columns_of(file)
+    _require(columns, ("person", "step", "success", "sensing", "processing", "asked_sensing",
+                       "asked_processing", "trust"))  # fmt: skip
+    number = {
+        name: np.array(
+            [_number(f"row {i + 1}", name, text) for i, text in enumerate(columns[name])]
+        )
+        for name in ("sensing", "processing", "asked_sensing", "asked_processing", "trust")
+    }
+    share = np.clip(number["trust"], 0.01, 0.99)
+    rating = np.clip(np.round(np.log(share / (1.0 - share)) + 4.0), 1, 7)
+    needs = [(number[n], number[f"asked_{n}"]) for n in ("sensing", "processing")]
+    table = {name: columns[name] for name in ("person", "step", "success")}
+    table["report"] = rating.tolist()
+    table["demand"] = np.mean([seen >= asked for seen, asked in needs], axis=0).tolist()
+    table["need"] = np.mean([asked for _, asked in needs], axis=0).tolist()
+    return read_reports(
+        table, outcome="success", demand="demand", inputs=("need",), scale="likert7"
+    )
+
+
+def read_soh(file: str | PathLike[str]) -> list[Mission]:
+    """Read a study of Soh et al. (2018): trust in tasks before and after two others were seen.
+
+    Bound 1 is before, and has reports of five tasks, A and B being those that are seen then; bound
+    2 is after, and has reports of C, D and E. Features are the task, `task_1` to `task_12`, the
+    outcome, and for tasks of the category of the seen ones (1 to 6, 7 to 12) `success_same` and
+    `failure_same` as well.
+
+    Args:
+        file: Table with a row for each person: person (optional), `A_ID` to `E_ID`, `A_rating`,
+            `B_rating`, `C1_rating` to `E1_rating`, `C2_rating` to `E2_rating` from 1 to 7, and
+            `B_SF`, 1 where the seen tasks succeeded.
+
+    Raises:
+        TrustboError: See `read_reports`.
+    """
+    columns = columns_of(file)
+    before = {t: f"{t}_rating" if t in "AB" else f"{t}1_rating" for t in "ABCDE"}
+    names = (*(f"{t}_ID" for t in "ABCDE"), *before.values(), "B_SF")
+    _require(columns, (*names, "C2_rating", "D2_rating", "E2_rating"))
+    features = (*(f"task_{n}" for n in range(1, 13)), "success", "failure", "success_same",
+                "failure_same")  # fmt: skip
+    missions = []
+    for i in range(len(columns["B_SF"])):
+        where = f"row {i + 1}"
+        tasks = [_number(where, f"{t}_ID", columns[f"{t}_ID"][i]) for t in "ABCDE"]
+        if not all(task in range(1, 13) for task in tasks):
+            raise TrustboError(f"{where}: tasks must be 1 to 12; got {tasks}.")
+        succeeded = _outcome(where, "B_SF", columns["B_SF"][i])
+        z, y = np.zeros((2, 5, len(features))), np.full((2, 5), np.nan)
+        for r, t in enumerate("ABCDE"):
+            z[:, r, int(tasks[r]) - 1] = 1.0
+            y[0, r] = _report(where, before[t], columns[before[t]][i], 7)
+            if t in "CDE":
+                y[1, r] = _report(where, f"{t}2_rating", columns[f"{t}2_rating"][i], 7)
+            same = float((tasks[r] > 6) == (tasks[0] > 6))
+            z[1, r, 12:14] = succeeded
+            z[1, r, 14:] = same * np.array(succeeded)
+        missions.append(_made(f"person {i + 1}", z, y, features, tuple("ABCDE"), 7))
+    if not missions:
+        raise TrustboError("the table has no rows.")
+    return missions
+
+
+def read_du(file: str | PathLike[str], *, events: bool = False) -> list[Mission]:
+    """Read a study of Du et al. (2025): trust before and after each of ten steps.
+
+    Changes of trust in these files are almost a function of level and event: they test inputs, and
+    are no evidence on people.
+
+    Args:
+        file: Table with the columns person, step, trust_before, trust_after, state and task_result.
+        events: Whether outcomes are apart by the level of trust before (from .5, or below) and the
+            state, instead of two inputs.
+
+    Raises:
+        TrustboError: See `read_reports`.
+    """
+    columns = columns_of(file)
+    _require(columns, ("person", "step", "trust_before", "trust_after", "state", "task_result"))
+    table: dict[str, list[Any]] = {name: [] for name in ("person", "step", "report", "outcome")}
+    kinds = [
+        f"{o}_{h}_{s}" for o in ("success", "failure") for h in ("high", "low") for s in (0, 1)
+    ]
+    table |= {name: [] for name in kinds}
+    for i, who in enumerate(columns["person"]):
+        where = f"row {i + 1}"
+        values = {
+            name: _number(where, name, columns[name][i])
+            for name in ("step", "trust_before", "trust_after", "state", "task_result")
+        }
+        result = values["task_result"] > 0.0
+        level = "high" if values["trust_before"] >= 0.5 else "low"
+        kind = f"{'success' if result else 'failure'}_{level}_{int(values['state'])}"
+        if who not in table["person"]:
+            _append(table, who, 0, values["trust_before"], "", dict.fromkeys(kinds, 0.0))
+        of_kind = {name: float(name == kind) for name in kinds}
+        _append(table, who, values["step"], values["trust_after"], str(int(result)), of_kind)
+    if events:
+        table.pop("outcome")
+        return read_reports(table, inputs=kinds)
+    return read_reports(table, outcome="outcome")
+
+
+def _append(
+    table: dict[str, list[Any]], who: str, step: float, trust: float, outcome: str,
+    kinds: Mapping[str, float],
+) -> None:  # fmt: skip
+    values = {"person": who, "step": step, "report": trust, "outcome": outcome, **kinds}
+    for name, value in values.items():
+        table[name].append(value)
+
+
+def _row(
+    line: int,
+    text: Mapping[str, str],
+    named: Mapping[str, str | None],
+    inputs: Sequence[str],
+    levels: int,
+) -> _Row:
+    where = f"row {line}"
+    outcome, demand = named["outcome"], named["demand"]
+    success, failure = (0.0, 0.0) if outcome is None else _outcome(where, outcome, text[outcome])
+    d = 0.0 if demand is None else _number(where, demand, text[demand])
+    if math.isnan(d) and not success + failure:
+        d = 0.0  # of nothing seen
+    if not 0.0 <= d <= 1.0:
+        raise TrustboError(f"{where}: {demand} = {text[str(demand)]!r} must be in [0, 1].")
+    given = tuple(_number(where, name, text[name]) for name in inputs)
+    if any(map(math.isnan, given)):
+        blank = inputs[[math.isnan(v) for v in given].index(True)]
+        raise TrustboError(f"{where}: {blank} is blank; an input must be known at each step.")
+    report = str(named["report"])
+    return _Row(line, _report(where, report, text[report], levels), success, failure, d, given)
+
+
+def _mission(
+    who: str,
+    steps: Mapping[float, Mapping[str, _Row]],
+    tasks: tuple[str, ...],
+    named: Mapping[str, str | None],
+    inputs: Sequence[str],
+    levels: int,
+) -> Mission:
+    features = [f"task_{name}" for name in tasks] if named["task"] else []
+    features += ["success", "failure"] if named["outcome"] else []
+    features += ["success_demand", "failure_demand"] if named["demand"] else []
+    features += inputs
+    z = np.zeros((len(steps), len(tasks), len(features)))
+    y = np.full(z.shape[:2], np.nan)
+    for k, of_step in enumerate(steps[s] for s in sorted(steps)):
+        for r, name in enumerate(tasks):
+            # What was seen is of the step: a task that was not asked about has it too.
+            row = of_step.get(name, next(iter(of_step.values())))
+            y[k, r] = row.report if name in of_step else np.nan
+            values = [float(name == other) for other in tasks] if named["task"] else []
+            values += [row.success, row.failure] if named["outcome"] else []
+            if named["demand"]:
+                values += [row.success * row.demand, row.failure * (1.0 - row.demand)]
+            z[k, r] = [*values, *row.inputs]
+    names = tasks if named["task"] else (_TASK,)
+    return _made(f"person {who}", z, y, tuple(features), names, levels)
+
+
+def _made(
+    who: str, z: np.ndarray, y: np.ndarray, features: Sequence[str], tasks: Sequence[str], n: int
+) -> Mission:
+    """Mission of a person."""
+    if np.isnan(y).all():
+        raise TrustboError(f"{who} has no report; leave out the rows of this person.")
+    ticks = np.full(y.shape, n - 1.0 if n else np.nan)
+    try:
+        return Mission.from_arrays(None, z, y, n_ticks=ticks, features=features, robots=tasks)
+    except TrustboError as error:
+        raise TrustboError(f"{who}: {error}") from None
+
+
+def _levels(scale: str) -> int:
+    """Number of levels of a scale, 0 for unit."""
+    if scale == "unit":
+        return 0
+    found = _SCALE.fullmatch(scale) if isinstance(scale, str) else None
+    if found is None or int(found[2]) < 2:
+        raise TrustboError(
+            f'scale must be "unit" or such as "likert7", with the number of levels; got {scale!r}.'
+        )
+    return int(found[2])
+
+
+def _report(where: str, name: str, text: str, levels: int) -> float:
+    """Report in [0, 1]."""
+    value = _number(where, name, text)
+    if math.isnan(value):
+        return value
+    if not levels:
+        if 0.0 <= value <= 1.0:
+            return value
+        remedy = (
+            'give its scale, such as scale="likert7"' if 1 < value <= 11 else "divide it by 100"
+        )
+        hint = f"; {remedy}" if value > 0.0 else ""
+        raise TrustboError(f"{where}: {name} = {text} is outside [0, 1]{hint}.")
+    if not (value.is_integer() and 1 <= value <= levels):
+        raise TrustboError(f"{where}: {name} = {text} is no whole number from 1 to {levels}.")
+    return (value - 1.0) / (levels - 1.0)
+
+
+def _outcome(where: str, name: str, text: str) -> tuple[float, float]:
+    """Success and failure, each 0 or 1; both 0 where nothing was seen."""
+    if not text:
+        return 0.0, 0.0
+    if text.lower() in _YES:
+        return 1.0, 0.0
+    if text.lower() in _NO:
+        return 0.0, 1.0
+    raise TrustboError(
+        f"{where}: {name} = {text!r} is no outcome; give 1 or 0, success or failure, or a blank."
+    )
+
+
+def _number(where: str, name: str, text: Any) -> float:
+    try:
+        value = float(text) if str(text) else math.nan
+    except ValueError:
+        value = math.inf
+    if math.isinf(value):
+        raise TrustboError(f"{where}: {name} = {text!r} is no number.")
+    return value
+
+
+def _require(columns: Mapping[str, object], names: Sequence[str]) -> None:
+    if missing := [name for name in names if name not in columns]:
+        raise TrustboError(
+            f"the table lacks {', '.join(missing)}; it has {', '.join(columns)}: is it the study's?"
+        )
+
+
+def _name_of(named: Mapping[str, str | None], column: str) -> str:
+    return next((name for name, given in named.items() if given == column), "inputs")
