@@ -17,6 +17,7 @@ from trustbo.models import (
     CoupledTrust,
     DriftTrust,
     HierarchicalTrust,
+    HumanTrust,
     PlaceEffect,
     PooledTrust,
     RobotEffect,
@@ -24,6 +25,7 @@ from trustbo.models import (
 
 SMALL = (3, 6, 2, 2)  # missions, bounds, robots, features
 LOG = (2, 40, 3, 1)  # missions of a log, trust carried over all of it
+PEOPLE = (12, 5, 1, 2)  # persons, steps, tasks, success and failure
 OWN = {
     "top": HalfNormal(1.0),
     "slope": LogNormal(1.0, 0.7),
@@ -57,6 +59,9 @@ def cases():
     yield CoupledTrust(), "exact", 200, SMALL
     yield CoupledTrust(inter_robot="ordered"), "exact", 200, SMALL
     yield PooledTrust(place=PlaceEffect()), "exact", 300, SMALL
+    for scale in ("unit", "likert7", "ordinal7"):
+        people = HumanTrust(scale=scale).for_features(("success", "failure"))
+        yield people, "exact", 200, PEOPLE
     yield PooledTrust(observation="student_t"), "joint", 200, SMALL
     for observation in ("gaussian", "censored", "beta_binomial"):
         sampler = "nuts" if observation == "gaussian" else "joint"
@@ -88,10 +93,11 @@ def main():
         detail = "saturating" if isinstance(model, DriftTrust) else detail
         effects = ["places"] * (model.place is not None) + ["robots"] * bool(model.effects)
         detail = " and ".join(effects) or detail
+        detail = getattr(model, "scale", detail)
         label = name if detail in ("full", "level") else f"{name}, {detail}"
         if shape is LOG:
             detail, label = f"{detail}-log", f"{label}, of a log"
-        if model.memory != "level":
+        if model.memory != "level" and not isinstance(model, HumanTrust):
             detail, label = f"{detail}-{model.memory}", f"{label}, memory of the {model.memory}"
         if given.only not in label:
             continue
@@ -110,8 +116,10 @@ def main():
         )
         p, limit = float(result["p_value"].min()), 0.01 / result.sizes["parameter"]
         half, most = result["coverage"].mean("parameter").values
+        levels = getattr(model, "scale", "unit") != "unit"
+        family = "intervals" if levels else model.observation
         table.row(
-            label, model.observation, f"`{sampler}`", n, result.attrs["n_refused"],
+            label, family, f"`{sampler}`", n, result.attrs["n_refused"],
             result.sizes["parameter"], f"{p:.4f}", f"{limit:.5f}", f"{half:.1%}", f"{most:.1%}",
             "not rejected" if p > limit else "REJECTED",
         )  # fmt: skip
