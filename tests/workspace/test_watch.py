@@ -54,6 +54,22 @@ def test_sight_along_a_path_is_its_line_of_sight_but_for_turns(wooded):
     assert abs((along - known).mean()) < 0.03
 
 
+def test_a_bound_with_one_way_on_is_unseen_as_its_path_is():
+    """A corridor of cells: the next bound, and with it T2's way, is known."""
+    terrain = synthetic_terrain((50.0, 200.0), seed=3, relief=12.0)
+    corridor = Workspace.from_terrain(terrain, (1, 4), Team(n_robots=2), sight="wall")
+    shares = corridor.unseen_bounds
+    assert shares.dims == ("move", "row", "col")
+    for move, path in (("e", range(4)), ("w", range(3, -1, -1))):
+        path = tuple((0, col) for col in path)
+        seen = corridor.watch.seen_along(path, corridor.watch.rule(path))
+        entered = [col for _, col in path[1:]]
+        np.testing.assert_allclose(shares.sel(move=move, row=0)[entered], seen.unseen(), rtol=1e-12)
+    assert 0.05 < float(shares.max()) <= 1.0
+    assert int(shares.notnull().sum()) == 6
+    assert Workspace.from_awareness(np.full((1, 2, 2, 1), 0.5)).unseen_bounds is None
+
+
 def test_an_overwatch_map_has_what_is_seen_from_each_post(wooded):
     a, c = PATH[:2]
     seen = wooded.overwatch_map((a, c))

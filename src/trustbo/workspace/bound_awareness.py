@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from itertools import batched
 from typing import NamedTuple
 
 import numpy as np
@@ -10,17 +9,15 @@ import xarray as xr
 
 from trustbo.data import LINE_OF_SIGHT, is_line_of_sight
 from trustbo.errors import TerrainError, TrustboError
-from trustbo.parallel import in_order
 from trustbo.terrain.composite import MAX_PIXELS
 from trustbo.terrain.dataset import is_lazy
-from trustbo.workspace.line_of_sight import bound_features, geometry
-from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.line_of_sight import Geometry, bound_features, over_bounds
+from trustbo.workspace.moves import existing_bounds
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.ways import Ways
 
 TRAVERSABLE = "traversability"
 """Name of the feature that is averaged along the way, instead of over the cell entered."""
-_BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
 
 
 class BoundMaps(NamedTuple):
@@ -82,8 +79,6 @@ def of_bounds(
     for the team.
     """
     exists = existing_bounds(passable)
-    index = np.argwhere(exists)  # (bound, (move, row, col))
-    steps = np.array(MOVES[8])
     n_robots, n_features = len(cells), cells.shape[-1]
     maps = np.full((n_robots, *exists.shape, n_features + len(sights)), np.nan)
     maps[..., :n_features] = np.where(exists[..., None], cells[:, None], np.nan)
@@ -93,23 +88,18 @@ def of_bounds(
     for row, col in np.argwhere(passable).tolist():
         ways.posts.require_room((row, col))
 
-    def work(block: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        bounds = np.array(block)
-        entered = bounds[:, 1:]
-        left = (entered - steps[bounds[:, 0]]).tolist()
-        pairs = [((i, j), (k, n)) for (i, j), (k, n) in zip(left, entered.tolist(), strict=True)]
-        given = geometry(ways, pairs, passable)
+    def work(given: Geometry) -> tuple[list[np.ndarray], np.ndarray]:
         features_of = partial(bound_features, surface, team=ways.posts.team, given=given)
         both = [features_of(sight=sight, index=traversability) for sight in sights]
-        return bounds, [los for los, _ in both], both[0][1]
+        return [los for los, _ in both], both[0][1]
 
-    for bounds, seen, easy in in_order(work, batched(index, _BLOCK)):
+    for bounds, (seen, easy) in over_bounds(ways, passable, work):
         for n, los in enumerate(seen):
-            maps[:, *bounds.T, n_features + n] = los.T
+            maps[:, *bounds, n_features + n] = los.T
         if TRAVERSABLE in features:
             m = list(features).index(TRAVERSABLE)
-            filled = np.where(np.isfinite(easy.T), easy.T, maps[:, *bounds.T, m])
-            maps[:, *bounds.T, m] = filled
+            filled = np.where(np.isfinite(easy.T), easy.T, maps[:, *bounds, m])
+            maps[:, *bounds, m] = filled
     maps = np.clip(maps, 0.0, 1.0)
     into = np.maximum(exists.sum(0), 1)[..., None]
     seen = np.nansum(maps[..., n_features:], axis=1) / into

@@ -18,21 +18,24 @@ the search of some 50 routes for each bound.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import batched
 from typing import NamedTuple
 
 import numpy as np
 
 from trustbo.data import Cell
+from trustbo.parallel import in_order
 from trustbo.team import Robot, Team
 from trustbo.workspace.formation import Formation
-from trustbo.workspace.moves import MOVES
+from trustbo.workspace.moves import MOVES, existing_bounds
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.surface import Surface
 from trustbo.workspace.ways import Ways
 
+_BLOCK = 256  # bounds computed at a time: they share calls, and bound the memory
 N_SAMPLES = 16
 """Times in each phase at which sight is computed."""
 _AHEAD = 0.5  # cosine of the largest turn that is expected where turns lead to other posts
@@ -58,6 +61,24 @@ def geometry(ways: Ways, bounds: Sequence[tuple[Cell, Cell]], passable: np.ndarr
         ahead = [posts.watching(c, b) for b in _onward(passable, a, c, least)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
     return Geometry(of_lead, np.array(starts), np.array(ends), posts.is_wide)
+
+
+def over_bounds[R](
+    ways: Ways, passable: np.ndarray, work: Callable[[Geometry], R]
+) -> Iterator[tuple[np.ndarray, R]]:
+    """Compute something of all bounds between passable cells, (row, col), some at a time.
+
+    Also their moves, rows and columns, (3, bound).
+    """
+    steps = np.array(MOVES[8])
+
+    def of_block(block: Sequence[np.ndarray]) -> tuple[np.ndarray, R]:
+        index = np.array(block)  # (bound, (move, row, col))
+        left = (index[:, 1:] - steps[index[:, 0]]).tolist()
+        pairs = [((i, j), (k, n)) for (i, j), (_, k, n) in zip(left, index.tolist(), strict=True)]
+        return index.T, work(geometry(ways, pairs, passable))
+
+    return in_order(of_block, batched(np.argwhere(existing_bounds(passable)), _BLOCK))
 
 
 def _onward(passable: np.ndarray, a: Cell, c: Cell, least: float) -> list[Cell | None]:

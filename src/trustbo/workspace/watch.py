@@ -13,7 +13,8 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.team import Robot
-from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, Phases, phases
+from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, Phases, over_bounds, phases
+from trustbo.workspace.moves import MOVES
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
 from trustbo.workspace.ways import Ways
@@ -73,6 +74,22 @@ class WatchTable:
         ends = np.repeat(ends[:, None], N_SAMPLES, axis=1)
         given = Geometry(ways, posts, ends, rule.is_wide)
         return phases(rule.surface, sight or self._sight, rule.team, given)
+
+    def unseen(self, passable: np.ndarray) -> np.ndarray:
+        """Share of the time of bounds in which nobody sees anybody, (move, row, col).
+
+        Between passable cells (row, col), NaN for others. T2 stands at the posts of the rule, and
+        closes up to those for each of the cells that a path may go on to, as line of sight has it.
+        """
+        rule = self._ways.posts
+
+        def work(given: Geometry) -> np.ndarray:
+            return phases(rule.surface, self._sight, rule.team, given).unseen()
+
+        shares = np.full((len(MOVES[8]), *passable.shape), np.nan)
+        for bounds, some in over_bounds(self._ways, passable, work):
+            shares[*bounds] = some
+        return shares
 
     def posts(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
         """Posts in a cell to watch the bound to the next one from, (post, 2), see `along`."""

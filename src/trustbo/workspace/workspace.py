@@ -334,6 +334,20 @@ class Workspace(Displayed):
             return None
         return WatchTable(self.ground, self.sights[0])
 
+    @cached_property
+    def unseen_bounds(self) -> xr.DataArray | None:
+        """Share of the time of each bound in which nobody sees anybody, DataArray (move, row, col).
+
+        Expected by the map, with T2 at the workspace's posts, over the cells that a path may go on
+        to; in [0, 1], NaN where there is no bound. The bound enters the cell (row, col) by the
+        move, one of the eight of `MOVES`. It is that of the assumed sight, the first of several;
+        None without a terrain in memory or an assumed sight.
+        """
+        if (table := self.watch) is None:
+            return None
+        like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
+        return like.copy(data=table.unseen(self.passable.values)).rename("unseen")
+
     @property
     def difficulty(self) -> xr.DataArray:
         """Difficulty of bounds, as version 0.2 had it: see `hazard.difficulty.difficulty_of`."""
