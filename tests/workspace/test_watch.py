@@ -70,6 +70,19 @@ def test_a_bound_with_one_way_on_is_unseen_as_its_path_is():
     assert Workspace.from_awareness(np.full((1, 2, 2, 1), 0.5)).unseen_bounds is None
 
 
+def test_posts_of_the_table_are_near_their_cells_of_a_broken_number_of_pixels():
+    """A campaign with a poor watcher once ended here: its plan's post was refused as too far."""
+    terrain = synthetic_terrain((78.0, 78.0), seed=3, relief=8.0)
+    small = Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2), sight_discount=0.0)
+    farthest = 0.0
+    for a, c in pairwise([(3, 0), (2, 0), (1, 0), (0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 3)]):
+        posts = small.watch.posts(a, c)
+        farthest = max(farthest, np.abs(posts - small.grid.center(a)).max())
+        for post in posts:
+            assert np.isfinite(small.gain_of([a, c], np.tile(post, (1, 2, 1)))).all()
+    assert farthest > small.grid.cell_height
+
+
 def test_an_overwatch_map_has_what_is_seen_from_each_post(wooded):
     a, c = PATH[:2]
     seen = wooded.overwatch_map((a, c))

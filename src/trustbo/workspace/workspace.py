@@ -51,8 +51,6 @@ from trustbo.workspace.survey import MAX_MISSING, reason_impassable
 from trustbo.workspace.watch import WatchTable
 from trustbo.workspace.ways import Ways
 
-_NEAR = 1.0 + 1e-9
-"""Distance of a post from the centre of its cell, in cells: half a cell from its edge."""
 _APART = 2.0
 """Distance of the points of an overwatch map, m."""
 
@@ -484,8 +482,10 @@ class Workspace(Displayed):
         """Refuse posts (bound, robot, 2) that are not near the cells that T2 watches from."""
         grid, given = self.grid, require_posts(posts, (len(path) - 1, self.team.n_robots, 2))
         centres = np.array([grid.center(cell) for cell in path[:-1]])[:, None]
-        off = np.abs(given - centres) / (grid.cell_width, grid.cell_height)
-        for k, i in np.argwhere(~(off <= _NEAR).all(-1)).tolist():
+        # Half a cell from its edge, by whole pixels: the window that the rule's posts are in.
+        pixel = (0.0, 0.0) if self.surface is None else self.surface.pixel
+        most = grid.cell_width + pixel[1], grid.cell_height + pixel[0]
+        for k, i in np.argwhere(~(np.abs(given - centres) <= most).all(-1)).tolist():
             raise TrustboError(
                 f"posts[{k}, {i}] = {given[k, i].round(1).tolist()} is not near cell {path[k]}, "
                 f"whose centre is {centres[k, 0].round(1).tolist()}; give x and y in CRS metres."
