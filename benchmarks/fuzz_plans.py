@@ -4,13 +4,13 @@ Run: python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--jobs J] [-
      [--out FILE]
 
 Draws grids, strips and closed bounds, awareness of cells or bounds, effects of places, all models,
-objectives and families, length weights, limits on bounds from "shortest" to "shortest+300", walks
-without revisits, risks with limits, confidence and costs, and numbers that are large, tied or 0.
-The compiled engine's plan, and where it is quick the reference engine's, must have the best score
-of all admissible paths (`peers.every_path`, which shares no code with the engines). Problem I of a
-seed is always the same. Chunks run in processes: one that crashes is counted, and the rest goes on.
-`--checked` compiles all kernels with checks of their indices. With `--out`, chunks that FILE has
-are not run again.
+objectives and families, tolls on length and on time unseen, limits on bounds from "shortest" to
+"shortest+300", walks without revisits, risks with limits, confidence and costs, and numbers that
+are large, tied or 0. The compiled engine's plan, and where it is quick the reference engine's, must
+have the best score of all admissible paths (`peers.every_path`, which shares no code with the
+engines). Problem I of a seed is always the same. Chunks run in processes: one that crashes is
+counted, and the rest goes on. `--checked` compiles all kernels with checks of their indices. With
+`--out`, chunks that FILE has are not run again.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import xarray as xr
 from common import add_record, arguments, parsed, read_records
 from peers.every_path import (
     STEPS,
@@ -220,9 +221,12 @@ def draw_case(rng):
     case.simple = case.objective == "stationary" or (case.history and not case.revisit)
     if case.objective == "stationary":
         case.longest, case.u_turns = int(case.passable.sum()) - 1, True
-    case.weight = float(pick(rng, 0.0, 0.0, 0.01, 0.1))
-    if case.objective in ("success", "bottleneck") or (case.dense and case.objective == "mean"):
-        case.weight = 0.0
+    case.weight, case.unseen = float(pick(rng, 0.0, 0.0, 0.01, 0.1)), 0.0
+    case.shares = rng.random((8, *shape))
+    if rng.random() < 0.4:
+        case.unseen = float(pick(rng, 0.01, 0.3, 3.0, 30.0))
+    if case.objective == "bottleneck" or (case.dense and case.objective == "mean"):
+        case.weight = case.unseen = 0.0
     return case
 
 
@@ -257,7 +261,8 @@ class Problem:
             risk, limits, needed = resources(self.p, self.draws, self.options)
             if case.objective == "lost_contact":
                 cost = self.options.get("failure_cost", float(case.shortest))
-        tolls = case.weight * CELL * np.hypot(*STEPS.T)
+        tolls = case.weight * CELL * np.hypot(*STEPS.T)[:, None]
+        tolls = tolls + case.unseen * case.shares.reshape(8, -1)
         self.case, self.world = case, World(
             case.objective, *case.ends, case.into, tolls, u, B0, x0, case.team == "min",
             case.family, sd, case.lag, case.longest, case.u_turns, case.simple, risk, limits,
@@ -289,11 +294,13 @@ class Problem:
         from trustbo.workspace import Workspace
 
         case, workspace = self.case, Workspace.from_awareness(self.z, self.case.passable, CELL)
+        shares = xr.DataArray(case.shares, dims=("move", "row", "col"))
+        vars(workspace)["unseen_bounds"] = shares  # as if computed from a map, and cached
         planner = Planner(
             workspace, case.start, case.goal, case.objective, connectivity=case.connectivity,
             max_bounds=case.most, revisit=case.revisit, team=case.team, length_weight=case.weight,
-            engine=engine, observation=case.family, response="change" if case.lag else "level",
-            **self.options,
+            unseen_cost=case.unseen, engine=engine, observation=case.family,
+            response="change" if case.lag else "level", **self.options,
         )  # fmt: skip
         if case.closed.any():
             planner = planner.avoiding(case.closed, np.zeros(case.closed.shape))

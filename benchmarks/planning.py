@@ -71,14 +71,14 @@ def many_draws(n, n_networkx):
     table.line("trustbo, stationary (a history-free cost)", ours)
 
     dynamics = planner.dynamics(draws)
-    steady_state, length_cost = dynamics.steady_state(), np.zeros(8)
+    steady_state, tolls = dynamics.steady_state(), np.zeros((8, 1))
     start, goal = planner.paths.flat(planner.start), planner.paths.flat(planner.goal)
     search = median_seconds(
         lambda: best_stationary(
             steady_state.__getitem__,
             1000,
             planner.paths.passable,
-            length_cost,
+            tolls,
             planner.paths.steps,
             start,
             goal,

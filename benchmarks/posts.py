@@ -8,6 +8,9 @@ the share of the time in which nobody sees anybody. Saved is the contact that a 
 lost by the posts and stops of version 0.2. Called again, it goes on where it stopped. Intervals
 are 95 %, bootstrap over worlds.
 
+`cover`: the same by `unseen_cost`, of the first plan and of that after eight missions of the
+default campaign, in the worlds of wellington; with the share unseen by the map, which is paid.
+
 `robots`: the same of robots that differ (r1 has its lidar on a mast of 3 m, r3 one that finds 60 %
 within 40 m), given to the posts of the path by the plan, or not.
 """
@@ -20,11 +23,13 @@ from typing import Any
 import numpy as np
 from common import Table, arguments, parsed, records_of
 
+from trustbo import iterate
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell, Mission
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
 from trustbo.team import Robot, Team
+from trustbo.workspace.moves import bounds_along
 
 RULES: dict[str, dict[str, Any]] = {
     "0.2": {"posts": "end", "stops": "centre"},
@@ -33,9 +38,11 @@ RULES: dict[str, dict[str, Any]] = {
 }
 FIRST = "0.2"
 N, MISSION = 16, 7
-PARTS = "rules", "robots"
+PARTS = "rules", "cover", "robots"
 UNLIKE = Team(robots=(Robot(sensor_height=3.0), Robot(), Robot(detection=0.6, lidar_range=40.0)))
 KINDS = "right", "aged"
+COSTS = 0.0, 1.0, 3.0, 10.0
+PLACE = "wellington"
 
 
 def main() -> None:
@@ -52,6 +59,9 @@ def main() -> None:
     chosen = [w for w in usable if not names or w.name in names]
     if "rules" in given.names:
         show(records_of(given.out / "posts.jsonl", chosen, courses, N, judged))
+    if "cover" in given.names:
+        here = [w for w in chosen if w.name.startswith(PLACE)]
+        show_cover(records_of(given.out / "cover.jsonl", here, courses, N, covered))
     if "robots" in given.names:
         show_robots([w for w in chosen if w.kind in KINDS], courses)
 
@@ -69,6 +79,53 @@ def judged(world: World, course: str, n: int) -> dict[str, Any]:
         path = campaign.recommend().path
         rules[rule] = summed(driven(world.simulator(workspace), path, n))
     return {"world": world.name, "kind": world.kind, "course": course, "n": n, "rules": rules}
+
+
+def covered(world: World, course: str, n: int) -> dict[str, Any]:
+    """Means over missions on the first plan, and on that after eight, by cost of time unseen."""
+    workspace, driven_on, by_cost = world.workspace(), {}, {}
+    simulator, ends = world.simulator(workspace), world.ends(course)
+    options: dict[str, Any] = {"connectivity": world.connectivity, "seed": 0}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of safest plans, and bounds avoided
+        result = iterate(
+            workspace, *ends, simulator=simulator, n_iterations=MISSION + 1, progress=False,
+            **options,
+        )  # fmt: skip
+        for cost in COSTS:
+            settings = result.settings | {"unseen_cost": cost}
+            for stage, plan in (
+                ("first plan", Campaign(workspace, *ends, unseen_cost=cost, **options).recommend()),
+                ("after 8 missions", replace(result, settings=settings).plan),
+            ):
+                if plan.path not in driven_on:
+                    driven_on[plan.path] = summed(driven(simulator, plan.path, n))
+                shares = workspace.unseen_bounds.values[tuple(bounds_along(plan.path).T)]
+                known = {"map": float(shares.mean()), "bounds": len(shares), "path": plan.path}
+                by_cost[f"{stage}, {cost:g}"] = driven_on[plan.path] | known
+    return {"world": world.name, "kind": world.kind, "course": course, "n": n, "rules": by_cost}
+
+
+def show_cover(records: Sequence[dict[str, Any]]) -> None:
+    """Print a row for each cost of the time unseen, of first plans and of those that learned."""
+    print("\nBy the cost of a bound in which nobody sees anybody\n")
+    table = Table(
+        "unseen_cost", "unseen, %", "contact lost, bounds", "by the map, %", "bounds", "duration",
+        "arrive", "paths changed", first=22,
+    )  # fmt: skip
+    for rule in records[0]["rules"]:
+        free = f"{rule.split(', ')[0]}, 0"
+        mean = {
+            what: np.nanmean([_of(r, rule, what) for r in records])
+            for what in ("unseen", "lost", "map", "bounds", "arrive")
+        }
+        longer = [_of(r, rule, "duration") / _of(r, free, "duration") for r in records]
+        changed = np.mean([_of(r, rule, "path") != _of(r, free, "path") for r in records])
+        table.row(
+            rule, f"{100.0 * mean['unseen']:.2f}", f"{mean['lost']:.3f}",
+            f"{100.0 * mean['map']:.2f}", f"{mean['bounds']:.2f}", f"{np.nanmean(longer):.2f}",
+            f"{mean['arrive']:.3f}", f"{changed:.0%}",
+        )  # fmt: skip
 
 
 def show_robots(chosen: Sequence[World], courses: Sequence[str]) -> None:

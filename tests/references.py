@@ -178,6 +178,13 @@ def expected_rate(family, x, sd):
     return integral[0] - integral[1]
 
 
+def sums_of(values, paths, n_cells):
+    """Sums of values of bounds (move, row, col) along paths (path, length), shape (path,)."""
+    pairs = np.nan_to_num(of_bounds(values[None])[0])
+    on = np.arange(1, paths.shape[1]) < n_cells[:, None]
+    return np.where(on, pairs[paths[:, :-1], paths[:, 1:]], 0.0).sum(1)
+
+
 def path_values(
     objective, paths, n_cells, u, transition, x0, *, team="mean", toll=None, rates=("gaussian", 0.1)
 ):
@@ -191,7 +198,7 @@ def path_values(
         transition: B0, shape (robot, robot).
         x0: Trust at the start.
         team: "mean" or "min".
-        toll: What each path's metres cost, shape (path,).
+        toll: What each path's metres and time unseen cost, shape (path,).
         rates: Family of the rates, and their noise sd.
     """
     if objective == "lost_contact" and rates[0] == "gaussian":  # trust is capped at 1
@@ -222,7 +229,7 @@ def path_values(
         "lost_contact": -lost - toll,
         "terminal": 1.0 / (1.0 + np.exp(toll - last)),
         "mean": total / (n_cells - 1) - toll,
-        "success": np.exp(-success),
+        "success": np.exp(-success - toll),
         "bottleneck": least,
         "stationary": np.exp(-stationary - toll),
     }[objective]

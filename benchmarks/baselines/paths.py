@@ -77,8 +77,8 @@ def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
     )
     gains = np.nan_to_num(rates[:, move_indices(paths.connectivity)])
     gains = gains.reshape(n_draws, 1, gains.shape[1], -1)
-    no_cost = np.zeros(len(paths.steps))
-    _, found = best_additive(paths.layers, gains, weights, no_cost, lengths)
+    no_tolls = np.zeros((len(paths.steps), 1))
+    _, found = best_additive(paths.layers, gains, weights, no_tolls, lengths)
     return [paths.cells(flat) for flat in found]
 
 

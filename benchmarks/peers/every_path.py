@@ -24,7 +24,7 @@ class World(NamedTuple):
     start: int
     goal: int
     into: np.ndarray  # (move, cell): the cell that the move leads to from a cell, -1 if it may not
-    length: np.ndarray  # (move,), its cost
+    tolls: np.ndarray  # (move, cell entered), costs apart from trust
     u: np.ndarray  # (state, move, cell entered)
     B0: np.ndarray  # (state, state)
     x0: np.ndarray  # (state,)
@@ -94,7 +94,7 @@ def every_walk(world, most):
     settled = steady(world) if world.objective == "stationary" else None
     cell, came = np.array([world.start]), np.array([NONE])
     x, risk = world.x0[:, None], np.zeros((len(world.limits), 1))
-    cost, metres = np.full(1, 0.0 if additive else -np.inf), np.zeros(1)
+    cost, toll = np.full(1, 0.0 if additive else -np.inf), np.zeros(1)
     seen, scores, risks, total = np.left_shift(1, cell), [], [], 0
     for k in range(1, world.longest + 1):
         m, walk = np.nonzero(world.into[:, cell] >= 0)
@@ -120,23 +120,23 @@ def every_walk(world, most):
         else:
             now = world.loss(t)
             cost = cost[walk] + now if additive else np.maximum(cost[walk], now)
-        metres = metres[walk] + world.length[m]
+        toll = toll[walk] + world.tolls[m, other]
         risk = risk[:, walk] + world.risk[:, m, other]
         seen, cell, came = seen[walk] | np.left_shift(1, other), other, m
         there = cell == world.goal
         scale = k if world.objective == "mean" else 1
-        scores.append(-cost[there] / scale - metres[there])
+        scores.append(-cost[there] / scale - toll[there])
         risks.append(risk[:, there])
         on = ~there
         cell, came, x, risk = cell[on], came[on], x[:, on], risk[:, on]
-        cost, metres, seen = cost[on], metres[on], seen[on]
+        cost, toll, seen = cost[on], toll[on], seen[on]
     return Walks(np.concatenate(scores), np.concatenate(risks, axis=1))
 
 
 def along(world, path):
     """Score and risks of one path, and whether it is admissible."""
     settled = steady(world) if world.objective == "stationary" else None
-    x, risk, costs, metres, came = world.x0, np.zeros(len(world.limits)), [], 0.0, NONE
+    x, risk, costs, toll, came = world.x0, np.zeros(len(world.limits)), [], 0.0, NONE
     admissible = path[0] == world.start and path[-1] == world.goal
     admissible &= world.goal not in path[:-1] and len(path) - 1 <= world.longest
     admissible &= not world.simple or len(set(path)) == len(path)
@@ -148,9 +148,9 @@ def along(world, path):
         x = world.B0 @ x + world.u[:, came, c]
         t = world.trust(x) - world.lag * before if settled is None else settled[came, c]
         costs.append(-t if world.objective in ("terminal", "mean") else world.loss(t))
-        risk, metres = risk + world.risk[:, came, c], metres + world.length[came]
+        risk, toll = risk + world.risk[:, came, c], toll + world.tolls[came, c]
     cost = {"terminal": costs[-1], "mean": np.mean(costs), "bottleneck": max(costs)}
-    return -cost.get(world.objective, sum(costs)) - metres, risk, admissible
+    return -cost.get(world.objective, sum(costs)) - toll, risk, admissible
 
 
 def best_of(walks, world):
@@ -202,12 +202,12 @@ def dense_weights(world):
 def bound_costs(world, weights, left):
     """Costs of bounds (move, cell) after which so many bounds are left."""
     if weights is not None:
-        return -np.einsum("s,smc->mc", weights[0][left], world.u) + world.length[:, None]
+        return -np.einsum("s,smc->mc", weights[0][left], world.u) + world.tolls
     trust = steady(world) if world.objective == "stationary" else world.trust(world.u)
     if world.objective == "terminal":
-        return (-trust if left == 0 else 0.0 * trust) + world.length[:, None]
+        return (-trust if left == 0 else 0.0 * trust) + world.tolls
     cost = -trust if world.objective == "mean" else world.loss(trust)
-    return cost + world.length[:, None]
+    return cost + world.tolls
 
 
 def dense_table(world):

@@ -47,7 +47,7 @@ def test_a_record_of_this_version_stays_as_it_is():
     record = migrate_state(STATE)
     assert migrate_state(record) == record
     result = migrate_result({"n_missions": 1, "settings": {"failure_cost": 2.0}})
-    assert result["settings"] == {"failure_cost": 2.0, "max_failure": None}
+    assert result["settings"] == {"failure_cost": 2.0, "max_failure": None, "unseen_cost": 0.0}
     assert migrate_result(result) == result
 
 

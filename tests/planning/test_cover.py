@@ -1,16 +1,23 @@
 """Cover of a path: in closed form, and beside missions where the map is right."""
 
+import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from trustbo import Campaign, Workspace
+from trustbo import Campaign, Workspace, iterate
+from trustbo.export import write_path
+from trustbo.inference import sample_prior
+from trustbo.models import PooledTrust, TrustParams
+from trustbo.planning import Planner
 from trustbo.planning.cover import cover_along
 from trustbo.planning.plan import plan_from_record, plan_to_record
+from trustbo.report.summary import facts_of
 from trustbo.simulation import KinematicSimulator
 from trustbo.terrain import synthetic_terrain
 from trustbo.workspace.line_of_sight import N_SAMPLES, Phases
+from trustbo.workspace.moves import bounds_along
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +83,53 @@ def test_robots_that_lose_contact_leave_more_of_the_path_unseen(workspace):
     shares = [cover_along(workspace, path, posts, f * sight[None]).unseen for f in (1.0, 0.7, 0.0)]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
+
+
+def test_the_more_the_time_unseen_costs_the_less_of_it_there_is(workspace):
+    params = TrustParams(0.4, np.array([0.1, 0.0, 0.5]), 0.05, 0.1, 0.1)
+    unseen, lost = [], []
+    for cost in (0.0, 1.0, 5.0, 100.0):
+        planner = Planner(workspace, (4, 0), (0, 4), unseen_cost=cost)
+        plan = planner.plan(params)
+        moves = bounds_along(plan.path)
+        unseen.append(workspace.unseen_bounds.values[tuple(moves.T)].sum())
+        assert plan.unseen_toll == pytest.approx(cost * unseen[-1], rel=1e-12)
+        lost.append(-plan.value - plan.unseen_toll)
+        free = Planner(workspace, (4, 0), (0, 4)).evaluate(plan.path, params)
+        assert free.value == pytest.approx(-lost[-1], rel=1e-12)
+        assert free.unseen_toll == 0.0
+        assert ("on the time unseen" in repr(plan)) == (cost > 0.0)
+    assert unseen == sorted(unseen, reverse=True)
+    assert unseen[-1] < unseen[0]
+    assert lost == sorted(lost)
+    assert plan.exact
+
+
+def test_shares_of_bounds_are_near_those_along_paths(workspace):
+    """But for turns, which bounds do not know, and for the goal, where T2 closes up otherwise."""
+    draws, shares = sample_prior(PooledTrust(), 3, 6, seed=1), []
+    for end in ((0, 4), (0, 1), (1, 4), (2, 3), (0, 2)):
+        for path in Planner(workspace, (4, 0), end).plan_draws(draws).candidates:
+            along = workspace.watch.seen_along(path, workspace.watch.rule(path)).unseen()
+            known = workspace.unseen_bounds.values[tuple(bounds_along(path).T)]
+            shares += zip(known, along, strict=True)
+    known, along = np.array(shares).T
+    assert np.corrcoef(known, along)[0, 1] > 0.95
+    assert abs((known - along).mean()) < 0.02
+
+
+def test_campaigns_pay_for_the_time_unseen_and_say_so(workspace, tmp_path):
+    options = {"unseen_cost": 2.5, "sampler": "exact", "seed": 0}
+    result = iterate(workspace, (4, 0), (0, 4), n_iterations=1, progress=False, **options)
+    assert result.settings["unseen_cost"] == 2.5
+    plan = result.plan
+    unseen = workspace.unseen_bounds.values[tuple(bounds_along(plan.path).T)].sum()
+    assert plan.unseen_toll == pytest.approx(2.5 * unseen)
+    facts = {fact.name: fact.text for fact in facts_of(result)}
+    assert "less the toll on the time in which nobody sees anybody" in facts["Value"]
+    assert "Its value pays a toll of" in facts["Cover"]
+    kept = plan_from_record(plan_to_record(plan), workspace)
+    assert kept.unseen_toll == plan.unseen_toll
+    write_path(tmp_path / "path.geojson", plan)
+    line = json.loads((tmp_path / "path.geojson").read_text())["features"][0]["properties"]
+    assert (line["unseen"], line["unseen_toll"]) == (plan.unseen, plan.unseen_toll)

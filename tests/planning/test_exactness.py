@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpyro.distributions import Normal
-from references import of_bounds, path_values, walks
+from references import of_bounds, path_values, sums_of, walks
+from worlds import with_unseen
 
 from trustbo.models import CoupledParams, DriftTrust, RobotParams, TrustParams
 from trustbo.planning import Planner
@@ -112,6 +113,7 @@ def problem(
     *,
     team="mean",
     weight=0.0,
+    unseen=0.0,
     more=None,
     family="gaussian",
 ):
@@ -128,13 +130,18 @@ def problem(
     moves = (8,) if seed else ()  # all seeds but 0 have a drift for each bound
     z, params, u, transition = random_problem(model, n, n_robots, beta0, rng, moves=moves)
     workspace = Workspace.from_awareness(z, passable, CELL)
+    toll = weight * length
+    if unseen:
+        shares = rng.uniform(size=(8, n, n))
+        workspace = with_unseen(workspace, shares)
+        toll = toll + unseen * sums_of(shares, paths, n_cells)
     if (
         model in ("pooled", "own") and team == "mean"
     ):  # one state, whose drift is capped for lost_contact
         u, transition = u.mean(0, keepdims=True), transition[:1, :1]
     rates = family, np.sqrt(0.1) if model == "coupled" else 0.1
     values = path_values(
-        objective, paths, n_cells, u, transition, 0.5, team=team, toll=weight * length, rates=rates
+        objective, paths, n_cells, u, transition, 0.5, team=team, toll=toll, rates=rates
     )
     cap = cap if isinstance(cap, str) or cap is None else shortest + cap
     planners = [
@@ -147,6 +154,7 @@ def problem(
             max_bounds=cap,
             team=team,
             length_weight=weight,
+            unseen_cost=unseen,
             engine=engine,
             observation=family,
         )
@@ -289,6 +297,26 @@ def test_a_length_weight_is_paid_per_metre_by_three_robots_on_larger_maps(object
         for beta0 in (0.3, 0.7):
             case = objective, "pooled", 5, 8, seed, beta0
             check(*plan_and_best(*case, team="min", weight=0.004))
+
+
+@pytest.mark.parametrize("objective", [name for name in BETA0 if name != "bottleneck"])
+@pytest.mark.parametrize("team", ["mean", "min"])
+def test_the_time_unseen_is_paid_bound_by_bound(objective, team):
+    """Shares of bounds at random, so that the way there and the way back cost differently."""
+    for seed in range(4):
+        for unseen, weight in ((0.3, 0.0), (3.0, 0.004)):
+            case = objective, "pooled", 4, (8, 4)[seed // 3], seed, 0.7
+            check(*plan_and_best(*case, team=team, weight=weight, unseen=unseen))
+            case = objective, "hierarchical", 4, 8, seed, 0.4
+            check(*plan_and_best(*case, team=team, weight=weight, unseen=unseen))
+
+
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+@pytest.mark.parametrize("model", ["pooled", "hierarchical"])
+def test_the_time_unseen_is_paid_by_counts_and_censored_rates_too(model, family):
+    for seed in range(3):
+        case = "lost_contact", model, 4, 8, seed, 0.7
+        check(*plan_and_best(*case, family=family, unseen=1.0))
 
 
 @pytest.mark.parametrize("b", [-400.0, 60.0])

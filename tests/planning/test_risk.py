@@ -5,7 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from references import of_bounds, path_values, walks
+from references import of_bounds, path_values, sums_of, walks
+from worlds import with_unseen
 
 from trustbo.errors import ShapeError, TrustboError
 from trustbo.models import RobotParams, TrustParams
@@ -71,7 +72,18 @@ def failures(p, paths, n_cells):
 class Case:
     """A random map with a planner, and value and P(fail) of all its paths."""
 
-    def __init__(self, objective, n, seed, *, team="mean", family="gaussian", beta0=None, cls=None):
+    def __init__(
+        self,
+        objective,
+        n,
+        seed,
+        *,
+        team="mean",
+        family="gaussian",
+        beta0=None,
+        cls=None,
+        unseen=0.0,
+    ):
         rng = np.random.default_rng([n, seed])
         limit, kind = CLASSES[objective] if cls is None else cls
         self.passable, shortest, self.paths, self.n_cells = random_map(n, seed % 4, limit, kind)
@@ -89,16 +101,18 @@ class Case:
             beta, b = rng.normal(size=2), rng.normal(-0.2, 0.4)
             self.params = TrustParams(beta0, beta, b, 0.1, 0.1)
             u, transition = (z @ beta + b).mean(0, keepdims=True), np.array([[beta0]])
-        self.workspace = Workspace.from_awareness(z, self.passable)
+        shares = np.random.default_rng(seed).uniform(size=(8, n, n))
+        self.workspace = with_unseen(Workspace.from_awareness(z, self.passable), shares)
+        toll = unseen * sums_of(shares, self.paths, self.n_cells)
         self.values = path_values(
             objective, self.paths, self.n_cells, of_bounds(u), transition, 0.5, team=team,
-            rates=(family, 0.1),
+            toll=toll, rates=(family, 0.1),
         )  # fmt: skip
         self.p, self.draws = random_risk(self.passable, rng)
         self.p_fail = failures(self.p, self.paths, self.n_cells)
         self.failure_cost = float(shortest) if objective == "lost_contact" else 0.0
         self.options = {
-            "objective": objective, "team": team, "observation": family,
+            "objective": objective, "team": team, "observation": family, "unseen_cost": unseen,
             "max_bounds": shortest + limit if isinstance(limit, int) else limit,
         }  # fmt: skip
         self.ends, self.rng = ((n - 1, 0), (0, n - 1)), rng
@@ -205,6 +219,21 @@ def test_lost_contact_pays_for_a_failure_with_and_without_a_limit():
             plan = planner.plan(case.params)
             check(plan, case.best(case.p_fail <= limit + 1e-12, cost), limit)
             np.testing.assert_allclose(planner.evaluate(plan.path, case.params).value, plan.value)
+
+
+@pytest.mark.parametrize("objective", [name for name in CLASSES if name != "bottleneck"])
+@pytest.mark.parametrize("team", ["mean", "min"])
+def test_the_time_unseen_is_paid_within_a_limit_too(objective, team):
+    for seed in range(8):
+        case = Case(objective, 4, seed, team=team, unseen=(0.4, 2.0)[seed % 2])
+        limit = case.limit()
+        if limit < case.p_fail.min():
+            continue
+        best = case.best(case.p_fail <= limit + 1e-12)
+        both = seed == 0 and objective != "stationary"  # few of whose simple paths dominate others
+        for engine in ("numba", "networkx")[: 1 + both]:
+            plan = case.planner(max_failure=limit, engine=engine).plan(case.params)
+            check(plan, best, limit)
 
 
 @pytest.mark.parametrize("objective", ["lost_contact", "bottleneck", "stationary"])

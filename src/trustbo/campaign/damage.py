@@ -29,8 +29,9 @@ _AFTER = [(_COUNT, None)]
 _CHOSEN = {
     "start": [int, int], "goal": [int, int], "objective": str, "sampler": str, "policy": str,
     "connectivity": int, "max_bounds": (int, str, None), "team": str, "length_weight": float,
-    "max_failure": (float, None), "failure_cost": (float, None), "initial": str, "update": str,
-    "forgetting": float, "awareness": str, "replan": str, "hazard": dict,
+    "unseen_cost": float, "max_failure": (float, None), "failure_cost": (float, None),
+    "initial": str, "update": str, "forgetting": float, "awareness": str, "replan": str,
+    "hazard": dict,
 }  # fmt: skip
 _PLAN = {
     "path": _PATH, "positions": [[float, float]], "length": float, "trust": [[float]],
@@ -38,6 +39,7 @@ _PLAN = {
     "objective": str, "exact": bool, "bound": float, "revisits": int, "engine": str,
     "seconds": float, "infeasible": bool, "value_band": ([float, float], None),
     "cover": (None, {"unseen": float, "band": [float, float], "by_bound": [float]}),
+    "unseen_toll": float,
     "risk": (None, {
         "p_fail": [float], "p_fail_band": [[float]], "p_arrive": float,
         "p_arrive_band": [float, float], "by_cause": {str: [float]}, "p_reach": [float],

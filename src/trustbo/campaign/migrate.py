@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import xarray as xr
 
-_PLANNING = {"max_failure": None, "failure_cost": None}
-"""Options of planning that version 0.1, which had no failures, lacks."""
+_PLANNING = {"max_failure": None, "failure_cost": None, "unseen_cost": 0.0}
+"""Options of planning that versions 0.1, which had no failures, and 0.2 lack."""
 _LEARNED = {"state": "learned", "reason": ""}
 """State of every mission of version 0.1, which had no other."""
 _SIMULATORS = {"MujocoBackend": "MujocoSimulator", "ReplayBackend": "ReplaySimulator"}

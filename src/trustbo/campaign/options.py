@@ -43,6 +43,8 @@ class CampaignOptions:
             `Planner`, also for the default.
         team: Trust of the team, the mean or the min of its robots'.
         length_weight: Cost of a metre of the path, in units of the objective. See `Planner`.
+        unseen_cost: Cost of a bound in which nobody sees anybody, in units of the objective. See
+            `Planner`; it needs a terrain.
         max_failure: Largest chance that a mission fails; where no path keeps within it, the
             safest is taken, with a warning. By default no limit.
         failure_cost: Cost of a failure for lost_contact, in bounds. By default all bounds of the
@@ -82,6 +84,7 @@ class CampaignOptions:
     max_bounds: int | str | None = field(default=None, metadata=_option(PLANNING))
     team: str = field(default="mean", metadata=_option(PLANNING, "mean", "min"))
     length_weight: float = field(default=0.0, metadata=_option(PLANNING))
+    unseen_cost: float = field(default=0.0, metadata=_option(PLANNING))
     max_failure: float | None = field(default=None, metadata=_option(PLANNING))
     failure_cost: float | None = field(default=None, metadata=_option(PLANNING))
     initial: str = field(

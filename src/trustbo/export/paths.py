@@ -92,7 +92,9 @@ def write_path(path: FilePath, plan: Plan | Result, workspace: Workspace | None 
              _posts.csv and _ways.csv.
     ======== ========================================================================
 
-    Columns and properties are those of `path_frame`. Posts and ways are left out where the
+    Columns and properties are those of `path_frame`; those of the whole path are its name, number
+    of bounds, length, value and objective, and where known `unseen`, the share of the time in which
+    nobody sees anybody, and the toll on it, `unseen_toll`. Posts and ways are left out where the
     workspace has no terrain in memory; the route of a robot ends where it has no way.
 
     Args:
@@ -125,6 +127,8 @@ def _facts(plan: Plan) -> dict[str, object]:
         "value": float(plan.value),
         "objective": plan.objective,
         "length_m": float(plan.length),
+        **({} if plan.unseen is None else {"unseen": plan.unseen}),
+        **({"unseen_toll": plan.unseen_toll} if plan.unseen_toll else {}),
     }
 
 

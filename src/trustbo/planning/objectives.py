@@ -21,6 +21,13 @@ class Objective(NamedTuple):
     """Family of the contact rates."""
     lag: float = 0.0
     """0 where rates measure trust, 1 where they measure its change over a bound."""
+    unseen_cost: float = 0.0
+    """Cost of a bound in which nobody sees anybody, in the same units as that of a metre."""
+
+    @property
+    def has_toll(self) -> bool:
+        """Whether bounds cost something apart from trust, see `tolls`."""
+        return self.length_weight > 0.0 or self.unseen_cost > 0.0
 
     @property
     def has_labels(self) -> bool:
@@ -55,14 +62,14 @@ class Objective(NamedTuple):
 
 
 class PathTrust(NamedTuple):
-    """Trust along a path and the path's length cost; leading axes (...,) such as (draw,)."""
+    """Trust along a path and the path's toll; leading axes (...,) such as (draw,)."""
 
     trust: np.ndarray
     """Expected trust of the team after each bound, shape (..., bound)."""
     steady_state: np.ndarray
     """Limit of the team's trust if each bound were repeated, u / (1 - beta0), (..., bound)."""
-    length_cost: np.ndarray | float = 0.0
-    """Length of the path times `length_weight`."""
+    toll: np.ndarray | float = 0.0
+    """Cost of its metres and of the time unseen, see `tolls`."""
     contact_lost: np.ndarray | float = np.nan
     """Expected contact lost in each bound, 1 - E[rate given trust], (..., bound)."""
 
@@ -73,12 +80,12 @@ def softplus(x: ArrayLike) -> np.ndarray:
 
 
 SCORES: dict[str, Callable[[PathTrust], np.ndarray]] = {
-    "lost_contact": lambda path: -np.sum(path.contact_lost, axis=-1) - path.length_cost,
-    "terminal": lambda path: path.trust[..., -1] - path.length_cost,
-    "mean": lambda path: path.trust.mean(-1) - path.length_cost,
-    "success": lambda path: -softplus(-path.trust).sum(-1),
+    "lost_contact": lambda path: -np.sum(path.contact_lost, axis=-1) - path.toll,
+    "terminal": lambda path: path.trust[..., -1] - path.toll,
+    "mean": lambda path: path.trust.mean(-1) - path.toll,
+    "success": lambda path: -softplus(-path.trust).sum(-1) - path.toll,
     "bottleneck": lambda path: path.trust.min(-1),
-    "stationary": lambda path: -softplus(-path.steady_state).sum(-1) - path.length_cost,
+    "stationary": lambda path: -softplus(-path.steady_state).sum(-1) - path.toll,
 }
 """Score of a path, to compare it by: the larger, the better.
 
@@ -90,19 +97,21 @@ OBJECTIVES: Mapping[str, Callable[[PathTrust], np.ndarray]] = SCORES | {
     "success": lambda path: np.exp(SCORES["success"](path)),
     "stationary": lambda path: np.exp(SCORES["stationary"](path)),
 }
-"""Value of a path, to be maximised; the length cost is the path's metres times `length_weight`.
+"""Value of a path, to be maximised; its toll is `length_weight` times its metres, and `unseen_cost`
+times the expected time in which nobody sees anybody, in bounds.
 
 lost_contact: minus the contact that is expected to be lost on the way, in bounds (9 bounds with an
-expected rate of .9 lose .9), less the length cost; where the planner has a risk, less
-`failure_cost` times the chance to fail. terminal: sigma(x^K - length cost), one minus the paper's
-cost (6) without length cost. mean: mean trust over the bounds, less the length cost. success:
-product of sigma(x^k), an index that compares paths: every bound counts, and a worse one more; the
-probability to arrive is another, `Plan.p_arrive`. bottleneck: least trust on the path. stationary:
-the product of sigma of each bound's steady-state trust, independent of history, times exp(-length
-cost).
+expected rate of .9 lose .9), less the toll; where the planner has a risk, less `failure_cost` times
+the chance to fail. terminal: sigma(x^K - toll), one minus the paper's cost (6) without a toll.
+mean: mean trust over the bounds, less the toll. success: product of sigma(x^k), an index that
+compares paths: every bound counts, and a worse one more; the probability to arrive is another,
+`Plan.p_arrive`; times exp(-toll). bottleneck: least trust on the path, without a toll. stationary:
+the product of sigma of each bound's steady-state trust, independent of history, times exp(-toll).
 """
 ADDITIVE = ("lost_contact", "terminal", "mean", "stationary")
-"""Objectives that admit a length weight."""
+"""Objectives that are sums over bounds, but for `lost_contact` of other than linear rates."""
+TOLLED = (*ADDITIVE, "success")
+"""Objectives from which a toll is taken; a least trust is no sum that it could be added to."""
 LABELLED = ("success", "bottleneck")
 """Objectives that depend on the whole history of a path, for every family of rates."""
 DEFAULT_MAX_BOUNDS: Mapping[str, str | None] = {"lost_contact": "shortest+4"} | {

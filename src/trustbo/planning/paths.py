@@ -183,6 +183,26 @@ class AdmissiblePaths:
         exists = existing_bounds(self.passable)[move_indices(self.connectivity)]
         return bool((self.bounds == exists).all())
 
+    @cached_property
+    def unseen(self) -> np.ndarray:
+        """`Workspace.unseen_bounds` of the moves, (move, row, col); 0 for bounds that are none.
+
+        TrustboError: the workspace has no line of sight.
+        """
+        if (shares := self.workspace.unseen_bounds) is None:
+            raise TrustboError(
+                "unseen_cost needs the line of sight of a map, and the workspace has no terrain in "
+                "memory, or no assumed sight; make it by Workspace.from_terrain, or leave "
+                "unseen_cost = 0."
+            )
+        return np.nan_to_num(shares.values[move_indices(self.connectivity)])
+
+    def length_of(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Length of a path from cell centre to cell centre, m."""
+        grid = self.workspace.grid
+        steps = np.diff(np.asarray(path), axis=0) * (grid.cell_height, grid.cell_width)
+        return float(np.hypot(*steps.T).sum())
+
     def masked(self, values: np.ndarray) -> np.ndarray:
         """Values of bounds (..., move, row, col), NaN for those that no path may take.
 

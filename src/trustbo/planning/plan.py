@@ -53,6 +53,8 @@ class Plan(Displayed):
             to fail expected; None where the plan is for one draw. Noise of rates is not in it.
         cover: Share of the time in which nobody sees anybody; None where the plan is for one draw,
             or on no terrain.
+        unseen_toll: Part of the value that is paid for the time in which nobody sees anybody:
+            `unseen_cost` times that expected by the map, in bounds.
     """
 
     path: tuple[Cell, ...]
@@ -73,6 +75,7 @@ class Plan(Displayed):
     infeasible: bool = False
     value_band: tuple[float, float] | None = None
     cover: PathCover | None = None
+    unseen_toll: float = 0.0
 
     def with_draws(self, given: Self) -> Self:
         """Return the plan with the bands and the cover of another of its path, for many draws."""
@@ -88,9 +91,12 @@ class Plan(Displayed):
         within = ""
         if self.value_band is not None:
             within = ", {:.3g} to {:.3g} in 90 % of the draws".format(*self.value_band)
+        tolls = ""
+        if self.unseen_toll:
+            tolls = f", with a toll of {self.unseen_toll:.3g} on the time unseen"
         rows = [
             ("path", f"{len(self.path) - 1} bounds, {self.length:.0f} m"),
-            ("value", f"{self.value:.3g} ({self.objective})" + within),
+            ("value", f"{self.value:.3g} ({self.objective}{tolls})" + within),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]

@@ -62,6 +62,7 @@ class Planner(Displayed):
         revisit: bool = True,
         team: str = "mean",
         length_weight: float = 0.0,
+        unseen_cost: float = 0.0,
         engine: str = "auto",
         backend: str | None = None,
         observation: str = "gaussian",
@@ -90,7 +91,10 @@ class Planner(Displayed):
                 rates may enter a cell twice; without effect on the other objectives.
             team: Trust of the team: `"mean"` or `"min"` (least) of that of its robots.
             length_weight: Cost of a metre of the path, for lost_contact (in bounds), terminal and
-                mean (in units of trust) and stationary (in units of log probability).
+                mean (in units of trust), success and stationary (in units of log probability).
+            unseen_cost: Cost of a bound in which nobody sees anybody, in the same units: a path
+                pays this times the sum over its bounds of the share of their time that
+                `Workspace.unseen_bounds` expects so.
             engine: `"numba"`, compiled, which `"auto"` takes; or `"networkx"`, the reference. Both
                 find paths of the same value.
             backend: networkx backend for the shortest paths, e.g. `"parallel"`.
@@ -109,9 +113,10 @@ class Planner(Displayed):
 
         Raises:
             TrustboError: Start or goal off the grid, impassable, or equal; an unknown name;
-                `max_bounds` below the fewest possible; a length weight that is negative, or for
-                success or bottleneck; lost_contact of rates that measure the change of trust, but
-                for Gaussian rates and `team="mean"`.
+                `max_bounds` below the fewest possible; a length weight or an unseen cost that is
+                negative, or for bottleneck; an unseen cost without a terrain in memory;
+                lost_contact of rates that measure the change of trust, but for Gaussian rates and
+                `team="mean"`.
             NoPathError: The goal cannot be reached.
         """
         self.engine, self._engine = engine, solve.Engine(engine, backend)
@@ -123,7 +128,7 @@ class Planner(Displayed):
         admitted = PathClass(connectivity, max_bounds, revisit)
         paths = AdmissiblePaths(workspace, start, goal, admitted)
         rule = RiskRule(max_failure, confidence, failure_cost, infeasible)
-        chosen = Objective(objective, length_weight, family, lag)
+        chosen = Objective(objective, length_weight, family, lag, unseen_cost)
         self._hold(PlanningProblem(paths, chosen, team, rule=rule))
 
     def _card(self) -> Card:
@@ -147,7 +152,7 @@ class Planner(Displayed):
         self.start, self.goal = paths.start, paths.goal
         self.shortest, self.longest = paths.shortest, paths.longest
         self.max_bounds, self.connectivity = paths.max_bounds, paths.connectivity
-        self.objective, _, self.family, self.lag = problem.objective
+        self.objective, _, self.family, self.lag, _ = problem.objective
         self.team = problem.team
 
     def _with(self, problem: PlanningProblem) -> Self:
@@ -165,9 +170,8 @@ class Planner(Displayed):
 
         Attributes of the edges: `length` (m); `drift` of the team's mean trust; `cost`, that of
         `stationary`: -log sigma of the trust that the bound would lead to if all were like it, and
-        the length cost; for lost_contact of rates that measure trust `lost`, the contact that the
-        bound would lose then, in bounds, and the length cost; and with a risk `risk`,
-        -log(1 - p_fail).
+        the toll; for lost_contact of rates that measure trust `lost`, the contact that the bound
+        would lose then, in bounds, and the toll; and with a risk `risk`, -log(1 - p_fail).
 
         Args:
             params: Parameters of any model, without leading axes.

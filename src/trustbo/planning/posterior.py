@@ -12,7 +12,8 @@ from trustbo.models.params import Params
 from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.problem import PlanningProblem
-from trustbo.planning.values import path_length, path_trust
+from trustbo.planning.tolls import toll_along
+from trustbo.planning.values import path_trust
 
 _ROUNDING = 1e-12
 """Difference of the values of two paths that may be the same."""
@@ -92,8 +93,9 @@ class DrawnPaths:
         return (count / len(self.paths)).reshape(passable.shape)
 
     def _value(self, dynamics: Dynamics, path: Sequence[Cell]) -> np.ndarray:
-        objective, length = self.problem.objective, path_length(self.problem.paths, path)
-        trust = path_trust(dynamics.along(path), objective, length)
+        objective = self.problem.objective
+        toll = toll_along(self.problem.paths, objective, path).total
+        trust = path_trust(dynamics.along(path), objective, toll)
         return OBJECTIVES[objective.name](trust) - self.problem.cost_of_failure(path)
 
     @cached_property

@@ -10,12 +10,18 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.errors import ShapeError, TrustboError, require_choice, require_kind
+from trustbo.errors import (
+    ShapeError,
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_not_negative,
+)
 from trustbo.hazard.risk import Risk
 from trustbo.inference.draws import params_of
 from trustbo.models.params import Params
 from trustbo.planning.dynamics import TEAMS, Dynamics, trust_dynamics
-from trustbo.planning.objectives import ADDITIVE, OBJECTIVES, Objective
+from trustbo.planning.objectives import OBJECTIVES, TOLLED, Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import NO_RULE, RiskRule, RiskTable, risk_table
 from trustbo.workspace import Workspace
@@ -48,16 +54,18 @@ class PlanningProblem:
     risk: Risk | None = None
 
     def __post_init__(self) -> None:
-        name, length_weight, family, lag = self.objective
+        name, _, family, lag, unseen_cost = self.objective
         self.rule.checked(name)
         require_choice("objective", name, OBJECTIVES)
         require_choice("team", self.team, TEAMS)
-        if not 0.0 <= length_weight < np.inf:
-            raise TrustboError(f"length_weight must be finite and >= 0; got {length_weight!r}.")
-        if length_weight and name not in ADDITIVE:
-            raise TrustboError(
-                f"length_weight is for {', '.join(ADDITIVE)}; the objective is {name!r}."
-            )
+        for weight in ("length_weight", "unseen_cost"):
+            per_unit = require_not_negative(weight, getattr(self.objective, weight))
+            if per_unit and name not in TOLLED:
+                raise TrustboError(
+                    f"{weight} is for {', '.join(TOLLED)}; the objective is {name!r}."
+                )
+        if unseen_cost:
+            _ = self.paths.unseen  # which refuses a workspace without line of sight
         if name == "lost_contact" and lag and (self.team == "min" or self.objective.has_labels):
             raise TrustboError(
                 "'lost_contact' of rates that measure the change of trust is for Gaussian rates "

@@ -12,23 +12,23 @@ from trustbo.models.params import Params
 from trustbo.planning.cover import cover_along
 from trustbo.planning.dynamics import Dynamics, as_map, roll, trust_dynamics
 from trustbo.planning.objectives import OBJECTIVES, Objective, PathTrust, softplus
-from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import PlanningProblem
+from trustbo.planning.tolls import toll_along
 
 Path = Sequence[Cell] | np.ndarray
 """Cells, start first; or an array of them, shape (cell, 2)."""
 
 
 def path_trust(
-    along: Dynamics, objective: Objective, length: float, *, cap: bool = True
+    along: Dynamics, objective: Objective, toll: float, *, cap: bool = True
 ) -> PathTrust:
     """Trust on the path whose bounds `along` has, and what `SCORES` and `OBJECTIVES` need of it.
 
     Args:
         along: Recursion of expected trust on the path, see `Dynamics.along`.
         objective: Objective of the values.
-        length: Length of the path, m.
+        toll: Toll of the path, see `tolls`.
         cap: False to keep trust above 1 for `lost_contact`, see `Objective.capped`.
     """
     along = objective.capped(along) if cap else along
@@ -39,14 +39,7 @@ def path_trust(
     if objective.name == "lost_contact":
         before = (along.start @ along.views.T).min(-1)
         lost = objective.contact_lost(trust, before, along.noise_sd)
-    return PathTrust(trust, steady_state, objective.length_weight * length, lost)
-
-
-def path_length(admissible: AdmissiblePaths, path: Path) -> float:
-    """Metres from cell centre to cell centre."""
-    grid = admissible.workspace.grid
-    steps = np.diff(np.asarray(path), axis=0) * (grid.cell_height, grid.cell_width)
-    return float(np.hypot(*steps.T).sum())
+    return PathTrust(trust, steady_state, toll, lost)
 
 
 def entry_cost(passable: np.ndarray, dynamics: Dynamics) -> np.ndarray:
@@ -72,26 +65,26 @@ def evaluate(
     z = as_map(z)
     draws = roll(trust_dynamics(along, z, "min", x0))
     draws = draws.reshape(-1, *draws.shape[-2:])
-    trust, objective, length = draws.mean(0), problem.objective, path_length(problem.paths, cells)
+    trust, objective = draws.mean(0), problem.objective
+    tolls = toll_along(problem.paths, objective, cells)
+    toll = tolls.total
     value_of, cost = OBJECTIVES[objective.name], problem.cost_of_failure(cells)
     team, teams = (t.mean(-1) if problem.team == "mean" else t.min(-1) for t in (trust, draws))
     if objective.name in ("stationary", "lost_contact"):
         dynamics = trust_dynamics(along, z, problem.team, x0)
-        value = value_of(path_trust(dynamics, objective, length, cap=cap)).mean()
+        value = value_of(path_trust(dynamics, objective, toll, cap=cap)).mean()
         # Trust capped draw by draw is biased, so that the band is of trust as it is; but no path
         # loses less than nothing.
-        values = value_of(path_trust(dynamics, objective, length, cap=False))
+        values = value_of(path_trust(dynamics, objective, toll, cap=False))
         if objective.name == "lost_contact":
-            values = np.minimum(values, -objective.length_weight * length)
+            values = np.minimum(values, -toll)
     else:
-        values, value = (
-            value_of(PathTrust(t, t, objective.length_weight * length)) for t in (teams, team)
-        )
+        values, value = (value_of(PathTrust(t, t, toll)) for t in (teams, team))
     risk = None if problem.risk is None else problem.risk.along(cells)
     plan = Plan(
         path=path,
         positions=np.stack([grid.x[cols], grid.y[rows]], axis=1),
-        length=length,
+        length=problem.paths.length_of(cells),
         trust=trust,
         bands=_bands(draws),
         value=float(value) - cost,
@@ -106,6 +99,7 @@ def evaluate(
         risk=risk,
         infeasible=risk is not None and not problem.is_within_risk(cells),
         value_band=_value_band(np.atleast_1d(values) - cost),
+        unseen_toll=tolls.unseen,
     )
     if len(draws) == 1 or plan.posts is None:
         return plan

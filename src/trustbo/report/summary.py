@@ -27,6 +27,9 @@ _MEANS = {
 }
 
 
+_TOLLS = {"length_weight": "its length", "unseen_cost": "the time in which nobody sees anybody"}
+
+
 def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
     """Return the facts of the summary: campaign, recommendation, value, diagnostics, changes.
 
@@ -39,7 +42,7 @@ def facts_of(result: Result, plan: Plan | None = None) -> list[Fact]:
         Fact("Recommended", _path(result, plan)),
         Fact("Value", f"{_value(result)} {_exactness(plan)}", plan.exact or None),
         *([] if plan.risk is None else [Fact("Arrival", _arrival(plan.risk))]),
-        *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover))]),
+        *([] if plan.cover is None else [Fact("Cover", _cover(plan.cover, plan.unseen_toll))]),
         _soundness(result),
         *changes,
         Fact("Why it ended", _end(result)),
@@ -78,8 +81,8 @@ def _path(result: Result, plan: Plan) -> str:
 def _value(result: Result) -> str:
     name = str(result.settings["objective"])
     meaning = _MEANS[name]
-    if result.settings.get("length_weight"):
-        meaning += ", less the toll on its length"
+    if paid := [toll for name, toll in _TOLLS.items() if result.settings.get(name)]:
+        meaning += f", less the toll on {joined(paid)}"
     within = ""
     if (band := result.plan.value_band) is not None:
         within = f" ({number(band[0])} to {number(band[1])} in 90 % of the draws)"
@@ -109,11 +112,12 @@ def _arrival(risk: PathRisk) -> str:
     return sentence
 
 
-def _cover(cover: PathCover) -> str:
+def _cover(cover: PathCover, toll: float) -> str:
     worst = int(np.argmax(cover.by_bound))
+    paid = f" Its value pays a toll of {number(toll)} on that time, as the map has it."
     return (
         f"On it nobody sees anybody {unseen_text(cover)}; longest in bound {worst + 1}, "
-        f"{cover.by_bound[worst]:.1%} of its time."
+        f"{cover.by_bound[worst]:.1%} of its time.{paid if toll else ''}"
     )
 
 

@@ -14,16 +14,18 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
 
-def grid_matrix(cost):
-    """Edges of an 8-connected grid that cost what it costs to enter their heads."""
+def grid_matrix(cost, tolls=None):
+    """Edges of an 8-connected grid: what it costs to enter their heads, and tolls (move, cell)."""
+    tolls = np.zeros((8, cost.size)) if tolls is None else tolls
     rows, cols = cost.shape
     edges = []
     for r in range(rows):
         for c in range(cols):
-            for down, right in MOVES[8]:
+            for m, (down, right) in enumerate(MOVES[8]):
                 i, j = r + down, c + right
                 if 0 <= i < rows and 0 <= j < cols and np.isfinite(cost[i, j] + cost[r, c]):
-                    edges.append((r * cols + c, i * cols + j, cost[i, j]))
+                    other = i * cols + j
+                    edges.append((r * cols + c, other, cost[i, j] + tolls[m, other]))
     tail, head, weight = np.array(edges).T
     return csr_matrix((weight, (tail.astype(int), head.astype(int))), shape=(rows * cols,) * 2)
 
@@ -37,13 +39,29 @@ def test_cheapest_paths_equal_scipy_s_however_uneven_the_costs(spread):
         passable = rng.uniform(size=(30, 40)) > 0.15
         passable[0, 0] = passable[29, 39] = True
         totals, paths = best_stationary(
-            level.__getitem__, 1, passable, np.zeros(8), np.array(MOVES[8]), 0, 30 * 40 - 1
+            level.__getitem__, 1, passable, np.zeros((8, 1)), np.array(MOVES[8]), 0, 30 * 40 - 1
         )
         cost = np.where(passable, np.logaddexp(0.0, -level[0, 0]), np.inf)
         best = dijkstra(grid_matrix(cost), indices=0)[-1]
         np.testing.assert_allclose(totals[0], best, rtol=1e-12)
         if np.isfinite(best):
             np.testing.assert_allclose(cost.ravel()[paths[0, 1:]].sum(), best, rtol=1e-9)
+
+
+@pytest.mark.parametrize("by_cell", [False, True])
+def test_tolls_of_moves_and_of_bounds_are_paid_by_every_draw(by_cell):
+    rng, passable = np.random.default_rng(5), np.ones((12, 15), bool)
+    level = rng.normal(1.0, 1.0, (3, 1, *passable.shape))
+    tolls = rng.uniform(size=(8, passable.size if by_cell else 1))
+    totals, paths = best_stationary(
+        level.__getitem__, 3, passable, tolls, np.array(MOVES[8]), 0, passable.size - 1
+    )
+    of_bounds = np.broadcast_to(tolls, (8, passable.size))
+    for d in range(3):
+        matrix = grid_matrix(np.logaddexp(0.0, -level[d, 0]), of_bounds)
+        np.testing.assert_allclose(totals[d], dijkstra(matrix, indices=0)[-1], rtol=1e-12)
+        path = paths[d][paths[d] >= 0]
+        np.testing.assert_allclose(matrix[path[:-1], path[1:]].sum(), totals[d], rtol=1e-12)
 
 
 def test_a_maze_s_path_is_found_by_many_draws_too():
@@ -60,7 +78,7 @@ def test_a_goal_behind_a_wall_has_no_path_and_costs_infinitely_much():
     passable = np.ones((4, 5), bool)
     passable[:, 2] = False
     totals, paths = best_stationary(
-        np.zeros((2, 1, 4, 5)).__getitem__, 2, passable, np.zeros(8), np.array(MOVES[8]), 0, 19
+        np.zeros((2, 1, 4, 5)).__getitem__, 2, passable, np.zeros((8, 1)), np.array(MOVES[8]), 0, 19
     )
     assert totals.tolist() == [np.inf, np.inf]
     assert (paths == -1).all()

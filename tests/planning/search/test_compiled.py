@@ -82,11 +82,18 @@ def test_an_unknown_engine_is_refused():
         Planner(random_workspace(0), (8, 0), (0, 8), engine="gpu")
 
 
-def test_length_weights_are_for_additive_objectives_only():
+@pytest.mark.parametrize("weight", ["length_weight", "unseen_cost"])
+def test_a_toll_is_for_sums_over_bounds_only(weight):
     ends = (random_workspace(0), (8, 0), (0, 8))
-    with pytest.raises(
-        TrustboError, match="length_weight is for lost_contact, terminal, mean, stationary"
-    ):
-        Planner(*ends, "success", length_weight=0.01)
-    with pytest.raises(TrustboError, match=r"length_weight must be finite and >= 0; got -1"):
-        Planner(*ends, length_weight=-1.0)
+    names = "lost_contact, terminal, mean, stationary, success; the objective is 'bottleneck'"
+    with pytest.raises(TrustboError, match=f"{weight} is for {names}"):
+        Planner(*ends, "bottleneck", **{weight: 0.01})
+    with pytest.raises(TrustboError, match=rf"{weight} must be 0 or more, and finite; got -1"):
+        Planner(*ends, **{weight: -1.0})
+
+
+def test_the_time_unseen_costs_nothing_where_no_map_tells_it():
+    workspace = random_workspace(0)
+    with pytest.raises(TrustboError, match="unseen_cost needs the line of sight of a map"):
+        Planner(workspace, (8, 0), (0, 8), unseen_cost=2.0)
+    assert Planner(workspace, (8, 0), (0, 8), unseen_cost=0.0).problem.objective.unseen_cost == 0.0

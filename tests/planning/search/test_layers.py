@@ -40,12 +40,11 @@ def test_the_best_sum_of_every_draw_is_that_of_all_walks(u_turns):
             rng.normal(size=(3, LONGEST + 1)),
             np.maximum(1.0, np.arange(LONGEST + 1.0)),
         )
-        length_cost = np.where(np.abs(STEPS).sum(1) == 2, 0.14, 0.1)
-        scores, found = best_additive(
-            layers, drift, weights, length_cost, np.arange(1, LONGEST + 1)
-        )
+        # Tolls of moves, or of moves into cells.
+        tolls = rng.uniform(size=(8, (1, N_ROWS * N_COLS)[seed // 2 % 2]))
+        scores, found = best_additive(layers, drift, weights, tolls, np.arange(1, LONGEST + 1))
         for d in range(3):
-            values = {path: score(path, drift[d], weights, d, length_cost) for path in paths}
+            values = {path: score(path, drift[d], weights, d, tolls) for path in paths}
             best = max(values.values())
             np.testing.assert_allclose(scores[d], best, rtol=1e-12)
             cells = found[d][found[d] >= 0]
@@ -53,13 +52,15 @@ def test_the_best_sum_of_every_draw_is_that_of_all_walks(u_turns):
             np.testing.assert_allclose(values[path], best, rtol=1e-12)
 
 
-def score(path, drift, weights, d, length_cost):
-    """(constant + sum of weights times u less the length cost) / scale, bound by bound."""
+def score(path, drift, weights, d, tolls):
+    """(constant + sum of weights times u less tolls) / scale, bound by bound."""
     n, total = len(path) - 1, weights.constant[d, len(path) - 1]
     for k in range(n):
         m = STEPS.tolist().index([path[k + 1][0] - path[k][0], path[k + 1][1] - path[k][1]])
-        u = drift[:, m if drift.shape[1] > 1 else 0, path[k + 1][0] * N_COLS + path[k + 1][1]]
-        total += weights.per_bound[d, n - 1 - k] @ u - length_cost[m]
+        entered = path[k + 1][0] * N_COLS + path[k + 1][1]
+        u = drift[:, m if drift.shape[1] > 1 else 0, entered]
+        toll = tolls[m, entered if tolls.shape[1] > 1 else 0]
+        total += weights.per_bound[d, n - 1 - k] @ u - toll
     return total / weights.scale[n]
 
 

@@ -38,7 +38,7 @@ def best_stationary(
     steady_state: Callable[[slice], np.ndarray],
     n_draws: int,
     passable: np.ndarray,
-    length_cost: np.ndarray,
+    tolls: np.ndarray,
     steps: np.ndarray,
     start: int,
     goal: int,
@@ -47,8 +47,8 @@ def best_stationary(
 
     `steady_state` maps a slice of the draws to the team's trust if all bounds were as each one,
     (draw, move, row, col), of one move where all into a cell are alike. A move of `steps` (move, 2)
-    adds its `length_cost` (move,), and must enter a `passable` cell (row, col). `start` and `goal`
-    are flat indices.
+    must enter a `passable` cell (row, col), and adds its toll, of `tolls` (move, cell), of one cell
+    where all bounds by a move are alike. `start` and `goal` are flat indices.
 
     Returns costs (draw,), inf where there is no path; and paths, flat indices of cells, shape
     (draw, length), filled with -1.
@@ -60,13 +60,20 @@ def best_stationary(
     paths = np.full((n_draws, capacity), -1, np.int32)
 
     step = max(1, _CELLS // (rows * cols))
+    of_moves, of_cells = tolls[:, 0], None
+    if tolls.shape[1] > 1:  # what depends on the cell too is a cost of the bound
+        of_moves = np.zeros(len(steps))
+        of_cells = np.pad(tolls.reshape(-1, rows, cols), ((0, 0), (1, 1), (1, 1)))
+        of_cells = of_cells.reshape(len(steps), -1)
 
     def work(first: int, last: int) -> None:
         for begin in range(first, max(last, first + 1), step):
             part = slice(begin, min(begin + step, last))
             cost = _with_margin(steady_state(part), passable)
+            if of_cells is not None:
+                cost = cost + of_cells
             found = totals[part], n_cells[part], paths[part]
-            _settle_draws(cost, length_cost, steps, cols, start, goal, *found)
+            _settle_draws(cost, of_moves, steps, cols, start, goal, *found)
 
     over_rows(work, n_draws) if n_draws > 1 else work(0, 1)
     longest = int(n_cells.max())
@@ -94,7 +101,7 @@ def _with_margin(trust: np.ndarray, passable: np.ndarray) -> np.ndarray:
 
 
 @_compiled
-def _settle_draws(costs, length_cost, steps, cols, start, goal, totals, n_cells, paths):
+def _settle_draws(costs, toll, steps, cols, start, goal, totals, n_cells, paths):
     """Find the cheapest path of every draw, its cost and its number of cells."""
     width = cols + 2
     offset = steps[:, 0] * width + steps[:, 1]
@@ -109,13 +116,13 @@ def _settle_draws(costs, length_cost, steps, cols, start, goal, totals, n_cells,
         cost, high = costs[d].ravel(), 0.0
         for c in cost:
             high = max(high, c) if c < np.inf else high
-        largest = high + length_cost.max()
+        largest = high + toll.max()
         # Wide enough that few are empty, narrow enough that few cells are scanned twice.
-        delta = max(_usual(cost) + length_cost.min(), largest / (_MAX_BUCKETS - 3), 1e-300)
+        delta = max(_usual(cost) + toll.min(), largest / (_MAX_BUCKETS - 3), 1e-300)
         if not _settle(
             cost,
             plane,
-            length_cost,
+            toll,
             offset,
             a,
             b,
@@ -126,7 +133,7 @@ def _settle_draws(costs, length_cost, steps, cols, start, goal, totals, n_cells,
             previous,
             following,
         ):
-            _settle_by_heap(cost, plane, length_cost, offset, a, b, distance, by)
+            _settle_by_heap(cost, plane, toll, offset, a, b, distance, by)
         totals[d] = distance[b]
         n_cells[d] = _trace(distance, by, offset, width, cols, a, b, paths[d])
 
@@ -148,7 +155,7 @@ def _usual(cost):
 
 @_part
 def _settle(
-    cost, plane, length_cost, offset, start, goal, delta, largest, distance, by, previous, following
+    cost, plane, toll, offset, start, goal, delta, largest, distance, by, previous, following
 ):
     """Compute all distances up to that of the goal; False if it takes too many scans."""
     per_cost, n_buckets = 1.0 / delta, 4
@@ -177,7 +184,7 @@ def _settle(
             for m in range(len(offset)):
                 other = c + offset[m]
                 near = np.uint64(other)  # unsigned: no test for a negative index
-                reach = so_far + cost[np.uint64(other + plane[m])] + length_cost[m]
+                reach = so_far + cost[np.uint64(other + plane[m])] + toll[m]
                 if not reach < distance[near]:
                     continue
                 to = int(reach * per_cost) & mask
@@ -216,7 +223,7 @@ def _remove(c, bucket, heads, tails, previous, following):
 
 
 @_part
-def _settle_by_heap(cost, plane, length_cost, offset, start, goal, distance, by):
+def _settle_by_heap(cost, plane, toll, offset, start, goal, distance, by):
     """Compute distances up to that of the goal with a binary heap."""
     distance[:] = np.inf
     distance[start] = 0.0
@@ -229,7 +236,7 @@ def _settle_by_heap(cost, plane, length_cost, offset, start, goal, distance, by)
             continue
         for m in range(len(offset)):
             other = c + offset[m]
-            reach = total + cost[other + plane[m]] + length_cost[m]
+            reach = total + cost[other + plane[m]] + toll[m]
             if reach < distance[other]:
                 distance[other], by[other] = reach, m
                 heapq.heappush(queue, (reach, np.int64(other)))

@@ -16,7 +16,9 @@ from trustbo.planning.dynamics import Dynamics
 from trustbo.planning.objectives import Objective
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.risk import RiskTable
+from trustbo.planning.search.graph import Graph
 from trustbo.planning.search.layers import Weights, additive_weights
+from trustbo.planning.tolls import tolls_of
 
 
 class Case(NamedTuple):
@@ -38,9 +40,14 @@ class Case(NamedTuple):
         return "history" if scalar and self.admissible.can_unroll else "vector"
 
     @property
-    def length_cost(self) -> np.ndarray:
-        """Cost of the length of each move, (move,)."""
-        return self.objective.length_weight * self.admissible.lengths
+    def tolls(self) -> np.ndarray:
+        """Toll of each bound, (move, cell) or (move, 1); see `tolls_of`."""
+        return tolls_of(self.admissible, self.objective)
+
+    def tolls_on(self, graph: Graph) -> np.ndarray:
+        """Toll of each edge of a graph of bounds, (edge,)."""
+        tolls = self.tolls
+        return tolls[graph.move, 0] if tolls.shape[1] == 1 else tolls.ravel()[graph.bound]
 
     @property
     def weights(self) -> Weights:

@@ -37,14 +37,14 @@ def _sums(case: Case) -> Best:
 
 
 def _best_of_lengths(case: Case, drift: np.ndarray, weights: Weights) -> Best:
-    layers, length_cost = case.admissible.layers, case.length_cost
+    layers, tolls = case.admissible.layers, case.tolls
     lengths = np.arange(case.admissible.shortest, case.admissible.longest + 1)
-    if not length_cost.any() or (weights.scale == 1.0).all():
-        scores, paths = best_additive(layers, drift, weights, length_cost, lengths)
+    if not tolls.any() or (weights.scale == 1.0).all():
+        scores, paths = best_additive(layers, drift, weights, tolls, lengths)
         return Best(paths, -scores, -scores)
-    # A mean divides by the number of bounds, so its length cost is scaled for each of them.
+    # A mean divides by the number of bounds, so its toll is scaled for each of them.
     tries = [
-        best_additive(layers, drift, weights, n * length_cost, lengths[i : i + 1])
+        best_additive(layers, drift, weights, n * tolls, lengths[i : i + 1])
         for i, n in enumerate(lengths)
     ]
     scores = np.stack([scores for scores, _ in tries])
@@ -62,14 +62,14 @@ def _sums_within(case: Case) -> Best:
 
 
 def _best_sums(case: Case, gains: list[np.ndarray], weights: Weights) -> Best:
-    """Find the paths of the largest (constant + sum of gains) / scale less their length cost.
+    """Find the paths of the largest (constant + sum of gains) / scale less their toll.
 
     Gains (left, bound) or (left, cell) of each draw, by the bounds left after a bound.
     """
     layers, scale = case.admissible.layers, weights.scale
     lengths = np.flatnonzero(layers.starts >= 0)
     left, bound = layers.rank[layers.head], layers.bound
-    cell, length_cost = layers.cell[layers.head], case.length_cost[layers.move]
+    cell, tolls = layers.cell[layers.head], case.tolls_on(layers)
     resources, n_cells = _resources(case, layers), case.admissible.passable.size
     groups = [lengths] if (scale == 1.0).all() else lengths[:, None]
     found: list[Best] = [_nothing()] * len(gains)
@@ -80,7 +80,7 @@ def _best_sums(case: Case, gains: list[np.ndarray], weights: Weights) -> Best:
             for group in groups:
                 start_cost = np.full((1, len(scale)), np.inf)
                 start_cost[0, group] = -weights.constant[d, group] / scale[group]
-                toll = (length_cost - of_edges / scale[group[0]])[None]
+                toll = (tolls - of_edges / scale[group[0]])[None]
                 found[d] = _better(
                     solve(_of_sums(layers, toll, start_cost, resources), found[d].cost), found[d]
                 )
@@ -126,8 +126,8 @@ def _history(case: Case) -> Best:
     trust[:, 0], trust[:, 1] = dynamics.transition[:, 0, 0], dynamics.start[:, 0]
     trust[:, 2] = np.maximum(dynamics.noise_sd, TINY_SD)
     toll = np.zeros((1, len(layers.head)))
-    if case.objective.length_weight > 0.0:
-        toll = case.length_cost[layers.move][None]
+    if case.objective.has_toll:
+        toll = case.tolls_on(layers)[None]
     drift = plain(dynamics.drift[:, 0].reshape(n_draws, -1))
     return solve(
         SearchProblem(
@@ -175,7 +175,7 @@ def _free(case: Case) -> Best:
         lambda part: admissible.masked(dynamics.take(part).steady_state()),
         len(dynamics.start),
         admissible.passable,
-        case.length_cost,
+        case.tolls,
         admissible.steps,
         admissible.flat(admissible.start),
         admissible.flat(admissible.goal),
@@ -187,7 +187,7 @@ def _free_within(case: Case) -> Best:
     grid, cost = case.admissible.grid, entry_cost(case.admissible.passable, case.dynamics)
     cost = cost.reshape(len(cost), -1)
     by_bound = cost.shape[1] > case.admissible.passable.size
-    toll = cost[:, grid.bound if by_bound else grid.cell[grid.head]] + case.length_cost[grid.move]
+    toll = cost[:, grid.bound if by_bound else grid.cell[grid.head]] + case.tolls_on(grid)
     return solve(_of_sums(grid, toll, np.zeros((1, 1)), _resources(case, grid)))
 
 

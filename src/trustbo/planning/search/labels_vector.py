@@ -9,7 +9,7 @@ last move where U-turns are forbidden; the set of cells entered where revisits a
 Cost, to be minimised: `success` sum of softplus(-trust), `bottleneck` max of -trust,
 `lost_contact` sum of 1 - E[rate given trust], `terminal` last -trust, `mean` sum of -trust. The
 latter two are over paths of exactly `max_bounds` bounds, and `lost_contact` is like `mean` where
-rates are linear in trust; to these three length costs are added. None rises if trust rises.
+rates are linear in trust. To all but `bottleneck` tolls are added. None rises if trust rises.
 
 Invariant: a label leaves the queue in the order of a lower limit on the cost of its completions
 (`Heuristic`). It is expanded unless an expanded label of the same cell dominates it (see
@@ -46,6 +46,7 @@ from trustbo.planning.search.losses import (
     loss_of,
 )
 from trustbo.planning.search.room import with_room
+from trustbo.planning.tolls import tolls_of
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
 _part = njit(nogil=True, error_model="numpy", **PART)
@@ -75,7 +76,7 @@ class LabelSearch(NamedTuple):
     tests: np.ndarray  # (test, state)
     heuristic: Heuristic
     neighbours: np.ndarray  # (cell, move), -1 where none
-    length_cost: np.ndarray  # (move,)
+    tolls: np.ndarray  # (move, cell), or (move, 1)
     to_goal: np.ndarray  # (cell,), -1 where there is no way
     start: int
     goal: int
@@ -157,7 +158,7 @@ def _problem(
         dominance_tests(dynamics, n_bounds),
         build_heuristic(dynamics, n_bounds, admissible.neighbours, goal, at_goal=at_goal),
         admissible.neighbours,
-        scale * objective.length_weight * admissible.lengths,
+        scale * tolls_of(admissible, objective),
         admissible.bounds_to_goal.ravel(),
         admissible.flat(admissible.start),
         goal,
@@ -213,7 +214,7 @@ def search(problem: LabelSearch, tolerance: float, max_labels: int) -> SearchRes
 def _search(problem, tolerance, max_labels):
     mode, revisit, most, goal = problem.mode, problem.revisit, problem.max_bounds, problem.goal
     neighbours, to_goal, u_turns = problem.neighbours, problem.to_goal, problem.u_turns
-    (n_cells, n_moves), by_move = neighbours.shape, problem.drift.shape[1] > 1
+    (n_cells, n_moves), drift, tolls = neighbours.shape, problem.drift, problem.tolls
     fixed, n_before = mode >= TERMINAL, 1 if u_turns else n_moves + 1
     heads = np.full(n_cells * n_before * (most + 1 if fixed else 1), -1, np.int64)
     size = min(max_labels, 1024)
@@ -256,10 +257,10 @@ def _search(problem, tolerance, max_labels):
                 problem.risk, tested, n, label, m * n_cells + other, other
             ):
                 continue
-            x = problem.transition @ state[label] + problem.drift[:, m * by_move, other]
+            x = problem.transition @ state[label] + drift[:, m * (drift.shape[1] > 1), other]
             total = _add_cost(
-                mode, cost[label, 0], _least(problem.views @ x), problem.length_cost[m],
-                problem.noise_sd,
+                mode, cost[label, 0], _least(problem.views @ x),
+                tolls[m, other * (tolls.shape[1] > 1)], problem.noise_sd,
             )  # fmt: skip
             left = most - n_bounds - 1 if fixed else to_goal[other]
             reach = _estimate(mode, problem.heuristic, x, total, other, left, problem.noise_sd)
@@ -333,17 +334,17 @@ def _spend(risk, tested, label, parent, bound, cell):
 
 
 @_part
-def _add_cost(mode, cost, trust, length_cost, noise_sd):
+def _add_cost(mode, cost, trust, toll, noise_sd):
     """Cost of a label after one more bound."""
     if mode == LOGISTIC_LOSS:
-        return cost + length_cost + expected_loss(LOGISTIC, trust, noise_sd)
+        return cost + toll + expected_loss(LOGISTIC, trust, noise_sd)
     if mode == CLIPPED_LOSS:
-        return cost + length_cost + expected_loss(CLIPPED, trust, noise_sd)
+        return cost + toll + expected_loss(CLIPPED, trust, noise_sd)
     if mode == SUCCESS:
-        return cost + loss_of(SOFTPLUS, trust, noise_sd)
+        return cost + toll + loss_of(SOFTPLUS, trust, noise_sd)
     if mode == BOTTLENECK:
         return max(cost, -trust)
-    return cost + length_cost - (trust if mode == MEAN else 0.0)
+    return cost + toll - (trust if mode == MEAN else 0.0)
 
 
 @_part

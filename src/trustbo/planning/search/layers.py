@@ -140,13 +140,13 @@ def best_additive(
     layers: Graph,
     drift: np.ndarray,
     weights: Weights,
-    length_cost: np.ndarray,
+    tolls: np.ndarray,
     lengths: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the best path of every draw over admissible numbers of bounds, `lengths`.
 
-    Drift u (draw, state, move, cell), of one move where all into a cell are alike, and its weights,
-    cost of each move (move,). Returns scores (draw,),
+    Drift u (draw, state, move, cell), of one move where all into a cell are alike, and its weights;
+    tolls of bounds (move, cell), of one cell where all by a move are alike. Returns scores (draw,),
     -inf where there is no path; and paths, flat indices of cells, (draw, length), filled with -1.
     """
     n_draws = len(drift)
@@ -155,7 +155,7 @@ def best_additive(
     drift, lengths = np.ascontiguousarray(drift), np.asarray(lengths)
 
     def work(first: int, last: int) -> None:
-        _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, first, last)
+        _best_paths(layers, drift, weights, tolls, lengths, scores, paths, first, last)
 
     over_rows(work, n_draws) if n_draws > 1 else work(0, n_draws)
     return scores, paths
@@ -171,13 +171,13 @@ class _Best(NamedTuple):
 
 
 @_compiled
-def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, begin, end):
+def _best_paths(layers, drift, weights, tolls, lengths, scores, paths, begin, end):
     n_nodes, (n_states, n_drifts) = len(layers.cell), drift.shape[1:3]
     left, cell, per_bound = layers.rank, layers.cell, weights.per_bound
     u = drift.reshape(len(drift), n_states, n_drifts * drift.shape[3])
     # Gain of each edge, or of each node where all edges into it are alike.
     by_edge, costly = n_drifts > 1, False
-    for cost in length_cost:
+    for cost in tolls.flat:
         costly = costly or cost > 0.0
     gain = np.empty(len(layers.head) if by_edge else n_nodes)
     # Its bounds left, and the index of its drift; unsigned: no test for a negative index.
@@ -198,7 +198,7 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
             w, u_s = per_bound[d, :, s], u[d, s]
             for i in range(len(gain)):
                 gain[i] += w[gain_left[i]] * u_s[gain_drift[i]]
-        _pass_back(layers, gain, length_cost, costly, by_edge, found)
+        _pass_back(layers, gain, tolls, costly, by_edge, found)
         chosen = -1
         for length in lengths:
             node = layers.starts[length]
@@ -207,14 +207,15 @@ def _best_paths(layers, drift, weights, length_cost, lengths, scores, paths, beg
                 if score > scores[d]:
                     scores[d], chosen = score, length
         if chosen >= 0:
-            _trace(layers, gain, length_cost, by_edge, found, layers.starts[chosen], paths[d])
+            _trace(layers, gain, tolls, by_edge, found, layers.starts[chosen], paths[d])
 
 
 @_inlined
-def _pass_back(layers, gain, length_cost, costly, by_edge, found):
+def _pass_back(layers, gain, tolls, costly, by_edge, found):
     """Compute the best and second-best sum of every node, in the order of the bounds left."""
     left, first, head, move = layers.rank, layers.first, layers.head, layers.move
-    n_moves, u_turns = layers.n_moves, layers.u_turns
+    n_moves, u_turns, cell = layers.n_moves, layers.u_turns, layers.cell
+    by_cell = tolls.shape[1] > 1
     best, second, edge, by = found
     for n in range(len(left)):
         if left[n] == 0:
@@ -226,7 +227,7 @@ def _pass_back(layers, gain, length_cost, costly, by_edge, found):
             on = best[b] if u_turns or by[b] != n_moves - 1 - m else second[b]
             value = gain[e if by_edge else b] + on
             if costly:
-                value -= length_cost[m]
+                value -= tolls[m, cell[b] * by_cell]
             if value > high:
                 next_high = high
                 high, at, m_high = value, e, m
@@ -236,11 +237,11 @@ def _pass_back(layers, gain, length_cost, costly, by_edge, found):
 
 
 @_inlined
-def _trace(layers, gain, length_cost, by_edge, found, node, path):
+def _trace(layers, gain, tolls, by_edge, found, node, path):
     """Write down the path from a start node; second-best edges are searched again."""
     cell, first, head, move = layers.cell, layers.first, layers.head, layers.move
     best, second, edge, by = found
-    k, came = 0, -1
+    k, came, by_cell = 0, -1, tolls.shape[1] > 1
     path[0] = cell[node]
     while edge[node] >= 0:
         e = edge[node]
@@ -251,7 +252,7 @@ def _trace(layers, gain, length_cost, by_edge, found, node, path):
                 if m == by[node]:
                     continue
                 on = best[b] if by[b] != layers.n_moves - 1 - m else second[b]
-                value = gain[x if by_edge else b] + on - length_cost[m]
+                value = gain[x if by_edge else b] + on - tolls[m, cell[b] * by_cell]
                 if value > high:
                     high, e = value, x
         node, came = head[e], move[e]

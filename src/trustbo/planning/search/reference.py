@@ -27,7 +27,8 @@ from trustbo.planning.search.case import Case
 from trustbo.planning.search.dominance import dominance_tests
 from trustbo.planning.search.graph import Best
 from trustbo.planning.search.layers import additive_weights
-from trustbo.planning.values import entry_cost, path_length, path_trust
+from trustbo.planning.tolls import toll_along
+from trustbo.planning.values import entry_cost, path_trust
 from trustbo.workspace.moves import MOVES
 
 Path = tuple[Cell, ...]
@@ -52,20 +53,21 @@ def _of_draw(case: Case, dynamics: Dynamics, backend: str | None) -> Path | None
     admissible, _, objective, risk = case
 
     def score(path: Path) -> float:
-        trust = path_trust(dynamics.along(path), objective, path_length(admissible, path))
+        toll = toll_along(admissible, objective, path).total
+        trust = path_trust(dynamics.along(path), objective, toll)
         return float(SCORES[objective.name](trust))
 
     if risk is None:
         if objective.name == "stationary":
             cost = entry_cost(admissible.passable, dynamics)
-            return best_stationary(admissible, cost, objective.length_weight, backend)
+            return best_stationary(admissible, cost, case.tolls, backend)
         if objective.has_labels:
-            return best_labelled(admissible, dynamics, objective)
+            return best_labelled(case, dynamics)
         if len(dynamics.views) == 1:  # the least of several views is no sum of weights
             return max(_best_sums(case, dynamics, backend), key=score)
         nothing = np.zeros((0, len(admissible.steps), admissible.passable.size))
         risk = RiskTable(nothing, np.zeros(0), 0, 0.0)
-    feasible = feasible_paths(admissible, dynamics, objective, risk)
+    feasible = feasible_paths(case, dynamics, risk)
     cost = [risk.cost(risk.along(path, admissible.passable.shape)) for path in feasible]
     scores = [score(path) for path in feasible]
     return feasible[int(np.argmax(np.subtract(scores, cost)))] if feasible else None
@@ -76,13 +78,14 @@ def _best_sums(case: Case, dynamics: Dynamics, backend: str | None) -> list[Path
     admissible, _, objective, _ = case
     weights = additive_weights(dynamics.flat(), dynamics.views[0], objective, admissible.longest)
     gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, move, row, col)
-    paths = []
+    paths, tolls = [], _on_map(admissible, case.tolls)
     for n_bounds in range(admissible.shortest, admissible.longest + 1):
 
         def gain(k: int, before: Cell, cell: Cell, n: int = n_bounds) -> float:
-            return float(_of_bound(gains[n - k], before, cell) / weights.scale[n])
+            trust = float(_of_bound(gains[n - k], before, cell) / weights.scale[n])
+            return trust - float(_of_bound(tolls, before, cell))
 
-        path = best_additive(admissible, gain, n_bounds, objective.length_weight, backend)
+        path = best_additive(admissible, gain, n_bounds, backend)
         if path is not None:
             paths.append(path)
     return paths
@@ -99,13 +102,11 @@ def best_additive(
     admissible: AdmissiblePaths,
     gain: Callable[[int, Cell, Cell], float],
     n_bounds: int,
-    length_weight: float = 0.0,
     backend: str | None = None,
 ) -> Path | None:
     """Find the path, if any, of exactly `n_bounds` bounds with the largest sum of gains.
 
-    That of bound k is gain(k, path[k-1], path[k]), `length_weight` the cost of a metre, and
-    `backend` networkx's.
+    That of bound k is gain(k, path[k-1], path[k]), and `backend` networkx's.
 
     The grid is unrolled over the bounds into a layered DAG. All paths through it are equally long,
     so each layer's weights may be shifted to be non-negative: Dijkstra then applies, to gains of
@@ -134,8 +135,7 @@ def best_additive(
         for target, sources in entered.items():
             for node in sources:
                 bound = node[2], target[2]
-                length_cost = length_weight * graph.edges[bound]["length"]
-                dag.add_edge(node, target, weight=most - gains[bound] + length_cost)
+                dag.add_edge(node, target, weight=most - gains[bound])
         layer = list(entered)
     for node in layer:
         dag.add_edge(node, sink, weight=0.0)
@@ -143,7 +143,7 @@ def best_additive(
     return tuple(node[2] for node in nodes[:-1])
 
 
-def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective) -> Path:
+def best_labelled(case: Case, dynamics: Dynamics) -> Path:
     """Find the walk with the best objective that has labels; TrustboError if none is short enough.
 
     Label setting: labels leave the queue in the order of their cost, which never falls along a
@@ -158,6 +158,8 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: Ob
             return cost + float(softplus(-x))
         return cost + float(objective.contact_lost(np.array([x]), x, dynamics.noise_sd)[0])
 
+    admissible, _, objective, _ = case
+    tolls = _on_map(admissible, case.tolls)
     graph, to_goal, max_bounds = admissible.graph, admissible.to_goal, admissible.longest
     tests, u_turns = dominance_tests(dynamics, max_bounds), admissible.u_turns
     bit = {cell: 1 << i for i, cell in enumerate(graph)} if not admissible.revisit else {}
@@ -182,8 +184,8 @@ def best_labelled(admissible: AdmissiblePaths, dynamics: Dynamics, objective: Ob
                 continue
             reached = dynamics.transition @ x + _of_bound(dynamics.drift, cell, other)
             trust = float((dynamics.views @ reached).min())
-            metres = objective.length_weight * graph.edges[cell, other]["length"]
-            label = (combine(cost, trust) + metres, n_bounds + 1, next(order), reached)
+            toll = float(_of_bound(tolls, cell, other))
+            label = (combine(cost, trust) + toll, n_bounds + 1, next(order), reached)
             heapq.heappush(queue, (*label, (*path, other), seen))
     raise TrustboError(f"no path has at most {max_bounds} bounds.")
 
@@ -194,39 +196,45 @@ def _on_time(admissible: AdmissiblePaths, cell: Cell, left: int) -> bool:
 
 
 def best_stationary(
-    admissible: AdmissiblePaths, cost: np.ndarray, length_weight: float, backend: str | None
+    admissible: AdmissiblePaths, cost: np.ndarray, tolls: np.ndarray, backend: str | None
 ) -> Path:
-    """Find the simple path with the least cost of bounds, (move, row, col), and its metres."""
-    graph, ends = with_costs(admissible, cost, length_weight), (admissible.start, admissible.goal)
+    """Find the simple path with the least cost of bounds, (move, row, col), and their tolls."""
+    graph, ends = with_costs(admissible, cost, tolls), (admissible.start, admissible.goal)
     return tuple(_dijkstra(graph, *ends, weight="cost", backend=backend))
 
 
 def with_costs(
-    admissible: AdmissiblePaths, cost: np.ndarray, length_weight: float, **values: np.ndarray
+    admissible: AdmissiblePaths, cost: np.ndarray, tolls: np.ndarray, **values: np.ndarray
 ) -> nx.DiGraph:
-    """Build the graph of bounds with their `cost`, that of their metres included.
+    """Build the graph of bounds with their `cost`, their toll (see `tolls_of`) included.
 
     Further edge attributes by name; like costs these are of bounds, (move, row, col), of one move
     where all into a cell are alike.
     """
-    graph = admissible.graph.copy()
+    graph, tolls = admissible.graph.copy(), _on_map(admissible, tolls)
     for a, b, edge in graph.edges(data=True):
-        edge["cost"] = float(_of_bound(cost, a, b)) + length_weight * edge["length"]
+        edge["cost"] = float(_of_bound(cost, a, b)) + float(_of_bound(tolls, a, b))
         edge.update({name: float(_of_bound(value, a, b)) for name, value in values.items()})
     return graph
 
 
+def _on_map(admissible: AdmissiblePaths, tolls: np.ndarray) -> np.ndarray:
+    """Tolls of bounds, (move, row, col), from (move, cell) or (move, 1)."""
+    shape = admissible.passable.shape
+    return np.broadcast_to(tolls, (len(tolls), shape[0] * shape[1])).reshape(-1, *shape)
+
+
 class _Label(NamedTuple):
     criteria: np.ndarray
-    """Numbers of which more is better: score, minus length, minus risks, tests of trust."""
+    """Numbers of which more is better: score, minus toll, minus risks, tests of trust."""
     x: np.ndarray
     path: Path
 
 
-def feasible_paths(
-    admissible: AdmissiblePaths, dynamics: Dynamics, objective: Objective, risk: RiskTable
-) -> list[Path]:
+def feasible_paths(case: Case, dynamics: Dynamics, risk: RiskTable) -> list[Path]:
     """Find feasible paths that include the best one; none if no path is feasible."""
+    admissible, _, objective, _ = case
+    tolls = _on_map(admissible, case.tolls)
     longest, drift, tests = admissible.longest, dynamics.drift, np.zeros((0, 1))
     if objective.name == "stationary":  # no history: the score of a bound is that of its own trust
         longest, drift = int(admissible.passable.sum()) - 1, dynamics.steady_state()[None]
@@ -247,7 +255,7 @@ def feasible_paths(
                     continue
                 flat, by_move = admissible.flat(other), min(m, drift.shape[1] - 1)
                 step, risks = drift[:, by_move, *other], risk.of_bounds[:, m, flat]
-                metres = objective.length_weight * admissible.lengths[m]
+                toll = tolls[m, *other]
                 for label in here:
                     if _excluded(admissible, label.path, other, simple=simple):
                         continue
@@ -257,8 +265,8 @@ def feasible_paths(
                     total = label.criteria[2 : 2 + n_risks] - risks
                     if not risk.is_feasible(-total):
                         continue
-                    length = label.criteria[1] - metres
-                    criteria = np.concatenate([[score, length], total, tests @ x])
+                    paid = label.criteria[1] - toll
+                    criteria = np.concatenate([[score, paid], total, tests @ x])
                     new = _Label(criteria, x, (*label.path, other))
                     if other == admissible.goal:
                         paths.append(new.path)

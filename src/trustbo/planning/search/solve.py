@@ -18,6 +18,7 @@ from trustbo.planning.search.case import Case
 from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
 from trustbo.planning.search.graph import Best
 from trustbo.planning.search.reference import plan_networkx, with_costs
+from trustbo.planning.tolls import tolls_of
 from trustbo.planning.values import entry_cost
 from trustbo.workspace.moves import move_indices
 
@@ -112,16 +113,12 @@ def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
         with np.errstate(divide="ignore"):
             values["risk"] = -np.log1p(-p_fail)
     values["drift"] = np.tensordot(dynamics.views.mean(0), dynamics.drift, 1)
-    objective = problem.objective
-    if objective.name == "lost_contact" and not objective.lag:
-        values["lost"] = _settled_loss(objective, dynamics)
-    graph = with_costs(
-        paths, entry_cost(paths.passable, dynamics), objective.length_weight, **values
-    )
-    for *_, edge in graph.edges(data=True):
-        if "lost" in edge:
-            edge["lost"] += objective.length_weight * edge["length"]
-    return graph
+    tolls = tolls_of(paths, problem.objective)
+    if problem.objective.name == "lost_contact" and not problem.objective.lag:
+        lost = _settled_loss(problem.objective, dynamics)
+        of_bounds = tolls.reshape(len(tolls), *(lost.shape[1:] if tolls.shape[1] > 1 else (1, 1)))
+        values["lost"] = lost + of_bounds
+    return with_costs(paths, entry_cost(paths.passable, dynamics), tolls, **values)
 
 
 def _settled_loss(objective: Objective, dynamics: Dynamics) -> np.ndarray:
