@@ -26,6 +26,7 @@ from common import Table, arguments, parsed, records_of
 from trustbo import iterate
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell, Mission
+from trustbo.inference import params_of
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
 from trustbo.team import Robot, Team
@@ -93,11 +94,10 @@ def covered(world: World, course: str, n: int) -> dict[str, Any]:
             **options,
         )  # fmt: skip
         for cost in COSTS:
-            settings = result.settings | {"unseen_cost": cost}
-            for stage, plan in (
-                ("first plan", Campaign(workspace, *ends, unseen_cost=cost, **options).recommend()),
-                ("after 8 missions", replace(result, settings=settings).plan),
-            ):
+            first = Campaign(workspace, *ends, unseen_cost=cost, **options).recommend()
+            learned = replace(result, settings=result.settings | {"unseen_cost": cost}).planner
+            last = learned.plan(params_of(result.posterior).mean())
+            for stage, plan in (("first plan", first), ("after 8 missions", last)):
                 if plan.path not in driven_on:
                     driven_on[plan.path] = summed(driven(simulator, plan.path, n))
                 shares = workspace.unseen_bounds.values[tuple(bounds_along(plan.path).T)]
