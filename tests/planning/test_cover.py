@@ -118,6 +118,21 @@ def test_shares_of_bounds_are_near_those_along_paths(workspace):
     assert abs((known - along).mean()) < 0.02
 
 
+def test_regret_is_a_share_of_the_contact_kept_with_a_toll_too(workspace):
+    draws = sample_prior(PooledTrust(), 3, 20, seed=2)
+    planner = Planner(workspace, (4, 0), (0, 4), unseen_cost=1000.0)
+    drawn = planner.plan_draws(draws)
+    path = drawn.candidates[0]
+    paths = [planner.paths.cells(flat) for flat in drawn.paths]
+    free = Planner(workspace, (4, 0), (0, 4)).plan_draws(draws).values_of(paths).diagonal()
+    kept = np.maximum(0.0, [len(one) - 1 for one in paths] + free)
+    regret, share = drawn.regret(path), drawn.relative_regret(path)
+    some = kept > 1e-6
+    np.testing.assert_allclose(share[some], regret[some] / kept[some], rtol=1e-9, atol=1e-12)
+    assert some.sum() > 5  # the prior has draws of no contact
+    assert (drawn.values < -4.0).all()  # more is paid than bounds could lose
+
+
 def test_campaigns_pay_for_the_time_unseen_and_say_so(workspace, tmp_path):
     options = {"unseen_cost": 2.5, "sampler": "exact", "seed": 0}
     result = iterate(workspace, (4, 0), (0, 4), n_iterations=1, progress=False, **options)

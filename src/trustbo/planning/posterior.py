@@ -71,7 +71,7 @@ class DrawnPaths:
         """
         scale = np.abs(self.values)
         if self.problem.objective.name == "lost_contact":
-            scale = np.maximum(0.0, (self.paths >= 0).sum(1) - 1 + self.values)
+            scale = np.maximum(0.0, (self.paths >= 0).sum(1) - 1 + self.values + self._tolls)
         regret = self.regret(path)
         nothing = np.where(regret > _ROUNDING, np.inf, 0.0)
         return np.divide(regret, scale, out=nothing, where=scale > 0.0)
@@ -97,6 +97,14 @@ class DrawnPaths:
         toll = toll_along(self.problem.paths, objective, path).total
         trust = path_trust(dynamics.along(path), objective, toll)
         return OBJECTIVES[objective.name](trust) - self.problem.cost_of_failure(path)
+
+    @cached_property
+    def _tolls(self) -> np.ndarray:
+        """Toll of the best path of each draw, (draw,)."""
+        paths, objective = self.problem.paths, self.problem.objective
+        unique, inverse, _ = self._unique
+        tolls = [toll_along(paths, objective, paths.cells(path)).total for path in unique]
+        return np.array(tolls)[inverse]
 
     @cached_property
     def _unique(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
