@@ -312,8 +312,8 @@ MISTAKES = {
     "a terrain of 4 TB": (
         lambda c: tb.terrain.synthetic_terrain((1e6, 1e6)), "1000000 x 1000000 pixels, more than"
     ),
-    "a mission without a path": (
-        lambda c: tb.Mission.from_arrays(None, c.z, c.y), "path must be cells .* got None"
+    "a mission of an empty path": (
+        lambda c: tb.Mission.from_arrays([], c.z, c.y), "path is empty; give its cells, or None for"
     ),
     "a single rate": (lambda c: tb.Mission.from_arrays(c.path, c.z, 0.5), "contact_rate .bound, r"),
     "a simulator without a path": (
