@@ -14,7 +14,7 @@ from trustbo.errors import ShapeError, TrustboError, require_not_negative, requi
 from trustbo.files import FilePath
 from trustbo.logs.bagfile import opened
 from trustbo.logs.messages import POSE_TYPES, TEXT, Topics
-from trustbo.logs.rows import text_columns
+from trustbo.logs.rows import columns_of, number_of
 
 _POSE, _DETECTION = ("t", "robot", "x", "y"), ("t", "watcher", "seen")
 _NS = 1e9  # in a second
@@ -226,7 +226,7 @@ def _columns(
     what: str, table: Any, needed: Sequence[str], others: Sequence[str] = ()
 ) -> dict[str, list[str]]:
     """Columns of a table by name; TrustboError: one that is needed is missing, or no rows."""
-    columns = text_columns(table)
+    columns = columns_of(table)
     if missing := [name for name in needed if name not in columns]:
         raise TrustboError(
             f"the table of {what} lacks {', '.join(missing)}; it has {', '.join(columns)}."
@@ -240,12 +240,9 @@ def _numbers(what: str, name: str, texts: Sequence[str], *, blank: bool = False)
     """Numbers of a column, (row,); NaN where blank, if this is allowed."""
     values = np.empty(len(texts))
     for i, text in enumerate(texts):
-        try:
-            values[i] = float(text) if text else np.nan
-        except ValueError:
-            values[i] = np.inf
-        if np.isinf(values[i]) or (np.isnan(values[i]) and not blank):
-            raise TrustboError(f"{what}, row {i + 1}: {name} = {text!r} is no number.")
+        values[i] = number_of(where := f"{what}, row {i + 1}", name, text)
+        if np.isnan(values[i]) and not blank:
+            raise TrustboError(f"{where}: {name} = {text!r} is no number.")
     return values
 
 

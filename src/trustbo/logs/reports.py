@@ -14,7 +14,7 @@ import numpy as np
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.logs.rows import columns_of
+from trustbo.logs.rows import columns_of, number_of
 
 _YES = {"1", "1.0", "true", "yes", "success", "succeeded", "ok"}
 _NO = {"0", "0.0", "false", "no", "failure", "failed", "fail"}
@@ -101,7 +101,7 @@ def read_reports(
         where = f"row {i + 1}"
         if not who or (task is not None and not about):
             raise TrustboError(f"{where}: {person if not who else task} is blank.")
-        k = _number(where, step, text[step])
+        k = number_of(where, step, text[step])
         if math.isnan(k):
             raise TrustboError(f"{where}: {step} is blank.")
         steps = people.setdefault(who, {}).setdefault(k, {})
@@ -136,7 +136,7 @@ def read_azevedo_sa(file: str | PathLike[str]) -> list[Mission]:
                        "asked_processing", "trust"))  # fmt: skip
     number = {
         name: np.array(
-            [_number(f"row {i + 1}", name, text) for i, text in enumerate(columns[name])]
+            [number_of(f"row {i + 1}", name, text) for i, text in enumerate(columns[name])]
         )
         for name in ("sensing", "processing", "asked_sensing", "asked_processing", "trust")
     }
@@ -177,7 +177,7 @@ def read_soh(file: str | PathLike[str]) -> list[Mission]:
     missions = []
     for i in range(len(columns["B_SF"])):
         where = f"row {i + 1}"
-        tasks = [_number(where, f"{t}_ID", columns[f"{t}_ID"][i]) for t in "ABCDE"]
+        tasks = [number_of(where, f"{t}_ID", columns[f"{t}_ID"][i]) for t in "ABCDE"]
         if not all(task in range(1, 13) for task in tasks):
             raise TrustboError(f"{where}: tasks must be 1 to 12; got {tasks}.")
         succeeded = _outcome(where, "B_SF", columns["B_SF"][i])
@@ -220,7 +220,7 @@ def read_du(file: str | PathLike[str], *, events: bool = False) -> list[Mission]
     for i, who in enumerate(columns["person"]):
         where = f"row {i + 1}"
         values = {
-            name: _number(where, name, columns[name][i])
+            name: number_of(where, name, columns[name][i])
             for name in ("step", "trust_before", "trust_after", "state", "task_result")
         }
         result = values["task_result"] > 0.0
@@ -255,12 +255,12 @@ def _row(
     where = f"row {line}"
     outcome, demand = named["outcome"], named["demand"]
     success, failure = (0.0, 0.0) if outcome is None else _outcome(where, outcome, text[outcome])
-    d = 0.0 if demand is None else _number(where, demand, text[demand])
+    d = 0.0 if demand is None else number_of(where, demand, text[demand])
     if math.isnan(d) and not success + failure:
         d = 0.0  # of nothing seen
     if not 0.0 <= d <= 1.0:
         raise TrustboError(f"{where}: {demand} = {text[str(demand)]!r} must be in [0, 1].")
-    given = tuple(_number(where, name, text[name]) for name in inputs)
+    given = tuple(number_of(where, name, text[name]) for name in inputs)
     if any(map(math.isnan, given)):
         blank = inputs[[math.isnan(v) for v in given].index(True)]
         raise TrustboError(f"{where}: {blank} is blank; an input must be known at each step.")
@@ -323,7 +323,7 @@ def _levels(scale: str) -> int:
 
 def _report(where: str, name: str, text: str, levels: int) -> float:
     """Report in [0, 1]."""
-    value = _number(where, name, text)
+    value = number_of(where, name, text)
     if math.isnan(value):
         return value
     if not levels:
@@ -350,16 +350,6 @@ def _outcome(where: str, name: str, text: str) -> tuple[float, float]:
     raise TrustboError(
         f"{where}: {name} = {text!r} is no outcome; give 1 or 0, success or failure, or a blank."
     )
-
-
-def _number(where: str, name: str, text: Any) -> float:
-    try:
-        value = float(text) if str(text) else math.nan
-    except ValueError:
-        value = math.inf
-    if math.isinf(value):
-        raise TrustboError(f"{where}: {name} = {text!r} is no number.")
-    return value
 
 
 def _require(columns: Mapping[str, object], names: Sequence[str]) -> None:

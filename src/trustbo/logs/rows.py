@@ -60,7 +60,7 @@ def read_columns(
 
     TrustboError: no such file, or no CSV; a missing or repeated column; no rows.
     """
-    columns = text_columns(table)
+    columns = columns_of(table)
     names = list(columns)
     for name in (ignore,) if isinstance(ignore, str) else ignore:
         if columns.pop(name, None) is None:
@@ -68,7 +68,7 @@ def read_columns(
     if _TICKS_BEFORE in columns:
         other = "n_ticks" if "n_ticks" not in columns else f"{_PREFIX}{_TICKS_BEFORE}"
         columns[other] = columns.pop(_TICKS_BEFORE)
-    place = position_of(columns) if mapped or has_places(columns) else ()
+    place = position_of(columns) or (POSITIONS[0] if mapped else ())
     missing = [n for n in (*KEYS[:3], *place) if n not in columns]
     if "contact_rate" not in columns and not {"contact_time", "duration"} <= columns.keys():
         missing.append("contact_rate (or contact_time and duration)")
@@ -77,18 +77,6 @@ def read_columns(
         raise TrustboError(f"the table lacks {', '.join(missing)}; it has {shown}.")
     if not columns["mission"]:
         raise TrustboError("the table has no rows.")
-    return columns
-
-
-def text_columns(table: Any) -> dict[str, list[str]]:
-    """Columns of a CSV file, a DataFrame or a mapping as text by name, "" if blank.
-
-    TrustboError: no such file, or no CSV; no table; or a repeated column.
-    """
-    names, values = _from_file(Path(table)) if isinstance(table, str | PathLike) else _of(table)
-    columns = {n: [_stripped(v) for v in column] for n, column in zip(names, values, strict=True)}
-    if len(columns) < len(names):
-        raise TrustboError(f"the table has two columns of one name: {', '.join(names)}.")
     return columns
 
 
@@ -115,7 +103,7 @@ def parse_rows(
     """
     wanted = [column_of(name) for name in features]
     missing = [name for name in wanted if name not in columns]
-    place = position_of(columns) if has_places(columns) else ()
+    place = position_of(columns)
     others = [n for n in columns if n not in (*COLUMNS, *place, *wanted)]
     if missing and others:
         raise TrustboError(
@@ -132,19 +120,20 @@ def parse_rows(
     ]
 
 
-def has_places(columns: Mapping[str, object]) -> bool:
-    """Whether a table has any column of cells or positions: one without is of a log of no map."""
-    return any(name in columns for pair in POSITIONS for name in pair)
+def position_of(columns: Mapping[str, object]) -> tuple[str, ...]:
+    """Columns with the cell: the first of `POSITIONS` that the table has.
 
-
-def position_of(columns: Mapping[str, object]) -> tuple[str, str]:
-    """Columns with the cell: the first of `POSITIONS` that the table has, else row and col."""
-    return next((pair for pair in POSITIONS if columns.keys() >= set(pair)), POSITIONS[0])
+    Row and col where it has a part of a pair alone, and nothing where it has none: a table without
+    is of a log without a map.
+    """
+    whole = (pair for pair in POSITIONS if columns.keys() >= set(pair))
+    parts = (POSITIONS[0] for pair in POSITIONS if columns.keys() & set(pair))
+    return next(whole, next(parts, ()))
 
 
 def features_of(columns: Mapping[str, object]) -> tuple[str, ...]:
     """Features by the names of a table's columns; those of `FEATURES` if it has none."""
-    place = position_of(columns) if has_places(columns) else ()
+    place = position_of(columns)
     others = [name for name in columns if name not in (*COLUMNS, *place)]
     bare = [name.removeprefix(_PREFIX) for name in others]
     features = tuple(b if b in _RESERVED else name for b, name in zip(bare, others, strict=True))
@@ -163,7 +152,7 @@ def _parse(
     place: Sequence[str],
     grid: Grid | None,
 ) -> Row:
-    numbers = {name: _number(line, name, text[name]) for name in NUMBERS}
+    numbers = {name: number_of(f"row {line}", name, text[name]) for name in NUMBERS}
     awareness = tuple(_awareness(line, name, text[name], bounded=bool(place)) for name in wanted)
     bound = _whole(line, "bound", text["bound"])
     if not text["mission"]:
@@ -182,7 +171,7 @@ def _parse(
 
 def _cell_at(line: int, place: Sequence[str], texts: Sequence[str], grid: Grid) -> Cell:
     """Cell at a position, (x, y) or (lon, lat)."""
-    a, b = (_number(line, name, text) for name, text in zip(place, texts, strict=True))
+    a, b = (number_of(f"row {line}", name, text) for name, text in zip(place, texts, strict=True))
     find = grid.cell_at if place[0] == "x" else grid.cell_at_lonlat
     where = f"row {line}: {place[0]} = {texts[0]}, {place[1]} = {texts[1]}"
     try:
@@ -238,24 +227,25 @@ def _of(table: Any) -> tuple[list[str], list[list[object]]]:
 
 def _awareness(line: int, name: str, text: str, *, bounded: bool) -> float:
     hint = f"; if it is no awareness feature: ignore=({name!r},)"
-    number = _number(line, name, text, hint)
+    number = number_of(f"row {line}", name, text, hint)
     if bounded and (number < 0.0 or number > 1.0):
         raise TrustboError(f"row {line}: {name} = {text} is outside [0, 1]{hint}.")
     return number
 
 
-def _number(line: int, name: str, text: str, hint: str = "") -> float:
+def number_of(where: str, name: str, text: str, hint: str = "") -> float:
+    """Number of a text, NaN if blank; TrustboError, which names the place, if it is none."""
     try:
         number = float(text) if text else math.nan
     except ValueError:
         number = math.inf
     if math.isinf(number):
-        raise TrustboError(f"row {line}: {name} = {text!r} is no number{hint}.")
+        raise TrustboError(f"{where}: {name} = {text!r} is no number{hint}.")
     return number
 
 
 def _whole(line: int, name: str, text: str) -> int:
-    number = _number(line, name, text)
+    number = number_of(f"row {line}", name, text)
     if not number.is_integer():
         raise TrustboError(f"row {line}: {name} = {text!r} must be a whole number.")
     return int(number)

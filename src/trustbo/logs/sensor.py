@@ -33,9 +33,16 @@ class Sensor(Displayed):
         pipeline: Fitted scikit-learn pipeline, with the columns of `variables` and hidden x range.
     """
 
-    def __init__(self, variables: Sequence[str], pipeline: Pipeline, fitted: "_Fitted") -> None:
-        """Made by `fit_sensor`."""
-        self.variables, self.pipeline, self._fitted = tuple(variables), pipeline, fitted
+    def __init__(
+        self,
+        variables: Sequence[str],
+        pipeline: Pipeline,
+        geometry: xr.Dataset,
+        left_out: xr.DataArray,
+    ) -> None:
+        """Hold a pipeline, the data it was fitted to, and chances by fits that left them out."""
+        self.variables, self.pipeline = tuple(variables), pipeline
+        self._geometry, self._left_out = geometry, left_out
 
     def predict(self, geometry: xr.Dataset) -> xr.DataArray:
         """Chance of detection, (watcher, seen, time), in [0, 1]; NaN where it is NaN in the data.
@@ -49,18 +56,18 @@ class Sensor(Displayed):
         Raises:
             TrustboError: A variable is missing.
         """
-        if geometry is self._fitted.geometry:
-            return self._fitted.left_out
+        if geometry is self._geometry:
+            return self._left_out
         table, known = _table(geometry, self.variables)
         return _back(geometry, known, self.pipeline.predict_proba(table)[:, 1])
 
     @cached_property
     def log_score(self) -> float:
         """Mean log score of contact in a tick, of ticks left out, nats."""
-        return _log_score(self._fitted.left_out, self._fitted.geometry)
+        return _log_score(self._left_out, self._geometry)
 
     def _card(self) -> Card:
-        geometry = self._fitted.geometry
+        geometry = self._geometry
         contact = float(geometry["contact"].mean())
         alone = contact * np.log(contact) + (1.0 - contact) * np.log1p(-contact)
         rows = [
@@ -70,13 +77,6 @@ class Sensor(Displayed):
             ("", f"{number(alone)} of the share of contact alone"),
         ]
         return Card("Sensor: chance of detection in a tick", rows)
-
-
-class _Fitted:
-    """The geometry that a sensor was fitted to, and its chances by fits that left it out."""
-
-    def __init__(self, geometry: xr.Dataset, left_out: xr.DataArray) -> None:
-        self.geometry, self.left_out = geometry, left_out
 
 
 def fit_sensor(
@@ -115,8 +115,8 @@ def fit_sensor(
     for k in range(folds):
         fit = _pipeline(chosen).fit(table[fold != k], contact[fold != k])
         left_out[fold == k] = fit.predict_proba(table[fold == k])[:, 1]
-    fitted = _Fitted(geometry, _back(geometry, known, left_out))
-    return Sensor(chosen, _pipeline(chosen).fit(table, contact), fitted)
+    whole = _pipeline(chosen).fit(table, contact)
+    return Sensor(chosen, whole, geometry, _back(geometry, known, left_out))
 
 
 def _pipeline(variables: Sequence[str]) -> Pipeline:

@@ -16,6 +16,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import moves_along
 
 EACH = "each"
+EXPECTED = "expected"
+"""Feature of a sensor: log odds of the share of ticks expected by it."""
 SIMPLE = ("near", "ahead", "clear")
 """Features without a sensor, in [0, 1]."""
 _AHEAD = np.pi / 6.0  # rad from the heading
@@ -184,9 +186,6 @@ def _mission(
         bounds.append(Bound(cell, z[k], rate[k], duration, "ok", t0, n_ticks=n_ticks[k]))
         t0 += lasts
     return Mission(stretch.path or (), tuple(bounds), "ok", names, log.robots)
-
-
-EXPECTED = "expected"
 
 
 def _columns(known: xr.Dataset, sensor: Sensor | None) -> tuple[tuple[str, ...], list[np.ndarray]]:
