@@ -387,6 +387,17 @@ def _new_block(most, D):
 
 
 @njit(**PART_OPTIONS)
+def _work(rows):
+    """Arrays that sweeps write to: those of all blocks, of one, of shared columns, and sites."""
+    D = rows.U.shape[1]
+    room = _room(rows, D)
+    most = room[5]
+    work, K, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
+    lam, eta = np.empty(len(rows.y)), np.empty(len(rows.y))
+    return room, work, K, block, np.zeros((D, D)), np.zeros(D), lam, eta
+
+
+@njit(**PART_OPTIONS)
 def _start(given, t, rows, kept, lam, eta):
     """Sites to begin with: exact ones of Gaussian terms, those kept of intervals."""
     precision = 1.0 / given.delta_v[t] ** 2
@@ -489,12 +500,8 @@ def _prepare(given, t, x0, lasting, rows, room):
 @njit(**OPTIONS)
 def _log_evidence(given, x0, lasting, rows, kept, n_sweeps):
     """Log evidence at each point; the last sweep only evaluates."""
-    D = rows.U.shape[1]
-    room = _room(rows, D)
-    most = room[5]
-    work, K, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
-    Q, h, F, mean = np.zeros((D, D)), np.zeros(D), np.zeros((D, D)), np.zeros(D)
-    lam, eta, out = np.empty(len(rows.y)), np.empty(len(rows.y)), np.empty(len(given.beta0))
+    room, work, K, block, Q, h, lam, eta = _work(rows)
+    F, mean, out = np.zeros(Q.shape), np.zeros(len(h)), np.empty(len(given.beta0))
     for t in range(len(out)):
         _prepare(given, t, x0, lasting, rows, room)
         _start(given, t, rows, kept, lam, eta)
@@ -507,12 +514,8 @@ def _log_evidence(given, x0, lasting, rows, kept, n_sweeps):
 @njit(**OPTIONS)
 def _settle(given, x0, lasting, rows, kept, n_sweeps):
     """Sites (2, row) after damped sweeps at the first point."""
-    D = rows.U.shape[1]
-    room = _room(rows, D)
-    most = room[5]
-    work, K, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
-    Q, h, F, mean = np.zeros((D, D)), np.zeros(D), np.zeros((D, D)), np.zeros(D)
-    sites = kept.copy()
+    room, work, K, block, Q, h, _, _ = _work(rows)
+    F, mean, sites = np.zeros(Q.shape), np.zeros(len(h)), kept.copy()
     _prepare(given, 0, x0, lasting, rows, room)
     _start(given, 0, rows, kept, sites[0], sites[1])
     for _ in range(n_sweeps):
@@ -670,11 +673,9 @@ def _draws(given, x0, lasting, rows, kept, n_sweeps, nu, n_particles, count, c, 
     become draws of the shared coefficients; with nu = 0 they are these.
     """
     D, n_blocks = rows.U.shape[1], len(rows.start) - 1
-    room = _room(rows, D)
+    room, work, K, block, Q, h, lam, eta = _work(rows)
     V, m, S, most = room[0], room[1], room[2], room[5]
-    work, K, block = np.zeros((most, most)), np.zeros((most, most)), _new_block(most, D)
-    Q, h, mean, F = np.zeros((D, D)), np.zeros(D), np.zeros((3, D)), np.zeros((3, D, D))
-    lam, eta = np.empty(len(rows.y)), np.empty(len(rows.y))
+    mean, F = np.zeros((3, D)), np.zeros((3, D, D))
     wide_lam, wide_eta = np.empty(len(rows.y)), np.empty(len(rows.y))
     stored = (
         np.zeros((n_blocks, most, D)), np.zeros((n_blocks, most)), np.zeros((n_blocks, most, D)),
