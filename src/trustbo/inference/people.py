@@ -44,8 +44,8 @@ def groups_of_people(
 ) -> dict[str, dict[str, Any]]:
     """Groups that `complete` adds: arrays by name, leading axes (chain, draw) but of moments.
 
-    Likelihoods of a mission have its own effects integrated out: leaving a mission out leaves out a
-    person. Predictions are of the same persons anew.
+    Likelihoods of a mission have the person's effects integrated out: leaving a mission out leaves
+    out a person. Predictions are of the same persons anew.
 
     Args:
         posterior: Posterior.

@@ -19,7 +19,6 @@ from trustbo.models.state_space import kalman
 Moments = tuple[np.ndarray, np.ndarray]
 Effect = np.ndarray | float
 """Effect of a place, shape (draw, robot or 1)."""
-_TICKS = np.asarray(200.0)  # of future bounds, whose number of ticks is unknown
 
 
 class Rates(NamedTuple):
@@ -105,7 +104,7 @@ class ApartFilter:
         x: np.ndarray,
         z: np.ndarray,
         effect: Effect,
-        n_ticks: np.ndarray = _TICKS,
+        n_ticks: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """State (draw, robot) after a bound, drawn given that before it, and rates of it."""
         drift = self._drift(z) + effect
@@ -160,7 +159,7 @@ class DeviationFilter(ApartFilter):
         x: np.ndarray,
         z: np.ndarray,
         effect: Effect,
-        n_ticks: np.ndarray = _TICKS,
+        n_ticks: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `ApartFilter.roll`."""
         trust, rates = super().roll(rng, family, x, z, effect, n_ticks)
@@ -246,7 +245,7 @@ class CoupledFilter:
         x: np.ndarray,
         z: np.ndarray,
         effect: Effect,
-        n_ticks: np.ndarray = _TICKS,
+        n_ticks: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `ApartFilter.roll`."""
         n, Delta_v = self._n_robots, np.asarray(self._p.Delta_v)

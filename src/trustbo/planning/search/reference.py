@@ -78,7 +78,7 @@ def _best_sums(case: Case, dynamics: Dynamics, backend: str | None) -> list[Path
     admissible, _, objective, _ = case
     weights = additive_weights(dynamics.flat(), dynamics.views[0], objective, admissible.longest)
     gains = np.tensordot(weights.per_bound[0], dynamics.drift, (1, 0))  # (left, move, row, col)
-    paths, tolls = [], _on_map(admissible, case.tolls)
+    paths, tolls = [], on_map(admissible, case.tolls)
     for n_bounds in range(admissible.shortest, admissible.longest + 1):
 
         def gain(k: int, before: Cell, cell: Cell, n: int = n_bounds) -> float:
@@ -159,7 +159,7 @@ def best_labelled(case: Case, dynamics: Dynamics) -> Path:
         return cost + float(objective.contact_lost(np.array([x]), x, dynamics.noise_sd)[0])
 
     admissible, _, objective, _ = case
-    tolls = _on_map(admissible, case.tolls)
+    tolls = on_map(admissible, case.tolls)
     graph, to_goal, max_bounds = admissible.graph, admissible.to_goal, admissible.longest
     tests, u_turns = dominance_tests(dynamics, max_bounds), admissible.u_turns
     bit = {cell: 1 << i for i, cell in enumerate(graph)} if not admissible.revisit else {}
@@ -211,14 +211,14 @@ def with_costs(
     Further edge attributes by name; like costs these are of bounds, (move, row, col), of one move
     where all into a cell are alike.
     """
-    graph, tolls = admissible.graph.copy(), _on_map(admissible, tolls)
+    graph, tolls = admissible.graph.copy(), on_map(admissible, tolls)
     for a, b, edge in graph.edges(data=True):
         edge["cost"] = float(_of_bound(cost, a, b)) + float(_of_bound(tolls, a, b))
         edge.update({name: float(_of_bound(value, a, b)) for name, value in values.items()})
     return graph
 
 
-def _on_map(admissible: AdmissiblePaths, tolls: np.ndarray) -> np.ndarray:
+def on_map(admissible: AdmissiblePaths, tolls: np.ndarray) -> np.ndarray:
     """Tolls of bounds, (move, row, col), from (move, cell) or (move, 1)."""
     shape = admissible.passable.shape
     return np.broadcast_to(tolls, (len(tolls), shape[0] * shape[1])).reshape(-1, *shape)
@@ -234,7 +234,7 @@ class _Label(NamedTuple):
 def feasible_paths(case: Case, dynamics: Dynamics, risk: RiskTable) -> list[Path]:
     """Find feasible paths that include the best one; none if no path is feasible."""
     admissible, _, objective, _ = case
-    tolls = _on_map(admissible, case.tolls)
+    tolls = on_map(admissible, case.tolls)
     longest, drift, tests = admissible.longest, dynamics.drift, np.zeros((0, 1))
     if objective.name == "stationary":  # no history: the score of a bound is that of its own trust
         longest, drift = int(admissible.passable.sum()) - 1, dynamics.steady_state()[None]

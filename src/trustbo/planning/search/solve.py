@@ -17,7 +17,7 @@ from trustbo.planning.risk import InfeasibleError, RiskRule, RiskTable
 from trustbo.planning.search.case import Case
 from trustbo.planning.search.compiled import expected_path, plan_compiled, safest_path
 from trustbo.planning.search.graph import Best
-from trustbo.planning.search.reference import plan_networkx, with_costs
+from trustbo.planning.search.reference import on_map, plan_networkx, with_costs
 from trustbo.planning.tolls import tolls_of
 from trustbo.planning.values import entry_cost
 from trustbo.workspace.moves import move_indices
@@ -115,9 +115,7 @@ def graph_of(problem: PlanningProblem, dynamics: Dynamics) -> nx.DiGraph:
     values["drift"] = np.tensordot(dynamics.views.mean(0), dynamics.drift, 1)
     tolls = tolls_of(paths, problem.objective)
     if problem.objective.name == "lost_contact" and not problem.objective.lag:
-        lost = _settled_loss(problem.objective, dynamics)
-        of_bounds = tolls.reshape(len(tolls), *(lost.shape[1:] if tolls.shape[1] > 1 else (1, 1)))
-        values["lost"] = lost + of_bounds
+        values["lost"] = _settled_loss(problem.objective, dynamics) + on_map(paths, tolls)
     return with_costs(paths, entry_cost(paths.passable, dynamics), tolls, **values)
 
 
