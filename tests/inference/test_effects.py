@@ -144,10 +144,14 @@ def test_a_campaign_learns_it_plans_with_it_and_goes_on(tmp_path):
     assert result.posteriors[-1].attrs["n_missions"] == 3
 
 
-def test_other_families_and_samplers_take_it(missions):
+def test_censored_rates_take_it(missions):
     censored = PooledTrust(effects=Daylight(HOURS), observation="censored")
     effect = tb.fit(missions, censored, draws=100, whole=False)["daylight"]["sun_effect"]
     assert abs(float(effect.mean()) - LIGHT) < 4.0 * float(effect.std())
+
+
+@pytest.mark.slow
+def test_nuts_takes_it(missions):
     run = {"n_chains": 2, "warmup": 100, "draws": 300, "check": False, "whole": False}
     model = PooledTrust(effects=Daylight(HOURS))
     nuts, exact = (

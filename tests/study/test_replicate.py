@@ -17,7 +17,7 @@ from trustbo.study.replicate import BASELINES, persistence, ridge, unobserved_co
 FEATURES = ("expected",)
 
 
-def log_of(seed, n=3, n_bounds=40):
+def log_of(seed, n=2, n_bounds=32):
     """Missions of an AR(1) around an expectation, counted in 20 ticks."""
     rng, missions = np.random.default_rng(seed), []
     for _ in range(n):
@@ -45,7 +45,7 @@ def test_the_model_that_the_logs_are_made_of_is_first_both_ways(logs):
     }
     table = replicate(logs, models, baselines=["persistence", "ridge"])
     assert table.shape == (8, 5)
-    assert (table["n"] == 3 * (2 * 39 - 1)).all()
+    assert (table["n"] == 2 * (2 * 31 - 1)).all()
     assert table["mean_log_score"].is_monotonic_decreasing
     for direction in (("one", "other"), ("other", "one")):
         of_one = table.xs(direction, level=("fitted to", "scored on"))
